@@ -28,7 +28,7 @@ from ..schemas.errors import (
     error_from_code,
 )
 from ..schemas.wire import keys
-from ..schemas.wire.answers import PARTS, PATH_ANSWERS, Cost, Part
+from ..schemas.wire.answers import Part
 from ..schemas.wire.columns import as_part, check_answers, unknown
 from ..schemas.wire.messages import (
     MAX_POSES,
@@ -45,12 +45,9 @@ from ..schemas.wire.messages import (
     decode_answer,
     encode,
 )
-from ..schemas.wire.requests import (
-    check_path_parameters,
-    is_bounded,
-    make_poses,
-    make_positions,
-)
+from ..schemas.wire.path_request import check_path_parameters
+from ..schemas.wire.questions import QUESTIONS, Question
+from ..schemas.wire.requests import is_bounded, make_poses, make_positions
 from .network.endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
 from .network.replies import Anchor, Asked, OtherAvatarError
 from .network.zenoh_settings import session_config
@@ -231,21 +228,22 @@ class Client(Questions):
             raise TooLargeError(f"path of {len(array)} poses: at most {MAX_POSES}: ask for it in pieces")
         request = PathRequest(name, array, op, **parameters)  # type: ignore[arg-type]
         total = max(0, len(array) - 1) if op == "sweep" else len(array)
-        return self._parts(PATH_ANSWERS[op], encode(request), name, total, is_bounded(parameters))
+        return self._parts(QUESTIONS[op], encode(request), name, total, is_bounded(parameters))
 
     def _parts(
-        self, kind: type[Cost], request: bytes, name: str, total: int, bounded: bool
+        self, question: Question[Any], request: bytes, name: str, total: int, bounded: bool
     ) -> Iterator[Part]:
         """The parts of a path, each once and in order, whatever came of them."""
 
         def missing(stop: int) -> Part:
             self._note_unanswered(stop - expected)
-            part: Part = as_part(unknown(kind, stop - expected, bounded=bounded), expected, total)
+            none = unknown(question.answers, stop - expected, bounded=bounded)
+            part: Part = as_part(none, expected, total)
             return part
 
         expected, complete = 0, False
         for payload in self._replies(request, name):
-            part = decode_answer(PARTS[kind], payload)
+            part = decode_answer(question.part, payload)
             check_answers(part, len(part))
             if part.total != total or part.first < 0 or part.first + len(part) > total:
                 raise InternalError(

@@ -128,7 +128,6 @@ MOST_LINES = 400
 # Longer files, with their lines: a file here may only become shorter, and none may be added.
 LONG = {
     "schemas/archive/index.py": 410,
-    "schemas/wire/requests.py": 434,
     "builder/plan/build_plan.py": 417,
     "builder/sources/scan_list.py": 409,
     "builder/spool/spool.py": 427,
@@ -142,7 +141,6 @@ LONG = {
     "server/scene.py": 458,
     "server/scenes/placed_archives.py": 413,
     "server/service/request_lanes.py": 401,
-    "server/service/service.py": 412,
     "server/simulation/simulation.py": 410,
     "server/simulation/world/collision_world.py": 411,
 }

@@ -6,7 +6,7 @@ return the same types.
 
 from collections.abc import Iterator
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -334,19 +334,3 @@ class SweepPart(SweepAnswers, frozen=True, eq=False, kw_only=True):
 
 
 Part = CollidePart | DistancePart | ContactsPart | SweepPart
-
-# Part type of each answer type.
-PARTS: dict[type, Any] = {
-    CollideAnswers: CollidePart,
-    DistanceAnswers: DistancePart,
-    ContactsAnswers: ContactsPart,
-    SweepAnswers: SweepPart,
-}
-
-# Answer type of each operation along a path.
-PATH_ANSWERS: dict[str, type[Cost]] = {
-    "collide": CollideAnswers,
-    "distance": DistanceAnswers,
-    "contacts": ContactsAnswers,
-    "sweep": SweepAnswers,
-}

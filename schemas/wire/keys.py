@@ -6,14 +6,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from ..errors import BadRequestError
+from .questions import QUESTIONS
 
 # The 1 is WIRE.md's version: servers of two versions can run side by side, and neither receives the
 # other's messages.
 ROOT = "solidcloud/1"
-OPERATIONS = (
-    "info", "add_avatar", "collide", "distance", "contacts", "sweep", "raycast", "within", "objects", "path",
-    "move", "reload", "stats",
-)  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -43,6 +40,11 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
+def operations() -> tuple[str, ...]:
+    """Return the operations of a scene: all questions, and those that every scene has besides."""
+    return ("info", "add_avatar", *QUESTIONS, "path", "move", "reload", "stats")
+
+
 def scenes_key() -> str:
     """Return the key under which every server lists the scenes that it serves."""
     return f"{ROOT}/scenes"
@@ -52,8 +54,8 @@ def question_key(scene: str, client: str, operation: str) -> str:
     """Return the key under which a client sends one operation to one scene."""
     check_name(scene, "scene")
     check_name(client, "client")
-    if operation not in OPERATIONS:
-        raise BadRequestError(f"operation {operation!r}: expected one of {', '.join(OPERATIONS)}")
+    if operation not in operations():
+        raise BadRequestError(f"operation {operation!r}: expected one of {', '.join(operations())}")
     return f"{ROOT}/scene/{scene}/{client}/{operation}"
 
 

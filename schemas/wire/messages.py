@@ -11,19 +11,6 @@ import msgspec
 import numpy as np
 
 from ..errors import ErrorCode
-from .answers import (
-    CollideAnswers,
-    CollidePart,
-    ContactsAnswers,
-    ContactsPart,
-    DistanceAnswers,
-    DistancePart,
-    ObjectsAnswers,
-    RaycastAnswers,
-    SweepAnswers,
-    SweepPart,
-    WithinAnswers,
-)
 from .arrays import ArrayType, Poses, Positions, array_fields
 from .columns import check_answers
 from .encoding import (
@@ -36,6 +23,8 @@ from .encoding import (
     wire_encoding,
 )
 from .moves import Moved, MoveRequest, State, Wish
+from .path_request import PathRequest
+from .questions import QUESTIONS, path_questions
 from .requests import (
     MAX_AVATAR_POINTS,
     MAX_POSES,
@@ -44,7 +33,6 @@ from .requests import (
     ContactsRequest,
     DistanceRequest,
     ObjectsRequest,
-    PathRequest,
     RaycastRequest,
     Request,
     SweepRequest,
@@ -251,25 +239,9 @@ MESSAGES: tuple[type, ...] = (
     SceneInfo,
     AddAvatarRequest,
     AvatarInfo,
-    CollideRequest,
-    CollideAnswers,
-    DistanceRequest,
-    DistanceAnswers,
-    ContactsRequest,
-    ContactsAnswers,
-    SweepRequest,
-    SweepAnswers,
-    RaycastRequest,
-    RaycastAnswers,
-    WithinRequest,
-    WithinAnswers,
-    ObjectsRequest,
-    ObjectsAnswers,
+    *(kind for question in QUESTIONS.values() for kind in (question.request, question.answers)),
     PathRequest,
-    CollidePart,
-    DistancePart,
-    ContactsPart,
-    SweepPart,
+    *(question.part for question in path_questions().values()),
     MoveRequest,
     Moved,
     Wish,

@@ -7,7 +7,7 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any, Literal, TypedDict, get_type_hints
+from typing import Annotated, Any, TypedDict, get_type_hints
 
 import msgspec
 import numpy as np
@@ -34,16 +34,6 @@ Duration = Annotated[float, msgspec.Meta(ge=0, description="milliseconds")]
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
 ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-PathOperation = Literal["collide", "distance", "contacts", "sweep"]
-
-# Parameters of each operation along a path, besides the avatar, the poses, the tolerance and the
-# budgets.
-PATH_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "collide": ("margin",),
-    "distance": ("reach",),
-    "contacts": ("limit", "margin", "cluster_distance"),
-    "sweep": ("margin",),
-}
 
 _FLOAT64 = np.dtype("<f8")
 
@@ -74,7 +64,7 @@ class AddAvatarRequest(Request, frozen=True):
     radius: Length | None = None
 
 
-class Question(Request, frozen=True, kw_only=True):
+class QuestionRequest(Request, frozen=True, kw_only=True):
     """Parameters that every query takes.
 
     tolerance: how early contact may be reported, and how far apart bounds may lie [m]; 0: exact.
@@ -89,9 +79,20 @@ class Question(Request, frozen=True, kw_only=True):
     budget_visits: Count | None = None
     radius_model: ModelName | None = None
 
+    def arguments(self) -> tuple[Any, ...]:
+        """Return the fields that only this request has, in the order of the query's method."""
+        return tuple([getattr(self, name) for name in self.__struct_fields__ if name not in _OPTIONS])
+
+    def options(self) -> dict[str, Any]:
+        """Return the fields of `QuestionRequest`, by name."""
+        return {name: getattr(self, name) for name in _OPTIONS}
+
+
+_OPTIONS = QuestionRequest.__struct_fields__
+
 
 class QuestionOptions(TypedDict, total=False):
-    """Fields of `Question` as keyword arguments, for this module and every query method."""
+    """Fields of `QuestionRequest` as keyword arguments, for this module and every query method."""
 
     tolerance: float
     budget_ms: float | None
@@ -106,7 +107,7 @@ def is_bounded(options: Mapping[str, Any]) -> bool:
     )
 
 
-class CollideRequest(Question, frozen=True):
+class CollideRequest(QuestionRequest, frozen=True):
     """Test, for each pose, if an avatar touches the scene.
 
     avatar: the name under which it was added.
@@ -119,7 +120,7 @@ class CollideRequest(Question, frozen=True):
     margin: Length = 0.0
 
 
-class DistanceRequest(Question, frozen=True):
+class DistanceRequest(QuestionRequest, frozen=True):
     """Measure, for each pose, the distance from an avatar to the scene, and its nearest points.
 
     avatar, poses: as in CollideRequest.
@@ -131,7 +132,7 @@ class DistanceRequest(Question, frozen=True):
     reach: Length
 
 
-class ContactsRequest(Question, frozen=True):
+class ContactsRequest(QuestionRequest, frozen=True):
     """List, for each pose, the pairs of points in contact.
 
     avatar, poses, margin: as in CollideRequest.
@@ -147,7 +148,7 @@ class ContactsRequest(Question, frozen=True):
     cluster_distance: Length | None = None
 
 
-class SweepRequest(Question, frozen=True, kw_only=True):
+class SweepRequest(QuestionRequest, frozen=True, kw_only=True):
     """Find, for each motion between two poses, the first contact of an avatar with the scene.
 
     avatar, margin: as in CollideRequest.
@@ -166,7 +167,7 @@ class SweepRequest(Question, frozen=True, kw_only=True):
         _same_length(self, "pose_from", "pose_to")
 
 
-class RaycastRequest(Question, frozen=True):
+class RaycastRequest(QuestionRequest, frozen=True):
     """Find, for each ray, the first scan point whose sphere it hits.
 
     origins, directions: (k, 3) float64, world [m], equally many; a direction may have any length
@@ -183,7 +184,7 @@ class RaycastRequest(Question, frozen=True):
         _same_length(self, "origins", "directions")
 
 
-class WithinRequest(Question, frozen=True):
+class WithinRequest(QuestionRequest, frozen=True):
     """Find, for each given point, the nearest scan point.
 
     points: (k, 3) float64, world [m].
@@ -206,7 +207,7 @@ class ObjectItem(Request, frozen=True):
     mask: Bits = ALL_GROUPS
 
 
-class ObjectsRequest(Question, frozen=True):
+class ObjectsRequest(QuestionRequest, frozen=True):
     """Test several avatars against the scene and against each other.
 
     objects: at most 2,048; an avatar may be named more than once.
@@ -222,59 +223,10 @@ class ObjectsRequest(Question, frozen=True):
         _same_length(self, "objects", "poses")
         _check_count(self.objects)
 
-
-class PathRequest(Request, frozen=True):
-    """Run one query along a path; the answers arrive in parts.
-
-    avatar: the name under which it was added.  poses: (k, 4, 4) float64, at most 100,000.
-    op: "collide", "distance", "contacts" or "sweep"; a sweep has k - 1 motions, each from one pose
-    to the next.
-    The other parameters are null where `op` does not take them, or for their default. "distance"
-    requires `reach`. `budget_ms` is for the whole path.
-    """
-
-    avatar: Name
-    poses: Poses
-    op: PathOperation = "collide"
-    margin: Length | None = None
-    reach: Length | None = None
-    limit: Annotated[int, msgspec.Meta(ge=0, le=MAX_CONTACTS)] | None = None
-    cluster_distance: Length | None = None
-    tolerance: Length | None = None
-    budget_ms: Duration | None = None
-    budget_visits: Count | None = None
-    radius_model: ModelName | None = None
-
-    def __post_init__(self) -> None:
-        Request.__post_init__(self)
-        self.parameters()
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters given for `op`.
-
-        Raises BadRequestError for a parameter that `op` does not take, or for a missing one.
-        """
-        names = [name for name in self.__struct_fields__ if name not in ("avatar", "poses", "op")]
-        given = {name: value for name in names if (value := getattr(self, name)) is not None}
-        check_path_parameters(self.op, given)
-        return given
-
-
-def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
-    """Check that `op` takes these parameters along a path and has all that it requires.
-
-    Raises BadRequestError otherwise.
-    """
-    if op not in PATH_PARAMETERS:
-        raise BadRequestError(f"op {op!r} along a path: expected one of {', '.join(PATH_PARAMETERS)}")
-    taken = (*PATH_PARAMETERS[op], *Question.__struct_fields__)
-    for name in parameters:
-        if name not in taken:
-            raise BadRequestError(
-                f"{name} is not a parameter of {op} along a path: it takes {', '.join(taken)}"
-            )
-    if op == "distance" and parameters.get("reach") is None:
-        raise BadRequestError("distance along a path needs reach, the farthest distance worth reporting [m]")
+    def arguments(self) -> tuple[Any, ...]:
+        """Return the arguments of the query's method, which takes each object with its pose."""
+        items = zip(self.objects, self.poses, strict=True)
+        return [(item.avatar, pose, item.group, item.mask) for item, pose in items], self.margin
 
 
 def make_positions(points: Any, what: str = "points") -> Positions:

@@ -165,11 +165,9 @@ def ask(scene: Any, op: str, arguments: tuple[Any, ...], parameters: dict[str, A
     """Ask a scene or a client one question; a path is answered by its parts, joined."""
     if op != "path":
         return getattr(scene, op)(*arguments, **parameters)
-    from solidcloud.schemas.wire.answers import PATH_ANSWERS
     from solidcloud.schemas.wire.columns import join, without_part
 
-    kind = PATH_ANSWERS[arguments[2]]
-    return join([without_part(kind, part) for part in scene.path(*arguments, **parameters)])
+    return join([without_part(part) for part in scene.path(*arguments, **parameters)])
 
 
 def near(rng: np.random.Generator, places: Arrays, count: int) -> Arrays:

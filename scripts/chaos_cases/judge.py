@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from solidcloud.schemas.wire.answers import ContactsAnswers, Cost, ObjectsAnswers, SweepAnswers, Verdict
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.columns import CLUSTER_COLUMNS, PAIR_COLUMNS
 from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.questions import CONTACTS
 
 # What is judged by itself, what depends on what was in memory, and what says how sure the rest is.
 _NOT_COMPARED = {
@@ -77,7 +77,10 @@ def _figures(got: Cost, truth: Cost, rows: Any) -> list[str]:
     faults = []
     skip = set(_NOT_COMPARED)
     if isinstance(truth, ContactsAnswers):
-        skip |= {*PAIR_COLUMNS, *CLUSTER_COLUMNS, "pair_starts", "cluster_starts"}
+        skip |= {name for name, rule in CONTACTS.columns.items() if rule.of} | {
+            "pair_starts",
+            "cluster_starts",
+        }
     if isinstance(truth, ObjectsAnswers):
         skip |= {"pairs", "pair_verdict"}
     for name in array_fields(type(truth)):
@@ -89,8 +92,8 @@ def _figures(got: Cost, truth: Cost, rows: Any) -> list[str]:
             f"row {row}: {name} {one[row]}, true is {other[row]}" for row in np.flatnonzero(rows & ~same)
         ]
     if isinstance(truth, ContactsAnswers) and isinstance(got, ContactsAnswers):
-        for starts, names in (("pair_starts", PAIR_COLUMNS), ("cluster_starts", CLUSTER_COLUMNS)):
-            faults += _lists(got, truth, rows, starts, names)
+        for starts in ("pair_starts", "cluster_starts"):
+            faults += _lists(got, truth, rows, starts, CONTACTS.rows_of(starts))
     if isinstance(truth, ObjectsAnswers) and isinstance(got, ObjectsAnswers):
         faults += _pairs(got, truth)
     return faults

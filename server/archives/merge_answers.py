@@ -1,87 +1,116 @@
-"""Answers of several archives as those of one scene: carried to the world, and merged. Pure.
+"""Answers of several archives as those of one scene: carried to the world, and merged by their columns' rules.
 
-The nearest of equals is that with the least scan point (x, y, z), then the least avatar centre, as one archive has it.
+Pure functions. The nearest of equals is that with the least scan point (x, y, z), then the least avatar centre, as in
+the answers of one archive.
 """
 
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from ...schemas.wire.answers import (
-    CollideAnswers,
-    ContactsAnswers,
-    Cost,
-    DistanceAnswers,
-    ObjectsAnswers,
-    RaycastAnswers,
-    SweepAnswers,
-    Verdict,
-    WithinAnswers,
-)
-from ...schemas.wire.columns import CLUSTER_COLUMNS, PAIR_COLUMNS
+from ...schemas.wire.answers import ContactsAnswers, Cost, Verdict
+from ...schemas.wire.arrays import array_fields
+from ...schemas.wire.questions import CONTACTS, Frame, Merge, Question, Rows, question_of
 from .rigid_transform import Pose, moved, moved_boxes, turned
 
 _A = TypeVar("_A", bound=Cost)
 
-_PLACES = (
-    "witness_avatar", "witness_cloud", "hit", "cloud_point", "avatar_point", "cluster_avatar", "cluster_cloud",
-)  # fmt: skip
-_SUMS = ("voxels_missing", "node_visits", "point_tests", "steps")
-_MOST = np.iinfo(np.uint32).max
+_PAIRS, _CLUSTERS = CONTACTS.rows_of("pair_starts"), CONTACTS.rows_of("cluster_starts")
 
 
 def carried(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
-    """The answers of an archive at a pose, in the world; None: at the identity.
+    """Return the answers of an archive at a pose, in the world; None: at the identity.
 
     first_source: which of the scene's sources the archive's first is. A box becomes the box around its corners.
     """
     fields: dict[str, Any] = {}
-    if first_source:
-        for name in ("scan_index", "cluster_scan"):
-            numbers = getattr(answers, name, None)
-            if numbers is not None:
-                fields[name] = np.where(numbers >= 0, numbers + np.int32(first_source), numbers)
-    if pose is not None:
-        fields |= {name: moved(pose, getattr(answers, name)) for name in _PLACES if hasattr(answers, name)}
-        if hasattr(answers, "normal"):
-            fields["normal"] = turned(pose, answers.normal)
-        if isinstance(answers, ContactsAnswers):
-            low, high = moved_boxes(pose, answers.cluster_low, answers.cluster_high)
-            fields |= {"cluster_low": low, "cluster_high": high}
+    low = ""
+    for name, rule in question_of(type(answers)).columns.items():
+        if rule.frame is Frame.SCAN and first_source:
+            numbers = _of(answers, name)
+            fields[name] = np.where(numbers >= 0, numbers + np.int32(first_source), numbers)
+        if pose is None:
+            continue
+        if rule.frame is Frame.POINT:
+            fields[name] = moved(pose, _of(answers, name))
+        elif rule.frame is Frame.DIRECTION:
+            fields[name] = turned(pose, _of(answers, name))
+        elif rule.frame is Frame.BOX_LOW:
+            low = name
+        elif rule.frame is Frame.BOX_HIGH:
+            fields[low], fields[name] = moved_boxes(pose, _of(answers, low), _of(answers, name))
     return structs.replace(answers, **fields) if fields else answers
 
 
 def merged(answers: Sequence[_A]) -> _A:
-    """The answers of several archives to the same poses (rays, points, motions, objects), in the world, as one."""
+    """Return the answers of several archives to the same items, in the world, as those of one scene.
+
+    What is no column, and no cost, is that of the first archive.
+    """
+    first = answers[0]
     if len(answers) == 1:
-        return answers[0]
-    kind = type(answers[0])
-    fields = _COLUMNS[kind](answers)
-    fields["verdict"] = _verdict(answers)
-    fields["outside"] = np.all([_of(a, "outside") for a in answers], axis=0)
-    for name in _SUMS:
-        if hasattr(answers[0], name):
-            total = sum(_of(a, name).astype(np.int64) for a in answers)
-            fields[name] = np.minimum(total, _MOST).astype(np.uint32)
+        return first
+    kind = type(first)
+    question = question_of(kind)
+    fields = {
+        name: getattr(first, name)
+        for name in kind.__struct_fields__
+        if name not in question.columns and name not in Cost.__struct_fields__
+    }
+    found = _Found(answers, question, _verdict(answers), _nearest(answers, question))
+    for name, rule in question.columns.items():
+        if rule.rows is Rows.BOUNDED and not len(_of(first, name)):
+            continue
+        if rule.merge in _RULES:
+            fields[name] = _RULES[rule.merge](found, name)
+    if isinstance(first, ContactsAnswers):
+        fields |= _contacts(answers)  # type: ignore[arg-type]  # all are of one type
     return kind(**fields, **_cost(answers))
 
 
+def limited(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
+    """Return the answers with at most `limit` pairs listed for a pose, the first ones."""
+    counts = np.minimum(np.diff(answers.pair_starts), limit)
+    if int(counts.sum()) == len(answers.signed_distance):
+        return answers
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    rows = np.arange(starts[-1]) + np.repeat(answers.pair_starts[:-1] - starts[:-1], counts)
+    columns = {name: _of(answers, name)[rows] for name in _PAIRS}
+    return structs.replace(answers, pair_starts=starts, **columns)
+
+
+class _Found(NamedTuple):
+    """Answers of several archives to one question.
+
+    verdict: (k,), merged.  nearest: (k,), which archive is the nearest; empty if the question does not ask for it.
+    """
+
+    answers: Sequence[Cost]
+    question: Question[Any]
+    verdict: NDArray[np.uint8]
+    nearest: NDArray[np.int64]
+
+    def stack(self, name: str) -> NDArray[Any]:
+        """Return a column of each archive's answers, one row an archive."""
+        return np.stack([_of(a, name) for a in self.answers])
+
+
 def _of(answers: Cost, name: str) -> NDArray[Any]:
-    """A column of answers."""
+    """Return a column of answers."""
     column: NDArray[Any] = getattr(answers, name)
     return column
 
 
 def _stack(answers: Sequence[Cost], name: str) -> NDArray[Any]:
-    """A column of each archive's answers, one row an archive."""
+    """Return a column of each archive's answers, one row an archive."""
     return np.stack([_of(a, name) for a in answers])
 
 
 def _cost(answers: Sequence[Cost]) -> dict[str, Any]:
-    """What all of them cost, and what is in memory of all."""
+    """Return the cost of all answers together, and what is in memory of all archives."""
     total: dict[str, Any] = {
         name: sum(getattr(a, name) for a in answers)
         for name in ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "wait_seconds")
@@ -93,124 +122,100 @@ def _cost(answers: Sequence[Cost]) -> dict[str, Any]:
 
 
 def _verdict(answers: Sequence[Cost]) -> NDArray[np.uint8]:
-    """CONTACT with any is contact; CLEAR is what is clear of all."""
+    """Return the merged verdicts: contact with any is contact; clear is what is clear of all."""
     verdicts = _stack(answers, "verdict")
     unknown = np.where((verdicts == Verdict.UNKNOWN).any(axis=0), Verdict.UNKNOWN, Verdict.CLEAR)
     return np.where((verdicts == Verdict.CONTACT).any(axis=0), Verdict.CONTACT, unknown).astype(np.uint8)
 
 
-def _sure(answers: Sequence[Cost], verdict: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Whether a verdict is the one of tolerance 0: a sure contact with one, or all surely clear."""
-    verdicts, exact = _stack(answers, "verdict"), _stack(answers, "exact")
-    touches = (exact & (verdicts == Verdict.CONTACT)).any(axis=0)
-    return np.asarray(np.where(verdict == Verdict.CONTACT, touches, exact.all(axis=0)))
-
-
-def _collide(answers: Sequence[CollideAnswers]) -> dict[str, Any]:
-    """The bounds of `CollideAnswers`, where there are any."""
-    if not len(answers[0].exact):
-        return {}
-    return {
-        "lower": _stack(answers, "lower").min(axis=0),
-        "upper": _stack(answers, "upper").min(axis=0),
-        "exact": _sure(answers, _verdict(answers)),
-    }
-
-
-def _least(values: NDArray[np.float64], *witnesses: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Which of n archives has the least value (n, k); of equals the one with the least witnesses (n, k, 3)."""
-    k = values.shape[1]
-    found = np.zeros(k, np.int64)
+def _nearest(answers: Sequence[Cost], question: Question[Any]) -> NDArray[np.int64]:
+    """Return which archive has the least value (k,); of equals the one with the least witnesses."""
+    if question.nearest is None:
+        return np.zeros(0, np.int64)
+    value, names = question.nearest
+    values, witnesses = _stack(answers, value), [_stack(answers, name) for name in names]
+    poses = np.arange(values.shape[1])
+    found = np.zeros(len(poses), np.int64)
     for number in range(1, len(values)):
-        better = values[number] < values[found, np.arange(k)]
-        undecided = values[number] == values[found, np.arange(k)]
+        better = values[number] < values[found, poses]
+        undecided = values[number] == values[found, poses]
         for places in witnesses:
             for axis in range(3):
-                own, other = places[number, :, axis], places[found, np.arange(k), axis]
+                own, other = places[number, :, axis], places[found, poses, axis]
                 better |= undecided & (own < other)
-                undecided &= own == other  # not so where there are none, NaN
+                undecided &= own == other  # false where there are none, NaN
         found[better] = number
     return found
 
 
-def _taken(answers: Sequence[Cost], names: Sequence[str], which: NDArray[np.int64]) -> dict[str, Any]:
-    """Of each of the columns, the row of the archive that `which` (k,) says."""
-    poses = np.arange(len(which))
-    return {name: _stack(answers, name)[which, poses] for name in names}
+def _sum(found: _Found, name: str) -> NDArray[Any]:
+    """Return the sums of a column, at most the largest number of its type."""
+    dtype = array_fields(type(found.answers[0]))[name].dtype
+    total = sum(_of(a, name).astype(np.int64) for a in found.answers)
+    return np.minimum(total, np.iinfo(dtype).max).astype(dtype)
 
 
-def _nearest(
-    answers: Sequence[Cost], value: str, witnesses: Sequence[str], taken: Sequence[str]
-) -> dict[str, Any]:
-    """The columns of what is nearest: value, `taken` of the same archive, bounds, and whether it is surely nearest."""
-    values, lower = _stack(answers, value), _stack(answers, "lower")
-    which = _least(values, *(_stack(answers, name) for name in witnesses))
-    fields = _taken(answers, (value, *witnesses, *taken), which)
-    exact = _stack(answers, "exact")
+def _of_nearest(found: _Found, name: str) -> NDArray[Any]:
+    """Return the values of the nearest archive."""
+    return np.asarray(found.stack(name)[found.nearest, np.arange(len(found.nearest))])
+
+
+def _exact_verdict(found: _Found, name: str) -> NDArray[np.bool_]:
+    """Return which verdicts are those of tolerance 0: an exact contact with one, or all exact."""
+    verdicts, exact = found.stack("verdict"), found.stack(name)
+    touches = (exact & (verdicts == Verdict.CONTACT)).any(axis=0)
+    return np.asarray(np.where(found.verdict == Verdict.CONTACT, touches, exact.all(axis=0)))
+
+
+def _exact_nearest(found: _Found, name: str) -> NDArray[np.bool_]:
+    """Return where the nearest is exact, and no other archive may hold a nearer one."""
+    value, _ = found.question.nearest or ("", ())
+    exact = found.stack(name)
     # Others may hold something no nearer than their bounds say, where they do not know it.
-    known = (exact | (lower >= fields[value])).all(axis=0)
-    fields["exact"] = known & exact[which, np.arange(len(which))]
-    fields["lower"], fields["upper"] = lower.min(axis=0), _stack(answers, "upper").min(axis=0)
-    return fields
+    known = (exact | (found.stack("lower") >= _of_nearest(found, value))).all(axis=0)
+    return np.asarray(known & _of_nearest(found, name))
 
 
-def _distance(answers: Sequence[DistanceAnswers]) -> dict[str, Any]:
-    """The columns of `DistanceAnswers`."""
-    return _nearest(answers, "signed_distance", ("witness_cloud", "witness_avatar"), ("normal",))
+def _exact_interval(found: _Found, name: str) -> NDArray[np.bool_]:
+    """Return where the first contact is within the tolerance, or where all is clear."""
+    verdicts, lower = found.stack("verdict"), found.stack("lower")
+    # An interval that begins first and ends no earlier than the one that is answered is within the tolerance.
+    first = found.stack(name) & (verdicts == Verdict.CONTACT) & (lower == lower.min(axis=0))
+    return np.asarray(first.any(axis=0) | (verdicts == Verdict.CLEAR).all(axis=0))
 
 
-def _raycast(answers: Sequence[RaycastAnswers]) -> dict[str, Any]:
-    """The columns of `RaycastAnswers`."""
-    return _nearest(answers, "distance", ("cloud_point",), ("hit", "normal"))
-
-
-def _within(answers: Sequence[WithinAnswers]) -> dict[str, Any]:
-    """The columns of `WithinAnswers`."""
-    return _nearest(answers, "distance", ("cloud_point",), ())
-
-
-def _sweep(answers: Sequence[SweepAnswers]) -> dict[str, Any]:
-    """The columns of `SweepAnswers`: nothing touches before the least `lower`, the pose at the least `upper` does."""
-    verdicts, exact = _stack(answers, "verdict"), _stack(answers, "exact")
-    lower, upper = _stack(answers, "lower"), _stack(answers, "upper")
-    witnesses = ("witness_cloud", "witness_avatar")
-    which = _least(upper, *(_stack(answers, name) for name in witnesses))
-    earliest = lower.min(axis=0)
-    # An interval that begins there and ends no earlier than the one that is answered is within the tolerance.
-    close = (exact & (verdicts == Verdict.CONTACT) & (lower == earliest)).any(axis=0)
-    clear = (verdicts == Verdict.CLEAR).all(axis=0)
-    return {
-        "lower": earliest,
-        "exact": close | clear,
-        **_taken(answers, ("upper", *witnesses), which),
-    }
-
-
-def _objects(answers: Sequence[ObjectsAnswers]) -> dict[str, Any]:
-    """What objects do to one another: the first archive was asked of that."""
-    names = ("pairs", "pair_verdict", "pairs_tested", "pairs_filtered", "pair_visits", "pair_tests")
-    return {name: getattr(answers[0], name) for name in names}
+# Merge.LISTED is missing: its columns depend on one another, see `_contacts`.
+_RULES: dict[Merge, Callable[[_Found, str], NDArray[Any]]] = {
+    Merge.VERDICT: lambda found, _: found.verdict,
+    Merge.ALL: lambda found, name: np.asarray(found.stack(name).all(axis=0)),
+    Merge.SUM: _sum,
+    Merge.LEAST: lambda found, name: np.asarray(found.stack(name).min(axis=0)),
+    Merge.NEAREST: _of_nearest,
+    Merge.FIRST: lambda found, name: _of(found.answers[0], name),
+    Merge.EXACT_VERDICT: _exact_verdict,
+    Merge.EXACT_NEAREST: _exact_nearest,
+    Merge.EXACT_INTERVAL: _exact_interval,
+}
 
 
 def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
-    """The columns of `ContactsAnswers`: all pairs, of all clusters, each by depth. No cluster is of two archives."""
-    fields: dict[str, Any] = {
-        "exact": _stack(answers, "exact").all(axis=0),
-        "pairs_found": _stack(answers, "pairs_found").sum(axis=0),
-    }
+    """Return the listed rows of `ContactsAnswers`: pairs and clusters of all archives, each by depth.
+
+    No cluster is of two archives.
+    """
     k = len(answers[0])
     clusters, cluster_starts, cluster_rows = _by_pose(answers, "cluster_starts", k)
     deepest = np.concatenate([a.cluster_deepest for a in answers])[clusters]
     cloud = np.concatenate([a.cluster_cloud for a in answers])[clusters]
     order = np.lexsort((*cloud.T[::-1], deepest, cluster_rows))
     clusters = clusters[order]
-    fields |= {name: np.concatenate([_of(a, name) for a in answers])[clusters] for name in CLUSTER_COLUMNS}
+    fields = {name: np.concatenate([_of(a, name) for a in answers])[clusters] for name in _CLUSTERS}
     fields["cluster_starts"] = cluster_starts
     # Where each archive's own cluster of each pose went, from the pose's first.
     place = np.empty(len(clusters), np.int64)
     place[clusters] = np.arange(len(clusters)) - cluster_starts[cluster_rows[order]]
     pairs, pair_starts, pair_rows = _by_pose(answers, "pair_starts", k)
-    columns = {name: np.concatenate([_of(a, name) for a in answers])[pairs] for name in PAIR_COLUMNS}
+    columns = {name: np.concatenate([_of(a, name) for a in answers])[pairs] for name in _PAIRS}
     columns["cluster"] = place[_own_clusters(answers)][pairs].astype(np.int32)
     keys = (columns["avatar_index"], *columns["avatar_point"].T[::-1], *columns["cloud_point"].T[::-1])
     order = np.lexsort((*keys, columns["signed_distance"], pair_rows))
@@ -220,8 +225,10 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
 def _by_pose(
     answers: Sequence[ContactsAnswers], starts: str, k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the archives' columns joined, in the order of the k poses; where each pose's begin (k + 1,), and the
-    pose of each."""
+    """Return the rows of the archives' columns joined, in the order of the k poses.
+
+    Also returns the starts of the poses' rows (k + 1,), and the pose of each row.
+    """
     poses = np.concatenate([np.repeat(np.arange(k), np.diff(_of(a, starts))) for a in answers])
     order = np.argsort(poses, kind="stable")
     counts = np.bincount(poses, minlength=k) if k else np.zeros(0, np.int64)
@@ -229,31 +236,9 @@ def _by_pose(
 
 
 def _own_clusters(answers: Sequence[ContactsAnswers]) -> NDArray[np.int64]:
-    """Of each pair of the archives' columns joined, its cluster's row in those joined."""
+    """Return, for each pair of the archives' columns joined, its cluster's row in the joined columns."""
     rows, first = [], 0
     for a in answers:
         rows.append(np.repeat(a.cluster_starts[:-1], np.diff(a.pair_starts)) + a.cluster + first)
         first += len(a.cluster_count)
     return np.concatenate(rows).astype(np.int64)
-
-
-def limited(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
-    """The answers with at most `limit` pairs listed a pose, the first ones."""
-    counts = np.minimum(np.diff(answers.pair_starts), limit)
-    if int(counts.sum()) == len(answers.signed_distance):
-        return answers
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    rows = np.arange(starts[-1]) + np.repeat(answers.pair_starts[:-1] - starts[:-1], counts)
-    columns = {name: _of(answers, name)[rows] for name in PAIR_COLUMNS}
-    return structs.replace(answers, pair_starts=starts, **columns)
-
-
-_COLUMNS: dict[type[Cost], Any] = {
-    CollideAnswers: _collide,
-    DistanceAnswers: _distance,
-    ContactsAnswers: _contacts,
-    SweepAnswers: _sweep,
-    RaycastAnswers: _raycast,
-    WithinAnswers: _within,
-    ObjectsAnswers: _objects,
-}

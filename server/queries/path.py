@@ -15,10 +15,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.wire.answers import PATH_ANSWERS, ContactsAnswers, Cost, Part
+from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.arrays import Poses
 from ...schemas.wire.columns import as_part, in_pieces
-from ...schemas.wire.requests import check_path_parameters
+from ...schemas.wire.path_request import check_path_parameters
+from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.pose_transform import check_poses
 from ..runtime.deadlines import stop_at
@@ -39,11 +40,9 @@ PATH_THREADS = 2
 FIRST_PART = 64
 LARGEST_PART = 1024
 PART_SECONDS = 0.01
-# Size of a part's answer, below the largest message even as JSON. A contact takes 68 bytes and its
-# cluster up to 116. There may be more clusters than contacts listed, so the size of a computed part
-# is checked again.
+# Size of a part's answer, below the largest message even as JSON. There may be more clusters than
+# contacts listed, so the size of a computed part is checked again.
 _PART_BYTES = 8 << 20
-_CONTACT_BYTES = 184
 
 Ask = Callable[[int, int], Cost]
 
@@ -100,7 +99,7 @@ def path_question(
 
     def ask(start: int, end: int, part: Stop | None = None) -> Cost:
         if effort.spent:
-            return unknown_part(PATH_ANSWERS[op], end - start, effort)
+            return unknown_part(QUESTIONS[op].answers, end - start, effort)
         what = [poses[start:end], poses[start + 1 : end + 1]] if op == "sweep" else [poses[start:end]]
         own = effort._replace(stop=part_stop(effort.stop, stop.part_seconds) if part is None else part)
         return ask_until_stopped(
@@ -125,12 +124,7 @@ def part_stop(stop: Stop, seconds: float) -> Stop:
 
 def largest_part(op: str, parameters: dict[str, Any]) -> int:
     """Return how many answers of `op` a part may hold to fit in a message."""
-    if op != "contacts":
-        return LARGEST_PART
-    limit = parameters.get("limit")
-    return min(
-        LARGEST_PART, max(1, _PART_BYTES // (_CONTACT_BYTES * max(1, 100 if limit is None else limit)))
-    )
+    return QUESTIONS[op].most_items(LARGEST_PART, _PART_BYTES, parameters)
 
 
 def path_parts(
@@ -157,9 +151,7 @@ def path_parts(
             else:
                 first, future = waiting.popleft()
                 answers = future.result()
-            for piece in (
-                in_pieces(answers, _PART_BYTES) if isinstance(answers, ContactsAnswers) else [answers]
-            ):
+            for piece in in_pieces(answers, _PART_BYTES):
                 yield as_part(piece, first, total)
                 first += len(piece)  # type: ignore[arg-type]
             size = _next_size(size, answers, most)

@@ -22,7 +22,9 @@ class Identity:
     def __init__(self, session: zenoh.Session, scene: str, timeout: float) -> None:
         """Take a fresh id and declare it. timeout: of a question [s]."""
         self.id = uuid.uuid4().hex
-        self.keys = {operation: keys.question_key(scene, self.id, operation) for operation in keys.OPERATIONS}
+        self.keys = {
+            operation: keys.question_key(scene, self.id, operation) for operation in keys.operations()
+        }
         with ExitStack() as stack:
             # Gone with this process, however it ends: then the server forgets our avatars.
             token = keys.client_alive_key(scene, self.id)

@@ -36,8 +36,8 @@ from ...schemas.wire.messages import (
 )
 from ...schemas.wire.moves import FRAME_SECONDS, Moved
 from ...schemas.wire.requests import (
-    Question,
     QuestionOptions,
+    QuestionRequest,
     is_bounded,
     make_objects,
     make_poses,
@@ -228,7 +228,7 @@ class Questions:
     def _question(
         self,
         kind: type[_A],
-        request: Callable[[slice, QuestionOptions], Question],
+        request: Callable[[slice, QuestionOptions], QuestionRequest],
         k: int,
         options: QuestionOptions,
         names: Sequence[str] = (),

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from typing import Any, NamedTuple
 
 from ...schemas.errors import (
@@ -26,24 +27,18 @@ from ...schemas.wire.messages import (
     MSGPACK,
     WIRE_VERSION,
     AddAvatarRequest,
-    CollideRequest,
-    ContactsRequest,
-    DistanceRequest,
     ErrorReply,
     MoveRequest,
-    ObjectsRequest,
     PathRequest,
-    RaycastRequest,
     ReloadAnswer,
     ScenesAnswer,
     StatsRequest,
-    SweepRequest,
-    WithinRequest,
     decode_request,
     encode,
     wire_encoding,
 )
-from ...schemas.wire.requests import Question
+from ...schemas.wire.questions import QUESTIONS, Question
+from ...schemas.wire.requests import QuestionRequest
 from ..runtime.deadlines import start_deadlines
 from ..runtime.process_heap import give_back_large_blocks
 from ..runtime.stop_flag import NEVER, Stop
@@ -70,54 +65,11 @@ class _Operation(NamedTuple):
     ask: Callable[[SceneLike, Any, str, Stop], Any]
 
 
-def _effort(request: Question, stop: Stop) -> dict[str, Any]:
-    """Return the options of a question to a scene."""
-    return {"stop": stop, **{name: getattr(request, name) for name in Question.__struct_fields__}}
-
-
-def _ask_objects(scene: SceneLike, request: ObjectsRequest, client: str, stop: Stop) -> Any:
-    items = zip(request.objects, request.poses, strict=True)
-    listed = [(item.avatar, pose, item.group, item.mask) for item, pose in items]
-    return scene.objects(listed, request.margin, client=client, **_effort(request, stop))
-
-
-_OPERATIONS = {
+# Operations with a payload that are not questions.
+_OTHERS = {
     "add_avatar": _Operation(
         AddAvatarRequest, "", lambda s, r, c, stop: s.add_avatar(r.name, r.points, r.radius, client=c)
     ),
-    "collide": _Operation(
-        CollideRequest,
-        "poses",
-        lambda s, r, c, stop: s.collide(r.avatar, r.poses, r.margin, client=c, **_effort(r, stop)),
-    ),
-    "distance": _Operation(
-        DistanceRequest,
-        "poses",
-        lambda s, r, c, stop: s.distance(r.avatar, r.poses, r.reach, client=c, **_effort(r, stop)),
-    ),
-    "contacts": _Operation(
-        ContactsRequest,
-        "poses",
-        lambda s, r, c, stop: s.contacts(
-            r.avatar, r.poses, r.limit, r.margin, r.cluster_distance, client=c, **_effort(r, stop)
-        ),
-    ),
-    "sweep": _Operation(
-        SweepRequest,
-        "pose_from",
-        lambda s, r, c, stop: s.sweep(
-            r.avatar, r.pose_from, r.pose_to, r.margin, client=c, **_effort(r, stop)
-        ),
-    ),
-    "raycast": _Operation(
-        RaycastRequest,
-        "origins",
-        lambda s, r, c, stop: s.raycast(r.origins, r.directions, r.reach, **_effort(r, stop)),
-    ),
-    "within": _Operation(
-        WithinRequest, "points", lambda s, r, c, stop: s.within(r.points, r.reach, **_effort(r, stop))
-    ),
-    "objects": _Operation(ObjectsRequest, "poses", _ask_objects),
     "move": _Operation(
         MoveRequest,
         "",
@@ -129,6 +81,21 @@ _OPERATIONS = {
         lambda s, r, c, stop: s.path(r.avatar, r.poses, r.op, client=c, stop=stop, **r.parameters()),
     ),
 }
+
+
+@cache
+def _operation(name: str) -> _Operation | None:
+    """Return how an operation is answered; None for one without a payload."""
+    question = QUESTIONS.get(name)
+    if question is None:
+        return _OTHERS.get(name)
+    own: Question[Any] = question
+
+    def ask(scene: SceneLike, request: QuestionRequest, client: str, stop: Stop) -> Any:
+        client_too = {"client": client} if own.about_avatars else {}
+        return getattr(scene, name)(*request.arguments(), stop=stop, **client_too, **request.options())
+
+    return _Operation(own.request, own.counted, ask)
 
 
 class Service:
@@ -264,7 +231,7 @@ class Service:
         if scene is None:
             served = ", ".join(sorted(self._scenes))
             raise UnknownSceneError(f"scene {route.scene!r} is not served here; served: {served}")
-        operation = _OPERATIONS.get(route.operation)
+        operation = _operation(route.operation)
         if operation is None:
             if route.operation == "stats":
                 asked = decode_request(StatsRequest, payload, encoding) if payload else StatsRequest()

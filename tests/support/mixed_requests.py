@@ -38,7 +38,7 @@ from solidcloud.schemas.wire.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.schemas.wire.requests import ObjectItem, Question
+from solidcloud.schemas.wire.requests import ObjectItem, QuestionRequest
 from solidcloud.server.scene import Scene
 from solidcloud.server.service.server_config import ServerConfig
 from solidcloud.server.service.service import Service
@@ -67,7 +67,7 @@ COSTS = {
 
 def question(
     rng: np.random.Generator, points: NDArray[np.float64], body: NDArray[np.float64]
-) -> tuple[str, Question]:
+) -> tuple[str, QuestionRequest]:
     """Any question, exact or within a budget of visits, of the spheres of any radius model."""
     poses = archive_cases.near_poses(
         rng, points, body, int(rng.integers(1, 4)), 0.15, float(rng.choice([1.0, 0.5]))
@@ -77,7 +77,7 @@ def question(
         effort["radius_model"] = str(rng.choice(MODELS))
     op = str(rng.choice(list(ANSWERS)))
     starts = rng.uniform(0, 2, (2, 3))
-    asked: Question
+    asked: QuestionRequest
     if op == "collide":
         asked = CollideRequest("body", poses, 0.002, **effort)
     elif op == "distance":

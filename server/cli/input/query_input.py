@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError
-from ....schemas.wire.answers import PATH_ANSWERS, Cost
+from ....schemas.wire.answers import Cost
 from ....schemas.wire.columns import join, without_part
 from ....schemas.wire.moves import LONGEST_SECONDS, Moved
-from ....schemas.wire.requests import PATH_PARAMETERS, Question
+from ....schemas.wire.questions import path_questions
+from ....schemas.wire.requests import QuestionRequest
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import Bodies, Places, Points, Rays, box_of
 
@@ -30,7 +31,7 @@ _OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-_OF_ALL = Question.__struct_fields__
+_OF_ALL = QuestionRequest.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
@@ -83,8 +84,8 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
     given = {name: value for name, value in options.items() if value is not None}
     along = given.get("along", "collide")
     if op == "path":
-        if along not in PATH_PARAMETERS:
-            raise BadRequestError(f"--along {along}: expected one of {', '.join(PATH_PARAMETERS)}")
+        if along not in path_questions():
+            raise BadRequestError(f"--along {along}: expected one of {', '.join(path_questions())}")
         needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
     asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
     # The budget of a frame is set by the scene, not by the request.
@@ -123,7 +124,7 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
     if query.op == "path":
         for part in scene.path("avatar", poses, op, **parameters):
             which = slice(part.first, part.first + len(part))
-            yield Asked(labels[which], begins[which], without_part(PATH_ANSWERS[op], part), places)
+            yield Asked(labels[which], begins[which], without_part(part), places)
     elif op == "sweep":
         yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters), places)
     else:

@@ -6,11 +6,7 @@ import zenoh
 from corner import POSES, same
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire import keys
-from solidcloud.schemas.wire.answers import (
-    PARTS,
-    PATH_ANSWERS,
-    Verdict,
-)
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.columns import join, without_part
 from solidcloud.schemas.wire.messages import (
     JSON,
@@ -19,6 +15,7 @@ from solidcloud.schemas.wire.messages import (
     decode_answer,
     encode,
 )
+from solidcloud.schemas.wire.questions import QUESTIONS
 from solidcloud.server.network.zenoh_settings import session_config
 from solidcloud.server.queries import path as path_module
 
@@ -51,7 +48,7 @@ def test_a_path_is_its_question_in_parts(scene, client, op, parameters, monkeypa
         stops = np.cumsum([len(part) for part in parts]).tolist()
         assert [part.first for part in parts] == [0, *stops[:-1]]
         assert {part.total for part in parts} == {stops[-1]} == {len(expected)}
-        same(join([without_part(type(expected), part) for part in parts]), expected)
+        same(join([without_part(part) for part in parts]), expected)
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
@@ -66,11 +63,10 @@ def test_plain_zenoh_gets_the_parts_of_a_path(scene, endpoint, op, parameters, e
         every = {"consolidation": zenoh.ConsolidationMode.NONE, "encoding": encoding}
         replies = [reply.ok.payload.to_bytes() for reply in session.get(key, payload=payload, **every)]
     assert len(replies) > 3
-    kind = PATH_ANSWERS[op]
-    parts = [decode_answer(PARTS[kind], reply, encoding) for reply in replies]
+    parts = [decode_answer(QUESTIONS[op].part, reply, encoding) for reply in replies]
     same(
-        join([without_part(kind, part) for part in parts]),
-        join([without_part(kind, part) for part in expected]),
+        join([without_part(part) for part in parts]),
+        join([without_part(part) for part in expected]),
     )
 
 

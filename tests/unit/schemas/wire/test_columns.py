@@ -7,29 +7,18 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import InternalError
 from solidcloud.schemas.wire.answers import (
-    PARTS,
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
     ObjectsAnswers,
-    RaycastAnswers,
-    SweepAnswers,
     Verdict,
-    WithinAnswers,
 )
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.schemas.wire.columns import as_part, check_answers, in_pieces, join, unknown, without_part
 from solidcloud.schemas.wire.messages import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.questions import QUESTIONS, path_questions
 
-KINDS = [
-    CollideAnswers,
-    DistanceAnswers,
-    ContactsAnswers,
-    SweepAnswers,
-    RaycastAnswers,
-    WithinAnswers,
-    ObjectsAnswers,
-]
+KINDS = [question.answers for question in QUESTIONS.values()]
 
 
 def some(kind, k, seed=1, pairs=(2, 0, 3)):
@@ -102,16 +91,17 @@ def test_joined_answers_are_those_of_all(kind):
         assert np.diff(whole.pair_starts).tolist() == counts.tolist()
 
 
-@pytest.mark.parametrize("kind", PARTS)
-def test_a_part_says_where_it_belongs(kind):
+@pytest.mark.parametrize("question", path_questions().values(), ids=lambda question: question.name)
+def test_a_part_says_where_it_belongs(question):
+    kind = question.answers
     answers = some(kind, 4)
     part = as_part(answers, 7, 20)
     for encoding in (MSGPACK, JSON):
-        got = decode_answer(PARTS[kind], encode(part, encoding), encoding)
+        got = decode_answer(question.part, encode(part, encoding), encoding)
         assert (got.first, got.total, len(check_answers(got, 4))) == (7, 20, 4)
         same(got, part)
     assert isinstance(part, kind)
-    same(without_part(kind, part), answers)
+    same(without_part(part), answers)
 
 
 @pytest.mark.parametrize("kind", KINDS)

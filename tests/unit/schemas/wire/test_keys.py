@@ -22,7 +22,7 @@ def test_keys_look_as_in_the_document():
 
 
 def test_a_question_is_read_as_it_was_written():
-    for operation in keys.OPERATIONS:
+    for operation in keys.operations():
         route = keys.parse_question(keys.question_key("St.Peter_2", "a", operation))
         assert route == keys.Route("St.Peter_2", "a", operation)
 

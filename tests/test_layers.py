@@ -45,7 +45,7 @@ ALLOWED = {
     "server/kernels/nearest": "kernels/core kernels/overlap",
     "server/network": "served",
     "server/kernels/bodies": "kernels/core kernels/motion",
-    "server/remote": "network",
+    "server/remote": "network served",
     "server/service": "observability runtime served network",
     "server/avatars": "kernels served",
     "server/client.py": "network remote",

@@ -162,9 +162,14 @@ class Question(Generic[A]):
 
     @cached_property
     def fields(self) -> tuple[str, ...]:
-        """Return the fields that only this question has, in the order of the methods' arguments."""
+        """Return the fields that only this question's request has."""
         options = QuestionRequest.__struct_fields__
         return tuple(name for name in self.request.__struct_fields__ if name not in options)
+
+    @cached_property
+    def arguments(self) -> tuple[str, ...]:
+        """Return the arguments of the question's method; `objects` come with their poses."""
+        return tuple(name for name in self.fields if not (name == "poses" and "objects" in self.fields))
 
     @cached_property
     def required(self) -> tuple[str, ...]:

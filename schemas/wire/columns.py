@@ -108,16 +108,14 @@ def in_pieces(answers: _A, most_bytes: int) -> Iterator[_A]:
 
 def as_part(answers: Cost, first: int, total: int) -> Any:
     """Return answers as the part [first, first + n) of `total` along a path."""
-    kind: type[Cost] = type(answers)
-    return question_of(kind).part(**asdict(answers), first=first, total=total)
+    return question_of(type(answers)).part(**asdict(answers), first=first, total=total)
 
 
 def without_part(part: Any) -> Any:
     """Return the answers of a part as an instance of their own type, without `first` and `total`."""
     fields = asdict(part)
     del fields["first"], fields["total"]
-    kind: type[Cost] = type(part)
-    return question_of(kind).answers(**fields)
+    return question_of(type(part)).answers(**fields)
 
 
 def check_answers(answers: _A, k: int) -> _A:

@@ -8,7 +8,7 @@ answer are in server/queries.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
-from functools import cache, cached_property
+from functools import cached_property
 from math import inf
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -325,10 +325,16 @@ QUESTIONS: dict[str, Question[Any]] = {
 }
 
 
-@cache
-def question_of(kind: type) -> Question[Any]:
+_BY_TYPE: dict[type, Question[Any]] = {}
+
+
+def question_of(kind: type[Any]) -> Question[Any]:
     """Return the question to which a type of answers, or of their parts along a path, belongs."""
-    return next(question for question in QUESTIONS.values() if issubclass(kind, question.answers))
+    found = _BY_TYPE.get(kind)
+    if found is None:
+        found = next(question for question in QUESTIONS.values() if issubclass(kind, question.answers))
+        _BY_TYPE[kind] = found
+    return found
 
 
 def path_questions() -> dict[str, Question[Any]]:

@@ -12,36 +12,34 @@ from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
 from ....schemas.wire.columns import join, without_part
 from ....schemas.wire.moves import LONGEST_SECONDS, Moved
-from ....schemas.wire.questions import path_questions
+from ....schemas.wire.questions import OBJECTS, QUESTIONS, Question, path_questions
 from ....schemas.wire.requests import QuestionRequest
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import Bodies, Places, Points, Rays, box_of
 
-# Required and optional options of each query, besides the scene and the options common to all.
-_OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "collide": (("avatar", "poses"), ("radius", "margin")),
-    "distance": (("avatar", "poses", "reach"), ("radius",)),
-    "contacts": (("avatar", "poses"), ("radius", "margin", "limit", "cluster_distance")),
-    "sweep": (("avatar", "poses"), ("radius", "margin")),
-    "raycast": (("rays", "reach"), ()),
-    "within": (("points", "reach"), ()),
-    "objects": (("objects",), ("radius", "margin")),
-    "move": (("avatar", "poses"), ("radius",)),
-    "path": (("avatar", "poses"), ("radius", "along", "margin", "reach", "limit", "cluster_distance")),
+# Files that give arguments of questions: option of each.
+_FILES = {
+    "avatar": "avatar",
+    "poses": "poses",
+    "pose_from": "poses",
+    "pose_to": "poses",
+    "origins": "rays",
+    "directions": "rays",
+    "points": "points",
+    "objects": "objects",
 }
-
-
+# Options that are not sent as parameters.
+_NOT_SENT = frozenset({*_FILES.values(), "radius", "along"})
 _OF_ALL = QuestionRequest.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
 
 class Asker(Protocol):
-    """A `Client` or a `Scene`. Queries without a method here are called by name."""
+    """A `Client` or a `Scene`."""
 
     def add_avatar(self, *what: Any) -> Any: ...
-    def sweep(self, *what: Any, **parameters: Any) -> Any: ...
-    def objects(self, *what: Any, **parameters: Any) -> Any: ...
+    def ask(self, question: Question[Any], *what: Any, **parameters: Any) -> Any: ...
     def path(self, *what: Any, **parameters: Any) -> Any: ...
     def move(self, *what: Any) -> Moved: ...
 
@@ -78,18 +76,23 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
     Raises BadRequestError, which names an option that the query does not take or one that is
     missing.
     """
-    if op not in _OPTIONS:
-        raise BadRequestError(f"--op {op}: expected one of {', '.join(_OPTIONS)}")
-    needed, others = _OPTIONS[op]
+    if op not in (*QUESTIONS, "move", "path"):
+        raise BadRequestError(f"--op {op}: expected one of {', '.join((*QUESTIONS, 'move', 'path'))}")
     given = {name: value for name, value in options.items() if value is not None}
     along = given.get("along", "collide")
-    if op == "path":
+    asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
+    needed: tuple[str, ...]
+    others: tuple[str, ...]
+    if op == "move":  # the budget of a frame is set by the scene, not by the request
+        needed, others = ("avatar", "poses"), ("radius",)
+    elif op == "path":
         if along not in path_questions():
             raise BadRequestError(f"--along {along}: expected one of {', '.join(path_questions())}")
-        needed, others = _OPTIONS[along][0], (*_OPTIONS[along][1], "along")
-    asked = f"--op path --along {along}" if op == "path" else f"--op {op}"
-    # The budget of a frame is set by the scene, not by the request.
-    others = others if op == "move" else (*others, *_OF_ALL)
+        needed, others = _options(QUESTIONS[along])
+        others = (*others, "along", *_OF_ALL)
+    else:
+        needed, others = _options(QUESTIONS[op])
+        others = (*others, *_OF_ALL)
     takes = ", ".join(map(_option, (*needed, *others)))
     for name in given:
         if name not in (*needed, *others):
@@ -100,35 +103,45 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
     return Query(op, along, given)
 
 
+def _options(question: Question[Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the required and the optional options of a question, besides those common to all."""
+    files = dict.fromkeys(_FILES[name] for name in question.arguments if name in _FILES)
+    radius = ("radius",) if question.about_avatars else ()
+    parameters = question.parameters
+    needed = (*files, *(name for name in parameters if name in question.required))
+    return needed, (*radius, *(name for name in parameters if name not in question.required))
+
+
 def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
     """Make a query and yield its answers at once, or in parts for a path.
 
     read_points: returns the points (n, 3) of a file [m].
     """
     given = dict(query.given)
-    parameters = {name: value for name, value in given.items() if name not in ("along", *_FILES)}
-    if query.op == "objects":
+    parameters = {name: value for name, value in given.items() if name not in _NOT_SENT}
+    question = QUESTIONS[query.along if query.op == "path" else query.op]
+    if "objects" in question.arguments:
         yield _ask_objects(scene, given["objects"], read_points, parameters, given.get("radius"))
         return
-    if query.op in ("raycast", "within"):
-        what = read_rays(given["rays"]) if query.op == "raycast" else (read_points(given["points"]),)
-        answers = getattr(scene, query.op)(*what, **parameters)
-        word, kind = ("ray", Rays) if query.op == "raycast" else ("point", Points)
-        labels = [f"{word} {number}" for number in range(len(answers))]
-        yield Asked(labels, [], answers, kind(*what, given["reach"]))  # type: ignore[call-arg]
+    if "avatar" not in question.arguments:
+        rays = "directions" in question.arguments
+        what = read_rays(given["rays"]) if rays else (read_points(given["points"]),)
+        answers = scene.ask(question, *what, **parameters)
+        labels = [f"{'ray' if rays else 'point'} {number}" for number in range(len(answers))]
+        kind: Any = Rays if rays else Points
+        yield Asked(labels, [], answers, kind(*what, given.get("reach", 0.0)))
         return
+    moving = "pose_to" in question.arguments
     times, poses = read_poses(given["poses"])
-    op = query.along if query.op == "path" else query.op
-    labels, begins = _labels(op, times.tolist())
-    places = _add_body(scene, query, read_points, poses, moving=op == "sweep")
+    labels, begins = _labels(times.tolist(), moving=moving)
+    places = _add_body(scene, query, read_points, poses, moving=moving)
     if query.op == "path":
-        for part in scene.path("avatar", poses, op, **parameters):
+        for part in scene.path("avatar", poses, question.name, **parameters):
             which = slice(part.first, part.first + len(part))
             yield Asked(labels[which], begins[which], without_part(part), places)
-    elif op == "sweep":
-        yield Asked(labels, begins, scene.sweep("avatar", poses[:-1], poses[1:], **parameters), places)
     else:
-        yield Asked(labels, begins, getattr(scene, op)("avatar", poses, **parameters), places)
+        ends = (poses[:-1], poses[1:]) if moving else (poses,)
+        yield Asked(labels, begins, scene.ask(question, "avatar", *ends, **parameters), places)
 
 
 def ask_moves(
@@ -141,7 +154,7 @@ def ask_moves(
     """
     times, poses = read_poses(query.given["poses"])
     places = _add_body(scene, query, read_points, poses, moving=True)
-    labels, _ = _labels("sweep", times.tolist())
+    labels, _ = _labels(times.tolist(), moving=True)
 
     def frames() -> Iterator[tuple[str, Moved]]:
         for number, (label, seconds) in enumerate(zip(labels, np.diff(times).tolist(), strict=True)):
@@ -169,9 +182,6 @@ def _add_body(
     return Bodies(box_of(points)[None], np.array([radius or 0.0]), reach, *ends)
 
 
-_FILES = ("avatar", "radius", "poses", "rays", "points", "objects")
-
-
 def _ask_objects(
     scene: Asker, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
 ) -> Asked:
@@ -184,9 +194,8 @@ def _ask_objects(
     for avatar, name in names.items():
         points = read_points(avatar)
         bodies[avatar] = box_of(points), scene.add_avatar(name, points, radius).radius or 0.0
-    answers = scene.objects(
-        [(names[row.avatar], row.pose, row.group, row.mask) for row in rows], **parameters
-    )
+    listed = [(names[row.avatar], row.pose, row.group, row.mask) for row in rows]
+    answers = scene.ask(OBJECTS, listed, **parameters)
     boxes = np.array([bodies[row.avatar][0] for row in rows]).reshape(-1, 2, 3)
     radii = np.array([bodies[row.avatar][1] for row in rows], np.float64)
     poses = np.array([row.pose for row in rows]).reshape(-1, 4, 4)
@@ -195,9 +204,9 @@ def _ask_objects(
     return Asked(labels, [], answers, places)
 
 
-def _labels(op: str, times: list[float]) -> tuple[list[str], list[float]]:
+def _labels(times: list[float], *, moving: bool) -> tuple[list[str], list[float]]:
     """Return the label of each answer and the time at which its item begins [s]."""
-    if op != "sweep":
+    if not moving:
         return [f"{time:10.3f} s" for time in times], times
     return [f"{begin:10.3f} .. {end:10.3f} s" for begin, end in pairwise(times)], times[:-1]
 

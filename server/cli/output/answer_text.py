@@ -1,7 +1,7 @@
 """Text lines and JSON values for the answers of all queries."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import groupby
 from typing import Any
 
@@ -21,11 +21,11 @@ from ....schemas.wire.answers import (
 )
 from ....schemas.wire.arrays import array_fields
 from ....schemas.wire.moves import Moved
+from ....schemas.wire.questions import COMMON, CONTACTS, Question, Rows, question_of
 
 _NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
+_COST = Cost.__struct_fields__
 _TOTALS = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults", "wait_seconds", "late")
-_OBJECTS = ("pairs_tested", "pairs_filtered", "pair_visits", "pair_tests")
-_WORDS = {SweepAnswers: "motions", RaycastAnswers: "rays", WithinAnswers: "points", ObjectsAnswers: "objects"}
 
 
 def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterator[str]:
@@ -48,7 +48,7 @@ def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterato
 
 def word_of(answers: Any) -> str:
     """Return the plural noun for the items that the answers are about, such as "poses"."""
-    return next((word for kind, word in _WORDS.items() if isinstance(answers, kind)), "poses")
+    return question_of(type(answers)).items
 
 
 def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
@@ -105,9 +105,11 @@ def answers_json(
     """
     k = len(answers)  # type: ignore[arg-type]
     rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
-    for name, of in array_fields(type(answers)).items():
+    kind: type[Cost] = type(answers)
+    question = question_of(kind)
+    for name, of in array_fields(kind).items():
         column = getattr(answers, name)
-        if len(column) == k and not _of_pairs(answers, name):
+        if len(column) == k and question.columns[name].rows in (Rows.ITEMS, Rows.BOUNDED):
             values = _plain(column, vectors=bool(of.tail))
             for row, value in zip(rows, values, strict=True):
                 row[name] = _NAMES[value] if name == "verdict" else value
@@ -121,7 +123,8 @@ def answers_json(
     if isinstance(answers, ObjectsAnswers):
         found = zip(answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True)
         totals["pairs"] = [{"objects": pair, "verdict": _NAMES[verdict]} for pair, verdict in found]
-        totals |= {name: getattr(answers, name) for name in _OBJECTS}
+    others = [name for name in kind.__struct_fields__ if name not in (*question.columns, *_COST)]
+    totals |= {name: getattr(answers, name) for name in others}
     return {"answers": rows, **totals}
 
 
@@ -136,31 +139,59 @@ def _stretches(times: list[float], answers: CollideAnswers) -> Iterator[str]:
 
 def _figure(answers: Cost, i: int) -> str:
     """Format the result of one answer, without its verdict."""
-    if isinstance(answers, DistanceAnswers):
-        if not math.isfinite(answers.signed_distance[i]):
-            return _beyond(answers, i)
-        bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
-        where = f"from {_place(answers.witness_avatar[i])} to {_place(answers.witness_cloud[i])}"
-        return f"{answers.signed_distance[i]:.6f} m {where}{bounds}"
-    if isinstance(answers, RaycastAnswers | WithinAnswers):
-        if not math.isfinite(answers.distance[i]):
-            return _beyond(answers, i)
-        where = answers.hit[i] if isinstance(answers, RaycastAnswers) else answers.cloud_point[i]
-        bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
-        return f"{answers.distance[i]:.6f} m at {_place(where)}{bounds}"
-    if isinstance(answers, SweepAnswers):
-        if not math.isfinite(answers.upper[i]):
-            return "" if answers.lower[i] >= 1 else f"clear up to {answers.lower[i]:.9f} of the motion"
-        span = f"from {answers.lower[i]:.9f} to {answers.upper[i]:.9f} of the motion"
-        return f"{span}, at {_place(answers.witness_cloud[i])}"
-    if isinstance(answers, ContactsAnswers) and answers.pairs_found[i]:
-        clusters = _slice(answers.cluster_starts, i)
-        text = f"{answers.pairs_found[i]} pairs in {clusters.stop - clusters.start} clusters"
-        if clusters.start < clusters.stop:
-            deepest = clusters.start
-            text += f", {answers.cluster_deepest[deepest]:.6f} m at {_place(answers.cluster_cloud[deepest])}"
-        return text
-    return ""
+    question = question_of(type(answers))
+    form = _FORMS.get(question.name)
+    return _own_columns(question, answers, i) if form is None else form(answers, i)
+
+
+def _own_columns(question: Question[Any], answers: Cost, i: int) -> str:
+    """Format the columns that only this question has."""
+    own = [name for name, rule in question.columns.items() if rule.rows is Rows.ITEMS and name not in COMMON]
+    return ", ".join(f"{name} {getattr(answers, name)[i]}" for name in own)
+
+
+def _distance(answers: DistanceAnswers, i: int) -> str:
+    if not math.isfinite(answers.signed_distance[i]):
+        return _beyond(answers, i)
+    bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
+    where = f"from {_place(answers.witness_avatar[i])} to {_place(answers.witness_cloud[i])}"
+    return f"{answers.signed_distance[i]:.6f} m {where}{bounds}"
+
+
+def _nearest(answers: RaycastAnswers | WithinAnswers, i: int) -> str:
+    if not math.isfinite(answers.distance[i]):
+        return _beyond(answers, i)
+    where = answers.hit[i] if isinstance(answers, RaycastAnswers) else answers.cloud_point[i]
+    bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
+    return f"{answers.distance[i]:.6f} m at {_place(where)}{bounds}"
+
+
+def _sweep(answers: SweepAnswers, i: int) -> str:
+    if not math.isfinite(answers.upper[i]):
+        return "" if answers.lower[i] >= 1 else f"clear up to {answers.lower[i]:.9f} of the motion"
+    span = f"from {answers.lower[i]:.9f} to {answers.upper[i]:.9f} of the motion"
+    return f"{span}, at {_place(answers.witness_cloud[i])}"
+
+
+def _contacts(answers: ContactsAnswers, i: int) -> str:
+    if not answers.pairs_found[i]:
+        return ""
+    clusters = _slice(answers.cluster_starts, i)
+    text = f"{answers.pairs_found[i]} pairs in {clusters.stop - clusters.start} clusters"
+    if clusters.start < clusters.stop:
+        deepest = clusters.start
+        text += f", {answers.cluster_deepest[deepest]:.6f} m at {_place(answers.cluster_cloud[deepest])}"
+    return text
+
+
+# Texts of results by question; any other question has its own columns by name.
+_FORMS: dict[str, Callable[[Any, int], str]] = {
+    "distance": _distance,
+    "raycast": _nearest,
+    "within": _nearest,
+    "sweep": _sweep,
+    "contacts": _contacts,
+}
 
 
 def _beyond(answers: Any, i: int) -> str:
@@ -173,26 +204,9 @@ def _place(point: Any) -> str:
     return " ".join(f"{value:.4f}" for value in point)
 
 
-def _of_pairs(answers: Cost, name: str) -> bool:
-    """Return whether a column does not have one element per answer, whatever its length."""
-    if isinstance(answers, ContactsAnswers):
-        own = ("verdict", "exact", "pairs_found", "outside", "voxels_missing", "node_visits", "point_tests")
-        return name not in own
-    return isinstance(answers, ObjectsAnswers) and name in ("pairs", "pair_verdict")
-
-
 def _rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
     """Return the contacts ("pair") or clusters ("cluster") of one pose."""
-    pairs = ("avatar_point", "cloud_point", "signed_distance", "avatar_index", "scan_index", "cluster")
-    names = (
-        {name: name for name in pairs}
-        if what == "pair"
-        else {
-            name: name.removeprefix("cluster_")
-            for name in array_fields(ContactsAnswers)
-            if name.startswith("cluster_") and name != "cluster_starts"
-        }
-    )
+    names = {name: name.removeprefix("cluster_") for name in CONTACTS.rows_of(f"{what}_starts")}
     which = _slice(getattr(answers, f"{what}_starts"), i)
     columns = [_plain(getattr(answers, name)[which], vectors=False) for name in names]
     return [dict(zip(names.values(), row, strict=True)) for row in zip(*columns, strict=True)]

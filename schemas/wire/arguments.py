@@ -1,6 +1,6 @@
 """Arguments of the query methods as fields of requests."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 from typing import Any, get_type_hints
@@ -12,24 +12,19 @@ from .requests import Length, QuestionRequest, make_objects, make_poses, make_ve
 
 
 def request_fields(
-    question: Question[Any], arguments: Sequence[Any], named: Mapping[str, Any]
+    question: Question[Any], arguments: tuple[Any, ...], named: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the fields of a question's request for the arguments of its method, by name.
 
-    arguments: in the order of `Question.arguments`.  named: further ones by name. Arrays become
-    what the wire has, with equally many elements each.
+    arguments, named: as `Question.all_arguments` takes them. Arrays become what the wire has, with
+    equally many elements each.
     Raises BadRequestError for an invalid argument, TypeError for one too many or too few.
     """
-    names = question.arguments
-    fields = dict(zip(names, arguments, strict=False), **named)
-    missing = [name for name in question.required if name in names and name not in fields]
-    if len(arguments) > len(names) or missing:
-        raise TypeError(f"{question.name}: expected the arguments {', '.join(names)}")
+    fields = dict(zip(question.arguments, question.all_arguments(arguments, named), strict=True))
     if "objects" in fields:
         fields["objects"], fields["poses"] = make_objects(fields["objects"])
     for name, convert in _conversions(question.request):
-        if name in fields:
-            fields[name] = convert(fields[name], name)
+        fields[name] = convert(fields[name], name)
     for first, second in pairwise(question.arrays):
         a, b = len(fields[first]), len(fields[second])
         if a != b:

@@ -129,6 +129,7 @@ class Question(Generic[A]):
     that decide among equals; None: no column has `Merge.NEAREST`.
     slow: an item may take milliseconds, and batches are small.
     whole: all items are asked about in one request, because they depend on one another.
+    directions: array fields of the request whose vectors are directions, and not points.
     listed: the request's field that limits the rows listed per item, and the bytes of one; None.
     """
 
@@ -141,6 +142,7 @@ class Question(Generic[A]):
     part: Any = None
     slow: bool = False
     whole: bool = False
+    directions: tuple[str, ...] = ()
     listed: tuple[str, int] | None = None
 
     def __post_init__(self) -> None:
@@ -172,13 +174,20 @@ class Question(Generic[A]):
         return tuple(name for name in self.fields if not (name == "poses" and "objects" in self.fields))
 
     @cached_property
+    def _defaults(self) -> dict[str, Any]:
+        """Return the defaults of the request's fields."""
+        return {field.name: field.default for field in struct_fields(self.request) if not field.required}
+
+    @cached_property
+    def other_defaults(self) -> dict[str, Any]:
+        """Return the defaults that differ from those of `QuestionRequest`."""
+        usual = {field.name: field.default for field in struct_fields(QuestionRequest)}
+        return {name: self._defaults[name] for name in usual if self._defaults[name] != usual[name]}
+
+    @cached_property
     def required(self) -> tuple[str, ...]:
         """Return those of `fields` that have no default."""
-        return tuple(
-            field.name
-            for field in struct_fields(self.request)
-            if field.required and field.name in self.fields
-        )
+        return tuple(name for name in self.fields if name not in self._defaults)
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -198,6 +207,25 @@ class Question(Generic[A]):
             for rows in {column.rows for column in self.columns.values()}
         }
 
+    def all_arguments(self, given: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
+        """Return all arguments of the method: those given, then those by name or their defaults.
+
+        named: arguments and options by name; the arguments are removed. TypeError for too many or
+        too few.
+        """
+        names = self.arguments
+        if len(given) == len(names):
+            return given
+        rest = [named.pop(name, self._defaults.get(name, given)) for name in names[len(given) :]]
+        if len(given) > len(names) or any(value is given for value in rest):
+            raise TypeError(f"{self.name}: expected the arguments {', '.join(names)}")
+        return (*given, *rest)
+
+    @cached_property
+    def around(self) -> int | None:
+        """Return which argument says how far from an avatar the scene matters; None: no argument."""
+        return next((i for i, name in enumerate(self.arguments) if name in ("margin", "reach")), None)
+
     def rows_of(self, starts: str) -> tuple[str, ...]:
         """Return the columns whose row ranges a column of starts has."""
         return tuple(name for name, column in self.columns.items() if column.of == starts)
@@ -212,7 +240,7 @@ class Question(Generic[A]):
         name, row_bytes = self.listed
         rows = given.get(name)
         if rows is None:
-            rows = next(field.default for field in struct_fields(self.request) if field.name == name)
+            rows = self._defaults[name]
         return min(most, max(1, most_bytes // (row_bytes * max(1, rows))))
 
 
@@ -298,6 +326,7 @@ RAYCAST = Question(
     "rays",
     _NEAREST | {"hit": _POINT, "normal": _DIRECTION},
     nearest=("distance", ("cloud_point",)),
+    directions=("directions",),
 )
 WITHIN = Question(
     "within",

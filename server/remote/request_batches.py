@@ -54,8 +54,7 @@ class Questions(Asks):
 
         What nobody answers is `UNKNOWN`; of `objects`, every pair is listed then.
         """
-        own = {name: options.pop(name) for name in question.arguments if name in options}
-        fields = request_fields(question, arguments, own)
+        fields = request_fields(question, arguments, options)
         return self._in_batches(question, fields, options)
 
     def move(self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS) -> Moved:

@@ -1,0 +1,80 @@
+"""Declarations of the questions: what must agree with them, and cannot read them."""
+
+import inspect
+from importlib.resources import files
+from pathlib import Path
+from typing import get_args
+
+import count_within_question
+import pytest
+import wire_sections
+from solidcloud.schemas.wire.answers import Part, WithinAnswers
+from solidcloud.schemas.wire.path_request import PathOperation, PathRequest
+from solidcloud.schemas.wire.questions import QUESTIONS, Column, Merge, Question, path_questions, question_of
+from solidcloud.schemas.wire.requests import QuestionRequest, WithinRequest
+from solidcloud.server.cli.commands.query_command import query
+from solidcloud.server.queries.engines import ENGINES
+from solidcloud.server.served.asks import Asks
+
+WIRE = (files("solidcloud.schemas") / "WIRE.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("question", QUESTIONS.values(), ids=lambda question: question.name)
+def test_wire_md_describes_every_field(question):
+    assert wire_sections.faults(question, WIRE) == []
+
+
+def test_a_field_that_wire_md_lacks_is_found():
+    text = WIRE.replace("| `steps` | uint32 (k) |", "| `paces` | uint32 (k) |")
+    assert wire_sections.faults(QUESTIONS["sweep"], text) == [
+        "SweepAnswers: no `steps`",
+        "SweepAnswers: has no 'paces'",
+    ]
+    text = WIRE.replace("| `steps` | uint32 (k) |", "| `steps` | uint32 (k, 3) |")
+    assert wire_sections.faults(QUESTIONS["sweep"], text) == [
+        "SweepAnswers: `steps` is uint32 (k), not uint32 (k, 3)"
+    ]
+
+
+@pytest.mark.parametrize("question", QUESTIONS.values(), ids=lambda question: question.name)
+def test_a_question_has_a_method_an_engine_and_options(question):
+    assert question.name in ENGINES
+    assert question_of(question.answers) is question
+    method = list(inspect.signature(getattr(Asks, question.name)).parameters)[1:-1]
+    assert [name.replace("name", "avatar") for name in method] == list(question.arguments)
+    options = inspect.signature(query).parameters
+    assert {*question.parameters, *QuestionRequest.__struct_fields__} <= set(options)
+
+
+def test_paths_are_of_the_questions_with_parts():
+    assert get_args(PathOperation) == tuple(path_questions())
+    assert set(get_args(Part)) == {question.part for question in path_questions().values()}
+    for question in path_questions().values():
+        assert set(question.parameters) <= set(PathRequest.__struct_fields__)
+        assert issubclass(question.part, question.answers)
+
+
+def test_defaults_of_parameters_are_those_of_the_methods():
+    for question in QUESTIONS.values():
+        parameters = inspect.signature(getattr(Asks, question.name)).parameters
+        for name in question.parameters:
+            default = parameters[name].default
+            assert (default is inspect.Parameter.empty) == (name in question.required)
+            if name not in question.required:
+                assert default == inspect.signature(question.request).parameters[name].default
+
+
+def test_a_declaration_has_a_rule_for_each_column():
+    rules = dict(QUESTIONS["within"].columns)
+    assert Question("within", WithinRequest, WithinAnswers, "points", rules).columns == rules
+    for wrong in (
+        {name: rule for name, rule in rules.items() if name != "distance"},
+        rules | {"hit": Column(Merge.FIRST)},
+    ):
+        with pytest.raises(TypeError, match="expected a rule for each array field"):
+            Question("within", WithinRequest, WithinAnswers, "points", wrong)
+
+
+def test_the_section_of_the_added_question_describes_it():
+    path = Path(count_within_question.__file__).with_name("count_within.md")
+    assert wire_sections.faults(count_within_question.COUNT_WITHIN, path.read_text(encoding="utf-8")) == []

@@ -328,7 +328,7 @@ def test_there_are_worked_examples():
 
 @pytest.mark.parametrize("name, text, digits", worked_examples())
 def test_worked_example(name, text, digits):
-    kind = getattr(messages, name)
+    kind = {kind.__name__: kind for kind in messages.MESSAGES}[name]
     decode = decode_request if issubclass(kind, Request) else decode_answer
     bits = bytes.fromhex(digits)
     for message in (decode(kind, text.encode(), JSON), decode(kind, bits, MSGPACK)):

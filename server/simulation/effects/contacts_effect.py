@@ -45,7 +45,7 @@ class ContactsRunner:
         )
         clusters = [cluster for answers in of_archives for cluster in _clusters(answers)]
         if len(of_archives) > 1:
-            clusters.sort(key=lambda cluster: cluster.deepest)
+            clusters.sort(key=lambda cluster: (cluster.deepest, cluster.cloud, cluster.avatar))
         exact = all(answers.exact[0] for answers in of_archives)
         return ContactsReport(clusters[: effect.limit], len(clusters), not exact)
 

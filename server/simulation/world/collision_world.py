@@ -30,6 +30,7 @@ from ...queries.within import within
 from ...runtime.stop_flag import NEVER, Stop
 from ...served.avatar_limits import EVERYBODY
 from .frame import Hit, Pose, Vec
+from .least_answer import comes_first, earlier, nearer
 from .vectors import lowest_of, unit
 
 # Avatars a thread has probes of at a time: users of one scene, and its objects.
@@ -203,9 +204,10 @@ class World:
         tolerance: float = 1e-6,
         effort: Effort = EXACT,
     ) -> Swept:
-        """When the avatar first touches any archive on its way between two poses; see server/queries/sweep.py.
+        """Return when the avatar first touches any archive on its way between two poses.
 
-        Of several archives: `lower` is the least, and `upper` and witness are those of the earliest contact.
+        See server/queries/sweep.py. Of several archives: `lower` is the least, and `upper` and
+        witness are those of the earliest contact, at the same time of the least witness.
         """
         probe, held = self._probe(avatar), self._held
         if self._alone and held.depth:
@@ -221,7 +223,7 @@ class World:
                 self.count(swept.visits, swept.unknown)
                 if not self._alone:
                     swept = _carried(swept, each, number)
-                found = swept if found is None else _earlier(found, swept)
+                found = swept if found is None else earlier(found, swept)
         assert found is not None
         return found
 
@@ -249,23 +251,27 @@ class World:
         return least
 
     def deepest(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Hit | None:
-        """The deepest contact at a pose, with fraction 0; None where there is none."""
+        """Return the deepest contact at a pose, with fraction 0, or None; of equals the least witness."""
         found: Hit | None = None
         depth = np.inf
         with self as seen:
             for number, each in enumerate(seen):
                 answers = contacts(each.data, avatar, _into(each, pose)[None], 1, effort=effort)
                 self._count_of(answers)
-                if len(answers.signed_distance) and answers.signed_distance[0] < depth:
-                    depth = float(answers.signed_distance[0])
+                if len(answers.signed_distance):
+                    value = float(answers.signed_distance[0])
                     own, cloud = (
                         _out(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
                     )
-                    found = Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
+                    if found is None or comes_first(value, (cloud, own), depth, (found.cloud, found.avatar)):
+                        depth, found = value, Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
         return found
 
     def nearest(self, place: Vec, reach: float, effort: Effort = EXACT) -> Hit | None:
-        """The scan point nearest to a place (3,), within a reach [m], as a Hit of it without an avatar."""
+        """Return the scan point nearest to a place (3,), within a reach [m], as a Hit without an avatar.
+
+        Of several at the same distance, the least (x, y, z).
+        """
         found: Hit | None = None
         least = np.inf
         with self as seen:
@@ -273,16 +279,22 @@ class World:
                 there = place if each.placed.inverse is None else moved(each.placed.inverse, place[None])[0]
                 answers = within(each.data, there[None], reach, effort)
                 self._count_of(answers)
-                if answers.distance[0] < least:
-                    least = float(answers.distance[0])
-                    cloud = _out(each, answers.cloud_point[0])
+                value = float(answers.distance[0])
+                if value > least or value == np.inf:
+                    continue
+                cloud = _out(each, answers.cloud_point[0])
+                if found is None or comes_first(value, (cloud,), least, (found.cloud,)):
+                    least = value
                     found = Hit(0.0, Verdict(int(answers.verdict[0])), None, cloud, "", number)
         return found
 
     def distance(
         self, avatar: AvatarModel, pose: Pose, reach: float, effort: Effort = EXACT
     ) -> DistanceAnswers:
-        """How far the avatar is from what is nearest of all archives, of one pose; see server/queries/distance.py."""
+        """Return how far the avatar is from what is nearest of all archives, of one pose.
+
+        See server/queries/distance.py, and `comes_first` for several at the same distance.
+        """
         found: DistanceAnswers | None = None
         with self as seen:
             for each in seen:
@@ -295,7 +307,7 @@ class World:
                         witness_cloud=moved(each.placed.pose, answers.witness_cloud),
                         normal=turned(each.placed.pose, answers.normal),
                     )
-                found = answers if found is None else _nearer(found, answers)
+                found = answers if found is None else nearer(found, answers)
         assert found is not None
         return found
 
@@ -373,39 +385,3 @@ def _carried(swept: Swept, seen: Seen, number: int) -> Swept:
     if swept.avatar is None or swept.cloud is None:
         return swept._replace(archive=number)
     return swept._replace(archive=number, avatar=_out(seen, swept.avatar), cloud=_out(seen, swept.cloud))
-
-
-def _earlier(one: Swept, other: Swept) -> Swept:
-    """What two archives together say of a motion."""
-    first = other if other.upper < one.upper else one
-    lower = min(one.lower, other.lower)
-    verdict = Verdict.CLEAR if lower >= 1.0 else Verdict.UNKNOWN
-    if first.upper < np.inf:
-        verdict = Verdict.CONTACT
-    exact = first.exact and lower >= first.lower
-    return first._replace(
-        verdict=verdict,
-        lower=lower,
-        exact=exact,
-        visits=one.visits + other.visits,
-        unknown=one.unknown or other.unknown,
-    )
-
-
-def _nearer(one: DistanceAnswers, other: DistanceAnswers) -> DistanceAnswers:
-    """What two archives together say of how near they are."""
-    first = other if other.signed_distance[0] < one.signed_distance[0] else one
-    verdicts = {int(one.verdict[0]), int(other.verdict[0])}
-    verdict = Verdict.CONTACT if Verdict.CONTACT in verdicts else max(verdicts)
-    lower = min(one.lower[0], other.lower[0])
-    return msgspec.structs.replace(
-        first,
-        verdict=np.array([verdict], np.uint8),
-        lower=np.array([lower]),
-        upper=np.array([min(one.upper[0], other.upper[0])]),
-        exact=np.array([bool(first.exact[0]) and lower >= first.lower[0]]),
-        outside=one.outside & other.outside,
-        voxels_missing=one.voxels_missing + other.voxels_missing,
-        node_visits=one.node_visits + other.node_visits,
-        point_tests=one.point_tests + other.point_tests,
-    )

@@ -2,21 +2,28 @@
 
 import gc
 import weakref
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import archive_cases
 import effect_rooms
 import numpy as np
 import pytest
+from effect_frames import body_of, report
 from effect_rooms import at
+from solidcloud.schemas.scene.effect_options import Contacts
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.resident_motion import Probe, Swept
 from solidcloud.server.runtime.stop_flag import NEVER
 from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.effects import contacts_effect
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Hit
+from split_scans import several
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 # A quarter turn about z, and a shift.
@@ -77,6 +84,40 @@ def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_pat
         assert world.deepest(BALL, at(2, 0.1, 0.5)) is None
         assert world.nearest(np.array([2.0, 0.1, 0.5]), 0.05) is None
         assert world.lowest() == pytest.approx(-0.8 - effect_rooms.RADIUS, abs=2e-3)
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_two_archives_at_the_same_distance_the_least_witness_is_named(
+    tmp_path: Path, order: tuple[int, int]
+) -> None:
+    """As the archive that holds both points names it, in frames and in questions (NUMERICS.md N11)."""
+    points = np.array([[-0.25, 0.0, 0.0], [0.25, 0.0, 0.0]])
+    how: dict[str, Any] = {"resolution": archive_cases.BINARY_STEP, "radius": 0.0625}
+    cases = [archive_cases.build(tmp_path, part, **how) for part in (points, *points[:, None])]
+    ball = make_avatar([[0.0, -0.03125, 0], [0.0, 0.03125, 0]], 0.25)
+    origin, above = np.zeros(3), at(0, 1, 0)
+    with ExitStack() as stack:
+        whole, *halves = [stack.enter_context(Scene.open(case.archive)) for case in cases]
+        alone, both = world_of((whole, None)), world_of(*[(halves[i], None) for i in order])
+        for world in (alone, both):
+            near = world.distance(ball, at(0, 0, 0), 0.5)
+            assert near.witness_cloud.tolist() == points[:1].tolist()
+            assert near.witness_avatar.tolist() == [[0.0, -0.03125, 0.0]]
+            for hit in (world.deepest(ball, at(0, 0, 0)), world.nearest(origin, 0.5)):
+                assert hit is not None and hit.cloud is not None
+                assert hit.cloud.tolist() == points[0].tolist()
+            swept = world.sweep(ball, above, at(0, 0, 0))
+            assert swept.verdict == Verdict.CONTACT and swept.cloud is not None
+            assert swept.cloud.tolist() == points[0].tolist()
+            runner = contacts_effect.make(Contacts(cluster_distance=0.0), None)
+            clusters = report(runner, world, body_of(ball), at(0, 0, 0)).clusters
+            assert [cluster.cloud for cluster in clusters] == [tuple(place) for place in points.tolist()]
+        asked = several(*[(cases[1 + i].archive, None) for i in order])
+        with asked:
+            asked.add_avatar("ball", ball.points, ball.radius)
+            found = asked.distance("ball", np.eye(4)[None], 0.5)
+            assert found.witness_cloud.tolist() == points[:1].tolist()
 
 
 @pytest.mark.interpreted

@@ -1,237 +1,228 @@
-"""Scene: an archive opened in this process, and the questions asked of it. The same methods as `Client`."""
+"""Scene: placed archives opened in this process, and the questions asked of them. The methods of `Client`."""
 
-import os
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence, Sized
-from concurrent.futures import Executor
-from contextlib import suppress
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, TypeVar, Unpack
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from ..schemas.errors import BadRequestError, BusyError
-from ..schemas.scene.scene_file import scene_of
-from ..schemas.wire.answers import (
-    CollideAnswers,
-    ContactsAnswers,
-    Cost,
-    DistanceAnswers,
-    ObjectsAnswers,
-    Part,
-    RaycastAnswers,
-    SweepAnswers,
-    WithinAnswers,
-)
+from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
+from ..schemas.wire.keys import User, check_name
 from ..schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
-from ..schemas.wire.requests import make_objects, make_poses
-from .archives.archive_generation import HeldParts, Opened
-from .archives.archive_info import describe, describe_scene, make_stats
-from .avatars.avatar_model import AvatarModel
-from .avatars.client_avatars import Avatars
+from ..schemas.wire.moves import FRAME_SECONDS, Moved
+from .archives.archive_info import describe_scene
+from .archives.placed_archive import PlacedArchive
+from .archives.scene_info import join_infos, make_stats
 from .observability.metrics import Metrics
-from .queries.collide import collide
-from .queries.contacts import contacts
-from .queries.context.query_budget import Effort, EngineOptions, make_effort
-from .queries.context.query_context import SceneData, with_stop
-from .queries.distance import distance
-from .queries.objects import objects as ask_objects
-from .queries.path import PATH_THREADS, largest_part, path_parts, path_question
-from .queries.raycast import raycast
-from .queries.stopped_answers import ask_until_stopped
-from .queries.sweep import sweep
-from .queries.within import within
+from .queries.context.query_context import SceneData
 from .residency.voxel_cache import Residency
 from .residency.voxel_store import OpenStore, Store
-from .runtime.path_threads import PathThreads
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NEVER, Stop
-from .served.avatar_limits import AvatarLimits
-from .simulation.assembly import Simulated
-
-_A = TypeVar("_A", bound=Cost)
+from .scenes.scene_archives import (
+    ReadPoints,
+    at_place,
+    find_archives,
+    is_scene_file,
+    open_archives,
+    read_avatars,
+)
+from .scenes.scene_questions import SceneQuestions
+from .served.avatar_limits import EVERYBODY, AvatarLimits
+from .simulation.assembly import simulate
+from .simulation.local_session import LocalSession
+from .simulation.simulation import Simulation
 
 DEFAULT_BUDGET = 512 << 20
-# How long a reload waits for the last reader of the generation before the one that is current [s]: with a third one
-# opened meanwhile, three budgets would be in memory.
-RELOAD_WAIT = 10.0
 
 
-class Scene(Simulated):
-    """A served archive. Thread-safe; a context manager.
+class Scene(SceneQuestions):
+    """One or more placed archives, served as one. Thread-safe; a context manager.
 
-    name: what clients call it; the archive's folder name unless given. What is in the folder when the scene is opened
-    stays what is asked, whatever becomes of the folder, until `reload`.
+    name: what clients call it; the name in the scene file, or that of the file or folder, unless
+    given. The content of the archives' folders at opening answers, whatever becomes of the folders,
+    until `reload`.
     """
 
     def __init__(
         self,
-        store: Store,
+        archives: Sequence[PlacedArchive],
         name: str,
-        budget_bytes: int,
-        policy: str,
-        open_store: OpenStore,
-        radius_model: str | None = None,
+        metrics: Metrics | None = None,
+        file: SceneFile | None = None,
+        avatars: Mapping[str, tuple[ArrayLike, float | None]] | None = None,
     ) -> None:
-        """Serve the voxels of `store`; use `Scene.open`."""
-        self.name, self._folder, self._open_store = name, store.archive.folder, open_store
-        self._budget_bytes, self._policy, self._radius_model = budget_bytes, policy, radius_model
-        self._metrics = Metrics()
-        self._opened = self._open(store, 0)
-        self._before: Opened | None = None  # swapped out; perhaps not ended yet
-        self._info = describe_scene(describe(store, name), scene_of(name))
-        self._avatars = Avatars()
-        self._path_threads = PathThreads(name, max(PATH_THREADS, os.cpu_count() or 1))
-        self._closed = False
-        self._lock = threading.Lock()
-        self._reloading = threading.Lock()
+        """Serve archives, which are closed with this scene; call `Scene.open` instead.
+
+        metrics: counts what is answered, and the loads of these archives.
+        file: declares effects, objects and limits; None: the effect `stop` alone.
+        avatars: the scene's own, which every client may ask about: points (n, 3) [m] and radius, by
+        name. Raises BadRequestError if there is no archive, or an avatar is invalid.
+        """
+        if not archives:
+            raise BadRequestError(f"{name}: a scene without archives: expected at least one")
+        super().__init__(archives, name, Metrics() if metrics is None else metrics)
+        self._file = scene_of(name) if file is None else file
+        self._simulation: Simulation | None = None
+        self._making = threading.Lock()
+        self._own = [
+            self.add_avatar(each, points, radius, client=EVERYBODY)
+            for each, (points, radius) in (avatars or {}).items()
+        ]
 
     @classmethod
     def open(
         cls,
-        folder: str | Path,
+        path: str | Path,
         name: str | None = None,
         *,
         budget_bytes: int = DEFAULT_BUDGET,
         policy: str = "lru",
-        open_store: OpenStore = Store,
+        open_store: OpenStore | None = None,
         radius_model: str | None = None,
+        read_points: ReadPoints | None = None,
     ) -> "Scene":
-        """Open the archive in `folder`, keeping at most budget_bytes of decoded voxels in memory.
+        """Open the folder of an archive, or a scene file (TOML) and everything that it names.
 
-        policy: which of them go first, and whether others are loaded before they are asked for, see eviction.py.
-        open_store: opens the folder, now and at each reload (simulation/effects/through_effect.py).
-        radius_model: of questions that name none, see schemas/archive/radius_model.py; None: the archive's one figure.
-        Raises FormatError or CorruptError when it is no whole archive, BadRequestError for too small a budget.
+        name: for clients; None: the name in the scene file, else that of the file or folder.
+        budget_bytes: maximum of decoded voxels in memory, all archives together.
+        policy: of eviction, and whether voxels are prefetched; see eviction.py.
+        open_store: opens the folder of an archive, now and at each reload; None: as it is.
+        radius_model: of questions that name none, see schemas/archive/radius_model.py; None: the
+        archive's one figure. Both are for an archive; a scene file says them itself.
+        read_points: returns the points (n, 3) of a file of an avatar [m]; None: reads scans and
+        meshes.
+        Raises FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
+        invalid scene file, or too small a budget.
         """
-        store = open_store(folder)
-        try:
-            name = name or Path(folder).resolve().name
-            return cls(store, name, budget_bytes, policy, open_store, radius_model)
-        except BaseException:
-            store.close()
-            raise
+        path = Path(path)
+        if is_scene_file(path):
+            if open_store is not None or radius_model is not None:
+                raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
+            return cls._open_file(path, name, budget_bytes, policy, read_points)
+        metrics = Metrics()
+        archive = PlacedArchive.open(
+            path,
+            name,
+            budget_bytes=budget_bytes,
+            policy=policy,
+            open_store=open_store or Store,
+            radius_model=radius_model,
+            took=metrics.loaded,
+        )
+        return cls([archive], archive.name, metrics)
+
+    @classmethod
+    def _open_file(
+        cls, path: Path, name: str | None, budget_bytes: int, policy: str, read_points: ReadPoints | None
+    ) -> "Scene":
+        """Open a scene file; see `open`. Errors name the file and the place in it."""
+        if read_points is None:
+            from .cli.input.point_file import read_avatar  # needs the readers of all formats
+
+            read_points = read_avatar
+        file = read_scene(path)
+        name = name or scene_name(file, path)
+        found = find_archives(file, path)
+        avatars = read_avatars(file, path, read_points)
+        own = {each.info.name: (each.points, each.info.radius) for each in avatars}
+        metrics = Metrics()
+        with ExitStack() as stack:
+            archives = open_archives(file, path, name, found, budget_bytes, policy, metrics.loaded)
+            for archive in archives:
+                stack.callback(archive.close)
+            with at_place(path, "$.effects"):
+                scene = cls(archives, name, metrics, file, own)
+                scene._simulation = simulate(scene, file)
+            stack.pop_all()
+        return scene
 
     def __enter__(self) -> "Scene":
-        """The scene itself."""
+        """Return the scene itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the archive."""
+        """Close the archives."""
         self.close()
 
     def close(self) -> None:
-        """Close the archive's files, once no part of a path is being computed and no reload is under way."""
-        with self._lock:
-            closed, self._closed = self._closed, True
+        """Close the archives' files, once no part of a path is computed and no reload is in progress."""
         self._path_threads.close()
-        if not closed:
-            with self._reloading:
-                self._opened.release()
-                self._opened.join()
+        with ExitStack() as stack:
+            for archive in self.archives:
+                stack.callback(archive.close)
 
     def reload(self) -> ReloadAnswer:
-        """Serve what is in the archive's folder now, opened and warmed beside what is served, then swapped for it.
+        """Serve what is in the archives' folders now, opened and warmed beside what is served, then swapped.
 
-        What was asked before is answered of the old generation, what is asked after this returns of the new one;
-        avatars stay. The old one is closed with its last reader: until then both keep voxels in memory, `budget_bytes`
-        each. Raises FormatError, CorruptError or BadRequestError, saying why, when the new one cannot be opened, and
-        BusyError when the one before the old is still being read; the old one is served on.
+        Requests that began before are answered from the old generation, requests that begin after
+        this returns from the new one; avatars stay. The old one is closed with its last reader:
+        until then both keep voxels in memory, `budget_bytes` each. Several archives are reloaded
+        one after the other: where one cannot be opened, those before it are new, and it and those
+        behind are served on as they were.
+        Raises FormatError, CorruptError or BadRequestError, saying why, when a new one cannot be
+        opened, and BusyError when the generation before the old one is still being read.
         """
         begin = time.perf_counter()
-        with self._reloading, self.take() as old:
-            if self._before is not None and not self._before.ended.wait(RELOAD_WAIT):
-                raise BusyError(
-                    f"{self.name}: the generation before the one served is still asked, by a path perhaps: reload later"
-                )
-            store = self._open_store(self._folder)
+        each: list[ReloadAnswer] = []
+        for number, archive in enumerate(self.archives):
             try:
-                new = self._open(store, old.number + 1)
-            except BaseException:
-                store.close()
+                each.append(archive.reload())
+            except SolidcloudError as error:
+                if len(self.archives) > 1:
+                    count = len(self.archives)
+                    new = f": of {count} archives the first {number} are reloaded" if number else ""
+                    error.args = (f"archive {number}: {error}{new}",)
                 raise
-            try:
-                new.warm()
-                new.follow(old, lambda: self._closed)
-                with self._lock:
-                    if self._closed:
-                        raise BadRequestError(f"{self.name}: closed while it was reloaded: open it again")
-                    info = describe_scene(describe(store, self.name), scene_of(self.name))
-                    self._opened, self._before, self._info = new, old, info
-            except BaseException:
-                new.release()
-                raise
-            old.release()
-        before, now = old.store.archive.header, store.archive.header
+        before, after = (sum(getattr(a, f"generation_{side}") for a in each) for side in ("before", "after"))
+        if self._simulation is not None:
+            self._simulation.reloaded(after)
         return ReloadAnswer(
-            self.name, before.generation, now.generation, now.points, time.perf_counter() - begin
+            self.name, before, after, sum(a.points for a in each), time.perf_counter() - begin
         )
-
-    def _open(self, store: Store, number: int) -> Opened:
-        """A generation as this scene serves it."""
-        return Opened(
-            store, self._budget_bytes, self._policy, number, self._metrics.loaded, self._radius_model
-        )
-
-    def take(self) -> Opened:
-        """What is asked now, to be released: for a `with`. BadRequestError when closed."""
-        while True:
-            opened = self._opened
-            if opened.take():
-                return opened
-            if opened is self._opened:  # nobody swapped it: it was closed
-                return opened.taken()
-
-    def path_threads(self, client: str) -> Executor:
-        """Return what computes the parts of a client's paths: threads, one a core, that all clients share in turn."""
-        return self._path_threads.of(client)
-
-    def avatar(self, name: str, client: str) -> AvatarModel:
-        """Return a client's avatar, or the scene's own. Raises UnknownAvatarError."""
-        return self._avatars.get(name, client)
 
     @property
     def _data(self) -> SceneData:
-        """What a question without a radius model reads now."""
-        return self._opened.data
+        """Return what a question without a radius model reads of the first archive."""
+        with self.archives[0].take() as opened:
+            return opened.data
 
     @property
     def residency(self) -> Residency:
-        """The resident voxels, for counters and checks."""
-        return self._data.residency
+        """Return the resident voxels of the first archive, for counters and checks."""
+        return self.archives[0].residency
 
     def warm(self) -> None:
-        """Ask one of everything, a load included, so that nobody waits for compilers after; start the threads."""
+        """Ask one of every question of each archive, so that no request waits for compilation; start the threads."""
         self._path_threads.start()
-        with self.take() as opened:
-            opened.warm()
+        for archive in self.archives:
+            archive.warm()
 
     def info(self) -> SceneInfo:
-        """What is served: counts, bounds, lattice, radius, sources."""
-        return self._info
+        """Return what is served, all archives together, and which effects its frames simulate."""
+        found = join_infos(self.name, [(archive.info(), archive.pose) for archive in self.archives])
+        return describe_scene(found, self._file, self._own)
 
     def stats(self, keys: bool = False) -> StatsAnswer:
-        """What is in memory, what was asked, and what had to be waited for. keys: name the resident voxels, too."""
-        with self.take() as opened:
-            coarse = opened.data.coarse
-            return make_stats(
-                opened.store,
-                self.name,
-                opened.data.residency,
-                self._metrics,
-                coarse_bytes=0 if coarse is None else coarse.bytes,
-                avatars=self._avatars.stats(),
-                keys=keys,
-            )
+        """Return what is in memory, what was asked, and what had to be waited for. keys: list resident voxels too."""
+        with ExitStack() as stack:
+            each = [stack.enter_context(archive.take()) for archive in self.archives]
+            return make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
 
     def limit_avatars(self, limits: AvatarLimits) -> None:
-        """Limit the memory of clients' avatars from now on; those that are there stay."""
+        """Limit the memory of clients' avatars from now on; existing ones stay."""
         self._avatars.limits = limits
 
     def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
-        """Forget avatars that were not used for so long [s], but for those of clients in `alive`."""
+        """Forget avatars that were not used for so long [s].
+
+        Those of clients in `alive`, and of clients whose users have bodies, stay.
+        """
+        if self._simulation is not None:
+            alive = {*alive, *(user.client for user in self._simulation.users)}
         if self._avatars.drop_unused(alive, seconds):
             give_back_freed_memory()
 
@@ -241,218 +232,56 @@ class Scene(Simulated):
         """Add an avatar of points (n, 3) float64, avatar frame [m].
 
         radius: of each point's sphere [m]; None: half the mean closest-point distance of the points.
-        client: whose it is; avatars of different clients do not meet. The same name again with the same points and
-        radius changes nothing; with others it is a BadRequestError. TooLargeError: over the limits.
+        client: whose it is; avatars of different clients do not meet. The same name again with the
+        same points and radius changes nothing; with others it is a BadRequestError. TooLargeError:
+        over the limits.
         """
         model = self._avatars.add(name, points, radius, client)
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
-    def _terms(
-        self,
-        opened: Opened,
-        tolerance: float = 0.0,
-        budget_ms: float | None = None,
-        budget_visits: int | None = None,
-        radius_model: str | None = None,
-        stop: Stop = NEVER,
-    ) -> tuple[SceneData, Effort]:
-        """What a question with these options reads, and what it may cost."""
-        effort = make_effort(tolerance, budget_ms, budget_visits, stop)
-        data = opened.data if radius_model is None else opened.radius_model(radius_model)
-        return with_stop(data, effort.stop), effort
+    @property
+    def simulation(self) -> Simulation:
+        """Return what simulates the frames of this scene's users; made at its first use."""
+        with self._making:
+            if self._simulation is None:
+                self._simulation = simulate(self, self._file)
+            return self._simulation
 
-    def _ask(
-        self,
-        question: Callable[..., _A],
-        name: str,
-        client: str,
-        poses: ArrayLike,
-        what: tuple[Any, ...],
-        around: float,
-        options: EngineOptions,
-    ) -> _A:
-        """Ask about an avatar under some poses; the last one says where its user is.
-
-        question: takes scene, avatar, `what`, and `effort`.  around: margin or reach [m].
-        """
-        with self.take() as opened:
-            data, effort = self._terms(opened, **options)
-            avatar = self.avatar(name, client)
-            if opened.saw((client, name), avatar, poses, around):
-                effort = effort._replace(scan=True)
-            answers = ask_until_stopped(
-                question, _count(poses), effort, lambda: question(data, avatar, *what, effort=effort)
-            )
-        self._metrics.answered(client, name, answers)
-        return answers
-
-    def collide(
-        self,
-        name: str,
-        poses: ArrayLike,
-        margin: float = 0.0,
-        *,
-        client: str = "",
-        **options: Unpack[EngineOptions],
-    ) -> CollideAnswers:
-        """Whether avatar `name` touches the scene under each of the poses (k, 4, 4); see server/queries/collide.py.
-
-        options, here and below: tolerance [m], budget_ms, budget_visits: what the answer may cost, see
-        server/queries/context/query_budget.py; radius_model: how large the scan's spheres are, see
-        schemas/archive/radius_model.py, None: as the scene was opened.
-        """
-        return self._ask(collide, name, client, poses, (poses, margin), margin, options)
-
-    def distance(
-        self,
-        name: str,
-        poses: ArrayLike,
-        reach: float,
-        *,
-        client: str = "",
-        **options: Unpack[EngineOptions],
-    ) -> DistanceAnswers:
-        """How far avatar `name` is from the scene under each pose, up to `reach` [m].
-
-        See server/queries/distance.py.
-        """
-        return self._ask(distance, name, client, poses, (poses, reach), reach, options)
-
-    def contacts(
-        self,
-        name: str,
-        poses: ArrayLike,
-        limit: int = 100,
-        margin: float = 0.0,
-        cluster_distance: float | None = None,
-        *,
-        client: str = "",
-        **options: Unpack[EngineOptions],
-    ) -> ContactsAnswers:
-        """Which pairs of points are in contact under each of the poses, deepest first.
-
-        See server/queries/contacts.py.
-        """
-        what = (poses, limit, margin, cluster_distance)
-        return self._ask(contacts, name, client, poses, what, margin, options)
-
-    def sweep(
+    def move(
         self,
         name: str,
         pose_from: ArrayLike,
         pose_to: ArrayLike,
-        margin: float = 0.0,
+        seconds: float = FRAME_SECONDS,
         *,
-        client: str = "",
-        **options: Unpack[EngineOptions],
-    ) -> SweepAnswers:
-        """When avatar `name` first touches the scene on its way between poses; see server/queries/sweep.py."""
-        options.setdefault("tolerance", 1e-6)
-        what = (pose_from, pose_to, margin, options["tolerance"])
-        return self._ask(sweep, name, client, pose_to, what, margin, options)
-
-    def raycast(
-        self,
-        origins: ArrayLike,
-        directions: ArrayLike,
-        reach: float,
-        **options: Unpack[EngineOptions],
-    ) -> RaycastAnswers:
-        """Which scan point's sphere rays (k, 3), (k, 3) hit first, up to `reach` [m]; see server/queries/raycast.py."""
-        with self.take() as opened:
-            data, effort = self._terms(opened, **options)
-            answers = ask_until_stopped(
-                raycast, _count(origins), effort, lambda: raycast(data, origins, directions, reach, effort)
-            )
-        self._metrics.answered("", "", answers)
-        return answers
-
-    def within(
-        self,
-        points: ArrayLike,
-        reach: float,
-        **options: Unpack[EngineOptions],
-    ) -> WithinAnswers:
-        """Which scan point is nearest to each loose point (k, 3), up to `reach` [m]; see server/queries/within.py."""
-        with self.take() as opened:
-            data, effort = self._terms(opened, **options)
-            answers = ask_until_stopped(
-                within, _count(points), effort, lambda: within(data, points, reach, effort)
-            )
-        self._metrics.answered("", "", answers)
-        return answers
-
-    def objects(
-        self,
-        objects: Sequence[Sequence[Any]],
-        margin: float = 0.0,
-        *,
-        client: str = "",
-        **options: Unpack[EngineOptions],
-    ) -> ObjectsAnswers:
-        """Which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another.
-
-        See server/queries/objects.py.
-        """
-        with self.take() as opened:
-            data, effort = self._terms(opened, **options)
-            items, poses = make_objects(objects)
-            avatars = [self.avatar(item.avatar, client) for item in items]
-            groups = np.array([item.group for item in items], np.uint32)
-            masks = np.array([item.mask for item in items], np.uint32)
-            answers = ask_until_stopped(
-                ask_objects,
-                len(items),
-                effort,
-                lambda: ask_objects(data, avatars, poses, groups, masks, margin, effort),
-            )
-        self._metrics.answered(client, "", answers)
-        return answers
-
-    def path(
-        self,
-        name: str,
-        poses: ArrayLike,
-        op: str = "collide",
-        *,
-        threads: int = PATH_THREADS,
-        radius_model: str | None = None,
         client: str = "",
         stop: Stop = NEVER,
-        **parameters: Any,
-    ) -> Iterator[Part]:
-        """Ask `op` (collide, distance, contacts, sweep) along the poses; the answers come part by part, in order.
+    ) -> Moved:
+        """Return where avatar `name` gets from one pose (1, 4, 4) towards another in a frame.
 
-        parameters: what `op` takes beside the poses, tolerance and budgets included; `budget_ms` is for the whole path.
-        threads: parts computed at a time.  sweep: k - 1 motions, from each pose to the next. Every part is the answer
-        of its question for [first, first + n) of `total`. All poses are checked before the first part.
+        Nothing is remembered. See `Simulation.move`.
         """
-        opened = self.take()
-        try:
-            data, avatar = opened.radius_model(radius_model), self.avatar(name, client)
-            ask, total = path_question(data, avatar, make_poses(poses), op, parameters, stop)
+        return self.simulation.move(name, pose_from, pose_to, seconds, client=client, stop=stop)
 
-            def ask_held(start: int, end: int) -> Cost:
-                with opened.taken():  # whoever wanted the parts may be gone, and their hold with them
-                    part = ask(start, end)
-                self._metrics.answered(client, name, part)
-                return part
+    def session(self, avatar: str, *, client: str = "") -> LocalSession:
+        """Return a session of an avatar, a client's or one of the scene's own, for a `with`.
 
-            most = largest_part(op, parameters)
-            ahead = (self.path_threads(client), 2 * threads) if threads > 1 else (None, 1)
-            return HeldParts(path_parts(ask_held, total, most, *ahead), opened)
-        except BaseException:
-            opened.release()
-            raise
+        It sends motion commands and receives the resulting states; each command is a frame of its
+        own. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
+        """
+        return LocalSession(self.simulation, User(client, check_name(avatar, "avatar of a session")))
 
     def drop_client(self, client: str) -> None:
-        """Forget the avatars of a client that is gone."""
+        """Forget the bodies and avatars of a client that is gone."""
+        if self._simulation is None:
+            self.forget_client(client)
+        else:
+            self._simulation.drop_client(client)
+
+    def forget_client(self, client: str) -> None:
+        """Forget the avatars of a client, but not its bodies; for the simulation of this scene."""
         self._avatars.drop_client(client)
-        with suppress(BadRequestError), self.take() as opened:  # closed, it keeps nothing for anybody
-            opened.prefetcher.leave_client(client)
+        for archive in self.archives:
+            with suppress(BadRequestError):  # closed, it keeps nothing for anybody
+                archive.leave_client(client)
         self._metrics.drop_client(client)
-
-
-def _count(rows: ArrayLike) -> int:
-    """Return how many rows an argument has; 0 for one that the question is about to refuse."""
-    return len(rows) if isinstance(rows, Sized) else 0

@@ -104,7 +104,10 @@ def find(name: str, *modules: str) -> Any:
 def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
     """Open a scene with the effects of a walk."""
     path = scene_file(archive)
-    open_scene = find("open_scene", "server.scenes.open_scene", "server.scene_file")
+    try:
+        open_scene = find("open_scene", "server.scenes.open_scene", "server.scene_file")
+    except ImportError:  # since Scene.open takes scene files, too
+        return stack.enter_context(find("Scene", "server.scene").open(path, budget_bytes=1 << 30))
     read_avatar = find("read_avatar", "server.cli.input.point_file", "server.report.points")
     return stack.enter_context(open_scene(path, read_points=read_avatar, budget_bytes=1 << 30))
 

@@ -3,14 +3,13 @@
 `open` and `Scene` answer in this process, `connect` and `Client` over zenoh. Each name is imported
 when it is first used: `import solidcloud` alone loads no library, and `Client` loads neither numba
 nor h5py. Setuptools installs this file as the package `solidcloud`; its imports are relative to
-that. May import server.cli.input, server/client.py, server/scene.py, server.scenes and schemas.
+that. May import server/client.py, server/scene.py, schemas.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from .schemas.errors import (
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from .schemas.wire.answers import Verdict
     from .server.client import Client
     from .server.scene import Scene
-    from .server.served.served_scene import SceneLike
 
     __version__: str
 
@@ -69,17 +67,16 @@ _MODULES = {
 }
 
 
-def open(path: "str | Path", **options: Any) -> "AbstractContextManager[SceneLike]":
-    """Open an archive folder or a scene file in this process, for a `with`.
+def open(path: "str | Path", **options: Any) -> "Scene":
+    """Open an archive folder or a scene file in this process, for a `with`; see `Scene.open`.
 
-    options: name, budget_bytes and policy, as in `Scene.open`.
+    options: name, budget_bytes and policy, as there.
     Raises BadRequestError for an invalid scene file or option, FormatError or CorruptError for an
     invalid archive.
     """
-    from .server.cli.input.point_file import read_avatar
-    from .server.scenes.open_scene import open_scene
+    from .server.scene import Scene
 
-    return open_scene(path, read_points=read_avatar, **options)
+    return Scene.open(path, **options)
 
 
 def connect(endpoint: str | None = None, *, scene: str, **options: Any) -> "Client":

@@ -7,7 +7,7 @@ when the answer is there; files and memory of one that was swapped out go with i
 import math
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from typing import Any, Self
@@ -261,11 +261,12 @@ class Filling:
 
 
 class HeldParts(Iterator[Part]):
-    """The parts of a path, holding the generation they are of until the last was taken or nobody wants more."""
+    """Parts of a path, which hold the generations they come from until the last part was taken or is not wanted."""
 
-    def __init__(self, parts: Generator[Part, None, None], opened: Opened) -> None:
+    def __init__(self, parts: Generator[Part, None, None], taken: Sequence[Opened]) -> None:
+        """Hold generations that were taken for these parts."""
         self._parts = parts
-        self._opened: Opened | None = opened
+        self._taken = list(taken)
 
     def __next__(self) -> Part:
         try:
@@ -276,10 +277,11 @@ class HeldParts(Iterator[Part]):
 
     def close(self) -> None:
         """Take no more."""
-        opened, self._opened = self._opened, None
-        if opened is not None:
+        taken, self._taken = self._taken, []
+        if taken:
             self._parts.close()
-            opened.release()
+            for opened in taken:
+                opened.release()
 
     def __del__(self) -> None:
         self.close()

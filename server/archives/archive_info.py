@@ -1,4 +1,4 @@
-"""What a scene says of itself: what its archive holds, as `info`, and what it keeps in memory, as `stats`."""
+"""What an archive says of itself, and what a scene file adds to it. Reads no voxel."""
 
 from collections.abc import Sequence
 
@@ -15,11 +15,7 @@ from ...schemas.wire.messages import (
     SceneInfo,
     SourceInfo,
     SpawnInfo,
-    StatsAnswer,
 )
-from ...schemas.wire.stats import AvatarStats
-from ..observability.metrics import Metrics, times_of
-from ..residency.voxel_cache import Residency
 from ..residency.voxel_store import Store
 
 
@@ -87,48 +83,3 @@ def run_order(file: SceneFile) -> list[str]:
     if len(declared) < 2:
         return list(declared)
     return [name for name in ("through", *ORDER) if name in declared]
-
-
-def make_stats(
-    store: Store,
-    name: str,
-    residency: Residency,
-    metrics: Metrics,
-    *,
-    coarse_bytes: int = 0,
-    avatars: AvatarStats = AvatarStats(),  # noqa: B008  # frozen
-    keys: bool = False,
-) -> StatsAnswer:
-    """What a scene keeps in memory of the archive of `store`, and how it did so far.
-
-    coarse_bytes: of coarse tops, beside the residency's budget.  avatars: of the clients' avatars.
-    keys: name the resident voxels, too.
-    """
-    total, users = metrics.snapshot()
-    counts = total.counts
-    resident = None
-    if keys:
-        rows = np.flatnonzero(residency.where[:, 0] >= 0)
-        resident = np.sort(store.archive.voxels["key"][rows]).tolist()
-    return StatsAnswer(
-        scene=name,
-        generation=store.archive.header.generation,
-        policy=residency.policy.name,
-        budget_bytes=residency.budget_bytes + coarse_bytes,
-        resident_bytes=residency.resident_bytes,
-        coarse_bytes=coarse_bytes,
-        voxels=len(store.sizes),
-        resident=residency.resident,
-        kept=len(residency.kept),
-        requests=counts.requests,
-        answers=counts.answers,
-        unknown=counts.unknown,
-        waited=counts.waited,
-        load_seconds=times_of(residency.load_times(), total.loads.times()),
-        stall_seconds=counts.stalls.times(),
-        engine_seconds=total.engine.times(),
-        users=users,
-        keys=resident,
-        avatars=avatars,
-        **structs.asdict(residency.counters()),
-    )

@@ -1,4 +1,4 @@
-"""What several archives say of themselves as one scene: `info` and `stats`."""
+"""What the archives of a scene say of themselves as one: `info` and `stats`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,28 +7,25 @@ import numpy as np
 from msgspec import structs
 
 from ...schemas.wire.messages import SceneInfo, StatsAnswer
-from ...schemas.wire.stats import Counters, Times
+from ...schemas.wire.stats import AvatarStats, Counters
 from ..observability.metrics import Metrics, times_of
 from .archive_generation import Opened
 from .archive_info import listed_sources
 from .rigid_transform import Pose, moved_boxes, under
 
-# Of StatsAnswer: what archives have each, to be added.
-_MEMORY = (
-    "generation", "budget_bytes", "resident_bytes", "coarse_bytes", "voxels", "resident", "kept",
-    *Counters.__struct_fields__,
-)  # fmt: skip
 
+def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> SceneInfo:
+    """Return the description of all archives as one scene.
 
-def info_of_several(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> SceneInfo:
-    """What a scene of several archives says of itself. each: what one says, and its pose; None: at the identity.
-
-    Counts are added, bounds are in the world, sources stand one archive's behind the other's. Of lattice and trees, of
-    which each archive has its own, the first archive's are said; of radii and what points were moved, the largest. The
-    radius models are those that all of them hold.
+    Counts are added, bounds are in the world, sources stand one archive's behind the other's. Of
+    lattice and trees, of which each archive has its own, the first archive's are said; of radii and
+    of how far points were moved, the largest. The radius models are those that all archives hold.
+    each: the description of one archive, and its pose; None: at the identity.
     """
     infos = [info for info, _ in each]
     first = infos[0]
+    if len(each) == 1 and each[0][1] is None:
+        return first
     bounds = np.array([_box(info.bounds, pose) for info, pose in each])
     largest = max(infos, key=lambda info: info.radius)
     # A generation of the scene is a change of any archive.
@@ -75,35 +72,45 @@ def _box(box: list[list[float]], pose: Pose | None) -> Any:
     return sides if pose is None else np.concatenate(moved_boxes(pose, sides[:1], sides[1:]))
 
 
-def stats_of_several(
-    name: str, each: Sequence[StatsAnswer], loads: Sequence[float], metrics: Metrics
+def make_stats(
+    name: str, each: Sequence[Opened], metrics: Metrics, avatars: AvatarStats, *, keys: bool = False
 ) -> StatsAnswer:
-    """What a scene of several archives keeps in memory, all together, and what was asked of it.
+    """Return what a scene keeps in memory, all archives together, and what it answered so far.
 
-    metrics: counted that.  loads: seconds of the last loads of all. Keys are each archive's own.
+    avatars: of the clients.  keys: list the resident voxels, each by its key in its own archive.
     """
     total, users = metrics.snapshot()
     counts = total.counts
-    times = [stats.load_seconds for stats in each]
-    buckets = [t.buckets for t in times if t.buckets]
-    of_all = Times(
-        sum(t.count for t in times),
-        sum(t.sum for t in times),
-        max=max(t.max for t in times),
-        buckets=np.sum(buckets, axis=0).tolist() if buckets else [],
-    )
-    keys = [stats.keys for stats in each if stats.keys is not None]
-    return structs.replace(
-        each[0],
+    residencies = [opened.data.residency for opened in each]
+    coarse = [0 if opened.data.coarse is None else opened.data.coarse.bytes for opened in each]
+    counters = [structs.asdict(residency.counters()) for residency in residencies]
+    loads = [seconds for residency in residencies for seconds in residency.load_times()]
+    return StatsAnswer(
         scene=name,
+        generation=sum(opened.store.archive.header.generation for opened in each),
+        policy=residencies[0].policy.name,
+        budget_bytes=sum(residency.budget_bytes for residency in residencies) + sum(coarse),
+        resident_bytes=sum(residency.resident_bytes for residency in residencies),
+        coarse_bytes=sum(coarse),
+        voxels=sum(len(opened.store.sizes) for opened in each),
+        resident=sum(residency.resident for residency in residencies),
+        kept=sum(len(residency.kept) for residency in residencies),
         requests=counts.requests,
         answers=counts.answers,
         unknown=counts.unknown,
         waited=counts.waited,
-        load_seconds=times_of(loads, of_all),
+        load_seconds=times_of(loads, total.loads.times()),
         stall_seconds=counts.stalls.times(),
         engine_seconds=total.engine.times(),
         users=users,
-        keys=sorted(key for own in keys for key in own) if keys else None,
-        **{field: sum(getattr(stats, field) for stats in each) for field in _MEMORY},
+        keys=sorted(key for opened in each for key in _resident_keys(opened)) if keys else None,
+        avatars=avatars,
+        **{field: sum(own[field] for own in counters) for field in Counters.__struct_fields__},
     )
+
+
+def _resident_keys(opened: Opened) -> list[int]:
+    """Return the keys of an archive's resident voxels."""
+    rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
+    keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()
+    return keys

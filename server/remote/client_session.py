@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import zenoh
@@ -30,6 +30,7 @@ from ...schemas.wire.moves import State, Wish
 from ..network.endpoints import zenoh_words
 from ..network.replies import Anchor, OtherAvatarError
 from ..network.zenoh_settings import FRAME_QOS
+from ..served.served_scene import Latest
 from .state_query import StateQuery
 
 log = logging.getLogger(__name__)
@@ -65,13 +66,6 @@ class WishNumbers:
         with self._lock:
             if self._last < seq < _MOST_NUMBER:
                 self._last = seq
-
-
-class Latest(NamedTuple):
-    """The last state that came, and how long ago that was [s]."""
-
-    state: State
-    age: float
 
 
 class ClientSession:

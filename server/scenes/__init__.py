@@ -1,7 +1,6 @@
-"""Scenes of several placed archives, and the scene file that opens any scene.
+"""What a scene consists of: its questions, and the archives and avatars that a scene file names.
 
 May import server.archives, server.avatars, server.kernels, server.observability, server.queries,
-server.queries.context, server.residency, server.runtime, server/scene.py, server.served,
-server.simulation, server.simulation.effects, schemas.
-Begin with open_scene.py.
+server.queries.context, server.residency, server.runtime, server.simulation.effects, schemas.
+Begin with scene_questions.py.
 """

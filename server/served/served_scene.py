@@ -62,6 +62,13 @@ class Outcome(NamedTuple):
     about: bytes = b""
 
 
+class Latest(NamedTuple):
+    """The last state of a session's avatar, and how long ago it came [s]."""
+
+    state: State
+    age: float
+
+
 class Simulates(Protocol):
     """Simulation of the frames of users that move in a scene; thread-safe."""
 

@@ -211,8 +211,7 @@ class Service:
 
         turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
         """
-        simulation = self._scenes[scene].simulation
-        if simulation is None:
+        if (simulation := self._scenes[scene].simulation) is None:
             return None
         frames = Frames(simulation, publish, self._config.max_request_seconds, turn)
         return self._frames.setdefault(scene, frames)
@@ -222,7 +221,9 @@ class Service:
         start_deadlines()
         for scene in self._scenes.values():
             log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
-            (scene.simulation or scene).warm()
+            scene.warm()
+            if scene.simulation is not None:
+                scene.simulation.warm()
 
     def _ask(self, key: str, payload: bytes, encoding: str, stop: Stop) -> Any:
         """Send one request to the scene that its key names."""
@@ -320,8 +321,7 @@ def serve(
         _reloader(service) as wanted,
     ):
         ready()
-        names = ", ".join(scene.name for scene in scenes)
-        print(f"serving {names} at {config.listen}", flush=True)
+        print(f"serving {', '.join(scene.name for scene in scenes)} at {config.listen}", flush=True)
         while signals.recv(1)[0] == signal.SIGHUP:
             wanted.set()
     return not service.left_at_work

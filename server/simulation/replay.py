@@ -121,7 +121,7 @@ class _Bodies:
                 raise BadRequestError(f"avatar {user.avatar!r} of the log: its points are not in it")
             points = np.frombuffer(record.points, "<f8").reshape(-1, 3)
             try:
-                self._simulation.add_avatar(user.avatar, points, record.radius, client=user.client)
+                self._simulation.scene.add_avatar(user.avatar, points, record.radius, client=user.client)
             except SolidcloudError as error:
                 raise BadRequestError(f"the log is of another scene: {error}") from None
             self._added[user] = entered.digest
@@ -134,11 +134,10 @@ class _Bodies:
 
 
 def archives_of(simulation: Simulation) -> list[tuple[str, int]]:
-    """The id, hexadecimal, and the generation of each archive that a scene is made of."""
-    served: Any = simulation.served
+    """Return the id, hexadecimal, and the generation of each archive of a scene."""
     found = []
-    for scene, _ in getattr(served, "archives", None) or [(served, None)]:
-        with scene.take() as opened:
+    for archive in simulation.scene.archives:
+        with archive.take() as opened:
             header = opened.store.archive.header
             found.append((header.archive_id.hex(), header.generation))
     return found
@@ -147,7 +146,7 @@ def archives_of(simulation: Simulation) -> list[tuple[str, int]]:
 def begin_of(simulation: Simulation, path: Path) -> Begin:
     """What a log of a scene begins with. path: of its archive or scene file."""
     file = path.read_bytes() if path.is_file() else b""
-    return Begin(simulation.name, str(path.resolve()), file, archives_of(simulation))
+    return Begin(simulation.scene.name, str(path.resolve()), file, archives_of(simulation))
 
 
 @contextmanager

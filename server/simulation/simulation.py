@@ -1,14 +1,14 @@
-"""Simulation: a scene, and what happens in it frame by frame: where users get to, by the effects it calls for.
+"""Simulation: the frames of a scene, which move its users by the effects that the scene declares.
 
-The same methods as `Scene`, which answers the questions; besides them `move`, one frame of which nothing is
-remembered, and `step`, one frame of everybody who wished, whose bodies are remembered until they end. The same wishes
-in the same order give the same poses, bit for bit: nothing here reads a clock but to say how long a frame took.
+`move` simulates one frame and remembers nothing. `step` simulates one frame of all users with a
+motion command, whose bodies are remembered until they end. The same commands in the same order give
+the same poses, bit for bit: nothing here reads a clock but to say how long a frame took.
 """
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any, Protocol
 
@@ -16,28 +16,17 @@ import numpy as np
 
 from ...schemas.errors import BadRequestError, BusyError, ExpiredError, InternalError, SolidcloudError
 from ...schemas.scene.scene_file import SceneFile
-from ...schemas.wire.answers import (
-    CollideAnswers,
-    ContactsAnswers,
-    DistanceAnswers,
-    ObjectsAnswers,
-    Part,
-    RaycastAnswers,
-    SweepAnswers,
-    Verdict,
-    WithinAnswers,
-)
+from ...schemas.wire.answers import Verdict
 from ...schemas.wire.keys import User, public_id
-from ...schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
+from ...schemas.wire.messages import AvatarInfo, SceneInfo
 from ...schemas.wire.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ...schemas.wire.requests import make_poses
-from ..archives.archive_info import describe_scene
+from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import EXACT, Effort
 from ..runtime.stop_flag import NEVER, Stop, StoppedError
 from ..served.answering_avatars import noted
-from ..served.avatar_limits import AvatarLimits
-from ..served.served_scene import Outcome, SceneLike, Turn
+from ..served.served_scene import Outcome, Turn
 from .world.frame import Body
 from .world.motion_commands import Pose, check_rigid, first_pose, frame_seconds, wished_pose
 from .world.vectors import size, unit
@@ -64,10 +53,18 @@ class Pipeline(Protocol):
     ) -> Moved: ...
 
 
-class Stage(SceneLike, Protocol):
-    """A scene whose users can be simulated."""
+class Stage(Protocol):
+    """The scene whose users are simulated."""
 
+    name: str
+    archives: list[PlacedArchive]
+
+    def info(self) -> SceneInfo: ...
     def avatar(self, name: str, client: str) -> AvatarModel: ...
+    def add_avatar(
+        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
+    ) -> AvatarInfo: ...
+    def forget_client(self, client: str) -> None: ...
 
 
 class Bodies(Protocol):
@@ -109,44 +106,27 @@ class _Presence:
 
 
 class Simulation:
-    """A scene and its frames. Thread-safe; a context manager.
+    """The frames of a scene. Thread-safe.
 
-    served: what answers the questions.  file: what the scene calls for.  pipeline: its effects.  avatars: the scene's
-    own, which every user finds: `served` has them as those of EVERYBODY.  bodies: kept up to date, where users meet.
-    place: of some scan point, (3,) world [m].
+    scene: whose users are simulated.  file: what it declares.  pipeline: its effects.
+    bodies: updated where users meet.  place: returns some scan point, (3,) world [m].
     """
 
     def __init__(
         self,
-        served: Stage,
+        scene: Stage,
         file: SceneFile,
         pipeline: Pipeline,
-        avatars: Sequence[AvatarInfo] = (),
         bodies: Bodies | None = None,
         place: Callable[[], Any] | None = None,
     ) -> None:
-        self.name, self.file = served.name, file
-        self.served, self._pipeline = served, pipeline
+        self.scene, self.file, self._pipeline = scene, file, pipeline
         self._up = unit(file.up)
-        self._own = list(avatars)
         self._present: dict[User, _Presence] = {}
         self._bodies, self._place = bodies, place
         self._recorder: Recorder | None = None
         self._frames = 0
         self._frame = threading.Lock()  # held for a frame: bodies change under it alone
-
-    def __enter__(self) -> "Simulation":
-        """The simulation itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the scene."""
-        self.close()
-
-    @property
-    def simulation(self) -> "Simulation":
-        """What simulates the frames: itself."""
-        return self
 
     @property
     def most_users(self) -> int:
@@ -187,7 +167,7 @@ class Simulation:
         user = User(client, name)
         begin = check_rigid(asked.pose_from[0].copy(), "pose_from")
         wish = check_rigid(asked.pose_to[0], "pose_to")
-        body = _body(user, self.served.avatar(name, client), begin)
+        body = _body(user, self.scene.avatar(name, client), begin)
         try:
             return self._pipeline.run(body, wish, asked.seconds, Effort(stop=stop))
         except StoppedError:
@@ -240,7 +220,7 @@ class Simulation:
         except StoppedError:
             return ExpiredError(f"{stop.reason}: the user stays where it was")
         except Exception as error:  # of this user alone: the others' frames go on
-            log.exception("a frame of %s in %s", _public_name(turn.user), self.name)
+            log.exception("a frame of %s in %s", _public_name(turn.user), self.scene.name)
             return InternalError(f"{type(error).__name__} in the server: its log says more")
         wish = turn.wish
         return State(
@@ -263,7 +243,7 @@ class Simulation:
         with ExitStack() as refused:
             if wish.objects:
                 if self._bodies is None:
-                    raise BadRequestError(f"{self.name}: a wish moves objects: this scene has none")
+                    raise BadRequestError(f"{self.scene.name}: a wish moves objects: this scene has none")
                 refused.callback(self._bodies.tell(wish.objects, stop))
             moved = self._pipeline.run(present.body, aim, seconds, Effort(stop=stop), skip=skip)
             refused.pop_all()
@@ -278,9 +258,9 @@ class Simulation:
         """A user who comes in; BusyError where the scene is full."""
         if len(self._present) >= self.most_users:
             raise BusyError(
-                f"{self.name}: {len(self._present)} users walk it, as many as its limits allow: come again later"
+                f"{self.scene.name}: {len(self._present)} users walk it, as many as its limits allow: come again later"
             )
-        avatar = self.served.avatar(user.avatar, user.client)
+        avatar = self.scene.avatar(user.avatar, user.client)
         if self._recorder is not None:
             self._recorder.entered(user, avatar)
         return _Presence(_body(user, avatar, first_pose(wish, self.file.spawn, self._up)))
@@ -306,41 +286,21 @@ class Simulation:
             self._leave([user for user in self._present if user.client == client])
 
     def drop_client(self, client: str) -> None:
-        """Forget the bodies and avatars of a client that is gone."""
+        """Forget the bodies and avatars of a client that is gone; see `Scene.drop_client`."""
         with self._frame:
             self._leave([user for user in self._present if user.client == client])
-            self.served.drop_client(client)
+            self.scene.forget_client(client)
             if self._recorder is not None:
                 self._recorder.dropped(client)
 
-    def limit_avatars(self, limits: AvatarLimits) -> None:
-        """Limit the memory of clients' avatars; see `Scene.limit_avatars`."""
-        self.served.limit_avatars(limits)
-
-    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
-        """Forget avatars that are not used, by a body either; see `Scene.drop_unused_avatars`."""
-        present = {user.client for user in self.users}
-        self.served.drop_unused_avatars({*alive, *present}, seconds)
-
-    def add_avatar(
-        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
-    ) -> AvatarInfo:
-        """Add an avatar; see `Scene.add_avatar`."""
-        return self.served.add_avatar(name, points, radius, client=client)
-
-    def info(self) -> SceneInfo:
-        """What is served, and which effects its frames simulate."""
-        return describe_scene(self.served.info(), self.file, self._own)
-
     def warm(self) -> None:
-        """Warm the scene, and simulate some frames, so that nobody waits for compilers after.
+        """Simulate some frames, so that no user waits for compilation.
 
         They go at a scan point from above, out of it and past it, and at another user.
         """
-        self.served.warm()
-        place = np.array(self.served.info().bounds[0]) if self._place is None else self._place()
+        place = np.array(self.scene.info().bounds[0]) if self._place is None else self._place()
         user, other = User(_WARM, "warm"), User(_WARM, "other")
-        self.served.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
+        self.scene.add_avatar("warm", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05, client=_WARM)
         across = np.roll(self._up, 1)
         far = min(0.5, self.file.limits.longest_move / 4)
         for way in (self._up, -self._up, across, self._up + across, 0 * across):
@@ -348,7 +308,7 @@ class Simulation:
                 poses = np.tile(np.eye(4), (2, 1, 1, 1))
                 poses[:, 0, :3, 3] = place + far * begin, place + far * end
                 with self._frame, suppress(SolidcloudError):  # of a place where a frame makes no sense
-                    body = _body(user, self.served.avatar("warm", _WARM), poses[0, 0])
+                    body = _body(user, self.scene.avatar("warm", _WARM), poses[0, 0])
                     if self._bodies is not None:
                         there = _body(other, body.avatar, poses[:, 0].mean(axis=0))
                         self._bodies[other] = there
@@ -356,48 +316,13 @@ class Simulation:
                         self._pipeline.run(body, pose, FRAME_SECONDS)
         if self._bodies is not None:
             self._bodies.pop(other)
-        self.served.drop_client(_WARM)
+        self.scene.forget_client(_WARM)
 
-    def reload(self) -> ReloadAnswer:
-        """Serve what is in the archives' folders now; see `Scene.reload`."""
-        answer = self.served.reload()
+    def reloaded(self, generation: int) -> None:
+        """Record that the archives were reloaded."""
         if self._recorder is not None:
             with self._frame:
-                self._recorder.reloaded(answer.generation_after)
-        return answer
-
-    def close(self) -> None:
-        """Close the scene."""
-        self.served.close()
-
-    def stats(self, keys: bool = False) -> StatsAnswer:
-        """What is in memory, and how that did."""
-        return self.served.stats(keys)
-
-    def collide(self, *what: Any, **options: Any) -> CollideAnswers:
-        """See `Scene.collide`, and so for the questions below."""
-        return self.served.collide(*what, **options)
-
-    def distance(self, *what: Any, **options: Any) -> DistanceAnswers:
-        return self.served.distance(*what, **options)
-
-    def contacts(self, *what: Any, **options: Any) -> ContactsAnswers:
-        return self.served.contacts(*what, **options)
-
-    def sweep(self, *what: Any, **options: Any) -> SweepAnswers:
-        return self.served.sweep(*what, **options)
-
-    def raycast(self, *what: Any, **options: Any) -> RaycastAnswers:
-        return self.served.raycast(*what, **options)
-
-    def within(self, *what: Any, **options: Any) -> WithinAnswers:
-        return self.served.within(*what, **options)
-
-    def objects(self, *what: Any, **options: Any) -> ObjectsAnswers:
-        return self.served.objects(*what, **options)
-
-    def path(self, *what: Any, **parameters: Any) -> Iterator[Part]:
-        return self.served.path(*what, **parameters)
+                self._recorder.reloaded(generation)
 
 
 def _body(user: User, avatar: AvatarModel, pose: Pose) -> Body:

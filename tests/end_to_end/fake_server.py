@@ -21,6 +21,7 @@ from solidcloud.schemas.wire.answers import (
     WithinAnswers,
 )
 from solidcloud.schemas.wire.columns import as_part, unknown
+from solidcloud.schemas.wire.keys import User
 from solidcloud.schemas.wire.messages import (
     WIRE_VERSION,
     AvatarInfo,
@@ -31,10 +32,12 @@ from solidcloud.schemas.wire.messages import (
 )
 from solidcloud.schemas.wire.moves import Moved, Touched
 from solidcloud.schemas.wire.seals import avatar_digest
+from solidcloud.server.archives.archive_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.served.answering_avatars import note
 from solidcloud.server.service.server_config import ServerConfig
 from solidcloud.server.service.service import serve
+from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import Begin, FrameLog
 from solidcloud.server.simulation.simulation import Simulation
 
@@ -74,9 +77,11 @@ class FloorPipeline:
 
 
 def floor_simulation(name="floor", users=64, **fields):
-    """A simulation of the floor, with a stand-in for its effects."""
-    file = SceneFile(format=1, archives=scene_of(name).archives, limits=Limits(users=users), **fields)
-    return Simulation(FloorScene(name), file, FloorPipeline())
+    """A simulation of the floor, with a stand-in for its effects; its `scene` has it as its own."""
+    scene = FloorScene(name)
+    scene.file = SceneFile(format=1, archives=scene_of(name).archives, limits=Limits(users=users), **fields)
+    scene.simulation = Simulation(scene, scene.file, FloorPipeline())
+    return scene.simulation
 
 
 class FloorScene:
@@ -90,14 +95,15 @@ class FloorScene:
         self.at_work = self.warmed = self.parts = self.reloaded = 0
         self.refuses = None  # what a reload raises
         self.lock = threading.Lock()
-        self.simulation = None
+        self.simulation = self.file = None
+        self.archives = []
 
     def warm(self):
         self.warmed += 1
 
     def info(self):
         source = SourceInfo("floor.las", 0, "0" * 64, 4, "las", np.eye(4).tolist(), {"nan": 1})
-        return SceneInfo(
+        info = SceneInfo(
             self.name,
             format_version=1,
             wire_version=WIRE_VERSION,
@@ -120,11 +126,14 @@ class FloorScene:
             record_bytes=100,
             resident_bytes=200,
         )
+        return info if self.file is None else describe_scene(info, self.file)
 
     def reload(self):
         if self.refuses is not None:
             raise self.refuses
         self.reloaded += 1
+        if self.simulation is not None:
+            self.simulation.reloaded(self.reloaded)
         return ReloadAnswer(self.name, self.reloaded - 1, self.reloaded, 4)
 
     def stats(self, keys=False):
@@ -148,6 +157,8 @@ class FloorScene:
         return make_avatar(*found)._replace(digest=digest)
 
     def move(self, name, pose_from, pose_to, seconds, *, client="", **options):
+        if self.simulation is not None:
+            return self.simulation.move(name, pose_from, pose_to, seconds, client=client, **options)
         self.check(name, pose_from, client)
         self.asked.append(("move", (name, seconds), options))
         return Moved(pose=pose_to, verdict=int(Verdict.CONTACT), left=0.5, simulated=["stop"])
@@ -246,7 +257,16 @@ class FloorScene:
     def drop_unused_avatars(self, alive, seconds):
         self.unused.append((set(alive), seconds))
 
+    def session(self, avatar, *, client=""):
+        return LocalSession(self.simulation, User(client, avatar))
+
     def drop_client(self, client):
+        if self.simulation is not None:
+            self.simulation.drop_client(client)
+        else:
+            self.forget_client(client)
+
+    def forget_client(self, client):
         for key in [key for key in self.avatars if key[0] == client]:
             del self.avatars[key]
         self.gone.append(client)
@@ -265,7 +285,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     scene = FloorScene(arguments.name, arguments.delay)
     if arguments.walked:
-        scene = floor_simulation(arguments.name)
+        scene = floor_simulation(arguments.name).scene
     if arguments.log:
-        scene.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [])))
+        scene.simulation.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [])))
     serve([scene], ServerConfig(listen=arguments.listen))

@@ -49,7 +49,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(archive, endpoint):
     with (
         Scene.open(archive, "floor", budget_bytes=64 << 20) as scene,
-        serving([scene.simulation], ServerConfig(listen=endpoint)),
+        serving([scene], ServerConfig(listen=endpoint)),
     ):
         yield
 

@@ -27,7 +27,7 @@ def endpoint(free_endpoint):
 def victim(endpoint):
     """A client with an avatar and a session, of a server that rogues reach too."""
     with (
-        serving([floor_simulation()], ServerConfig(listen=endpoint)),
+        serving([floor_simulation().scene], ServerConfig(listen=endpoint)),
         Client(endpoint, scene="floor", timeout=DEADLINE) as client,
     ):
         client.add_avatar(AVATAR, POINTS, 0.125)
@@ -59,14 +59,14 @@ def test_a_rogue_is_not_gossiped_to_clients(rogue, victim):
 def test_a_token_of_everybody_leaves_the_scenes_own_avatars(free_endpoint):
     """The scene's own avatars are kept under the client "*", which is no client's name."""
     endpoint, floor = free_endpoint(), floor_simulation()
-    floor.served.add_avatar("own", POINTS, 0.125, client=EVERYBODY)
-    with serving([floor], ServerConfig(listen=endpoint)), Rogue(endpoint, "client") as rogue:
-        gone = len(floor.served.gone)
+    floor.scene.add_avatar("own", POINTS, 0.125, client=EVERYBODY)
+    with serving([floor.scene], ServerConfig(listen=endpoint)), Rogue(endpoint, "client") as rogue:
+        gone = len(floor.scene.gone)
         for key in ("solidcloud/1/client/floor/*", "solidcloud/1/client/floor/last"):
             rogue.session.liveliness().declare_token(key).undeclare()
             rogue.settle()
-        eventually(lambda: "last" in floor.served.gone)  # behind the others on one channel
-        assert floor.served.gone[gone:] == ["last"] and floor.served.avatar("own", "anybody")
+        eventually(lambda: "last" in floor.scene.gone)  # behind the others on one channel
+        assert floor.scene.gone[gone:] == ["last"] and floor.scene.avatar("own", "anybody")
 
 
 def test_few_attacks_by_the_script_have_no_success():

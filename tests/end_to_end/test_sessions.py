@@ -34,7 +34,7 @@ def floor():
 
 @pytest.fixture
 def served(floor, endpoint):
-    with serving([floor], ServerConfig(listen=endpoint)):
+    with serving([floor.scene], ServerConfig(listen=endpoint)):
         yield floor
 
 
@@ -236,7 +236,7 @@ def test_what_is_no_wish_is_refused_before_it_is_sent(served, endpoint, wish):
 
 def test_a_full_scene_says_so(endpoint):
     with (
-        serving([floor_simulation(users=1)], ServerConfig(listen=endpoint)),
+        serving([floor_simulation(users=1).scene], ServerConfig(listen=endpoint)),
         walking(endpoint) as one,
         walking(endpoint) as two,
     ):
@@ -260,7 +260,7 @@ def reached(session):
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
 def test_plain_zenoh_is_enough_to_walk(served, endpoint, encoding):
     user, heard, ended = keys.User("me", "al"), [], threading.Event()
-    served.add_avatar("al", POINTS, 0.125, client="me")
+    served.scene.add_avatar("al", POINTS, 0.125, client="me")
     with zenoh.open(session_config(connect=endpoint)) as session:
         session.get(
             keys.state_key("floor", user),
@@ -296,7 +296,7 @@ def test_plain_zenoh_is_enough_to_walk(served, endpoint, encoding):
 
 def test_a_state_that_comes_before_its_query_is_kept_for_it(served, endpoint):
     user, heard = keys.User("me", "al"), []
-    served.add_avatar("al", POINTS, 0.125, client="me")
+    served.scene.add_avatar("al", POINTS, 0.125, client="me")
     with zenoh.open(session_config(connect=endpoint)) as session:
         wish = Wish(seq=7, time=1.0, pose=pose_at(0.0, 2.0)[None])
         session.put(keys.wish_key("floor", user), encode(wish))

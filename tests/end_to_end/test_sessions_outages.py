@@ -29,7 +29,7 @@ def floor():
 
 @pytest.fixture
 def served(floor, endpoint):
-    with serving([floor], ServerConfig(listen=endpoint)):
+    with serving([floor.scene], ServerConfig(listen=endpoint)):
         yield floor
 
 
@@ -82,8 +82,8 @@ def test_a_killed_client_leaves_the_scene(served, endpoint):
         assert [user.avatar for user in served.users] == ["large"]
         other.kill()
         eventually(lambda: not served.users)
-    _, client = served.served.gone  # the first is who warmed it
-    assert client != "*warm" and not served.served.avatars
+    _, client = served.scene.gone  # the first is who warmed it
+    assert client != "*warm" and not served.scene.avatars
 
 
 def test_a_session_goes_on_with_a_server_that_was_restarted(endpoint):

@@ -229,9 +229,6 @@ def test_a_path_that_stops_after_its_first_part(
 
 def test_frames_that_are_answered(endpoint: str, files: dict[str, Any], capsys: Any) -> None:
     """All of them: a simulation that answers is not taken for one that does not, whatever its verdicts."""
-    simulation = floor_simulation()
-    scene = simulation.served
-    scene.simulation = simulation
-    with serving([scene], ServerConfig(listen=endpoint)):
+    with serving([floor_simulation().scene], ServerConfig(listen=endpoint)):
         assert run(query(endpoint, "move", files["move"])) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5

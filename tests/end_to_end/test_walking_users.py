@@ -29,7 +29,6 @@ from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
-from solidcloud.server.scenes.open_scene import open_scene
 from solidcloud.server.served.served_scene import Turn
 from solidcloud.server.service.server_config import ServerConfig
 from solidcloud.server.service.service import serving
@@ -99,11 +98,14 @@ def test_nobody_answers_and_the_avatar_goes_nowhere(endpoint: str) -> None:
     assert np.array_equal(moved.pose[0], pose_at(0.0))
 
 
-def test_users_block_one_another_until_one_of_them_leaves(scene: Scene, endpoint: str) -> None:
-    file = SceneFile(format=1, archives=scene_of("room").archives, effects=[Stop(), Sweep(), Crowd()])
-    simulation = simulate(scene, file)
+def test_users_block_one_another_until_one_of_them_leaves(
+    archive: Path, tmp_path: Path, endpoint: str
+) -> None:
+    effects = "".join(f'[[effects]]\neffect = "{name}"\n' for name in ("stop", "sweep", "crowd"))
+    (tmp_path / "room.toml").write_text(f'format = 1\n[[archives]]\npath = "{archive}"\n{effects}')
     with (
-        serving([simulation], ServerConfig(listen=endpoint)),
+        Scene.open(tmp_path / "room.toml") as scene,
+        serving([scene], ServerConfig(listen=endpoint)),
         Client(endpoint, scene="room") as one,
         Client(endpoint, scene="room") as two,
     ):
@@ -119,7 +121,7 @@ def test_users_block_one_another_until_one_of_them_leaves(scene: Scene, endpoint
                 assert walk(standing, 0.5)[0] == 0.5, "who is met may go on"
                 assert walk(walker, 1.0)[0] == pytest.approx(0.5 - 2 * RADIUS, abs=0.01)
             one.close()
-            eventually(lambda: len(simulation.users) == 1)
+            eventually(lambda: len(scene.simulation.users) == 1)
             assert walk(walker, 1.0)[0] == 1.0
 
 
@@ -223,7 +225,7 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
     rng = np.random.default_rng(12)
     users = [User("a", "box"), User("b", "box")]  # as the scene's own avatar
     moved = {}
-    with open_scene(path, read_points=np.loadtxt) as scene, recorded(scene, path, log):
+    with Scene.open(path, read_points=np.loadtxt) as scene, recorded(scene, path, log):
         scene.simulation.warm()
         for number in range(60):
             turns = []
@@ -234,7 +236,7 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
             for outcome in scene.simulation.step(turns):
                 moved.update(outcome.state.objects.poses)
     assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"
-    with open_scene(path, read_points=np.loadtxt) as scene:  # not warmed: that leaves nothing behind
+    with Scene.open(path, read_points=np.loadtxt) as scene:  # not warmed: that leaves nothing behind
         assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None)
 
 

@@ -10,7 +10,6 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import archive_cases
 import msgspec
@@ -90,7 +89,7 @@ def child(names):
     file = msgspec.convert({"format": 1, "archives": [{"path": "a"}], "effects": effects}, SceneFile)
     with Scene.open(pathlib.Path(sys.argv[1])) as scene:
         simulation = simulate(scene, file)
-        simulation.add_avatar("ball", np.zeros((1, 3)), 0.1, client="c")
+        scene.add_avatar("ball", np.zeros((1, 3)), 0.1, client="c")
         pose = np.eye(4)[None]
         pose[0, 2, 3] = 0.3
         said = []
@@ -205,7 +204,6 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
     replies = []
     for beside in ("nothing", "others", "effects"):
         with Scene.open(case.archive, "scene") as scene:
-            asked: Any = scene
             if beside == "others":
                 for name in ("other", "third"):
                     scene.add_avatar(name, other, 0.02, client="c")
@@ -214,14 +212,14 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
                 scene.objects([("other", pose) for pose in poses], client="c")
                 scene.raycast(poses[:, :3, 3], poses[:, :3, 0], 1.0)
             if beside == "effects":
-                asked = simulate(scene, EVERY_EFFECT)
+                scene._simulation = simulate(scene, EVERY_EFFECT)
                 scene.add_avatar("other", other, 0.02, client="c")
                 for pose, wish in pairwise(poses):
-                    moved = asked.move("other", pose[None], wish[None], client="c")
+                    moved = scene.move("other", pose[None], wish[None], client="c")
                     assert moved.simulated == [name for name in ORDER if name != "objects"]
             scene.add_avatar("body", body, 0.01, client="c")
-            found = asked.collide("body", poses, client="c")
-            service = Service([asked], ServerConfig())
+            found = scene.collide("body", poses, client="c")
+            service = Service([scene], ServerConfig())
             payload = encode(CollideRequest("body", poses), MSGPACK)
             answer = service.answer("solidcloud/1/scene/scene/c/collide", payload, MSGPACK)
             assert answer.ok

@@ -94,7 +94,7 @@ def test_near_and_distance_agree_under_every_radius_model(tmp_path: Path, rng: n
     counted = Counted()
     with Scene.open(case.archive) as scene:
         for model in radius_class_archives.MODELS:
-            both_ways(scene._opened.radius_model(model), avatar, poses, 0.1, counted)
+            both_ways(scene.archives[0]._opened.radius_model(model), avatar, poses, 0.1, counted)
     assert counted.nothing > 20 and counted.touching > 20
 
 

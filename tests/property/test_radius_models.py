@@ -100,6 +100,6 @@ def test_reach_is_that_of_the_largest_sphere_there_is(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, grid, models=frozenset({"mean", "local"}), radius=0.02)
     _, radii = radius_class_archives.stored_radii(case.archive, "local")
     with Scene.open(case.archive) as scene:
-        data = scene._opened.radius_model("local")
+        data = scene.archives[0]._opened.radius_model("local")
         assert data.radius_units == radii.max() < 0.02 * naive.UNITS
         assert data.arrays.drop.min() == 0 and data.arrays.drop.max() > 0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.context.query_budget import EXACT, Effort
 from solidcloud.server.scene import Scene
@@ -53,9 +54,18 @@ class Counting:
 def world_of(*scenes: Scene, poses: Any = ()) -> Counting:
     """The world of opened archives. poses: of each, archive to world; left out: the identity."""
 
-    archives = list(zip(scenes, poses or [None] * len(scenes), strict=True))
+    archives = [
+        placed(scene, pose) for scene, pose in zip(scenes, poses or [None] * len(scenes), strict=True)
+    ]
     file = SceneFile(format=1, archives=[ArchiveItem(path=scene.name) for scene in scenes])
     return Counting(World(SimpleNamespace(archives=archives), file))
+
+
+def placed(scene: Scene, pose: Any = None) -> Any:
+    """The first archive of a scene, as if it lay at a pose; None: the identity."""
+    archive, pose = scene.archives[0], archive_pose(pose)
+    inverse = None if pose is None else inverse_of(pose)
+    return SimpleNamespace(take=archive.take, info=archive.info, pose=pose, inverse=inverse)
 
 
 def flip_a_byte(archive: Path, voxel: tuple[int, int, int]) -> None:

@@ -15,7 +15,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.moves import Moved
 from solidcloud.server.client import Client
-from solidcloud.server.scenes.open_scene import open_scene
+from solidcloud.server.scene import Scene
 from solidcloud.server.service.server_config import ServerConfig
 from solidcloud.server.service.service import serving
 
@@ -138,7 +138,7 @@ def serving_scene(folder: Path, text: str) -> Iterator[Served]:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     with (
-        open_scene(folder / "scene.toml", read_points=_no_avatars) as scene,
+        Scene.open(folder / "scene.toml", read_points=_no_avatars) as scene,
         serving([scene], ServerConfig(listen=endpoint)),
         Client(endpoint, scene=scene.name) as client,
     ):

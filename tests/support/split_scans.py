@@ -9,8 +9,9 @@ import numpy as np
 import synthetic_scans
 from numpy.typing import NDArray
 from point_clouds import signed_permutations
-from solidcloud.server.scene import Scene
-from solidcloud.server.scenes.placed_archives import SeveralScenes
+from solidcloud.server.archives.placed_archive import PlacedArchive
+from solidcloud.server.observability.metrics import Metrics
+from solidcloud.server.scene import DEFAULT_BUDGET, Scene
 
 STEP = archive_cases.BINARY_STEP
 
@@ -48,9 +49,13 @@ class Built:
         self.whole = archive_cases.build(folder, np.vstack(self.points), **OPTIONS).archive
 
 
-def several(*archives: tuple[Path, Any], **options: Any) -> SeveralScenes:
+def several(*archives: tuple[Path, Any], **options: Any) -> Scene:
     """A scene of archives at poses, with an avatar."""
-    scene = SeveralScenes([(Scene.open(path, "part", **options), pose) for path, pose in archives], "hall")
+    metrics, how = Metrics(), {"budget_bytes": DEFAULT_BUDGET, **options}
+    opened = [
+        PlacedArchive.open(path, "hall", pose=pose, took=metrics.loaded, **how) for path, pose in archives
+    ]
+    scene = Scene(opened, "hall", metrics)
     scene.add_avatar("al", BODY, RADIUS)
     return scene
 

@@ -88,12 +88,12 @@ def _require(holds: bool, fault: str) -> None:
 
 def main(path: str) -> int:
     """Open, warm and check the scene as a server start does. Return 0 unless the kernels fail."""
-    from ...scenes.open_scene import open_scene
-    from ..input.point_file import read_avatar
+    from ...scene import Scene
 
     try:
-        with open_scene(path, read_points=read_avatar) as scene:
-            (scene.simulation or scene).warm()
+        with Scene.open(path) as scene:
+            scene.warm()
+            scene.simulation.warm()
             check_answers(scene)
     except SolidcloudError:
         return 0  # a fault of the archive or scene file, which the server start itself reports

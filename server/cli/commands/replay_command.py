@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -25,20 +25,17 @@ def replay(
 
     Compares the pose of every frame. Exit code 1: some poses differ.
     """
-    from ...scenes.open_scene import open_scene
+    from ...scene import Scene
     from ...simulation.replay import check_same
     from ...simulation.replay import replay as replay_log
     from ...simulation.replay_log import Begin, read_log
-    from ..input.point_file import read_avatar
 
     records = read_log(log)
     begin = next(records)
     assert isinstance(begin, Begin), "read_log checks this"
     path = Path(begin.path) if what is None else what
-    with open_scene(
-        path, read_points=read_avatar, name=begin.scene, budget_bytes=parse_bytes(cache, "--cache")
-    ) as scene:
-        simulation: Any = scene.simulation
+    with Scene.open(path, begin.scene, budget_bytes=parse_bytes(cache, "--cache")) as scene:
+        simulation = scene.simulation
         if not check_same(begin, simulation, path):
             print(f"warning: {path} is not the scene file that was logged", file=sys.stderr)
         found = replay_log(simulation, records)

@@ -83,11 +83,10 @@ def serve(
 
     from ....schemas.kernels.compiling import kernel_files
     from ...network.key_files import read_given_key
-    from ...scenes.open_scene import open_scene
+    from ...scene import Scene
     from ...service.server_config import ServerConfig
     from ...service.service import serve as serve_scenes
     from ...simulation.replay import recorded
-    from ..input.point_file import read_avatar
     from .rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
@@ -112,9 +111,7 @@ def serve(
     with ExitStack() as stack, ExitStack() as start:
         if start.enter_context(files.starting()):
             rehearse(what, files)
-        scene = stack.enter_context(
-            open_scene(what, read_points=read_avatar, name=name, budget_bytes=budget, policy=policy)
-        )
+        scene = stack.enter_context(Scene.open(what, name, budget_bytes=budget, policy=policy))
         if log is not None:
             stack.enter_context(recorded(scene, what, log))
         if not serve_scenes([scene], config, ready=start.close):

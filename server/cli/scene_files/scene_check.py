@@ -11,7 +11,7 @@ from ....schemas.scene.effect_options import Objects, Through, Uncertainty
 from ....schemas.scene.scene_file import SceneFile, effect_name, identity, read_scene, scene_name, up_of
 from ...archives.archive_info import run_order
 from ...archives.rigid_transform import moved_boxes
-from ...scenes.open_scene import (
+from ...scenes.scene_archives import (
     Found,
     FoundAvatar,
     ReadPoints,
@@ -42,7 +42,7 @@ class Checked(NamedTuple):
 def check_scene_file(path: Path, read_points: ReadPoints) -> Checked:
     """Read a scene file and everything it names.
 
-    Raises the same errors as `open_scene`, except those about budgets.
+    Raises the same errors as `Scene.open`, except those about budgets.
     """
     file = read_scene(path)
     name = scene_name(file, path)

@@ -116,7 +116,7 @@ def scans_of(effect: Uncertainty, info: SceneInfo, keeps_scan: bool) -> Scans:
 def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
     """Create the effect of a scene. Raises BadRequestError as `check` does."""
     with world as seen:
-        check(effect, *(each.placed.scene.info() for each in seen))
+        check(effect, *(each.placed.info() for each in seen))
         for each in seen:
             if each.data.keeps_scan:
                 _warm(each.data)
@@ -149,7 +149,7 @@ class UncertaintyRunner:
         with world as seen:
             return Known(
                 world.generations(),
-                [scans_of(self._effect, each.placed.scene.info(), each.data.keeps_scan) for each in seen],
+                [scans_of(self._effect, each.placed.info(), each.data.keeps_scan) for each in seen],
             )
 
     def run(self, frame: Frame) -> None:

@@ -6,7 +6,7 @@ there is one, at the identity, as nearly always, its questions are asked as they
 
 import threading
 from collections import OrderedDict
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,9 +17,9 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
-from ....schemas.wire.messages import SceneInfo
 from ...archives.archive_generation import Opened
-from ...archives.rigid_transform import inverse_of, moved, turned, under
+from ...archives.placed_archive import PlacedArchive
+from ...archives.rigid_transform import moved, turned, under
 from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, Effort
@@ -42,27 +42,12 @@ _NOWHERE = np.zeros(3)
 SPARSE = 3.0
 
 
-class ArchiveScene(Protocol):
-    """A scene of one archive."""
-
-    def take(self) -> Opened: ...
-    def info(self) -> SceneInfo: ...
-
-
-class Placed(NamedTuple):
-    """One archive of a scene. pose, inverse: (4, 4), archive to world and back; None at the identity."""
-
-    scene: ArchiveScene
-    pose: Pose | None = None
-    inverse: Pose | None = None
-
-
 class Seen(NamedTuple):
     """An archive as it is held now. data: under the scene's radius model."""
 
     opened: Opened
     data: SceneData
-    placed: Placed
+    placed: PlacedArchive
 
 
 class _Held(threading.local):
@@ -82,19 +67,15 @@ class _Held(threading.local):
 class World:
     """A scene as its effects see it. Thread-safe.
 
-    file: what it calls for.  up: (3,) unit, against gravity.  scenes: its archives.
+    file: what it calls for.  up: (3,) unit, against gravity.  archives: of the scene.
     """
 
-    def __init__(self, served: Any, file: SceneFile) -> None:
-        """served: a `Scene`, or several with their poses (`archives`)."""
-        self.file, self._served = file, served
+    def __init__(self, scene: Any, file: SceneFile) -> None:
+        """Query a scene's archives. scene: has `archives` and `avatar`, as a `Scene` has."""
+        self.file, self._scene = file, scene
         self.up: Vec = unit(file.up)
-        placed = getattr(served, "archives", None)
-        self.scenes = [
-            Placed(scene, pose, None if pose is None else inverse_of(pose))
-            for scene, pose in (placed if placed is not None else [(served, None)])
-        ]
-        self._alone = len(self.scenes) == 1 and self.scenes[0].pose is None
+        self.archives: list[PlacedArchive] = list(scene.archives)
+        self._alone = len(self.archives) == 1 and self.archives[0].pose is None
         self._held = _Held()
 
     def __enter__(self) -> list[Seen]:
@@ -103,8 +84,8 @@ class World:
         if not held.depth:
             seen: list[Seen] = []
             try:
-                for placed in self.scenes:
-                    opened = placed.scene.take()
+                for placed in self.archives:
+                    opened = placed.take()
                     seen.append(Seen(opened, opened.data, placed))
                     data = with_stop(opened.radius_model(self.file.radius_model), held.stop)
                     seen[-1] = Seen(opened, data, placed)
@@ -145,7 +126,7 @@ class World:
 
     def avatar(self, name: str) -> AvatarModel:
         """One of the scene's own avatars, once they have been added; UnknownAvatarError."""
-        model: AvatarModel = self._served.avatar(name, EVERYBODY)
+        model: AvatarModel = self._scene.avatar(name, EVERYBODY)
         return model
 
     @property

@@ -14,7 +14,7 @@ import pytest
 import synthetic_scans
 from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BusyError, FormatError, SolidcloudError
-from solidcloud.server import scene as scene_module
+from solidcloud.server.archives import placed_archive
 from solidcloud.server.scene import Scene
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0]])
@@ -121,7 +121,7 @@ def test_a_path_that_nobody_wants_any_more_holds_nothing(place: Path, begun: boo
         if begun:
             next(path)
         scene.reload()
-        before = scene._before
+        before = scene.archives[0]._before
         assert before is not None and not before.ended.is_set()
         del path
         assert before.ended.wait(20.0), "parts that were being computed have ended too"
@@ -134,11 +134,11 @@ def test_a_refused_path_holds_nothing(place: Path) -> None:
         with pytest.raises(BadRequestError):
             scene.path("al", AT_ALONE, "distance")  # without a reach
         scene.reload()
-        assert scene._before is not None and scene._before.ended.is_set()
+        assert scene.archives[0]._before is not None and scene.archives[0]._before.ended.is_set()
 
 
 def test_a_third_generation_waits_for_the_first(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_module, "RELOAD_WAIT", 0.01)
+    monkeypatch.setattr(placed_archive, "RELOAD_WAIT", 0.01)
     with Scene.open(place) as scene:
         scene.add_avatar("al", BODY, 0.01)
         path = scene.path("al", np.repeat(AT_ALONE, 5000, axis=0))

@@ -187,7 +187,10 @@ def test_a_reload_keeps_the_boxes(whole: Path, rng: np.random.Generator) -> None
 def test_a_small_cache_answers_the_same(whole: Path, rng: np.random.Generator) -> None:
     poses = poses_near(rng, 8)
     with open_without(whole, DOOR, ROOM) as scene:
-        largest, expected = int(scene._opened.store.sizes.max()), list(ask_all(scene, poses, None))
+        largest, expected = (
+            int(scene.archives[0]._opened.store.sizes.max()),
+            list(ask_all(scene, poses, None)),
+        )
     for policy, budget in (
         ("lru", largest + 4096),
         ("lru+prefetch", largest + 4096),

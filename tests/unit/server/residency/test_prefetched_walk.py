@@ -89,4 +89,4 @@ def test_questions_that_are_refused_or_wide_keep_nothing_for_themselves(
         for poses, margin in ((here, 1e6), (here, 10**400), (here, float("nan")), (here, -1.0), (large, 0.0)):
             with pytest.raises((BadRequestError, BadTransformError)):
                 scene.collide("al", poses, margin)
-        assert not scene._opened.prefetcher.running and not scene.residency.kept
+        assert not scene.archives[0]._opened.prefetcher.running and not scene.residency.kept

@@ -151,7 +151,7 @@ def test_what_waits_when_it_is_closed_is_still_taken():
 def floor():
     simulation = floor_simulation(users=2)
     for user in (AL, BO, CY):
-        simulation.add_avatar(user.avatar, POINTS, 0.1, client=user.client)
+        simulation.scene.add_avatar(user.avatar, POINTS, 0.1, client=user.client)
     return simulation
 
 

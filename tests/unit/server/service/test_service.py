@@ -165,7 +165,7 @@ def test_a_scene_that_simulates_nothing_has_no_sessions(service, scene):
 
 def test_the_sessions_of_a_client_that_is_gone_end():
     scene = floor_simulation()
-    service = Service([scene], ServerConfig())
+    service = Service([scene.scene], ServerConfig())
     sent = []
     frames = service.frames("floor", lambda user, answer: sent.append((user, answer.ok)))
     for client in ("c", "d"):
@@ -180,8 +180,8 @@ def test_the_sessions_of_a_client_that_is_gone_end():
 
 def test_warming_warms_the_frames_too(scene):
     simulation = floor_simulation()
-    Service([simulation], ServerConfig()).warm()
-    assert simulation.served.warmed == 1 and simulation._pipeline.frames > 0
+    Service([simulation.scene], ServerConfig()).warm()
+    assert simulation.scene.warmed == 1 and simulation._pipeline.frames > 0
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])

@@ -47,7 +47,7 @@ def log(tmp_path):
     rng = np.random.default_rng(8)
     simulation, path = simulated(), tmp_path / "log"
     for user in (AL, BO, CY):
-        simulation.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
+        simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     users = [AL, BO, CY, User("d", "unknown")]
     with FrameLog(path, Begin("floor", "", b"", [])) as frames:
         simulation.record(frames)
@@ -65,7 +65,7 @@ def log(tmp_path):
             if number == 40:
                 simulation.drop_client("a")
             if number == 45:
-                simulation.add_avatar("al", np.vstack([POINTS, POINTS]), 0.125, client="a")
+                simulation.scene.add_avatar("al", np.vstack([POINTS, POINTS]), 0.125, client="a")
         simulation.record(None)
     return path
 
@@ -137,7 +137,7 @@ def test_a_wish_that_was_another_changes_what_comes_after(log, tmp_path):
 
 def test_a_refusal_that_is_none_now_is_a_difference(log):
     simulation = simulated()
-    simulation.add_avatar("unknown", POINTS, 0.125, client="d")
+    simulation.scene.add_avatar("unknown", POINTS, 0.125, client="d")
     found = replay(simulation, read_log(log))
     assert found.different > 0 and found.first.user == User("d", "unknown")
     assert "logged error unknown_avatar, replayed a pose at" in str(found.first)
@@ -145,7 +145,7 @@ def test_a_refusal_that_is_none_now_is_a_difference(log):
 
 def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
     simulation, path = simulated(), tmp_path / "log"
-    simulation.add_avatar("al", POINTS, 0.125, client="a")
+    simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     with FrameLog(path, Begin("floor", "", b"", [])) as frames:
         simulation.record(frames)
         for number in range(4):
@@ -153,7 +153,7 @@ def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
             wish = Wish(seq=number, time=float(number), pose=np.eye(4)[None])
             simulation.step([Turn(AL, wish)])
             if number == 1:
-                simulation.reload()
+                simulation.scene.reload()
     assert replay(simulated(), read_log(path)) == (3, 3, 0, None, 4)
 
 

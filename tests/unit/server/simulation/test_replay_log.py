@@ -39,13 +39,13 @@ def write(path):
     """A log of two frames of two users with the same body, one who leaves, a reload; the simulation."""
     simulation = floor_simulation()
     for user in (AL, BO):
-        simulation.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
+        simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     with FrameLog(path, BEGIN) as log:
         simulation.record(log)
         simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.25))])
         simulation.end(BO)
         simulation.step([Turn(AL, wish(2, -9.0)), Turn(NOBODY, wish(1, 0.0))])
-        simulation.reload()
+        simulation.scene.reload()
         simulation.drop_client("a")
         simulation.record(None)
     return simulation
@@ -67,8 +67,8 @@ def test_all_that_decides_is_in_it_in_order_and_points_once(tmp_path):
 
 def test_another_radius_is_another_avatar(tmp_path):
     simulation = floor_simulation()
-    simulation.add_avatar("al", POINTS, 0.125, client="a")
-    simulation.add_avatar("bo", POINTS, 0.25, client="b")
+    simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
+    simulation.scene.add_avatar("bo", POINTS, 0.25, client="b")
     with FrameLog(tmp_path / "log", BEGIN) as log:
         simulation.record(log)
         simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))])
@@ -124,7 +124,7 @@ def test_a_log_is_not_written_over(tmp_path):
 
 def test_a_log_that_can_grow_no_more_stops_nobody(tmp_path, caplog):
     simulation = floor_simulation()
-    simulation.add_avatar("al", POINTS, 0.125, client="a")
+    simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     log = FrameLog(tmp_path / "log", BEGIN)
     simulation.record(log)
     simulation.step([Turn(AL, wish(1, 0.5))])

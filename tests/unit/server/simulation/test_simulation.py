@@ -18,9 +18,11 @@ from solidcloud.schemas.scene.scene_file import SceneFile, Spawn, scene_of
 from solidcloud.schemas.wire.keys import User, public_id
 from solidcloud.schemas.wire.moves import FRAME_SECONDS, Moved, State, Wish
 from solidcloud.server.client import Client
+from solidcloud.server.remote.client_session import ClientSession
 from solidcloud.server.scene import Scene
 from solidcloud.server.served.avatar_limits import EVERYBODY
 from solidcloud.server.served.served_scene import SceneLike, Turn
+from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.simulation import SILENT_SECONDS, Simulation
 
 pytestmark = pytest.mark.interpreted
@@ -44,7 +46,7 @@ def wish(seq, z=None, velocity=None, time=None, **fields):
 def floor():
     simulation = floor_simulation()
     for user in (AL, BO):
-        simulation.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
+        simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     return simulation
 
 
@@ -62,7 +64,7 @@ def test_a_frame_goes_on_from_where_the_last_one_ended(floor):
 
 def test_users_begin_at_the_spawn():
     simulation = floor_simulation(spawn=Spawn(position=(3.0, 4.0, 5.0)))
-    simulation.add_avatar("al", POINTS, 0.125, client="a")
+    simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     ((_, state, _),) = simulation.step([Turn(AL, wish(1, velocity=(3.0, 0.0, 0.0)))])
     assert np.array_equal(state.pose[0, :3, 3], [3.0 + 3.0 * FRAME_SECONDS, 4.0, 5.0])
 
@@ -81,7 +83,7 @@ def test_everybody_who_wished_has_one_frame_in_the_order_given(floor):
 
 
 def test_a_refused_wish_is_its_users_alone_and_changes_nothing(floor):
-    floor.add_avatar("crash", POINTS, 0.125, client="a")
+    floor.scene.add_avatar("crash", POINTS, 0.125, client="a")
     floor.step([Turn(AL, wish(1, 0.5))])
     crash, nobody = User("a", "crash"), User("a", "nobody")
     sheared = wish(2, 0.25)
@@ -100,7 +102,7 @@ def test_a_refused_wish_is_its_users_alone_and_changes_nothing(floor):
 def test_there_is_room_for_so_many_users_and_who_leaves_makes_room():
     simulation = floor_simulation(users=1)
     for user in (AL, BO):
-        simulation.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
+        simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     outcomes = simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))])
     assert isinstance(outcomes[0].state, State) and isinstance(outcomes[1].state, BusyError)
     simulation.end(AL)
@@ -109,7 +111,7 @@ def test_there_is_room_for_so_many_users_and_who_leaves_makes_room():
     simulation.end_client("a")
     assert simulation.users == [BO]
     simulation.drop_client("b")
-    assert simulation.users == [] and simulation.served.gone == ["b"]
+    assert simulation.users == [] and simulation.scene.gone == ["b"]
     assert isinstance(simulation.step([Turn(BO, wish(2, 0.5))])[0].state, UnknownAvatarError)
 
 
@@ -167,8 +169,8 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
     bodies = Bodies()
     file = SceneFile(format=1, archives=scene_of("floor").archives)
     stand_in = floor_simulation()
-    simulation = Simulation(stand_in.served, file, stand_in._pipeline, bodies=bodies)
-    simulation.add_avatar("al", POINTS, 0.125, client="a")
+    simulation = Simulation(stand_in.scene, file, stand_in._pipeline, bodies=bodies)
+    simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     objects = {"door": np.eye(4).tolist()}
     simulation.step([Turn(AL, wish(1, 0.5, objects=objects))])
     assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
@@ -182,25 +184,23 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
 
 def test_the_scenes_own_avatars_are_everybodys():
     stand_in = floor_simulation()
-    own = stand_in.served.add_avatar("guide", POINTS, 0.125, client=EVERYBODY)
+    own = stand_in.scene.add_avatar("guide", POINTS, 0.125, client=EVERYBODY)
     file = SceneFile(format=1, archives=scene_of("floor").archives, effects=[Ground(), Stop()])
-    simulation = Simulation(stand_in.served, file, stand_in._pipeline, [own])
+    simulation = Simulation(stand_in.scene, file, stand_in._pipeline)
     guides = [User("a", "guide"), User("b", "guide")]
     outcomes = simulation.step([Turn(user, wish(1, 0.5)) for user in guides])
     assert all(isinstance(outcome.state, State) for outcome in outcomes)
-    assert simulation.add_avatar("guide", POINTS, 0.125, client="c") == own
+    assert simulation.scene.add_avatar("guide", POINTS, 0.125, client="c") == own
     with pytest.raises(BadRequestError):
-        simulation.add_avatar("guide", POINTS + 1, 0.125, client="c")
-    info = simulation.info()
-    assert info.effects == ["stop", "ground"] and info.avatars == [own]
+        simulation.scene.add_avatar("guide", POINTS + 1, 0.125, client="c")
 
 
 def test_warming_simulates_a_frame_and_leaves_nothing(floor):
     before = floor._pipeline.frames
-    avatars = dict(floor.served.avatars)
+    avatars = dict(floor.scene.avatars)
     floor.warm()
-    assert floor.served.warmed == 1 and floor._pipeline.frames > before
-    assert floor.served.avatars == avatars and floor.users == []
+    assert floor._pipeline.frames > before
+    assert floor.scene.avatars == avatars and floor.users == []
 
 
 def test_frames_come_one_at_a_time(floor):
@@ -238,28 +238,21 @@ def test_it_has_all_that_a_scene_has():
         if not name.startswith("_") and (callable(found) or isinstance(found, property))
     }
     assert {"move", "collide", "simulation", "reload", "path"} <= wanted
-    for kind in (Simulation, Scene, FloorScene):
+    for kind in (Scene, FloorScene):
         missing = {name for name in wanted if not hasattr(kind, name)} - {"simulation"}
         assert not missing, kind
     asked = {name for name in wanted if name not in ("simulation", "drop_client", "warm", *_OF_THE_SERVER)}
     assert {name for name in asked if not hasattr(Client, name)} == set()
+    # And the other way round: what a client can do, a scene in this process can.
+    own = {name for name in vars(Client) if not name.startswith("_")} - {"silence"}
+    assert {"session", "add_avatar", "stats"} <= own
+    assert {name for name in own if not hasattr(Scene, name)} == set()
+    sessions = {name for name in vars(ClientSession) if not name.startswith("_")}
+    assert sessions == {name for name in vars(LocalSession) if not name.startswith("_")}
 
 
-@pytest.mark.parametrize(
-    "operation, what",
-    [
-        ("collide", ("al", pose_at(0.0), 0.125)),
-        ("distance", ("al", pose_at(0.0), 0.75)),
-        ("contacts", ("al", pose_at(0.0), 9, 0.125, 0.5)),
-        ("sweep", ("al", pose_at(0.0), pose_at(0.0), 0.125)),
-        ("raycast", (POINTS, POINTS, 2.0)),
-        ("within", (POINTS, 2.0)),
-        ("objects", ([("al", pose_at(0.0)[0], 1, 2)], 0.125)),
-        ("path", ("al", pose_at(0.0), "collide")),
-    ],
-)
-def test_questions_are_the_scenes(floor, operation, what):
-    options = {} if operation in ("raycast", "within") else {"client": "a"}
-    getattr(floor, operation)(*what, **options)
-    assert [asked[0] for asked in floor.served.asked] == [operation]
-    assert floor.stats(keys=True).keys == [3, 5] and floor.reload().generation_after == 1
+def test_a_simulation_has_frames_and_no_questions():
+    public = {name for name in dir(Simulation) if not name.startswith("_")}
+    assert public == {
+        "drop_client", "end", "end_client", "most_users", "move", "record", "reloaded", "step", "users", "warm",
+    }  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from solidcloud.schemas.scene.scene_file import parse_scene, read_scene
 from solidcloud.server.cli.main import run
-from solidcloud.server.scenes.open_scene import is_scene_file
+from solidcloud.server.scenes.scene_archives import is_scene_file
 
 pytestmark = pytest.mark.interpreted
 

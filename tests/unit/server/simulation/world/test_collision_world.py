@@ -11,7 +11,7 @@ import archive_cases
 import effect_rooms
 import numpy as np
 import pytest
-from effect_frames import body_of, report
+from effect_frames import body_of, placed, report
 from effect_rooms import at
 from solidcloud.schemas.scene.effect_options import Contacts
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
@@ -34,7 +34,7 @@ THERE[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
 def world_of(*archives: tuple[Scene, np.ndarray | None]) -> World:
     """The world of scenes at poses."""
     file = SceneFile(format=1, archives=[ArchiveItem(path=scene.name) for scene, _ in archives])
-    return World(SimpleNamespace(archives=list(archives)), file)
+    return World(SimpleNamespace(archives=[placed(*each) for each in archives]), file)
 
 
 @pytest.mark.interpreted

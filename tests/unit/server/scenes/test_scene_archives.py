@@ -28,19 +28,20 @@ from solidcloud.schemas.wire.messages import (
     decode_answer,
     encode,
 )
+from solidcloud.server import scene as scene_module
+from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files.scene_check import check_scene_file
+from solidcloud.server.residency.voxel_store import Store
 from solidcloud.server.scene import Scene
-from solidcloud.server.scenes import open_scene as scene_file
-from solidcloud.server.scenes.open_scene import (
+from solidcloud.server.scenes import scene_archives
+from solidcloud.server.scenes.scene_archives import (
     at_place,
     is_scene_file,
     normals_asked,
-    open_scene,
     share_budget,
     store_opener,
 )
-from solidcloud.server.scenes.placed_archives import SeveralScenes
 
 pytestmark = pytest.mark.interpreted
 
@@ -90,11 +91,11 @@ def write(folder: Path) -> Write:
 
 
 def test_an_archive_is_itself_and_stop(folder: Path) -> None:
-    with open_scene(folder / "floor", read_points=read_points) as scene:
+    with Scene.open(folder / "floor", read_points=read_points) as scene:
         assert isinstance(scene, Scene) and scene.name == "floor"
         info = scene.info()
         assert info.effects == ["stop"] and info.avatars == [] and info.spawn is None and info.up == (0, 0, 1)
-    with open_scene(folder / "floor", read_points=read_points, name="hall") as scene:
+    with Scene.open(folder / "floor", read_points=read_points, name="hall") as scene:
         assert scene.name == "hall"
 
 
@@ -110,7 +111,7 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
         + '[[objects]]\nname = "b"\navatar = "ball"\nkind = "pushed"\npose = [[1, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5],'
         ' [0, 0, 0, 1]]\n[[effects]]\neffect = "objects"\n[spawn]\nposition = [0, 0, 2]\nheading = 90\n'
     )  # fmt: skip
-    with open_scene(write(text), read_points=read_points) as scene:
+    with Scene.open(write(text), read_points=read_points) as scene:
         assert scene.name == "hall"
         info = scene.info()
         assert info.scene == "hall" and info.effects == ["objects", "stop"] and info.up == (0, 0, 1)
@@ -144,10 +145,26 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
 
 def test_a_name_that_is_given_goes_before_the_files(write: Write) -> None:
     file = write('format = 1\nname = "said"\n' + TOP[11:])
-    with open_scene(file, read_points=read_points) as scene:
+    with Scene.open(file, read_points=read_points) as scene:
         assert scene.name == scene.info().scene == "said"
-    with open_scene(file, read_points=read_points, name="given") as scene:
+    with Scene.open(file, read_points=read_points, name="given") as scene:
         assert scene.name == scene.info().scene == "given"
+
+
+def test_a_scene_file_is_opened_with_the_readers_of_scans(write: Write) -> None:
+    with Scene.open(write(TOP + BALL + STOP)) as scene:
+        assert [avatar.name for avatar in scene.info().avatars] == ["ball"]
+        assert scene.collide("ball", at((0, 0, 0)), client="any").verdict.tolist() == [Verdict.CONTACT]
+        with scene.session("ball") as session:
+            state = session.wait(session.wish(at((0, 0, 0.5))))
+            assert state.simulated == ["stop"] and state.verdict == Verdict.CLEAR
+            assert session.wait(session.wish(at((0, 0, 0)))).pose[0, 2, 3] > 0.09
+        info = scene.info()
+        scene.reload()
+        assert scene.info() == info
+    for option in ({"radius_model": "mean"}, {"open_store": Store}):
+        with pytest.raises(BadRequestError, match=r"hall.toml: a scene file: expected no open_store"):
+            Scene.open(write(TOP), **option)
 
 
 def test_a_scene_moves_as_its_effects_say(write: Write) -> None:
@@ -155,7 +172,7 @@ def test_a_scene_moves_as_its_effects_say(write: Write) -> None:
     for effects, last in (("", -0.5), (STOP + '[[effects]]\neffect = "sweep"\n', 0.1)):
         # Without a table of effects there is `stop`; a list of none is none.
         text = TOP + BALL + effects if effects else "format = 1\neffects = []\n" + TOP[11:] + BALL
-        with open_scene(write(text), read_points=read_points) as scene:
+        with Scene.open(write(text), read_points=read_points) as scene:
             moved = scene.move("ball", begin, end, client="any")
             assert moved.simulated == (["stop", "sweep"] if effects else [])
             assert last <= moved.pose[0, 2, 3] <= last + 0.01
@@ -163,7 +180,7 @@ def test_a_scene_moves_as_its_effects_say(write: Write) -> None:
 
 def test_what_is_passed_through_is_not_there(write: Write) -> None:
     through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
-    with open_scene(write(TOP + BALL + STOP + through), read_points=read_points) as scene:
+    with Scene.open(write(TOP + BALL + STOP + through), read_points=read_points) as scene:
         assert scene.info().effects == ["through", "stop"]
         answers = scene.collide("ball", at((0, 0, 0), (0.4, 0, 0)), client="any")
         assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
@@ -174,7 +191,7 @@ def test_what_is_passed_through_is_not_there(write: Write) -> None:
 )
 def test_several_archives_answer_as_one(write: Write, second: str) -> None:
     text = TOP + '[[archives]]\npath = "floor"\n' + second + BALL + STOP
-    with open_scene(write(text), read_points=read_points, budget_bytes=64 << 20) as scene:
+    with Scene.open(write(text), read_points=read_points, budget_bytes=64 << 20) as scene:
         info = scene.info()
         assert (info.points, info.scene, info.effects) == (242, "hall", ["stop"])
         answers = scene.collide("ball", at((0.5, 0.5, 0.05), (9.5, 0.5, 2.05)), client="any")
@@ -184,7 +201,7 @@ def test_several_archives_answer_as_one(write: Write, second: str) -> None:
 
 def test_one_archive_at_a_pose_is_there(write: Write) -> None:
     pose = "pose = [[1, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
-    with open_scene(write(TOP + pose + BALL + STOP), read_points=read_points) as scene:
+    with Scene.open(write(TOP + pose + BALL + STOP), read_points=read_points) as scene:
         answers = scene.collide("ball", at((0, 0, 0), (100, 0, 0)), client="any")
         assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
 
@@ -201,7 +218,7 @@ def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write)
     spawn = "[spawn]\nposition = [0, 5, 1.5]\n"
     file = write(TOP + second + BALL + STOP + through + spawn)
     places = at((0, 5, 1), (0.4, 5, 1), (0, 0, 0), (0.4, 0.4, 0))
-    with open_scene(file, read_points=read_points, policy="lru+prefetch") as scene:
+    with Scene.open(file, read_points=read_points, policy="lru+prefetch") as scene:
         expected = [Verdict.CLEAR, Verdict.CONTACT, Verdict.CONTACT, Verdict.CLEAR]
         assert scene.collide("ball", places, client="any").verdict.tolist() == expected
         assert scene.stats().policy == "lru+prefetch"
@@ -274,7 +291,7 @@ def test_a_fault_of_what_is_named_has_the_file_and_the_place(
     folder: Path, write: Write, text: str, kind: type[Exception], said: str
 ) -> None:
     file = write(text)
-    with pytest.raises(kind) as found, open_scene(file, read_points=read_points):
+    with pytest.raises(kind) as found, Scene.open(file, read_points=read_points):
         pass
     assert str(found.value).startswith(f"{file}: {said.format(folder)}")
     with pytest.raises(kind) as checked:
@@ -283,7 +300,7 @@ def test_a_fault_of_what_is_named_has_the_file_and_the_place(
 
 
 def test_a_large_avatar_that_meets_nobody_is_fine(write: Write) -> None:
-    with open_scene(write(TOP + BALL.replace("0.05", "4.5") + STOP), read_points=read_points) as scene:
+    with Scene.open(write(TOP + BALL.replace("0.05", "4.5") + STOP), read_points=read_points) as scene:
         assert scene.collide("ball", at((0, 0, 4)), client="any").verdict.tolist() == [Verdict.CONTACT]
 
 
@@ -292,7 +309,7 @@ def test_too_small_a_cache_is_told(write: Write) -> None:
         pytest.raises(
             BadRequestError, match=r"hall.toml: \$.archives\[0\]: cache of 10 bytes: the largest voxel"
         ),
-        open_scene(write(TOP), read_points=read_points, budget_bytes=10),
+        Scene.open(write(TOP), read_points=read_points, budget_bytes=10),
     ):
         pass
     two = write(TOP + '[[archives]]\npath = "floor"\n')
@@ -300,30 +317,31 @@ def test_too_small_a_cache_is_told(write: Write) -> None:
         pytest.raises(
             BadRequestError, match=r"hall.toml: \$.archives: cache of 10 bytes: the largest voxels of 2"
         ),
-        open_scene(two, read_points=read_points, budget_bytes=10),
+        Scene.open(two, read_points=read_points, budget_bytes=10),
     ):
         pass
 
 
 @pytest.mark.parametrize(
-    "fails", ["store_opener", "simulate", "share_budget", "Scene.__init__", "SeveralScenes.__init__"]
+    "fails", ["store_opener", "simulate", "share_budget", "PlacedArchive.__init__", "Scene.__init__"]
 )
 def test_what_fails_half_way_leaves_no_file_open(
     write: Write, monkeypatch: pytest.MonkeyPatch, fails: str
 ) -> None:
     through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
     file = write(TOP + '[[archives]]\npath = "floor"\n' + BALL + STOP + through)
-    with open_scene(file, read_points=read_points):  # what it imports opens files
+    with Scene.open(file, read_points=read_points):  # what it imports opens files
         pass
     calls: list[int] = []
     place, _, method = fails.partition(".")
-    at_fault: Any = {"Scene": Scene, "SeveralScenes": SeveralScenes}.get(place, scene_file)
+    places = {"Scene": Scene, "PlacedArchive": PlacedArchive, "simulate": scene_module}
+    at_fault: Any = places.get(place, scene_archives)
     name = method or place
     right = getattr(at_fault, name)
 
     def fault(*what: Any, **options: Any) -> Any:
         calls.append(1)
-        if len(calls) == 2 or place not in ("store_opener", "Scene"):
+        if len(calls) == 2 or place not in ("store_opener", "PlacedArchive"):
             raise BadRequestError("no")
         return right(*what, **options)
 
@@ -331,7 +349,7 @@ def test_what_fails_half_way_leaves_no_file_open(
     before, threads = os.listdir("/proc/self/fd"), set(threading.enumerate())
     with (
         pytest.raises(BadRequestError, match=r"hall.toml: \$.*no"),
-        open_scene(file, read_points=read_points, policy="lru+prefetch"),
+        Scene.open(file, read_points=read_points, policy="lru+prefetch"),
     ):
         pass
     assert calls and len(os.listdir("/proc/self/fd")) == len(before)
@@ -357,7 +375,7 @@ def test_a_reload_finds_where_a_link_points_then(folder: Path, tmp_path: Path) -
     (tmp_path / "current").symlink_to("first")
     (tmp_path / "linked").symlink_to("one/deep")
     (tmp_path / "one/deep/hall.toml").write_text('format = 1\n[[archives]]\npath = "./../../current/"\n')
-    with open_scene(tmp_path / "linked/hall.toml", read_points=read_points) as scene:
+    with Scene.open(tmp_path / "linked/hall.toml", read_points=read_points) as scene:
         assert scene.info().points == 121
         (tmp_path / "current").unlink()
         (tmp_path / "current").symlink_to("second")

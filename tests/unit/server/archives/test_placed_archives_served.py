@@ -14,7 +14,6 @@ from solidcloud.schemas.errors import BadRequestError, BadTransformError, Format
 from solidcloud.schemas.wire.keys import public_id
 from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of, moved, under
 from solidcloud.server.scene import Scene
-from solidcloud.server.scenes.placed_archives import SeveralScenes
 from solidcloud.server.service.server_config import ServerConfig
 from solidcloud.server.service.service import Service
 from split_scans import BODY, COUNT, OPTIONS, RADIUS, STEP, Built, exact_pose, near, several
@@ -26,15 +25,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
 
 
 @pytest.fixture
-def both(built: Built) -> Iterator[SeveralScenes]:
+def both(built: Built) -> Iterator[Scene]:
     """Both halves where they were scanned."""
     with several((built.first, None), (built.second, np.eye(4))) as scene:
         yield scene
 
 
-def test_time_that_is_up_leaves_nothing_clear(
-    both: SeveralScenes, built: Built, rng: np.random.Generator
-) -> None:
+def test_time_that_is_up_leaves_nothing_clear(both: Scene, built: Built, rng: np.random.Generator) -> None:
     poses = near(rng, np.vstack(built.points), 10)
     exact = both.collide("al", poses)
     assert both.collide("al", poses, budget_ms=0.0).verdict.tolist() == [2] * 10
@@ -102,7 +99,9 @@ def test_what_cannot_be_read_of_one_archive_is_unknown_unless_another_touches(
     with several((built.first, None), (own, None)) as scene:
         assert scene.collide("al", at).verdict.tolist() == [1]
         found = scene.collide("al", beside)
-        assert found.verdict.tolist() == [2 if scene._first.collide("al", beside).verdict[0] == 0 else 1]
+        with several((built.first, None)) as first:
+            alone = first.collide("al", beside).verdict[0]
+        assert found.verdict.tolist() == [2 if alone == 0 else 1]
         assert len(found.faults) > 0 and str(own) in found.faults[0]
         far = archive_cases.pose_of(np.eye(3), np.array([0.0, 0.0, 50.0]))[None]
         assert scene.collide("al", far).verdict.tolist() == [0]
@@ -112,7 +111,7 @@ def test_what_cannot_be_read_of_one_archive_is_unknown_unless_another_touches(
 def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.random.Generator) -> None:
     pose = exact_pose(rng)
     with several((built.first, None), (built.second, pose)) as scene:
-        info, each = scene.info(), [part.info() for part, _ in scene.archives]
+        info, each = scene.info(), [part.info() for part in scene.archives]
         assert info.scene == "hall"
         for name in ("points", "voxels", "record_bytes", "resident_bytes"):
             assert getattr(info, name) == sum(getattr(part, name) for part in each)
@@ -146,13 +145,15 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
 
 
 def test_scans_are_numbered_by_the_archives_that_are_asked(
-    built: Built, both: SeveralScenes, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+    built: Built, both: Scene, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
     """And not by those that a reload puts there meanwhile, of which `info` speaks already."""
-    first, second = (scene for scene, _ in both.archives)
+    first, second = both.archives
     monkeypatch.setattr(first, "_info", structs.replace(first.info(), sources=first.info().sources * 3))
     poses = near(rng, built.points[1], 20)
-    found, own = both.contacts("al", poses), first.contacts("al", poses)
+    found = both.contacts("al", poses)
+    with several((built.first, None)) as alone:
+        own = alone.contacts("al", poses)
     assert found.pairs_found.sum() > own.pairs_found.sum()
     assert set(found.scan_index.tolist()) <= {0, 1} and 1 in found.scan_index
     parts = list(both.path("al", poses, "contacts"))
@@ -161,9 +162,9 @@ def test_scans_are_numbered_by_the_archives_that_are_asked(
 
 
 def test_a_reload_that_fails_says_which_archives_are_new(
-    both: SeveralScenes, monkeypatch: pytest.MonkeyPatch
+    both: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second = (scene for scene, _ in both.archives)
+    first, second = both.archives
     before = [scene._opened for scene in (first, second)]
 
     def gone(_: Any) -> Any:
@@ -180,7 +181,7 @@ def test_a_reload_that_fails_says_which_archives_are_new(
     assert len(both.collide("al", np.eye(4)[None])) == 1
 
 
-def test_what_is_refused_says_why(built: Built, both: SeveralScenes) -> None:
+def test_what_is_refused_says_why(built: Built, both: Scene) -> None:
     here = np.eye(4)[None]
     with pytest.raises(BadRequestError, match="this archive holds mean"):
         both.collide("al", here, radius_model="local")
@@ -194,11 +195,10 @@ def test_what_is_refused_says_why(built: Built, both: SeveralScenes) -> None:
         both.raycast(np.zeros((1, 3)), np.zeros((1, 3)), 1.0)
     with pytest.raises(UnknownAvatarError, match="add it"):
         both.path("nobody", here)
-    with Scene.open(built.first) as scene:
-        with pytest.raises(BadTransformError, match="pose of archive 0: not rigid"):
-            SeveralScenes([(scene, np.diag([2.0, 2, 2, 1]))], "hall")
-        with pytest.raises(BadRequestError, match="no archives"):
-            SeveralScenes([], "hall")
+    with pytest.raises(BadTransformError, match="pose of the archive: not rigid"):
+        several((built.first, np.diag([2.0, 2, 2, 1])))
+    with pytest.raises(BadRequestError, match="without archives"):
+        Scene([], "hall")
 
 
 @pytest.mark.interpreted

@@ -10,7 +10,6 @@ import pytest
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.archives.rigid_transform import inverse_of, moved, under
 from solidcloud.server.scene import Scene
-from solidcloud.server.scenes.placed_archives import SeveralScenes
 from split_scans import BODY, COUNT, RADIUS, STEP, Built, exact_pose, near, several
 
 # What answers say of the cost, and of bounds, which are each archive's own.
@@ -29,7 +28,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
 
 
 @pytest.fixture
-def both(built: Built) -> Iterator[SeveralScenes]:
+def both(built: Built) -> Iterator[Scene]:
     """Both halves where they were scanned."""
     with several((built.first, None), (built.second, np.eye(4))) as scene:
         yield scene
@@ -52,7 +51,7 @@ def assert_same(found: Any, expected: Any, but: tuple[str, ...] = COSTS) -> None
 
 @pytest.mark.parametrize("model", [None, "fixed:0.015", "mean:0.5"])
 def test_halves_answer_as_the_whole(
-    both: SeveralScenes, whole: Scene, built: Built, rng: np.random.Generator, model: str | None
+    both: Scene, whole: Scene, built: Built, rng: np.random.Generator, model: str | None
 ) -> None:
     poses = near(rng, np.vstack(built.points))
     places, ways = poses[:, :3, 3].copy(), poses[:, :3, 0].copy()
@@ -75,17 +74,18 @@ def test_halves_answer_as_the_whole(
     assert_same(both.contacts("al", poses, 3, 0.05, radius_model=model), one, COSTS + clusters)
     assert one.pairs_found.max() > 3
     for part in both.archives:
-        part[0].residency.check()
+        part.residency.check()
 
 
 def test_clusters_are_those_of_each_archive_deepest_first(
-    both: SeveralScenes, built: Built, rng: np.random.Generator
+    both: Scene, built: Built, rng: np.random.Generator
 ) -> None:
     poses = near(rng, np.vstack(built.points), 20)
     found = both.contacts("al", poses, 1000, 0.05, 0.01)
-    alone = [scene.contacts("al", poses, 1000, 0.05, 0.01) for scene, _ in both.archives[:1]]
-    both.archives[1][0].add_avatar("al", BODY, RADIUS)
-    alone.append(both.archives[1][0].contacts("al", poses, 1000, 0.05, 0.01))
+    alone = []
+    for path in (built.first, built.second):
+        with several((path, None)) as half:
+            alone.append(half.contacts("al", poses, 1000, 0.05, 0.01))
     assert found.pairs_found.tolist() == (alone[0].pairs_found + alone[1].pairs_found).tolist()
     for i in range(len(poses)):
         own = slice(found.cluster_starts[i], found.cluster_starts[i + 1])
@@ -113,7 +113,7 @@ def test_clusters_are_those_of_each_archive_deepest_first(
 
 
 def test_a_sweep_ends_at_the_earliest_contact(
-    both: SeveralScenes, whole: Scene, built: Built, rng: np.random.Generator
+    both: Scene, whole: Scene, built: Built, rng: np.random.Generator
 ) -> None:
     poses = near(rng, np.vstack(built.points))
     poses[:2, 2, 3] += [5.0, 6.0]  # a motion between these two meets nothing
@@ -175,7 +175,7 @@ def test_verdicts_are_those_of_the_naive_judge_of_both(built: Built, rng: np.ran
     poses = near(rng, seen)
     with several((built.first, None), (built.second, pose)) as scene:
         verdict = scene.collide("al", poses).verdict
-        origins = [part.info().origin for part, _ in scene.archives]
+        origins = [part.info().origin for part in scene.archives]
     own = [poses, np.linalg.inv(pose) @ poses]
     judged = np.zeros(len(poses), bool)
     for points, origin, asked in zip(built.points, origins, own, strict=True):
@@ -219,7 +219,7 @@ def test_any_rigid_pose_is_within_a_micrometre(built: Built, rng: np.random.Gene
 
 
 def test_a_budget_of_visits_is_for_all_archives_together(
-    both: SeveralScenes, whole: Scene, built: Built, rng: np.random.Generator
+    both: Scene, whole: Scene, built: Built, rng: np.random.Generator
 ) -> None:
     poses = near(rng, np.vstack(built.points), 30)
     truth = whole.collide("al", poses).verdict
@@ -241,7 +241,7 @@ def test_a_budget_of_visits_is_for_all_archives_together(
 
 
 def test_objects_meet_every_archive_and_one_another_once(
-    both: SeveralScenes, whole: Scene, built: Built, rng: np.random.Generator
+    both: Scene, whole: Scene, built: Built, rng: np.random.Generator
 ) -> None:
     poses = near(rng, np.vstack(built.points), 30)
     items = [("al", pose, 1 << (i % 3), 0xFFFFFFFF if i % 5 else 3) for i, pose in enumerate(poses)]

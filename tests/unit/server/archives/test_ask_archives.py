@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from solidcloud.server.archives import ask_archives
 from solidcloud.server.runtime.stop_flag import NEVER, Stop
-from solidcloud.server.scenes import placed_paths as several_path
 
 pytestmark = pytest.mark.interpreted
 
@@ -22,15 +22,15 @@ def flags(monkeypatch):
 
         return ask, len(poses)
 
-    monkeypatch.setattr(several_path, "path_question", question)
-    monkeypatch.setattr(several_path, "carried", lambda found, *_: found)
-    monkeypatch.setattr(several_path, "merged", lambda answers: answers)
+    monkeypatch.setattr(ask_archives, "path_question", question)
+    monkeypatch.setattr(ask_archives, "carried", lambda found, *_: found)
+    monkeypatch.setattr(ask_archives, "merged", lambda answers: answers)
     return asked
 
 
 def asked_along(stop, **parameters):
-    legs = [several_path.Leg(None, None, 0, np.zeros((8, 4, 4))) for _ in range(3)]
-    return several_path.along(legs, None, "collide", parameters, stop)[0]
+    legs = [ask_archives.Leg(None, None, 0, np.zeros((8, 4, 4))) for _ in range(3)]
+    return ask_archives.along(legs, None, "collide", parameters, stop)[0]
 
 
 @pytest.mark.parametrize("parameters", [{}, {"budget_visits": 100}])

@@ -1,7 +1,6 @@
-"""Opening of an archive, or of a scene file and everything it names.
+"""The archives and avatars that a scene file names: found, checked, opened.
 
-Errors name the file and the place in it.
-Modules that a scene does not need are not imported: several archives, masked archives.
+Errors name the file and the place in it. Masked archives are imported only if the scene has them.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,17 +18,14 @@ from ...schemas.archive.radius_model import class_radii
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.scene.effect_options import Crowd, Ground, Objects, Slide, Through, Uncertainty
-from ...schemas.scene.scene_file import SUFFIX, SceneFile, identity, read_scene, scene_name
+from ...schemas.scene.scene_file import SUFFIX, SceneFile
 from ...schemas.wire.messages import AvatarInfo, SceneInfo
 from ..archives.archive_info import describe
+from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import make_avatar
 from ..kernels.core.pose_transform import MAX_REACH_UNITS
 from ..residency.arena import ArenaBuffer
 from ..residency.voxel_store import OpenStore, Store
-from ..scene import DEFAULT_BUDGET, Scene
-from ..served.served_scene import SceneLike
-from ..simulation.assembly import simulate
-from ..simulation.simulation import Stage
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/effects/bodies.py).
@@ -64,42 +60,6 @@ class FoundAvatar(NamedTuple):
 def is_scene_file(path: Path) -> bool:
     """Return whether a path is that of a scene file, existing or not; else it is an archive's."""
     return path.suffix == SUFFIX and not path.is_dir()
-
-
-@contextmanager
-def open_scene(
-    path: str | Path,
-    *,
-    read_points: ReadPoints,
-    name: str | None = None,
-    budget_bytes: int = DEFAULT_BUDGET,
-    policy: str = "lru",
-) -> Iterator[SceneLike]:
-    """Open an archive or a scene file, and close it at the end of the block.
-
-    read_points: returns the points (n, 3) of a file [m].
-    name: of the scene, for clients; None: the name in the scene file, else that of the file or
-    folder.
-    budget_bytes: of decoded voxels, all archives together.  policy: eviction policy, see
-    eviction.py.
-    Raises BadRequestError for an invalid scene file, FormatError, CorruptError or ScanError for
-    invalid files that it names.
-    """
-    path = Path(path)
-    if not is_scene_file(path):
-        with Scene.open(path, name, budget_bytes=budget_bytes, policy=policy) as scene:
-            yield scene
-        return
-    file = read_scene(path)
-    name = name or scene_name(file, path)
-    found = find_archives(file, path)
-    avatars = read_avatars(file, path, read_points)
-    own = {item.name: (a.points, a.info.radius) for item, a in zip(file.avatars, avatars, strict=True)}
-    with ExitStack() as stack:
-        served = _open_archives(file, path, name, found, budget_bytes, policy, stack)
-        with at_place(path, "$.effects"):
-            simulation = simulate(served, file, own)
-        yield stack.enter_context(simulation)
 
 
 def find_archives(file: SceneFile, path: Path) -> list[Found]:
@@ -195,37 +155,41 @@ def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]
     return [low + rest * size // max(sum(whole), 1) for low, size in zip(least, whole, strict=True)]
 
 
-def _open_archives(
+def open_archives(
     file: SceneFile,
     path: Path,
     name: str,
     found: list[Found],
     budget_bytes: int,
     policy: str,
-    stack: ExitStack,
-) -> Stage:
-    """Open the archives as one scene. They are closed when `stack` is."""
+    took: Callable[[float], None],
+) -> list[PlacedArchive]:
+    """Open the archives of a scene, which the caller closes.
+
+    name: of the scene.  budget_bytes: of decoded voxels, all archives together.  policy: eviction
+    policy, see eviction.py.  took: called with the duration of each voxel load [s].
+    Raises the errors of opening, with the place in the scene file; then none stays open.
+    """
     with at_place(path, "$.archives"):
         budgets = share_budget(budget_bytes, [each.sizes for each in found])
-    scenes = []
-    for number, (each, budget) in enumerate(zip(found, budgets, strict=True)):
-        with at_place(path, f"$.archives[{number}]"):
-            scene = Scene.open(
-                each.folder,
-                name,
-                budget_bytes=budget,
-                policy=policy,
-                open_store=store_opener(file, number),
-                radius_model=file.radius_model,
-            )
-        scenes.append(stack.enter_context(scene))
-    poses = [None if item.pose == identity() else np.array(item.pose) for item in file.archives]
-    if len(scenes) == 1 and poses[0] is None:
-        return scenes[0]
-    from .placed_archives import SeveralScenes
-
-    with at_place(path, "$.archives"):
-        return SeveralScenes(list(zip(scenes, poses, strict=True)), name)
+    opened: list[PlacedArchive] = []
+    with ExitStack() as stack:
+        for number, (each, budget, item) in enumerate(zip(found, budgets, file.archives, strict=True)):
+            with at_place(path, f"$.archives[{number}]"):
+                archive = PlacedArchive.open(
+                    each.folder,
+                    name,
+                    budget_bytes=budget,
+                    policy=policy,
+                    open_store=store_opener(file, number),
+                    radius_model=file.radius_model,
+                    pose=item.pose,
+                    took=took,
+                )
+            stack.callback(archive.close)
+            opened.append(archive)
+        stack.pop_all()
+    return opened
 
 
 def _beside(path: Path, named: str) -> Path:

@@ -1,8 +1,14 @@
-"""A path through several archives, and budgets of visits that several archives share."""
+"""A question to the archives of a scene: asked of each in its own frame, the answers merged.
+
+Contact with any is contact; unknown for any is unknown; clear is what is clear of all, and
+`outside` what is outside of all. A budget is for all archives together: each gets what those before
+it left. With one archive at the identity, nothing is transformed or merged.
+"""
 
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -10,17 +16,23 @@ from numpy.typing import NDArray
 
 from ...schemas.wire.answers import ContactsAnswers, Cost
 from ...schemas.wire.columns import join
-from ..archives.merge_answers import carried, limited, merged
-from ..archives.rigid_transform import Pose
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import NO_LIMIT, Effort
-from ..queries.context.query_context import SceneData
+from ..queries.context.query_budget import NO_LIMIT, Effort, make_effort
+from ..queries.context.query_context import SceneData, with_stop
 from ..queries.path import part_stop, path_question
+from ..queries.stopped_answers import ask_until_stopped
 from ..runtime.stop_flag import NEVER, Stop
+from .archive_generation import Opened
+from .merge_answers import carried, limited, merged
+from .placed_archive import PlacedArchive
+from .rigid_transform import Pose
+from .scene_info import sources_asked
 
 _A = TypeVar("_A", bound=Cost)
-# Asks one archive about some rows of a request.
-Ask = Callable[[SceneData, Effort, slice], _A]
+# Asks one archive about some rows of a request; None: about all.
+Ask = Callable[[SceneData, Effort, slice | None], _A]
+# Returns what asks an archive, and whether what is looked at is passed by (`Effort.scan`).
+Prepare = Callable[[PlacedArchive, Opened], tuple[Ask[_A], bool]]
 # Pairs that `contacts` lists where no limit is given.
 LISTED = 100
 
@@ -37,14 +49,43 @@ class Leg(NamedTuple):
     poses: NDArray[np.float64]
 
 
-def in_budget(ask: Ask[_A], data: SceneData, effort: Effort, visits: NDArray[np.int64]) -> _A:
-    """What an archive answers with the node visits (k,) that others took off the budget of each pose.
+def ask_each(
+    archives: Sequence[PlacedArchive],
+    question: Callable[..., _A],
+    k: int,
+    prepare: Prepare[_A],
+    tolerance: float = 0.0,
+    budget_ms: float | None = None,
+    budget_visits: int | None = None,
+    radius_model: str | None = None,
+    stop: Stop = NEVER,
+) -> _A:
+    """Ask every archive a question of k poses (rays, points, motions, objects), and merge the answers."""
+    effort = make_effort(tolerance, budget_ms, budget_visits, stop)
+    visits = np.zeros(k, np.int64)
+    answers: list[_A] = []
+    first = 0
+    for archive in archives:
+        with archive.take() as opened:
+            data = with_stop(opened.radius_model(radius_model), effort.stop)
+            ask, scan = prepare(archive, opened)
+            own = effort._replace(scan=scan)
+            found = ask_until_stopped(question, k, own, partial(in_budget, ask, data, own, visits))
+            answers.append(carried(found, archive.pose, first))
+            first += sources_asked(opened)
+        if effort.visits < NO_LIMIT and len(archives) > 1:
+            visits += found.node_visits  # type: ignore[attr-defined]  # all answers have them
+    return merged(answers)
 
-    Poses that follow one another and have as much left are asked about together: nearly always all of those that no
-    other archive has near it.
+
+def in_budget(ask: Ask[_A], data: SceneData, effort: Effort, visits: NDArray[np.int64]) -> _A:
+    """Ask an archive within the budget of each pose less the node visits (k,) that others made.
+
+    Consecutive poses with the same budget are asked about together: nearly always all poses that no
+    other archive is near.
     """
-    if effort.visits == NO_LIMIT or not len(visits):
-        return ask(data, effort, slice(None))
+    if effort.visits == NO_LIMIT or not visits.any():
+        return ask(data, effort, None)
     left = np.maximum(effort.visits - visits, 0)
     ends = [*(np.flatnonzero(np.diff(left)) + 1).tolist(), len(left)]
     starts = [0, *ends[:-1]]
@@ -54,6 +95,25 @@ def in_budget(ask: Ask[_A], data: SceneData, effort: Effort, visits: NDArray[np.
             for start, end in zip(starts, ends, strict=True)
         ]
     )
+
+
+def make_legs(
+    archives: Sequence[PlacedArchive],
+    taken: Sequence[Opened],
+    radius_model: str | None,
+    poses: NDArray[np.float64],
+) -> list[Leg]:
+    """Return a path's leg through each archive. taken: the archives' generations, in their order."""
+    firsts = [0, *np.cumsum([sources_asked(opened) for opened in taken]).tolist()]
+    return [
+        Leg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
+        for opened, archive, first in zip(taken, archives, firsts, strict=False)
+    ]
+
+
+def rows_of(column: Any, rows: slice | None) -> Any:
+    """Return some rows of an argument; None: the argument as it is."""
+    return column if rows is None else column[rows]
 
 
 def along(
@@ -72,7 +132,8 @@ def along(
     def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: Stop | None) -> Cost:
         """Ask with what is left of the visits of each answer from `start` on, and of the time."""
 
-        def ask(data: SceneData, effort: Effort, k: slice) -> Cost:
+        def ask(data: SceneData, effort: Effort, rows: slice | None) -> Cost:
+            k = slice(0, len(spent)) if rows is None else rows
             # The motions of a path end where the next begin.
             own = leg.poses[start + k.start : start + k.stop + (op == "sweep")]
             options = parameters | {"budget_visits": effort.visits}
@@ -88,7 +149,7 @@ def along(
         part = None if stop.part_seconds == math.inf else part_stop(stop, stop.part_seconds)
         answers: list[Cost] = []
         for leg, (ask_all, _) in zip(legs, asks, strict=True):
-            if visits is None or end == start:
+            if visits is None or end == start or len(legs) == 1:
                 found = ask_all(start, end, part)
             else:
                 found = ask_bounded(leg, start, spent, part)

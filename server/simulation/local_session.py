@@ -1,0 +1,151 @@
+"""A session in this process: an avatar of a client sends motion commands and receives states.
+
+The methods of the session that `Client.session` returns. Here each command is a frame of its own,
+simulated before `wish` returns, so its state is there at once.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from time import monotonic
+from typing import Any, Self
+
+import numpy as np
+
+from ...schemas.errors import BadRequestError, BusyError, SolidcloudError
+from ...schemas.wire.keys import User
+from ...schemas.wire.moves import State, Wish
+from ..served.served_scene import Latest, Turn
+from .simulation import Simulation
+
+# Maximum number of states kept for `states`; of more, the oldest are dropped.
+_MOST_STATES = 1024
+
+
+class LocalSession:
+    """One avatar's session, made by `Scene.session`. A context manager, thread-safe."""
+
+    def __init__(self, simulation: Simulation, user: User) -> None:
+        """Create a session; entering it begins it."""
+        self._simulation, self._user = simulation, user
+        self._commands = threading.Lock()  # held for a frame, so that states come in the order of commands
+        self._changed = threading.Condition()
+        self._states: deque[State | SolidcloudError] = deque(maxlen=_MOST_STATES)
+        self._latest: State | None = None
+        self._error: SolidcloudError | None = None  # newer than `_latest`
+        self._when = 0.0
+        self._seq = 0
+        self._open = False
+
+    def __enter__(self) -> Self:
+        """Begin the session."""
+        self._open = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the scene."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the scene: others may walk where the avatar stood. Closing twice is allowed."""
+        with self._commands:
+            was_open, self._open = self._open, False
+            if was_open:
+                self._simulation.end(self._user)
+        with self._changed:
+            self._changed.notify_all()
+
+    def wish(
+        self,
+        pose: Any = None,
+        velocity: Any = None,
+        turn: float = 0.0,
+        *,
+        objects: Mapping[str, list[list[float]]] | None = None,
+        time: float | None = None,
+    ) -> int:
+        """Command a pose, (4, 4) or (1, 4, 4), or a velocity (3,) [m/s]; one of the two. Simulate the frame.
+
+        Returns the number of the command, which its state has as `seq`.
+        turn: with a velocity, about the scene's up axis [rad/s].  objects: poses of the scene's
+        objects that this user moves.  time: of the command, on a clock that does not go back [s];
+        None: of this process.
+        Raises BadRequestError for an invalid command, or if the session is closed. What the frame
+        was refused for, `latest`, `wait` and `states` raise.
+        """
+        array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
+        speed = None if velocity is None else tuple(float(part) for part in velocity)
+        if speed is not None and len(speed) != 3:
+            raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
+        with self._commands:
+            if not self._open:
+                raise BadRequestError(
+                    "this session is closed: wish inside `with scene.session(...) as session`"
+                )
+            now = monotonic()
+            wish = Wish(
+                seq=self._seq + 1,
+                time=now if time is None else float(time),
+                pose=np.ascontiguousarray(array),
+                velocity=speed,  # type: ignore[arg-type]
+                turn=float(turn),
+                objects=dict(objects or {}),
+            )
+            self._seq = wish.seq
+            (outcome,) = self._simulation.step([Turn(self._user, wish)], now)
+            self._keep(outcome.state)
+        return wish.seq
+
+    def _keep(self, said: State | SolidcloudError) -> None:
+        """Keep what came of a frame for `latest`, `wait` and `states`."""
+        with self._changed:
+            if isinstance(said, SolidcloudError):
+                self._error = said
+            else:
+                self._latest, self._error, self._when = said, None, monotonic()
+            self._states.append(said)
+            self._changed.notify_all()
+
+    def _raise_error(self) -> None:
+        """Raise, once, what was refused since the last state. To be called with `_changed` held."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def latest(self) -> Latest | None:
+        """Return the last state and its age; None: there is none yet. Raise, once, a refusal since."""
+        with self._changed:
+            self._raise_error()
+            return None if self._latest is None else Latest(self._latest, monotonic() - self._when)
+
+    def wait(self, seq: int, timeout: float = 5.0) -> State:
+        """Return the state of a command, or of a newer one. BusyError: none came within `timeout` [s].
+
+        Raises, once, what was refused since the last state.
+        """
+
+        def reached() -> bool:
+            return self._latest is not None and self._latest.seq >= seq
+
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._error) or not self._open or reached(), timeout)
+            self._raise_error()
+            if self._latest is None or self._latest.seq < seq:
+                raise BusyError(f"no state of wish {seq} of avatar {self._user.avatar!r} in {timeout:g} s")
+            return self._latest
+
+    def states(self, timeout: float = 5.0) -> Iterator[State]:
+        """Yield each state in order, until none came for `timeout` [s] or the session is closed.
+
+        Of more than 1,024 that nobody took, the oldest are left out. Raises what was refused, at its
+        place among them.
+        """
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._states) or not self._open, timeout)
+                if not self._states:
+                    return
+                said = self._states.popleft()
+            if isinstance(said, SolidcloudError):
+                raise said
+            yield said

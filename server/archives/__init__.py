@@ -1,6 +1,6 @@
-"""Opened archive generations, their placement in the world, scene information, merged answers.
+"""Placed archives of a scene: open generations, hot reload, questions to several, merged answers.
 
 May import server.avatars, server.observability, server.queries, server.queries.context,
 server.residency, server.runtime, builder.voxel, schemas.
-Begin with archive_generation.py.
+Begin with placed_archive.py, then archive_generation.py.
 """

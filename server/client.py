@@ -227,8 +227,9 @@ class Client(Questions):
         if len(array) > MAX_POSES:
             raise TooLargeError(f"path of {len(array)} poses: at most {MAX_POSES}: ask for it in pieces")
         request = PathRequest(name, array, op, **parameters)  # type: ignore[arg-type]
-        total = max(0, len(array) - 1) if op == "sweep" else len(array)
-        return self._parts(QUESTIONS[op], encode(request), name, total, is_bounded(parameters))
+        question = QUESTIONS[op]
+        total = question.items_along(len(array))
+        return self._parts(question, encode(request), name, total, is_bounded(parameters))
 
     def _parts(
         self, question: Question[Any], request: bytes, name: str, total: int, bounded: bool

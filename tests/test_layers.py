@@ -63,7 +63,8 @@ ALLOWED = {
         "runtime served avatars queries/context queries archives simulation/world simulation/effects"
     ),
     "server/scenes": (
-        "kernels observability runtime avatars residency queries/context queries archives simulation/effects"
+        "kernels observability runtime served avatars residency queries/context queries archives "
+        "simulation/effects"
     ),
     "server/scene.py": (
         "cli/input observability runtime served residency queries/context archives simulation scenes"
@@ -73,7 +74,7 @@ ALLOWED = {
     "server/report/accuracy": "cli/input kernels avatars report/kernels residency scene.py report/common",
     "server/report/walk": "cli/input client.py residency cli/output scene.py report/common",
     "server/cli/commands": (
-        "cli/input served network service client.py residency cli/output archives simulation scene.py "
+        "cli/input network service client.py residency cli/output archives simulation scene.py "
         "cli/scene_files report/accuracy"
     ),
     "server/cli": "cli/commands",

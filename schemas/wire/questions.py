@@ -200,6 +200,15 @@ class Question(Generic[A]):
         return "avatar" in self.fields or "objects" in self.fields
 
     @cached_property
+    def moving(self) -> bool:
+        """Return whether items are motions of an avatar, each from one pose to another."""
+        return self.about_avatars and len(self.arrays) == 2
+
+    def items_along(self, poses: int) -> int:
+        """Return the number of items along a path of so many poses."""
+        return max(0, poses - 1) if self.moving else poses
+
+    @cached_property
     def with_rows(self) -> dict[Rows, tuple[str, ...]]:
         """Return the columns with each number of rows."""
         return {

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas.wire.answers import ContactsAnswers, Cost
 from ...schemas.wire.columns import join
+from ...schemas.wire.questions import QUESTIONS, Question
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import NO_LIMIT, Effort, make_effort
 from ..queries.context.query_context import SceneData, with_stop
@@ -51,7 +52,7 @@ class Leg(NamedTuple):
 
 def ask_each(
     archives: Sequence[PlacedArchive],
-    question: Callable[..., _A],
+    question: Question[_A],
     k: int,
     prepare: Prepare[_A],
     tolerance: float = 0.0,
@@ -135,7 +136,7 @@ def along(
         def ask(data: SceneData, effort: Effort, rows: slice | None) -> Cost:
             k = slice(0, len(spent)) if rows is None else rows
             # The motions of a path end where the next begin.
-            own = leg.poses[start + k.start : start + k.stop + (op == "sweep")]
+            own = leg.poses[start + k.start : start + k.stop + QUESTIONS[op].moving]
             options = parameters | {"budget_visits": effort.visits}
             if budget_ms is not None:
                 options["budget_ms"] = max(0.0, budget_ms - (time.perf_counter() - begin) * 1e3)

@@ -28,7 +28,7 @@ def _sweep(
     avatar: AvatarModel,
     pose_from: ArrayLike,
     pose_to: ArrayLike,
-    margin: float,
+    margin: float = 0.0,
     *,
     effort: Effort,
 ) -> SweepAnswers:

@@ -24,13 +24,10 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.pose_transform import check_poses
 from ..runtime.deadlines import stop_at
 from ..runtime.stop_flag import NEVER, Stop
-from .collide import collide
-from .contacts import contacts
 from .context.query_budget import make_effort
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
-from .distance import distance
+from .engines import ENGINES
 from .stopped_answers import ask_until_stopped, unknown_part
-from .sweep import sweep
 
 # Default number of parts computed at a time.
 PATH_THREADS = 2
@@ -76,16 +73,14 @@ def path_question(
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
     budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
-    tolerance = given.pop("tolerance", 1e-6 if op == "sweep" else 0.0)
+    question, engine = QUESTIONS[op], ENGINES[op]
+    tolerance = given.pop("tolerance", question.other_defaults.get("tolerance", 0.0))
     # The voxels along a path are used once. Half of the cache is left for those at users'
     # positions, which take at most half (prefetch.py).
     effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
     poses = kernel_poses(poses)  # copied here at most once, so that no part copies its poses
-    other = (
-        to_units(given["reach"], "reach")
-        if op == "distance"
-        else to_units(given.get("margin", 0.0), "margin")
-    )
+    around = next(name for name in question.parameters if name in ("margin", "reach"))
+    other = to_units(given.get(around, 0.0), around)
     scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(
@@ -93,23 +88,19 @@ def path_question(
     )
     refuse(fault, pose, found)
 
-    question: Any = {"collide": collide, "distance": distance, "contacts": contacts, "sweep": sweep}[op]
-    if op == "sweep":
-        given["tolerance"] = tolerance
-
     def ask(start: int, end: int, part: Stop | None = None) -> Cost:
         if effort.spent:
-            return unknown_part(QUESTIONS[op].answers, end - start, effort)
-        what = [poses[start:end], poses[start + 1 : end + 1]] if op == "sweep" else [poses[start:end]]
+            return unknown_part(question.answers, end - start, effort)
+        what = [poses[start:end], poses[start + 1 : end + 1]] if question.moving else [poses[start:end]]
         own = effort._replace(stop=part_stop(effort.stop, stop.part_seconds) if part is None else part)
         return ask_until_stopped(
             question,
             end - start,
             own,
-            lambda: question(with_stop(data, own.stop), avatar, *what, **given, effort=own),
+            lambda: engine(with_stop(data, own.stop), avatar, *what, **given, effort=own),
         )
 
-    return ask, max(0, len(poses) - 1) if op == "sweep" else len(poses)
+    return ask, question.items_along(len(poses))
 
 
 def part_stop(stop: Stop, seconds: float) -> Stop:

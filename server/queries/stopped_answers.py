@@ -7,22 +7,20 @@ from msgspec import structs
 
 from ...schemas.wire.answers import Cost
 from ...schemas.wire.columns import unknown
-from ...schemas.wire.questions import QUESTIONS
+from ...schemas.wire.questions import Question
 from ..runtime.stop_flag import StoppedError
 from .context.query_budget import Effort
 
 _A = TypeVar("_A", bound=Cost)
 
 
-def ask_until_stopped(question: Callable[..., _A], k: int, effort: Effort, ask: Callable[[], _A]) -> _A:
-    """Run a query of k poses (motions, rays, points, objects) with `ask`; add a stop's reason.
-
-    question: function of server/queries, which has the name of its question.
-    """
+def ask_until_stopped(question: Question[_A], k: int, effort: Effort, ask: Callable[[], _A]) -> _A:
+    """Run a query of k poses (motions, rays, points, objects) with `ask`; add a stop's reason."""
     try:
         answers = ask()
     except StoppedError:
-        return unknown_part(QUESTIONS[question.__name__].answers, k, effort)
+        stopped: _A = unknown_part(question.answers, k, effort)
+        return stopped
     return structs.replace(answers, stopped=effort.stop.reason) if effort.stop else answers
 
 

@@ -24,8 +24,19 @@ from ...schemas.wire.questions import (
     Question,
 )
 from ...schemas.wire.requests import QuestionOptions
+from ..runtime.stop_flag import Stop
 
 A = TypeVar("A", bound=Cost)
+
+
+class AskOptions(QuestionOptions, total=False):
+    """Options of the query methods.
+
+    Those of every question; and of a `Scene`, client: whose avatar it is; stop: ends the work early.
+    """
+
+    client: str
+    stop: Stop
 
 
 class Asks:
@@ -41,14 +52,12 @@ class Asks:
         raise NotImplementedError
 
     def collide(
-        self, name: str, poses: Any, margin: float = 0.0, **options: Unpack[QuestionOptions]
+        self, name: str, poses: Any, margin: float = 0.0, **options: Unpack[AskOptions]
     ) -> CollideAnswers:
         """Test for k poses if an avatar touches the scene."""
         return self.ask(COLLIDE, name, poses, margin, **options)
 
-    def distance(
-        self, name: str, poses: Any, reach: float, **options: Unpack[QuestionOptions]
-    ) -> DistanceAnswers:
+    def distance(self, name: str, poses: Any, reach: float, **options: Unpack[AskOptions]) -> DistanceAnswers:
         """Measure for k poses the distance from an avatar to the scene, up to `reach`."""
         return self.ask(DISTANCE, name, poses, reach, **options)
 
@@ -59,7 +68,7 @@ class Asks:
         limit: int = 100,
         margin: float = 0.0,
         cluster_distance: float | None = None,
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[AskOptions],
     ) -> ContactsAnswers:
         """List for k poses the pairs of points in contact: the deepest `limit` of each pose, and all clusters."""
         return self.ask(CONTACTS, name, poses, limit, margin, cluster_distance, **options)
@@ -70,18 +79,18 @@ class Asks:
         pose_from: Any,
         pose_to: Any,
         margin: float = 0.0,
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[AskOptions],
     ) -> SweepAnswers:
         """Find the first contact of an avatar with the scene on its way from each of k poses to another."""
         return self.ask(SWEEP, name, pose_from, pose_to, margin, **options)
 
     def raycast(
-        self, origins: Any, directions: Any, reach: float, **options: Unpack[QuestionOptions]
+        self, origins: Any, directions: Any, reach: float, **options: Unpack[AskOptions]
     ) -> RaycastAnswers:
         """Find the scan point whose sphere each of k rays, (k, 3) and (k, 3), hits first, up to `reach`."""
         return self.ask(RAYCAST, origins, directions, reach, **options)
 
-    def within(self, points: Any, reach: float, **options: Unpack[QuestionOptions]) -> WithinAnswers:
+    def within(self, points: Any, reach: float, **options: Unpack[AskOptions]) -> WithinAnswers:
         """Find the scan point nearest to each of k points (k, 3), up to `reach`."""
         return self.ask(WITHIN, points, reach, **options)
 
@@ -89,7 +98,7 @@ class Asks:
         self,
         objects: Sequence[Sequence[Any]],
         margin: float = 0.0,
-        **options: Unpack[QuestionOptions],
+        **options: Unpack[AskOptions],
     ) -> ObjectsAnswers:
         """Test which of several avatars (name, pose, group = 1, mask = all) touch the scene and one another."""
         return self.ask(OBJECTS, objects, margin, **options)

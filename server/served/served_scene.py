@@ -2,24 +2,18 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from enum import Enum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.wire.answers import (
-    CollideAnswers,
-    ContactsAnswers,
-    DistanceAnswers,
-    ObjectsAnswers,
-    Part,
-    RaycastAnswers,
-    SweepAnswers,
-    WithinAnswers,
-)
+from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.keys import User
 from ...schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ...schemas.wire.moves import Moved, State, Wish
+from ...schemas.wire.questions import Question
 from ..runtime.stop_flag import Stop
 from .avatar_limits import AvatarLimits
+
+_A = TypeVar("_A", bound=Cost)
 
 
 class Full(Enum):
@@ -91,7 +85,7 @@ class Simulates(Protocol):
 class SceneLike(Protocol):
     """Scene that answers a service's requests; thread-safe. Refuses one with a SolidcloudError.
 
-    The query methods take the parameters of those of `Scene`. Each notes the avatars that answer it
+    `ask`, `path` and `move` take the parameters of those of `Scene`. Each notes the avatars that answer
     (answering_avatars.py) in the calling thread, before it returns.
     simulation: of its users' frames; None if it has none.
     """
@@ -104,13 +98,7 @@ class SceneLike(Protocol):
     def add_avatar(
         self, name: str, points: Any, radius: float | None = None, *, client: str = ""
     ) -> AvatarInfo: ...
-    def collide(self, *what: Any, **effort: Any) -> CollideAnswers: ...
-    def distance(self, *what: Any, **effort: Any) -> DistanceAnswers: ...
-    def contacts(self, *what: Any, **effort: Any) -> ContactsAnswers: ...
-    def sweep(self, *what: Any, **effort: Any) -> SweepAnswers: ...
-    def raycast(self, *what: Any, **effort: Any) -> RaycastAnswers: ...
-    def within(self, *what: Any, **effort: Any) -> WithinAnswers: ...
-    def objects(self, *what: Any, **effort: Any) -> ObjectsAnswers: ...
+    def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A: ...
     def path(self, *what: Any, **parameters: Any) -> Iterator[Part]: ...
     def move(self, *what: Any, **parameters: Any) -> Moved: ...
     def limit_avatars(self, limits: AvatarLimits) -> None: ...

@@ -93,7 +93,7 @@ def _operation(name: str) -> _Operation | None:
 
     def ask(scene: SceneLike, request: QuestionRequest, client: str, stop: Stop) -> Any:
         client_too = {"client": client} if own.about_avatars else {}
-        return getattr(scene, name)(*request.arguments(), stop=stop, **client_too, **request.options())
+        return scene.ask(own, *request.arguments(), stop=stop, **client_too, **request.options())
 
     return _Operation(own.request, own.counted, ask)
 

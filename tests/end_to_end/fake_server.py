@@ -163,6 +163,9 @@ class FloorScene:
         self.asked.append(("move", (name, seconds), options))
         return Moved(pose=pose_to, verdict=int(Verdict.CONTACT), left=0.5, simulated=["stop"])
 
+    def ask(self, question, *arguments, **options):
+        return getattr(self, question.name)(*arguments, **options)
+
     def collide(self, name, poses, margin=0.0, *, client="", **effort):
         self.check(name, poses, client)
         self.asked.append(("collide", (name, margin), effort))

@@ -37,8 +37,9 @@ def count_within(
             else:
                 stored = _stored_points(scene, row)
                 for i in np.flatnonzero(near):
-                    square = ((stored - units[i]).astype(float) ** 2).sum(axis=1)
-                    counts[i] += (square <= float(reach_units) ** 2).sum()
+                    apart = stored - units[i]
+                    apart = apart[(np.abs(apart) <= reach_units).all(axis=1)]  # their squares fit 63 bits
+                    counts[i] += ((apart * apart).sum(axis=1) <= reach_units * reach_units).sum()
                     tests[i] += len(stored)
                     visits[i] += 1
         spent.add(held)
@@ -46,7 +47,7 @@ def count_within(
     for low, high in data.unknown * scene.units_per_step:
         exact &= ((units + reach_units < low) | (units - reach_units > high)).any(axis=1)
     verdict = np.where(counts > 0, Verdict.CONTACT, np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN))
-    low, high = data.broad.scene_low * scene.units_per_step, data.broad.scene_high * scene.units_per_step
+    low, high = (np.rint(b * scene.units_per_step) for b in (data.broad.scene_low, data.broad.scene_high))
     outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
     return CountWithinAnswers(
         verdict.astype(np.uint8), counts, exact, outside, missing, visits, tests, **spent.cost(data)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from solidcloud.schemas.wire import questions
 from solidcloud.schemas.wire.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.collide import collide
@@ -37,7 +38,9 @@ class Asked(NamedTuple):
 
 def _ask(question: Any, k: int, a: Asked, effort: Effort, *what: Any) -> Any:
     data = with_stop(a.data, effort.stop)
-    return ask_until_stopped(question, k, effort, lambda: question(data, *what, effort=effort))
+    return ask_until_stopped(
+        questions.QUESTIONS[question.__name__], k, effort, lambda: question(data, *what, effort=effort)
+    )
 
 
 def _objects(a: Asked, effort: Effort) -> ObjectsAnswers:
@@ -56,7 +59,9 @@ def _distance(a: Asked, effort: Effort, **more: Any) -> Any:
 
 def _near(a: Asked, effort: Effort) -> Any:
     data = with_stop(a.data, effort.stop)
-    return ask_until_stopped(distance, 1, effort, lambda: near(data, a.avatar, a.poses[0], a.reach, effort))
+    return ask_until_stopped(
+        questions.DISTANCE, 1, effort, lambda: near(data, a.avatar, a.poses[0], a.reach, effort)
+    )
 
 
 def _places(a: Asked) -> NDArray[np.float64]:

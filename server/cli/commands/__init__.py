@@ -2,6 +2,6 @@
 
 May import server.archives, server.cli.input, server.cli.output, server.cli.scene_files,
 server/client.py, server.network, server.report.accuracy, server.residency, server/scene.py,
-server.served, server.service, server.simulation, builder, schemas.
+server.service, server.simulation, builder, schemas.
 Begin with serve_command.py or build_command.py.
 """

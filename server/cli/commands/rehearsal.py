@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,9 @@ from numpy.typing import NDArray
 from ....schemas.errors import SolidcloudError
 from ....schemas.kernels.kernel_files import KernelFiles
 from ....schemas.wire.answers import Verdict
-from ...served.served_scene import SceneLike
+
+if TYPE_CHECKING:
+    from ...scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +55,7 @@ def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
     )
 
 
-def check_answers(scene: SceneLike) -> None:
+def check_answers(scene: "Scene") -> None:
     """Make queries whose answers are known. Raises AssertionError if a kernel computes a wrong one.
 
     Checks that `collide` and `distance`, which use different kernels, agree at the corners and the

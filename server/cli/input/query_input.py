@@ -131,7 +131,7 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
         kind: Any = Rays if rays else Points
         yield Asked(labels, [], answers, kind(*what, given.get("reach", 0.0)))
         return
-    moving = "pose_to" in question.arguments
+    moving = question.moving
     times, poses = read_poses(given["poses"])
     labels, begins = _labels(times.tolist(), moving=moving)
     places = _add_body(scene, query, read_points, poses, moving=moving)

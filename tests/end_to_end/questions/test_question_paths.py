@@ -130,7 +130,7 @@ def test_nothing_is_asked_once_the_time_is_up(scene, monkeypatch):
         raise AssertionError("asked")
 
     for op in ("collide", "contacts", "sweep"):
-        monkeypatch.setattr(path_module, op, question)
+        monkeypatch.setitem(path_module.ENGINES, op, question)
         assert {len(part) for part in scene.path("al", POSES, op, budget_ms=0.0)} <= {
             len(POSES),
             len(POSES) - 1,

@@ -237,7 +237,7 @@ def test_it_has_all_that_a_scene_has():
         for name, found in inspect.getmembers(SceneLike)
         if not name.startswith("_") and (callable(found) or isinstance(found, property))
     }
-    assert {"move", "collide", "simulation", "reload", "path"} <= wanted
+    assert {"move", "ask", "simulation", "reload", "path"} <= wanted
     for kind in (Scene, FloorScene):
         missing = {name for name in wanted if not hasattr(kind, name)} - {"simulation"}
         assert not missing, kind

@@ -1,7 +1,7 @@
 """Message types of the wire protocol, gathered from their modules, and their JSON Schemas.
 
-WIRE.md documents this file, requests.py, answers.py, moves.py, stats.py and encoding.py. No zenoh
-here.
+WIRE.md documents this file, questions.py, requests.py, answers.py, moves.py, stats.py and
+encoding.py. No zenoh here.
 """
 
 import inspect

@@ -18,16 +18,13 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.wire.answers import Part
+from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..queries.collide import collide
-from ..queries.contacts import contacts
 from ..queries.context.query_budget import EXACT, Effort
 from ..queries.context.query_context import SceneData, check_request, make_scene_data, with_radius_model
-from ..queries.distance import distance
+from ..queries.engines import ENGINES
 from ..queries.objects import objects as ask_objects
-from ..queries.raycast import raycast
-from ..queries.sweep import sweep
-from ..queries.within import within
 from ..residency.arena import ArenaBuffer
 from ..residency.coarse_bounds import Coarse, settle
 from ..residency.eviction import make_policy, prefetches
@@ -197,6 +194,10 @@ class Opened:
         self.prefetcher.warm((x, y, z))
         avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
         both = np.full(2, 0xFFFFFFFF, np.uint32)
+        some: dict[str, Any] = {
+            "avatar": avatar, "poses": pose, "pose_from": pose, "pose_to": pose, "points": place, "origins": place,
+            "directions": np.array([[0.0, 0.0, 1.0]]), "reach": 0.01,
+        }  # fmt: skip
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
         if data.coarse is not None:  # of the voxel that was just loaded, as if it were not
@@ -204,13 +205,13 @@ class Opened:
             nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
             settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
         for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
-            for poses in (pose, np.concatenate([pose, pose])):
-                collide(data, avatar, poses, 0.0, effort)
-            distance(data, avatar, pose, 0.01, effort)
-            contacts(data, avatar, pose, effort=effort)
-            sweep(data, avatar, pose, pose, effort=effort)
-            raycast(data, place, np.array([[0.0, 0.0, 1.0]]), 0.01, effort)
-            within(data, place, 0.01, effort)
+            collide(
+                data, avatar, np.concatenate([pose, pose]), 0.0, effort
+            )  # several poses take other kernels
+            for question in (one for one in QUESTIONS.values() if not one.whole):
+                samples = [some[name] for name in question.arguments if name in question.required]
+                tolerance = max(effort.tolerance, question.other_defaults.get("tolerance", 0.0))
+                ENGINES[question.name](data, *samples, effort=effort._replace(tolerance=tolerance))
             ask_objects(data, [avatar, avatar], np.concatenate([pose, pose]), both, both, effort=effort)
 
     def follow(self, other: "Opened", stopped: Callable[[], bool]) -> None:

@@ -30,10 +30,13 @@ from .rigid_transform import Pose
 from .scene_info import sources_asked
 
 _A = TypeVar("_A", bound=Cost)
-# Asks one archive about some rows of a request; None: about all.
-Ask = Callable[[SceneData, Effort, slice | None], _A]
-# Returns what asks an archive, and whether what is looked at is passed by (`Effort.scan`).
-Prepare = Callable[[PlacedArchive, Opened], tuple[Ask[_A], bool]]
+# Some rows of a request; None: all.
+Rows = slice | None
+# Asks one archive about some rows of a request.
+Ask = Callable[[SceneData, Effort, Rows], _A]
+# What asks an archive, and whether what is looked at is passed by (`Effort.scan`).
+Prepared = tuple[Callable[[SceneData, Effort, Rows], Any], bool]
+Prepare = Callable[[PlacedArchive, Opened], Prepared]
 # Pairs that `contacts` lists where no limit is given.
 LISTED = 100
 
@@ -54,7 +57,7 @@ def ask_each(
     archives: Sequence[PlacedArchive],
     question: Question[_A],
     k: int,
-    prepare: Prepare[_A],
+    prepare: Prepare,
     tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
@@ -63,6 +66,12 @@ def ask_each(
 ) -> _A:
     """Ask every archive a question of k poses (rays, points, motions, objects), and merge the answers."""
     effort = make_effort(tolerance, budget_ms, budget_visits, stop)
+    if len(archives) == 1 and archives[0].pose is None:
+        with archives[0].take() as opened:
+            data = opened.data if radius_model is None else opened.radius_model(radius_model)
+            ask, scan = prepare(archives[0], opened)
+            own = effort._replace(scan=True) if scan else effort
+            return ask_until_stopped(question, k, own, partial(ask, with_stop(data, own.stop), own, None))
     visits = np.zeros(k, np.int64)
     answers: list[_A] = []
     first = 0
@@ -74,7 +83,7 @@ def ask_each(
             found = ask_until_stopped(question, k, own, partial(in_budget, ask, data, own, visits))
             answers.append(carried(found, archive.pose, first))
             first += sources_asked(opened)
-        if effort.visits < NO_LIMIT and len(archives) > 1:
+        if effort.visits < NO_LIMIT:
             visits += found.node_visits  # type: ignore[attr-defined]  # all answers have them
     return merged(answers)
 
@@ -112,7 +121,7 @@ def make_legs(
     ]
 
 
-def rows_of(column: Any, rows: slice | None) -> Any:
+def rows_of(column: Any, rows: Rows) -> Any:
     """Return some rows of an argument; None: the argument as it is."""
     return column if rows is None else column[rows]
 
@@ -133,7 +142,7 @@ def along(
     def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: Stop | None) -> Cost:
         """Ask with what is left of the visits of each answer from `start` on, and of the time."""
 
-        def ask(data: SceneData, effort: Effort, rows: slice | None) -> Cost:
+        def ask(data: SceneData, effort: Effort, rows: Rows) -> Cost:
             k = slice(0, len(spent)) if rows is None else rows
             # The motions of a path end where the next begin.
             own = leg.poses[start + k.start : start + k.stop + QUESTIONS[op].moving]

@@ -14,7 +14,7 @@ from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.questions import Question
 from ...schemas.wire.requests import make_objects, make_poses, make_vectors
 from ..archives.archive_generation import HeldParts, Opened
-from ..archives.ask_archives import Ask, along, ask_each, make_legs, rows_of
+from ..archives.ask_archives import Prepared, Rows, along, ask_each, make_legs, rows_of
 from ..archives.merge_answers import limited
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
@@ -108,10 +108,10 @@ class SceneQuestions(Asks):
                 f"{len(arrays[0])} poses to begin at and {len(arrays[-1])} to end at: expected as many"
             )
 
-        def prepare(archive: PlacedArchive, opened: Opened) -> tuple[Ask[_A], bool]:
+        def prepare(archive: PlacedArchive, opened: Opened) -> Prepared:
             own = [archive.poses_in(each) for each in arrays]
 
-            def ask(data: SceneData, effort: Effort, rows: slice | None) -> _A:
+            def ask(data: SceneData, effort: Effort, rows: Rows) -> _A:
                 answers: _A = engine(
                     data, avatar, *(rows_of(each, rows) for each in own), *what, effort=effort
                 )
@@ -125,28 +125,36 @@ class SceneQuestions(Asks):
 
     def _ask_vectors(self, question: Question[_A], given: tuple[Any, ...], options: dict[str, Any]) -> _A:
         """Ask about vectors (k, 3), points or directions."""
-        names, engine = tuple(question.arrays), ENGINES[question.name]
-        arrays, what = given[: len(names)], given[len(names) :]
-        if self._alone is None:  # an archive at the identity checks them itself
-            arrays = tuple(make_vectors(each, name) for each, name in zip(arrays, names, strict=True))
-            if len(arrays[0]) != len(arrays[-1]):
-                raise BadRequestError(
-                    f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected as many"
+        engine = ENGINES[question.name]
+        if self._alone is not None:
+            with self._alone.take() as opened:
+                data, effort = _terms(opened, **options)
+                found: _A = ask_until_stopped(
+                    question, _count(given[0]), effort, lambda: engine(data, *given, effort=effort)
                 )
+            self._metrics.answered("", "", found)
+            return found
+        names = tuple(question.arrays)
+        arrays, what = given[: len(names)], given[len(names) :]
+        arrays = tuple(make_vectors(each, name) for each, name in zip(arrays, names, strict=True))
+        if len(arrays[0]) != len(arrays[-1]):
+            raise BadRequestError(
+                f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected as many"
+            )
 
-        def prepare(archive: PlacedArchive, _: Opened) -> tuple[Ask[_A], bool]:
+        def prepare(archive: PlacedArchive, _: Opened) -> Prepared:
             own = [
                 archive.directions_in(each) if name in question.directions else archive.points_in(each)
                 for each, name in zip(arrays, names, strict=True)
             ]
 
-            def ask(data: SceneData, effort: Effort, rows: slice | None) -> _A:
+            def ask(data: SceneData, effort: Effort, rows: Rows) -> _A:
                 answers: _A = engine(data, *(rows_of(each, rows) for each in own), *what, effort=effort)
                 return answers
 
             return ask, False
 
-        answers = ask_each(self.archives, question, _count(arrays[0]), prepare, **options)
+        answers = ask_each(self.archives, question, len(arrays[0]), prepare, **options)
         self._metrics.answered("", "", answers)
         return answers
 
@@ -160,13 +168,13 @@ class SceneQuestions(Asks):
         groups = np.array([item.group for item in items], np.uint32)
         masks = np.array([item.mask for item in items], np.uint32)
 
-        def prepare(archive: PlacedArchive, _: Opened) -> tuple[Ask[_A], bool]:
+        def prepare(archive: PlacedArchive, _: Opened) -> Prepared:
             # Objects of no group meet nobody but the scene.
             first = archive is self.archives[0]
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
             mask = masks if first else masks & np.uint32(SCENE_GROUP)
 
-            def ask(data: SceneData, effort: Effort, rows: slice | None) -> _A:
+            def ask(data: SceneData, effort: Effort, rows: Rows) -> _A:
                 k = slice(None) if rows is None else rows
                 answers: _A = engine(data, avatars[k], own[k], group[k], mask[k], *what, effort=effort)
                 return answers

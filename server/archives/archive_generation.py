@@ -200,10 +200,6 @@ class Opened:
         }  # fmt: skip
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
-        if data.coarse is not None:  # of the voxel that was just loaded, as if it were not
-            reach = check_request(data, avatar, pose, data.radius_units)
-            nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-            settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
         for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
             collide(
                 data, avatar, np.concatenate([pose, pose]), 0.0, effort
@@ -213,6 +209,12 @@ class Opened:
                 tolerance = max(effort.tolerance, question.other_defaults.get("tolerance", 0.0))
                 ENGINES[question.name](data, *samples, effort=effort._replace(tolerance=tolerance))
             ask_objects(data, [avatar, avatar], np.concatenate([pose, pose]), both, both, effort=effort)
+        if (
+            data.coarse is not None
+        ):  # a load has made the coarse bounds of a voxel: ask as if it were not resident
+            reach = check_request(data, avatar, pose, data.radius_units)
+            nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+            settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
 
     def follow(self, other: "Opened", stopped: Callable[[], bool]) -> None:
         """Load the voxels that `other` has in memory, as many of those used last as fit; until `stopped`.

@@ -15,6 +15,7 @@ import synthetic_scans
 from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BusyError, FormatError, SolidcloudError
 from solidcloud.server.archives import placed_archive
+from solidcloud.server.residency import coarse_bounds
 from solidcloud.server.scene import Scene
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0]])
@@ -234,3 +235,17 @@ def test_a_closed_scene_says_so(place: Path) -> None:
     ):
         with pytest.raises(SolidcloudError, match="closed"):
             ask()
+
+
+def test_warming_calls_the_kernel_of_coarse_bounds(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is called only once a load has made coarse bounds; the first request waited for its compilation."""
+    calls, kernel = [], coarse_bounds.settle_pairs
+
+    def counted(*arguments: object) -> int:
+        calls.append(len(arguments))
+        return int(kernel(*arguments))
+
+    monkeypatch.setattr(coarse_bounds, "settle_pairs", counted)
+    with Scene.open(place, policy="lru+prefetch") as scene:
+        scene.warm()
+    assert calls

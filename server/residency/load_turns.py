@@ -2,8 +2,8 @@
 
 A load is 0.1 ms of interpreted code between some twenty calls that release the interpreter's lock.
 Threads that load at the same time take that lock from one another at every such call. On two cores,
-with a cache of a quarter of the scene, one thread answers 107 queries a second, eight threads
-answered 45, and eight that take turns answer 97 (`scripts/chaos`' queries in one process).
+with a cache of a quarter of the scene, one thread answers 113 queries per second; 16 threads answer
+113 in turns and 49 without turns (`scripts/bench_thrash`).
 """
 
 import threading
@@ -15,8 +15,8 @@ from ..runtime.stop_flag import Stop, seconds_to
 # A turn that takes longer, for a slow disk or a wait for memory, does not block others [s].
 MAX_TURN_SECONDS = 0.025
 # A request that misses at most this many voxels does not wait for a turn behind those that miss
-# more. Eight threads answer about as many queries a second with 4 as with 0 (97 and 100), and fewer
-# with 16 (63).
+# more. Eight threads answer about as many queries per second with 4 as with 0, and a third fewer
+# with 16.
 LOADS_WITHOUT_TURN = 4
 
 

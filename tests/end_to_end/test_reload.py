@@ -16,6 +16,7 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
+from frozen_processes import freeze
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
 from solidcloud.schemas.wire.answers import Verdict
@@ -233,7 +234,7 @@ def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
     monkeypatch.setitem(OPEN_SECONDS, "reload", 1.5)
     with Client(endpoint, scene="hall", timeout=1.5) as client:
         client.reload()
-        os.kill(server.pid, signal.SIGSTOP)
+        freeze(server.pid)
         with pytest.raises(BusyError) as told:
             client.reload()
         assert str(told.value) == (
@@ -244,7 +245,7 @@ def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
     os.kill(server.pid, signal.SIGCONT)
     with Client(endpoint, scene="hall") as client:
         client.reload()
-        os.kill(server.pid, signal.SIGSTOP)
+        freeze(server.pid)
         killer = threading.Timer(0.3, server.kill)  # while it is asked, and before: it is gone all the same
         killer.start()
         with pytest.raises(BusyError) as told:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from floor import DEADLINE, POINTS, eventually, server_process
+from frozen_processes import freeze
 from solidcloud.schemas.wire import keys
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.schemas.wire.moves import Wish
@@ -65,7 +66,7 @@ def test_a_frozen_client_stops_nobody(served, endpoint):
     with other_client(endpoint) as other, walking(endpoint) as session:
         (frozen,) = [user for user in served.users if user.avatar == "large"]
         key, stranger = keys.wish_key("floor", frozen), session._session
-        os.kill(other.pid, signal.SIGSTOP)
+        freeze(other.pid)
         try:
             for number in range(250):
                 wish = Wish(seq=10**6 + number, time=1.0, pose=pose_at(0.0, 1.0)[None])

@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 from floor import DEADLINE, PATH, POINTS, eventually, heights, server_process
+from frozen_processes import freeze
 from solidcloud.schemas.errors import (
     BusyError,
     UnknownSceneError,
@@ -59,7 +60,7 @@ def test_a_frozen_server_is_unknown_after_the_timeout(endpoint, monkeypatch):
     poses = heights([-1.0, 1.0, 1.0])
     with server_process(endpoint) as process, Client(endpoint, scene="floor", timeout=0.3) as client:
         client.add_avatar("al", POINTS, 0.1)
-        process.send_signal(signal.SIGSTOP)
+        freeze(process.pid)
         asked = time.monotonic()
         assert client.collide("al", poses).verdict.tolist() == [Verdict.UNKNOWN] * 3
         assert time.monotonic() - asked < DEADLINE

@@ -17,7 +17,7 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_S
 from ...schemas.errors import ScanError
 from ..config import DEFAULT_STEP, BuildConfig
 from ..kernels.points.spool_rows import usable_bounds
-from ..run.passing_errors import raise_passing
+from ..run.transient_errors import raise_transient
 from ..sources.common.scan import NOT_FINITE, Scan, sha256_of
 from ..sources.common.scan import Lattice as SourceLattice
 
@@ -120,7 +120,7 @@ def survey_range(unit: RangeUnit) -> Part:
             count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
             seen += len(block.xyz)
     except ScanError as error:
-        raise_passing(error, unit.scan.path)
+        raise_transient(error, unit.scan.path)
         fault = str(error)
     return Part(
         unit.start,
@@ -149,7 +149,7 @@ def hash_file(path: Path) -> tuple[str, str]:
     try:
         return sha256_of(path), ""
     except ScanError as error:
-        raise_passing(error, path)
+        raise_transient(error, path)
         return "", str(error)
 
 

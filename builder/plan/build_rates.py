@@ -58,8 +58,8 @@ def _writers() -> dict[str, tuple[str, Callable[[Path, NDArray[np.float64]], Non
     """Return the file suffix and the writer function of each format."""
 
     def made(path: Path, xyz: NDArray[np.float64]) -> None:
-        from ..made.scanner import Place, Scan
-        from ..made.write import open_target
+        from ..synthetic.scanner import Place, Scan
+        from ..synthetic.write import open_target
 
         with open_target(path) as file:
             file.write(1, Scan(Place((0.0, 0.0, 0.0), 0.0), 0.0, xyz, np.zeros(len(xyz), np.uint16)))

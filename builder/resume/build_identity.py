@@ -11,7 +11,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import Source
 from ...schemas.errors import BadRequestError, FormatError
 from ..config import BuildConfig
-from ..run.software import software
+from ..run.software_versions import software_versions
 from ..sources.common.scan import NOT_FINITE, Scan, sha256_of
 from ..sources.scan_list import Input
 
@@ -31,7 +31,7 @@ def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
     Memory and jobs are not included.
     """
     return {
-        "software": software(),
+        "software": software_versions(),
         "options": {**config.identity(), "strict": config.strict, "skip_bad": config.skip_bad},
         "inputs": [
             entry for item in sorted(inputs, key=lambda item: str(item.path)) for entry in _entries(item)

@@ -25,7 +25,7 @@ from ...schemas.process.interrupts import check, children_ignore
 from .executor import ASK_SECONDS, Result, Unit, results_in_order
 from .memory_shares import CLUSTER_WORKER_KILLED, cluster_worker_limit
 from .progress import Progress
-from .software import software
+from .software_versions import software_versions
 
 try:
     import dask
@@ -89,7 +89,7 @@ def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
     """
     worker = get_worker()
     try:
-        _check_worker(worker.address, software(), expected, worker.state.nthreads)
+        _check_worker(worker.address, software_versions(), expected, worker.state.nthreads)
     except BadRequestError as error:
         raise SolidcloudError(str(error)) from None  # not the request: the build could begin as requested
     try:
@@ -111,7 +111,7 @@ def _look(dask_worker: Worker) -> tuple[dict[str, str], int]:
 
     The builder calls this before it hands out work.
     """
-    return software(), dask_worker.state.nthreads
+    return software_versions(), dask_worker.state.nthreads
 
 
 def _check_worker(address: str, found: dict[str, str], expected: dict[str, str], threads: int) -> None:
@@ -184,7 +184,7 @@ class ClusterExecutor:
                 f"{address}: a worker has no {error.name}: install solidcloud, the same version, where workers run"
             ) from None
         for worker, (found, threads) in looks.items():
-            _check_worker(worker, found, software(), threads)
+            _check_worker(worker, found, software_versions(), threads)
         return max(1, len(looks))  # workers seen before may be gone
 
     def _say_dashboard(self) -> None:
@@ -246,7 +246,9 @@ class ClusterExecutor:
         """
         # dask would search an unpickled unit for tasks, through all its keys.
         work = pickle.dumps((function, unit))
-        future = self._client.submit(_run_unit, work, software(), os.getcwd(), pure=False, key=_key(function))
+        future = self._client.submit(
+            _run_unit, work, software_versions(), os.getcwd(), pure=False, key=_key(function)
+        )
         self._given.add(future)
         return future
 

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, ScanError
 from ...schemas.process.new_file import sync_folder
-from ..run.passing_errors import raise_passing
 from ..run.progress import Progress, Silent
+from ..run.transient_errors import raise_transient
 from .coincident_scans import coincident_scan
 from .common.scan import Scan, sha256_of
 from .placed_scan import METRES, TURNS, placed
@@ -344,7 +344,7 @@ def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
     Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
     opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
     that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
-    that is named twice, OSError if a file cannot be opened for a transient reason (passing_errors.py).
+    that is named twice, OSError if a file cannot be opened for a transient reason (transient_errors.py).
     """
     found: list[Input] = []
     for path in map(Path, paths):
@@ -399,7 +399,7 @@ def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) 
             scans.append(scan)
         return Input(path, scans)
     except ScanError as error:
-        raise_passing(error, path)
+        raise_transient(error, path)
         region = header_bounds(path)
         moved = entries is not None and any(
             (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None

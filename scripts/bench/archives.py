@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.made.scenes import make_facade
+from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from solidcloud.builder.made.facade import build_facade
-from solidcloud.builder.made.figure import figure_points
-from solidcloud.builder.made.truth import FacadeTruth
+from solidcloud.builder.synthetic.facade import build_facade
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.builder.synthetic.truth import FacadeTruth
 
 from .archives import facade_archives
 from .poses import Floats, walk_at

@@ -13,9 +13,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from solidcloud.builder.made.scenes import make_town
-from solidcloud.builder.made.town import POINTS_PER_FACADE
-from solidcloud.builder.made.truth import read_truth
+from solidcloud.builder.synthetic.scenes import make_town
+from solidcloud.builder.synthetic.town import POINTS_PER_FACADE
+from solidcloud.builder.synthetic.truth import read_truth
 from solidcloud.server.report.walk.walkthrough import open_whole
 from solidcloud.server.scene import Scene
 

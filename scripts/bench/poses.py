@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
-from solidcloud.builder.made.truth import FacadeTruth
-from solidcloud.builder.made.walk import floor_height, walk_poses
+from solidcloud.builder.synthetic.truth import FacadeTruth
+from solidcloud.builder.synthetic.walk import floor_height, walk_poses
 
 Floats = NDArray[np.float64]
 

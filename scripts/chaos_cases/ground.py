@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit.edit_archive import add_scans
-from solidcloud.builder.made.figure import figure_points
-from solidcloud.builder.made.scenes import make_facade
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.schemas.archive.index_file import INDEX_NAME
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.input.point_file import read_thinned

@@ -36,9 +36,9 @@ def scene_file(archive: Path) -> Path:
 def scene_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     """Return the cases of a scene in this process."""
     import numpy as np
-    from solidcloud.builder.made.facade import build_facade
-    from solidcloud.builder.made.figure import figure_points
-    from solidcloud.builder.made.walk import walk_poses
+    from solidcloud.builder.synthetic.facade import build_facade
+    from solidcloud.builder.synthetic.figure import figure_points
+    from solidcloud.builder.synthetic.walk import walk_poses
     from solidcloud.server.scene import Scene
 
     scene = stack.enter_context(Scene.open(archive, budget_bytes=1 << 30))
@@ -115,7 +115,7 @@ def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
 def wire_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     """Return the cases of a client with a separate server."""
     import numpy as np
-    from solidcloud.builder.made.figure import figure_points
+    from solidcloud.builder.synthetic.figure import figure_points
 
     client_of = find("Client", "server.client")
     served = find("served", "server.report.walk.server_process", "server.report.serving")

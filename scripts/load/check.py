@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.report.walk.walkthrough import open_whole
 from solidcloud.server.scene import Scene

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.wire.messages import CollideRequest, encode
 from solidcloud.server.client import Client
 

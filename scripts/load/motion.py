@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.made.walk import RAMP, SOLE, STRIDE
+from solidcloud.builder.synthetic.walk import RAMP, SOLE, STRIDE
 
 Floats = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.made.facade import FORECOURT_Y, NAVE_X, NAVE_Y
-from solidcloud.builder.made.town import PITCH_X, PITCH_Y
-from solidcloud.builder.made.truth import FacadeTruth, SceneTruth
-from solidcloud.builder.made.walk import floor_height
+from solidcloud.builder.synthetic.facade import FORECOURT_Y, NAVE_X, NAVE_Y
+from solidcloud.builder.synthetic.town import PITCH_X, PITCH_Y
+from solidcloud.builder.synthetic.truth import FacadeTruth, SceneTruth
+from solidcloud.builder.synthetic.walk import floor_height
 
 Floats = NDArray[np.float64]
 Cell = tuple[int, int]  # column, row of a façade in the town

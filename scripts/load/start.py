@@ -6,7 +6,7 @@ from contextlib import ExitStack
 import numpy as np
 from bench.build_limits import forget
 from numpy.typing import NDArray
-from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.server.client import Client
 
 from . import server

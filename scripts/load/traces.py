@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.made.truth import SceneTruth
+from solidcloud.builder.synthetic.truth import SceneTruth
 from solidcloud.server.avatars.avatar_model import AvatarModel
 
 from . import motion, places

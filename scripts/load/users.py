@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 import zenoh
-from solidcloud.builder.made.figure import figure_points
+from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.wire.answers import CollideAnswers
 from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, decode_answer, encode
 from solidcloud.server.avatars.avatar_model import make_avatar

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from facade_scene import Served, cylinder, standing
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.made.figure import figure_points
-from solidcloud.builder.made.sheet import make_sheet
-from solidcloud.builder.made.truth import FacadeTruth
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.builder.synthetic.sheet import make_sheet
+from solidcloud.builder.synthetic.truth import FacadeTruth
 from solidcloud.schemas.wire.answers import Verdict
 
 POINTS = 300_000

@@ -172,7 +172,7 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
     assert not {name for name in ours if name.startswith("server.simulation.effects")}
     assert not {"server.simulation.world.collision_world", "server.queries.resident_motion", *HELPERS} & ours
     for part in ("server.report", "server.service", "server.network", "server.remote", "server.client", "server.cli",
-                 "builder.made", "builder.sources", "builder.pipeline"):  # fmt: skip
+                 "builder.synthetic", "builder.sources", "builder.pipeline"):  # fmt: skip
         assert not [name for name in ours if name == part or name.startswith(part + ".")], part
     for library in (
         "zenoh",

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.made.scenes import make_facade
-from solidcloud.builder.made.truth import FacadeTruth, read_truth
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.synthetic.scenes import make_facade
+from solidcloud.builder.synthetic.truth import FacadeTruth, read_truth
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.moves import Moved
 from solidcloud.server.client import Client

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import synthetic_scans
 from numpy.typing import NDArray
-from solidcloud.builder.made.scenes import make_facade
+from solidcloud.builder.synthetic.scenes import make_facade
 
 
 def _write(path: Path, xyz: NDArray[np.float64], step: float) -> None:

@@ -28,7 +28,7 @@ def make_facade(
     Its ground truth is written beside the scan, as NAME.truth.json.
     """
     with needs_extra("made"):
-        from ....builder.made.scenes import make_facade as make_it
+        from ....builder.synthetic.scenes import make_facade as make_it
     from ....schemas.process.os_errors import writing
     from ..output.progress_display import progress_listener
 
@@ -49,7 +49,7 @@ def make_town(
     The ground truth is written beside the scans, as NAME.truth.json.
     """
     with needs_extra("made"):
-        from ....builder.made.scenes import make_town as make_it
+        from ....builder.synthetic.scenes import make_town as make_it
     from ....schemas.process.os_errors import writing
     from ..output.progress_display import progress_listener
 
@@ -65,7 +65,7 @@ def make_figure(
     height: Annotated[float, typer.Option(help="Height of the figure [m].")] = 1.75,
 ) -> None:
     """Make an avatar: a human figure in mid-stride."""
-    from ....builder.made.figure import figure_points, write_figure
+    from ....builder.synthetic.figure import figure_points, write_figure
     from ....schemas.process.os_errors import writing
 
     with interruptible(), writing(output):
@@ -82,8 +82,8 @@ def make_walk(
 
     The columns are t,x,y,z,qw,qx,qy,qz, as solidcloud query reads them.
     """
-    from ....builder.made.truth import read_truth
-    from ....builder.made.walk import walk_poses
+    from ....builder.synthetic.truth import read_truth
+    from ....builder.synthetic.walk import walk_poses
     from ....schemas.process.os_errors import writing
     from ..input.pose_file import write_poses
 

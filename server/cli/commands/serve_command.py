@@ -87,7 +87,7 @@ def serve(
     from ...service.server_config import ServerConfig
     from ...service.service import serve as serve_scenes
     from ...simulation.replay import recorded
-    from .rehearsal import rehearse
+    from .kernel_rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     config = ServerConfig(

@@ -88,7 +88,7 @@ class Pace:
 class Listener:
     """Receiver of progress reports and context manager. Subclasses display the reports.
 
-    Implements the protocol `builder.progress.Progress` and the callback of `builder.made`.
+    Implements the protocol `builder.progress.Progress` and the callback of `builder.synthetic`.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -130,7 +130,7 @@ class Listener:
         self._pace = None
 
     def made(self, done: int, total: int) -> None:
-        """Report the points written so far and in total, as `builder.made` calls it."""
+        """Report the points written so far and in total, as `builder.synthetic` calls it."""
         if self._pace is None and done < total:
             self.start("scan", total, "points")
         if self._pace is not None:

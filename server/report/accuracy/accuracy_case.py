@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....builder.config import DEFAULT_STEP, BuildConfig
-from ....builder.made.facade import build_facade
-from ....builder.made.figure import figure_points
-from ....builder.made.scenes import make_facade
-from ....builder.made.truth import SceneTruth, read_truth
-from ....builder.made.walk import walk_poses
 from ....builder.sources.scan_files import open_scans
+from ....builder.synthetic.facade import build_facade
+from ....builder.synthetic.figure import figure_points
+from ....builder.synthetic.scenes import make_facade
+from ....builder.synthetic.truth import SceneTruth, read_truth
+from ....builder.synthetic.walk import walk_poses
 from ....builder.voxel.point_radius import voxel_points
 from ....schemas.archive.archive import Archive
 from ....schemas.archive.index import Header

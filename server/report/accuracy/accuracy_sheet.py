@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ....builder.config import BuildConfig
-from ....builder.made.sheet import make_sheet
 from ....builder.pipeline import build_archive
+from ....builder.synthetic.sheet import make_sheet
 from ...scene import Scene
 from ..common.doorway import doorway_error
 from ..common.leak import leak
@@ -23,7 +23,7 @@ SPACING = 0.03
 
 
 def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[Row]:
-    """Measure the sheet of builder/made/sheet.py: doorway error and leak of MODELS with FACTORS.
+    """Measure the sheet of builder/synthetic/sheet.py: doorway error and leak of MODELS with FACTORS.
 
     Times are not measured here, but on the façade.
     folder: receives the sheet and its archive.  tick: called after each row.

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.made.figure import figure_points
-from ....builder.made.truth import DoorTruth, FacadeTruth
+from ....builder.synthetic.figure import figure_points
+from ....builder.synthetic.truth import DoorTruth, FacadeTruth
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
 

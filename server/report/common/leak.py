@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.made.places import WallPlaces, wall_places
-from ....builder.made.truth import SceneTruth
+from ....builder.synthetic.places import WallPlaces, wall_places
+from ....builder.synthetic.truth import SceneTruth
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
 
@@ -45,7 +45,7 @@ class Leak(NamedTuple):
 def leak_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> WallPlaces:
     """Return places on the façade's walls, from dense to four times as sparse.
 
-    See builder/made/places.py.
+    See builder/synthetic/places.py.
     """
     return wall_places(truth, places, seed)
 

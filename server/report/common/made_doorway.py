@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ....builder.config import BuildConfig
-from ....builder.made.facade import NARROWEST_DOOR
-from ....builder.made.scenes import make_facade
-from ....builder.made.truth import FacadeTruth, read_truth
 from ....builder.pipeline import build_archive
+from ....builder.synthetic.facade import NARROWEST_DOOR
+from ....builder.synthetic.scenes import make_facade
+from ....builder.synthetic.truth import FacadeTruth, read_truth
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
 from .doorway import LIFTS, Doorway, made_figure, passage

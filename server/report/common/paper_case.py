@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.made.facade import build_facade
-from ....builder.made.figure import figure_points
-from ....builder.made.scenes import make_facade
-from ....builder.made.walk import walk_poses
+from ....builder.synthetic.facade import build_facade
+from ....builder.synthetic.figure import figure_points
+from ....builder.synthetic.scenes import make_facade
+from ....builder.synthetic.walk import walk_poses
 from ....schemas.archive.archive import Archive
 from ....schemas.errors import BadRequestError
 from ...cli.input.point_file import read_avatar

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....builder.config import BuildConfig
-from ....builder.made.figure import figure_points
 from ....builder.pipeline import build_archive
+from ....builder.synthetic.figure import figure_points
 from ....schemas.errors import SolidcloudError
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.messages import SceneInfo
@@ -95,7 +95,7 @@ def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False
 
 def make_scan(out: Path) -> Path:
     """Generate the façade's scan in the folder `out`; return the path of its ground truth."""
-    from ....builder.made.scenes import make_facade
+    from ....builder.synthetic.scenes import make_facade
 
     with progress_listener() as bars:
         return make_facade(out / "facade.laz", progress=bars.made).truth
@@ -164,8 +164,8 @@ def make_report(walk: Walk, frames: Frames, info: SceneInfo, avatar_points: int)
 
 def _facade_walk(scans: Sequence[Path], truth: Path, points: int) -> Walk:
     """Return the walk through the generated façade."""
-    from ....builder.made.truth import read_truth
-    from ....builder.made.walk import walk_poses
+    from ....builder.synthetic.truth import read_truth
+    from ....builder.synthetic.walk import walk_poses
 
     times, poses = walk_poses(read_truth(truth).facades[0])
     path = "along the walls, around the column and through the door of the façade"

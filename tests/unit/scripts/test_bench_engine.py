@@ -13,8 +13,8 @@ from bench import machine, picture, poses, results, sides
 from bench.definition import Judge, least_distance
 from bench.machine import Clock
 from scipy.spatial import cKDTree
-from solidcloud.builder.made.facade import build_facade
-from solidcloud.builder.made.walk import walk_poses
+from solidcloud.builder.synthetic.facade import build_facade
+from solidcloud.builder.synthetic.walk import walk_poses
 
 PLANE = np.array([[x, y, 0.0] for x in np.arange(0, 2, 0.05) for y in np.arange(0, 2, 0.05)])
 BODY = np.array([[0.0, 0, 0.1], [0.1, 0, 0.1], [0, 0, 1.0]])

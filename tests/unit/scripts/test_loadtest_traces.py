@@ -7,9 +7,9 @@ import pytest
 from load import motion, places, traces
 from load.traces import KINDS, Trace
 from numpy.typing import NDArray
-from solidcloud.builder.made.figure import figure_points
-from solidcloud.builder.made.town import POINTS_PER_FACADE, town_lots
-from solidcloud.builder.made.truth import SceneTruth
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.builder.synthetic.town import POINTS_PER_FACADE, town_lots
+from solidcloud.builder.synthetic.truth import SceneTruth
 from solidcloud.server.avatars.avatar_model import make_avatar
 
 MOVING = ("stroll", "run", "tour", "crowd")

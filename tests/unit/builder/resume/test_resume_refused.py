@@ -15,7 +15,7 @@ from interrupted_builds import build, content, done_folder, interrupted, two_sca
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.build_directory import building_folder
 from solidcloud.builder.resume.build_identity import check_same, described
-from solidcloud.builder.run.software import software
+from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.builder.sources.scan_list import Input, inputs, inspect, write_scan_list
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.cli.main import run
@@ -87,9 +87,9 @@ def test_other_software_is_refused(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupted(tmp_path / "hall", scans, monkeypatch)
-    other = {**software(), "h5py": "0.1"}
-    monkeypatch.setattr("solidcloud.builder.resume.build_identity.software", lambda: other)
-    expected = rf"begun with other software: h5py {software()['h5py']}, now 0\.1: use .*--fresh to start over"
+    other = {**software_versions(), "h5py": "0.1"}
+    monkeypatch.setattr("solidcloud.builder.resume.build_identity.software_versions", lambda: other)
+    expected = rf"begun with other software: h5py {software_versions()['h5py']}, now 0\.1: use .*--fresh to start over"
     with pytest.raises(BadRequestError, match=expected):
         build(tmp_path / "hall", scans)
 

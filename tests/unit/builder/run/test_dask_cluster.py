@@ -17,7 +17,7 @@ from distributed import LocalCluster
 from solidcloud.builder.run.dask_cluster import ClusterExecutor, local_workers
 from solidcloud.builder.run.executor import WAITING
 from solidcloud.builder.run.progress import Silent
-from solidcloud.builder.run.software import software
+from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 
 # Units are text for `eval`, because workers cannot import a test module by its name.
@@ -154,7 +154,9 @@ def test_a_scheduler_is_used_where_it_is_and_left_running(
     assert "dashboard http" in said[0]
     assert mapped(executor, "1 + 1") == [2]
 
-    monkeypatch.setattr(cluster_module, "software", lambda: {**software(), "zstandard": "0.1"})
+    monkeypatch.setattr(
+        cluster_module, "software_versions", lambda: {**software_versions(), "zstandard": "0.1"}
+    )
     with pytest.raises(
         BadRequestError, match=r"worker tcp://\S+: zstandard [\d.]+, expected 0\.1 as the builder has"
     ):
@@ -163,7 +165,7 @@ def test_a_scheduler_is_used_where_it_is_and_left_running(
     with pytest.raises(SolidcloudError, match=r"zstandard [\d.]+, expected 0\.1") as caught:
         mapped(executor, "1")
     assert caught.type is SolidcloudError  # the request was a good one: what is done stays
-    monkeypatch.setattr(cluster_module, "software", software)
+    monkeypatch.setattr(cluster_module, "software_versions", software_versions)
     monkeypatch.setattr(os, "getcwd", lambda: "/nowhere/at/all")
     with pytest.raises(SolidcloudError, match=r"no folder /nowhere/at/all.*need the same files"):
         mapped(executor, "1")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import synthetic_scans
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.made.figure import figure_points
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import InternalError
 from solidcloud.server.report.accuracy.accuracy import judge, warnings_of

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.made.sheet import Sheet, make_sheet
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.synthetic.sheet import Sheet, make_sheet
 from solidcloud.server.report.common.doorway import doorway_error
 from solidcloud.server.report.common.leak import leak
 from solidcloud.server.scene import Scene

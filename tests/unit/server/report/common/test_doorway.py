@@ -8,8 +8,8 @@ import archive_cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.builder.made.figure import figure_points
-from solidcloud.builder.made.truth import DoorTruth, FacadeTruth
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.builder.synthetic.truth import DoorTruth, FacadeTruth
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.report.common import doorway
 from solidcloud.server.report.common.doorway import doorway_error

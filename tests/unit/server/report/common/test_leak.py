@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radius_class_archives
 from numpy.typing import NDArray
-from solidcloud.builder.made.places import WallPlaces
+from solidcloud.builder.synthetic.places import WallPlaces
 from solidcloud.server.report.common import leak as report
 from solidcloud.server.report.common.leak import leak, leak_depths
 from solidcloud.server.scene import Scene

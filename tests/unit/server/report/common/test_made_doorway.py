@@ -9,8 +9,8 @@ import archive_cases
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.made.figure import figure_points
-from solidcloud.builder.made.truth import DoorTruth, FacadeTruth
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.builder.synthetic.truth import DoorTruth, FacadeTruth
 from solidcloud.server.report.common import made_doorway
 from solidcloud.server.report.common.made_doorway import FINEST, WIDEST, MadeDoor, made_doorways, passes
 from solidcloud.server.scene import Scene

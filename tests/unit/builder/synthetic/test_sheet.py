@@ -6,7 +6,7 @@ import numpy as np
 import plyfile
 import pytest
 from scipy.spatial import cKDTree
-from solidcloud.builder.made.sheet import DOOR, HALF_WIDTH, HEIGHT, MARGIN, make_sheet
+from solidcloud.builder.synthetic.sheet import DOOR, HALF_WIDTH, HEIGHT, MARGIN, make_sheet
 from solidcloud.schemas.errors import BadRequestError
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.made.facade import NAVE_X, SILL, build_facade
-from solidcloud.builder.made.scanner import Place, RayScene
+from solidcloud.builder.synthetic.facade import NAVE_X, SILL, build_facade
+from solidcloud.builder.synthetic.scanner import Place, RayScene
 from solidcloud.schemas.errors import BadRequestError
 
 

@@ -10,18 +10,18 @@ from ...schemas.errors import ScanError
 from ...schemas.process.interrupts import check
 
 # Errors of a disk, a network or an overloaded machine.
-PASSING = frozenset(
+TRANSIENT = frozenset(
     {errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.ETIMEDOUT,
      errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.EREMOTEIO}
 )  # fmt: skip
 
 
-def raise_passing(error: ScanError, path: Path) -> None:
+def raise_transient(error: ScanError, path: Path) -> None:
     """Raise Interrupted or the OSError if a file could not be read for a transient reason.
 
     Lack of memory is detected where it occurs, in every pass (sources/common/scan.py `library_errors`).
     """
     check()
     cause = error.__cause__
-    if isinstance(cause, OSError) and cause.errno in PASSING:
+    if isinstance(cause, OSError) and cause.errno in TRANSIENT:
         raise OSError(cause.errno, cause.strerror, str(path)) from None

@@ -4,9 +4,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from solidcloud.builder.made.facade import build_facade
-from solidcloud.builder.made.scanner import LATTICE, NOISE, Place, RayScene, Scan, plan, scan
-from solidcloud.builder.made.shapes import Parts
+from solidcloud.builder.synthetic.facade import build_facade
+from solidcloud.builder.synthetic.scanner import LATTICE, NOISE, Place, RayScene, Scan, plan, scan
+from solidcloud.builder.synthetic.shapes import Parts
 
 FORECOURT = Place((0.8, -13.0, 1.7), 0.3)
 NEAR = Place((0.5, -3.4, 1.7), -1.0)

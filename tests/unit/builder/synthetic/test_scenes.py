@@ -7,9 +7,9 @@ import numpy as np
 import pye57
 import pytest
 from numpy.typing import NDArray
-from solidcloud.builder.made.scanner import LATTICE, NOISE
-from solidcloud.builder.made.scenes import MadeScene, make_facade, make_town
-from solidcloud.builder.made.truth import SceneTruth, read_truth
+from solidcloud.builder.synthetic.scanner import LATTICE, NOISE
+from solidcloud.builder.synthetic.scenes import MadeScene, make_facade, make_town
+from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
 from solidcloud.schemas.errors import BadRequestError, ScanError
 
 

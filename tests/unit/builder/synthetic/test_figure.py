@@ -7,7 +7,7 @@ import plyfile
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
-from solidcloud.builder.made.figure import figure_points, half_width, write_figure
+from solidcloud.builder.synthetic.figure import figure_points, half_width, write_figure
 from solidcloud.schemas.errors import BadRequestError
 
 

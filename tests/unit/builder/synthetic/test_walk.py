@@ -6,10 +6,10 @@ import laspy
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from solidcloud.builder.made.facade import build_facade
-from solidcloud.builder.made.figure import figure_points, half_width
-from solidcloud.builder.made.scenes import make_facade
-from solidcloud.builder.made.walk import SIDE, SOLE, floor_height, walk_poses
+from solidcloud.builder.synthetic.facade import build_facade
+from solidcloud.builder.synthetic.figure import figure_points, half_width
+from solidcloud.builder.synthetic.scenes import make_facade
+from solidcloud.builder.synthetic.walk import SIDE, SOLE, floor_height, walk_poses
 
 TRUTH = build_facade().truth
 FIGURE = figure_points()

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from solidcloud.builder.made.places import AROUND, SPREAD, WallPlaces, wall_places
-from solidcloud.builder.made.scenes import make_facade
-from solidcloud.builder.made.truth import SceneTruth, read_truth
+from solidcloud.builder.synthetic.places import AROUND, SPREAD, WallPlaces, wall_places
+from solidcloud.builder.synthetic.scenes import make_facade
+from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
 from solidcloud.schemas.errors import BadDataError
 
 
@@ -77,6 +77,6 @@ def test_too_many_places_are_refused(
     made: tuple[SceneTruth, NDArray[np.float64], WallPlaces], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth, _, _ = made
-    monkeypatch.setattr("solidcloud.builder.made.places.TRIED", 50)
+    monkeypatch.setattr("solidcloud.builder.synthetic.places.TRIED", 50)
     with pytest.raises(BadDataError, match="expected 600"):
         wall_places(truth, 600)

@@ -10,7 +10,7 @@ LIBRARIES = ("numpy", "numba", "llvmlite", "h5py", "zstandard")
 
 
 @functools.cache
-def software() -> dict[str, str]:
+def software_versions() -> dict[str, str]:
     """Return the software that a unit's bytes may depend on, name -> version.
 
     The version of solidcloud includes a hash of its sources.

@@ -21,7 +21,7 @@ from ...schemas.wire.answers import Part
 from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..queries.collide import collide
-from ..queries.context.query_budget import EXACT, Effort
+from ..queries.context.query_budget import EXACT, QueryBudget
 from ..queries.context.query_context import SceneData, check_request, make_scene_data, with_radius_model
 from ..queries.engines import ENGINES
 from ..queries.objects import objects as ask_objects
@@ -200,15 +200,15 @@ class Opened:
         }  # fmt: skip
         # Budgets that are hardly ever spent: what is bounded has kernels of its own, and so have deadlines.
         later = time.perf_counter() + 3600.0
-        for effort in (EXACT, Effort(tolerance=1e-3, visits=1 << 20), Effort(deadline=later)):
+        for budget in (EXACT, QueryBudget(tolerance=1e-3, visits=1 << 20), QueryBudget(deadline=later)):
             collide(
-                data, avatar, np.concatenate([pose, pose]), 0.0, effort
+                data, avatar, np.concatenate([pose, pose]), 0.0, budget
             )  # several poses take other kernels
             for question in (one for one in QUESTIONS.values() if not one.whole):
                 samples = [some[name] for name in question.arguments if name in question.required]
-                tolerance = max(effort.tolerance, question.other_defaults.get("tolerance", 0.0))
-                ENGINES[question.name](data, *samples, effort=effort._replace(tolerance=tolerance))
-            ask_objects(data, [avatar, avatar], np.concatenate([pose, pose]), both, both, effort=effort)
+                tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
+                ENGINES[question.name](data, *samples, budget=budget._replace(tolerance=tolerance))
+            ask_objects(data, [avatar, avatar], np.concatenate([pose, pose]), both, both, budget=budget)
         if (
             data.coarse is not None
         ):  # a load has made the coarse bounds of a voxel: ask as if it were not resident

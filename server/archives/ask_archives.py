@@ -18,10 +18,9 @@ from ...schemas.wire.answers import ContactsAnswers, Cost
 from ...schemas.wire.columns import join
 from ...schemas.wire.questions import QUESTIONS, Question
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import NO_LIMIT, Effort, make_effort
+from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stopped, make_budget
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.path import part_stop, path_question
-from ..queries.stopped_answers import ask_until_stopped
 from ..runtime.stop_flag import NEVER, Stop
 from .archive_generation import Opened
 from .merge_answers import carried, limited, merged
@@ -33,9 +32,9 @@ _A = TypeVar("_A", bound=Cost)
 # Some rows of a request; None: all.
 Rows = slice | None
 # Asks one archive about some rows of a request.
-Ask = Callable[[SceneData, Effort, Rows], _A]
-# What asks an archive, and whether what is looked at is passed by (`Effort.scan`).
-Prepared = tuple[Callable[[SceneData, Effort, Rows], Any], bool]
+Ask = Callable[[SceneData, QueryBudget, Rows], _A]
+# What asks an archive, and whether what is looked at is passed by (`QueryBudget.scan`).
+Prepared = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
 Prepare = Callable[[PlacedArchive, Opened], Prepared]
 # Pairs that `contacts` lists where no limit is given.
 LISTED = 100
@@ -65,43 +64,43 @@ def ask_each(
     stop: Stop = NEVER,
 ) -> _A:
     """Ask every archive a question of k poses (rays, points, motions, objects), and merge the answers."""
-    effort = make_effort(tolerance, budget_ms, budget_visits, stop)
+    budget = make_budget(tolerance, budget_ms, budget_visits, stop)
     if len(archives) == 1 and archives[0].pose is None:
         with archives[0].take() as opened:
             data = opened.data if radius_model is None else opened.radius_model(radius_model)
             ask, scan = prepare(archives[0], opened)
-            own = effort._replace(scan=True) if scan else effort
+            own = budget._replace(scan=True) if scan else budget
             return ask_until_stopped(question, k, own, partial(ask, with_stop(data, own.stop), own, None))
     visits = np.zeros(k, np.int64)
     answers: list[_A] = []
     first = 0
     for archive in archives:
         with archive.take() as opened:
-            data = with_stop(opened.radius_model(radius_model), effort.stop)
+            data = with_stop(opened.radius_model(radius_model), budget.stop)
             ask, scan = prepare(archive, opened)
-            own = effort._replace(scan=scan)
+            own = budget._replace(scan=scan)
             found = ask_until_stopped(question, k, own, partial(in_budget, ask, data, own, visits))
             answers.append(carried(found, archive.pose, first))
             first += sources_asked(opened)
-        if effort.visits < NO_LIMIT:
+        if budget.visits < NO_LIMIT:
             visits += found.node_visits  # type: ignore[attr-defined]  # all answers have them
     return merged(answers)
 
 
-def in_budget(ask: Ask[_A], data: SceneData, effort: Effort, visits: NDArray[np.int64]) -> _A:
+def in_budget(ask: Ask[_A], data: SceneData, budget: QueryBudget, visits: NDArray[np.int64]) -> _A:
     """Ask an archive within the budget of each pose less the node visits (k,) that others made.
 
     Consecutive poses with the same budget are asked about together: nearly always all poses that no
     other archive is near.
     """
-    if effort.visits == NO_LIMIT or not visits.any():
-        return ask(data, effort, None)
-    left = np.maximum(effort.visits - visits, 0)
+    if budget.visits == NO_LIMIT or not visits.any():
+        return ask(data, budget, None)
+    left = np.maximum(budget.visits - visits, 0)
     ends = [*(np.flatnonzero(np.diff(left)) + 1).tolist(), len(left)]
     starts = [0, *ends[:-1]]
     return join(
         [
-            ask(data, effort._replace(visits=int(left[start])), slice(start, end))
+            ask(data, budget._replace(visits=int(left[start])), slice(start, end))
             for start, end in zip(starts, ends, strict=True)
         ]
     )
@@ -142,16 +141,16 @@ def along(
     def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: Stop | None) -> Cost:
         """Ask with what is left of the visits of each answer from `start` on, and of the time."""
 
-        def ask(data: SceneData, effort: Effort, rows: Rows) -> Cost:
+        def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> Cost:
             k = slice(0, len(spent)) if rows is None else rows
             # The motions of a path end where the next begin.
             own = leg.poses[start + k.start : start + k.stop + QUESTIONS[op].moving]
-            options = parameters | {"budget_visits": effort.visits}
+            options = parameters | {"budget_visits": budget.visits}
             if budget_ms is not None:
                 options["budget_ms"] = max(0.0, budget_ms - (time.perf_counter() - begin) * 1e3)
             return path_question(data, avatar, own, op, options, stop)[0](0, k.stop - k.start, part)
 
-        return in_budget(ask, leg.data, Effort(visits=int(visits or 0)), spent)
+        return in_budget(ask, leg.data, QueryBudget(visits=int(visits or 0)), spent)
 
     def ask(start: int, end: int) -> Cost:
         spent = np.zeros(end - start, np.int64)

@@ -13,10 +13,17 @@ from ..kernels.core.voxels_in_reach import Reach
 from ..kernels.overlap.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
 from ..residency.coarse_bounds import settle
 from .context.anytime_search import collide_bounded
-from .context.proved_reach import find_proved_reach
-from .context.query_budget import EXACT, NO_LIMIT, Effort
-from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, refuse, to_units
-from .context.query_cost import Spent
+from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
+from .context.query_context import (
+    SceneData,
+    as_held,
+    find_proved_reach,
+    in_unknown,
+    kernel_poses,
+    pieces,
+    refuse,
+    to_units,
+)
 
 # Avatars of at most this many points are tested under the residency's lock in a request of one
 # pose: 20 µs for the 3,617 points of the walk. Larger ones could block other requests, and gain
@@ -60,47 +67,47 @@ def _answer_at_once(
 
 
 def collide(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, effort: Effort = EXACT
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
 ) -> CollideAnswers:
     """Test whether the avatar touches the scene under each pose.
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
-    effort: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and
+    budget: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and
     has bounds.
     The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read or
     a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    if effort.limited:
-        return collide_bounded(data, avatar, poses, margin, effort)
+    if budget.limited:
+        return collide_bounded(data, avatar, poses, margin, budget)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
     other_units = data.radius_units + margin_units
     k = len(array)
     unseen = data.nothing_clear or len(data.unknown) > 0
-    if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen and effort.tolerance == 0:
+    if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen and budget.tolerance == 0:
         answers = _answer_at_once(data, avatar, array, other_units, begin)
         if answers is not None:
             return answers
-    residency, spent = data.residency, Spent(begin)
+    residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
 
     def settled(reach: Reach) -> Reach:
         if data.coarse is None or not len(avatar.points):
             return reach
         return settle(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)[0]
 
-    reach = find_proved_reach(data, avatar, array, other_units, effort, spent, settled)
+    reach = find_proved_reach(data, avatar, array, other_units, budget, spent, settled)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     # An empty avatar is clear, whatever else is unknown.
     for which, rows, part in (
-        pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
+        pieces(reach, residency, budget.share, budget.stop) if len(avatar.points) else ()
     ):
-        if effort.stop:
+        if budget.stop:
             verdict[which[verdict[which] == CLEAR]] = UNKNOWN
             continue
-        with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
             overlap_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
         spent.add(held)
@@ -108,20 +115,24 @@ def collide(
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(
-        verdict, reach.outside, counts[0], counts[1], counts[2], **spent.cost(data),
-        **_bounds(verdict, reach.units - margin_units, margin, margin_units, effort),
+        verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(),
+        **_bounds(verdict, reach.units - margin_units, margin, margin_units, budget),
     )  # fmt: skip
 
 
 def _bounds(
-    verdict: NDArray[np.uint8], radii: NDArray[np.int64], margin: float, margin_units: int, effort: Effort
+    verdict: NDArray[np.uint8],
+    radii: NDArray[np.int64],
+    margin: float,
+    margin_units: int,
+    budget: QueryBudget,
 ) -> dict[str, Any]:
     """Return the bounds of `CollideAnswers` that follow from verdicts; {} without a tolerance.
 
     radii: (k,) sum of the largest radii of avatar and scan, exact units: the depth limit of a pair.
     margin: [m].  margin_units: the margin as rounded, up or down; verdicts are based on it.
     """
-    if effort.tolerance == 0:
+    if budget.tolerance == 0:
         return {}
     rounded = margin_units / UNITS_PER_METRE
     return {

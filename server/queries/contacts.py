@@ -41,10 +41,16 @@ from ..kernels.core.voxel_layout import LANES
 from ..kernels.core.voxels_in_reach import Reach
 from ..kernels.overlap.overlap import STACK
 from ..runtime.stop_flag import NEVER
-from .context.proved_reach import find_proved_reach
-from .context.query_budget import EXACT, Effort
-from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
-from .context.query_cost import Spent
+from .context.query_budget import EXACT, CostCounter, QueryBudget
+from .context.query_context import (
+    SceneData,
+    as_held,
+    find_proved_reach,
+    in_unknown,
+    kernel_poses,
+    pieces,
+    to_units,
+)
 from .distance import signed_from_square
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
@@ -66,7 +72,7 @@ def contacts(
     limit: int = 100,
     margin: float = 0.0,
     cluster_distance: float | None = None,
-    effort: Effort = EXACT,
+    budget: QueryBudget = EXACT,
 ) -> ContactsAnswers:
     """Find all pairs in contact under each pose: count them, list the deepest, and cluster them.
 
@@ -81,7 +87,7 @@ def contacts(
     The deepest pair has the least |a - b| - r_a - r_b, with r_b of the scan point's own sphere,
     compared exactly and not by the rounded figure. Each of several coincident points forms a pair.
     Ties are ordered by scan point, avatar centre, avatar row, scan number.
-    effort: a budget may leave pairs out; `exact` is then false, and the listed pairs are in contact
+    budget: a budget may leave pairs out; `exact` is then false, and the listed pairs are in contact
     but may not be the deepest. A tolerance has no effect: it cannot end a count earlier.
     The verdict is CONTACT if a pair was found; otherwise CLEAR, or UNKNOWN if not everything in
     reach was examined. Raise BadRequestError, BadTransformError, TooLargeError.
@@ -91,8 +97,8 @@ def contacts(
     limit = _checked_limit(limit)
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
-    spent = Spent(begin)
-    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
+    spent = CostCounter(begin, data.residency, data.broad.keys)
+    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
     k = len(array)
     tally = Tally(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
@@ -100,23 +106,23 @@ def contacts(
     memory = _empty_memory(limit)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, effort.visits, MOST_CELLS)
-        parts = list(pieces(reach, data.residency, effort.share, effort.stop))
+        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MOST_CELLS)
+        parts = list(pieces(reach, data.residency, budget.share, budget.stop))
         for number, (which, rows, part) in enumerate(parts):
             # A pose that is split over several pieces is alone in each, and the pieces are
             # adjacent.
             closes = (
                 number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
             )
-            if effort.spent:
-                memory = _gather(data, avatar, array, part, which, asked, closes, effort, memory, tally)
+            if budget.spent:
+                memory = _gather(data, avatar, array, part, which, asked, closes, budget, memory, tally)
                 continue
-            with data.residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+            with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
-                memory = _gather(seen, avatar, array, part, which, asked, closes, effort, memory, tally)
+                memory = _gather(seen, avatar, array, part, which, asked, closes, budget, memory, tally)
             spent.add(held)
     columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
-    return ContactsAnswers(**columns, **spent.cost(data))
+    return ContactsAnswers(**columns, **spent.fields())
 
 
 def _checked_limit(limit: int) -> int:
@@ -162,15 +168,15 @@ def _gather(
     which: NDArray[np.int64],
     asked: Asked,
     closes: bool,
-    effort: Effort,
+    budget: QueryBudget,
     memory: Memory,
     tally: Tally,
 ) -> Memory:
     """Answer one piece, to its end or to the deadline; mark poses left over as cut."""
     memory.cursor[:] = 0, -1, 0
-    pause = SIZE_VISITS if effort.deadline == math.inf else SLICE_VISITS
+    pause = SIZE_VISITS if budget.deadline == math.inf else SLICE_VISITS
     while memory.cursor[0] < len(which):
-        if effort.spent:
+        if budget.spent:
             asked = asked._replace(visits=-1)
         memory = gather_contacts(
             poses, avatar.arrays, data.arrays, part, which, asked, closes, pause, memory, tally

@@ -14,17 +14,15 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.nearest.nearest_pair import Nearest
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.anytime_search import distance_bounded
-from .context.proved_reach import find_proved_reach
-from .context.query_budget import EXACT, NO_LIMIT, Effort
-from .context.query_context import SceneData, as_held, kernel_poses, pieces, to_units
-from .context.query_cost import Spent
+from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
+from .context.query_context import SceneData, as_held, find_proved_reach, kernel_poses, pieces, to_units
 from .context.signed_distance import distance_columns, signed_from_square, unknown_gaps
 
 __all__ = ["distance", "signed_from_square"]
 
 
 def distance(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort = EXACT
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> DistanceAnswers:
     """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
@@ -35,24 +33,24 @@ def distance(
     examined pair, and exact only if nothing missing can contain a nearer pair.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    if effort.limited:
-        return distance_bounded(data, avatar, poses, reach, effort)
+    if budget.limited:
+        return distance_bounded(data, avatar, poses, reach, budget)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
     k = len(array)
-    residency, spent = data.residency, Spent(begin)
-    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, effort, spent)
+    residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
+    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, budget, spent)
     nearest = Nearest(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
     )
     counts = np.zeros((3, k), np.uint32)
     if len(avatar.points):
-        for which, rows, part in pieces(around, residency, effort.share, effort.stop):
-            if effort.stop:
+        for which, rows, part in pieces(around, residency, budget.share, budget.stop):
+            if budget.stop:
                 nearest.gap[which] = 0.0
                 continue
-            with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+            with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
                 nearest_poses(
                     array,
@@ -70,5 +68,5 @@ def distance(
         np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)
     return DistanceAnswers(
         **distance_columns(data, around, float(reach), reach_units, nearest, counts),
-        **spent.cost(data),
+        **spent.fields(),
     )

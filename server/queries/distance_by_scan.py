@@ -8,10 +8,16 @@ from numpy.typing import ArrayLike
 
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.nearest.nearest_by_scan import Nearer, nearest_by_scan
-from .context.proved_reach import find_proved_reach
-from .context.query_budget import EXACT, Effort
-from .context.query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
-from .context.query_cost import Spent
+from .context.query_budget import EXACT, CostCounter, QueryBudget
+from .context.query_context import (
+    SceneData,
+    as_held,
+    find_proved_reach,
+    in_unknown,
+    kernel_poses,
+    pieces,
+    to_units,
+)
 
 # Number of points whose scan is not stored, or whose number belongs to no scan.
 ANY_SCAN = -1
@@ -32,7 +38,12 @@ class ScanGaps(NamedTuple):
 
 
 def gaps_by_scan(
-    data: SceneData, avatar: AvatarModel, pose: ArrayLike, margin: float, scans: int, effort: Effort = EXACT
+    data: SceneData,
+    avatar: AvatarModel,
+    pose: ArrayLike,
+    margin: float,
+    scans: int,
+    budget: QueryBudget = EXACT,
 ) -> ScanGaps:
     """Compute the least signed separation of every scan from the avatar under a pose (4, 4).
 
@@ -42,26 +53,28 @@ def gaps_by_scan(
     of its deepest pair, except for the last bits: if the separations of several pairs differ only
     by rounding, it is that of one of them. A point whose number belongs to no scan counts as
     ANY_SCAN.
-    effort: a budget may leave pairs out; `exact` is then false.
+    budget: a budget may leave pairs out; `exact` is then false.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     poses = kernel_poses(np.asarray(pose)[None])
     margin_units = to_units(margin, "margin")
     units = data.radius_units + margin_units
-    reach = find_proved_reach(data, avatar, poses, units, effort, Spent(time.perf_counter()))
+    reach = find_proved_reach(
+        data, avatar, poses, units, budget, CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    )
     if not len(avatar.points):
         return ScanGaps({}, True)
     nearer = Nearer(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
     counts, exact = np.zeros(3, np.int64), True
-    for _, rows, part in pieces(reach, data.residency, effort.share, effort.stop):
-        if effort.spent:
+    for _, rows, part in pieces(reach, data.residency, budget.share, budget.stop):
+        if budget.spent:
             exact = False
             break
-        with data.residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+        with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             arrays = as_held(data, held).arrays
             exact &= bool(
                 nearest_by_scan(
-                    poses, avatar.arrays, arrays, part, margin_units, effort.visits, nearer, counts
+                    poses, avatar.arrays, arrays, part, margin_units, budget.visits, nearer, counts
                 )
             )
     exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]

@@ -1,7 +1,7 @@
 """The function that answers each question of schemas/wire/questions.py.
 
 Each takes the data of one archive, the avatar if the question is about one, the arguments of the request in their
-order, and `effort`. `objects` takes avatars, poses, groups, masks and margin.
+order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from ...schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYC
 from ..avatars.avatar_model import AvatarModel
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import Effort
+from .context.query_budget import QueryBudget
 from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
@@ -30,10 +30,10 @@ def _sweep(
     pose_to: ArrayLike,
     margin: float = 0.0,
     *,
-    effort: Effort,
+    budget: QueryBudget,
 ) -> SweepAnswers:
     """Answer `sweep`, whose tolerance is also the length of its intervals."""
-    return sweep(data, avatar, pose_from, pose_to, margin, effort.tolerance, effort)
+    return sweep(data, avatar, pose_from, pose_to, margin, budget.tolerance, budget)
 
 
 ENGINES: dict[str, Callable[..., Any]] = {

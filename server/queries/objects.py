@@ -19,9 +19,8 @@ from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and
 from ..kernels.core.pose_transform import MAX_REACH_UNITS, check_poses
 from ..runtime.stop_flag import NEVER
 from .collide import collide
-from .context.query_budget import EXACT, Effort
+from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
-from .context.query_cost import Spent
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
@@ -69,7 +68,7 @@ def objects(
     groups: ArrayLike,
     masks: ArrayLike,
     margin: float = 0.0,
-    effort: Effort = EXACT,
+    budget: QueryBudget = EXACT,
 ) -> ObjectsAnswers:
     """Test which of n objects touch the scene, and which touch one another.
 
@@ -87,21 +86,21 @@ def objects(
     placing = _check(data, avatars, poses, groups, masks, margin)
     n = len(placing.poses)
     verdict, outside, counts = np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((3, n), np.uint32)
-    spent = Spent(begin)
+    spent = CostCounter(begin, data.residency, data.broad.keys)
     for number, model in enumerate(placing.models):
         rows = np.flatnonzero((placing.model_of == number) & ((placing.masks & SCENE_GROUP) > 0))
         if not len(rows):
             continue
-        if effort.spent:
+        if budget.spent:
             verdict[rows] = UNKNOWN
             continue
-        found = collide(data, model, placing.poses[rows], margin, effort._replace(tolerance=0.0))
+        found = collide(data, model, placing.poses[rows], margin, budget._replace(tolerance=0.0))
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
-        spent.add_cost(found, data)
-    met = _meet(placing, data.arrays.origin, effort)
+        spent.add_cost(found)
+    met = _meet(placing, data.arrays.origin, budget)
     return ObjectsAnswers(
-        verdict, outside, counts[0], counts[1], counts[2], *met, **spent.cost(data)
+        verdict, outside, counts[0], counts[1], counts[2], *met, **spent.fields()
     )  # fmt: skip
 
 
@@ -206,7 +205,7 @@ def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[n
     return np.column_stack((numbers // n, numbers % n)), filtered
 
 
-def _meet(placing: Placing, origin: NDArray[np.float64], effort: Effort) -> Met:
+def _meet(placing: Placing, origin: NDArray[np.float64], budget: QueryBudget) -> Met:
     """Test the pairs; without a deadline, those of the same two avatars in one kernel call."""
     pairs, filtered = find_pairs(placing, origin)
     kinds = placing.model_of[pairs]
@@ -223,19 +222,19 @@ def _meet(placing: Placing, origin: NDArray[np.float64], effort: Effort) -> Met:
     counters = np.zeros(2, np.int64)
     tested = 0
     for first, last in zip(firsts.tolist(), [*firsts[1:].tolist(), len(order)], strict=False):
-        if effort.spent:
+        if budget.spent:
             break
         rows = order[first:last]
         a, b = divmod(int(kind[rows[0]]), models)
-        step = TIMED_PAIRS if effort.deadline < np.inf else len(rows)
+        step = TIMED_PAIRS if budget.deadline < np.inf else len(rows)
         for begin in range(0, len(rows), step):
-            if effort.spent:
+            if budget.spent:
                 break
             part = rows[begin : begin + step]
             found = np.empty(len(part), np.uint8)
             touch_pairs(
                 placing.models[a].arrays, placing.models[b].arrays, placing.poses, placing.scales, placing.units,
-                ordered[part], placing.margin_units, origin, effort.visits, effort.stop.flag, found, counters,
+                ordered[part], placing.margin_units, origin, budget.visits, budget.stop.flag, found, counters,
             )  # fmt: skip
             verdict[part] = found
             tested += len(part)

@@ -24,10 +24,9 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.pose_transform import check_poses
 from ..runtime.deadlines import stop_at
 from ..runtime.stop_flag import NEVER, Stop
-from .context.query_budget import make_effort
+from .context.query_budget import ask_until_stopped, make_budget, unknown_answers
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .engines import ENGINES
-from .stopped_answers import ask_until_stopped, unknown_part
 
 # Default number of parts computed at a time.
 PATH_THREADS = 2
@@ -77,27 +76,27 @@ def path_question(
     tolerance = given.pop("tolerance", question.other_defaults.get("tolerance", 0.0))
     # The voxels along a path are used once. Half of the cache is left for those at users'
     # positions, which take at most half (prefetch.py).
-    effort = make_effort(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
+    budget = make_budget(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
     poses = kernel_poses(poses)  # copied here at most once, so that no part copies its poses
     around = next(name for name in question.parameters if name in ("margin", "reach"))
     other = to_units(given.get(around, 0.0), around)
     scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(
-        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, effort.stop).arrays, scales, units
+        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.stop).arrays, scales, units
     )
     refuse(fault, pose, found)
 
     def ask(start: int, end: int, part: Stop | None = None) -> Cost:
-        if effort.spent:
-            return unknown_part(question.answers, end - start, effort)
+        if budget.spent:
+            return unknown_answers(question, end - start, budget)
         what = [poses[start:end], poses[start + 1 : end + 1]] if question.moving else [poses[start:end]]
-        own = effort._replace(stop=part_stop(effort.stop, stop.part_seconds) if part is None else part)
+        own = budget._replace(stop=part_stop(budget.stop, stop.part_seconds) if part is None else part)
         return ask_until_stopped(
             question,
             end - start,
             own,
-            lambda: engine(with_stop(data, own.stop), avatar, *what, **given, effort=own),
+            lambda: engine(with_stop(data, own.stop), avatar, *what, **given, budget=own),
         )
 
     return ask, question.items_along(len(poses))

@@ -13,9 +13,8 @@ from ..kernels.core.pose_transform import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import Lists
 from ..kernels.rays.rays import Nearest, Rays, follow_rays
 from .context.front_to_back import finish, look, make_origins
-from .context.query_budget import EXACT, Effort
+from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
-from .context.query_cost import Spent
 
 # Differences within this reach [m] are exact in float64: 2^53 units are 134,000 km.
 MAX_RAY_REACH = 1e6
@@ -37,7 +36,7 @@ def make_directions(values: ArrayLike) -> NDArray[np.float64]:
 
 
 def raycast(
-    data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, effort: Effort = EXACT
+    data: SceneData, origins: ArrayLike, directions: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> RaycastAnswers:
     """Find the first sphere of the scan that each ray hits; the radius model gives each radius.
 
@@ -50,7 +49,7 @@ def raycast(
     hit, `exact` is false and `lower` bounds its distance. With a tolerance, `lower` may be below
     `upper` by at most the tolerance. Raise BadRequestError.
     """
-    spent = Spent(time.perf_counter())
+    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):
@@ -60,7 +59,7 @@ def raycast(
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
-    tolerance = effort.tolerance * UNITS_PER_METRE
+    tolerance = budget.tolerance * UNITS_PER_METRE
 
     def kernel(
         first: int,
@@ -71,9 +70,9 @@ def raycast(
         best: Nearest,
     ) -> None:
         rays = Rays(units[first:last], unit[first:last], reach_units, data.radius_units)
-        follow_rays(rays, lists, cursor, held, data.arrays, tolerance, effort.visits, best)
+        follow_rays(rays, lists, cursor, held, data.arrays, tolerance, budget.visits, best)
 
-    best = look(data, units, unit, reach_units, data.radius_units, effort, kernel, spent)
+    best = look(data, units, unit, reach_units, data.radius_units, budget, kernel, spent)
     verdict, lower, upper, exact = finish(best.value, best.unseen, reach_units)
     hit, cloud, normal = _where(data, world, units, unit, best)
     ends = np.stack([units.astype(np.float64), units + float(reach_units) * unit])
@@ -83,7 +82,7 @@ def raycast(
     return RaycastAnswers(
         verdict, upper, lower, upper.copy(), exact, hit, cloud, normal,
         ((ends < low) | (ends > high)).any(axis=(0, 2)), *best.counts,
-        **spent.cost(data),
+        **spent.fields(),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from ...schemas.wire.answers import DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.nearest.nearest_resident import AVATAR, CLOUD, COLUMNS, LOWER, NORMAL, SIGNED, nearest_resident
 from .collide import QUICK_POINTS
-from .context.query_budget import EXACT, Effort
+from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units
 from .distance import distance
 
@@ -24,26 +24,26 @@ _CLEAR, _CONTACT = np.uint8(Verdict.CLEAR), np.uint8(Verdict.CONTACT)
 
 
 def near(
-    data: SceneData, avatar: AvatarModel, pose: ArrayLike, reach: float, effort: Effort = EXACT
+    data: SceneData, avatar: AvatarModel, pose: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> DistanceAnswers:
     """Return the answer of `distance` for one pose (4, 4).
 
     It is identical to the last bit, cost counters included, except engine_seconds.
-    reach, effort, errors: as for `distance`.
+    reach, budget, errors: as for `distance`.
     """
     poses = kernel_poses(np.asarray(pose)[None])
-    answers = _near_at_once(data, avatar, poses, reach, effort)
-    return distance(data, avatar, poses, reach, effort) if answers is None else answers
+    answers = _near_at_once(data, avatar, poses, reach, budget)
+    return distance(data, avatar, poses, reach, budget) if answers is None else answers
 
 
 def _near_at_once(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget
 ) -> DistanceAnswers | None:
     """Return the answer of one kernel call, or None if the fast path does not apply.
 
     It does not apply if a voxel has to be loaded or the request exceeds its limits.
     """
-    if effort.limited or len(avatar.points) > QUICK_POINTS or data.nothing_clear or len(data.unknown):
+    if budget.limited or len(avatar.points) > QUICK_POINTS or data.nothing_clear or len(data.unknown):
         return None
     begin = time.perf_counter()
     reach_units = to_units(reach, "reach")
@@ -65,7 +65,7 @@ def _near_at_once(
             said,
         )
         if needed > 0:
-            residency.use(rows[:needed].tolist(), scan=effort.scan)
+            residency.use(rows[:needed].tolist(), scan=budget.scan)
     refuse(fault, pose, found)
     if needed < 0:
         return None

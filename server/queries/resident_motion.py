@@ -16,7 +16,7 @@ from ..kernels.motion.sweep_resident import AVATAR, CLOUD, COLUMNS, box_of, pose
 from ..kernels.overlap.overlap import answer_resident
 from ..residency.voxel_cache import Residency
 from .collide import QUICK_POINTS, collide
-from .context.query_budget import Effort
+from .context.query_budget import QueryBudget
 from .context.query_context import SceneData, refuse
 from .sweep import sweep
 
@@ -93,18 +93,18 @@ class Probe:
         self._again = 0
 
     def sweep(
-        self, data: SceneData, pose_from: Pose, pose_to: Pose, tolerance: float, effort: Effort
+        self, data: SceneData, pose_from: Pose, pose_to: Pose, tolerance: float, budget: QueryBudget
     ) -> Swept:
         """Find when the avatar first touches between two poses (4, 4).
 
         server/queries/sweep.py documents the errors.
         """
-        if self.quick and not effort.limited:
+        if self.quick and not budget.limited:
             avatar, residency, rows, said = self.avatar, data.residency, self._rows, self._said
             with residency.still():
                 needed, verdict, visits, _, _ = sweep_resident(
                     pose_from, pose_to, avatar.arrays, avatar.radius, data.radius_units, self._box, data.arrays,
-                    data.broad, data.unknown, data.nothing_clear, max(tolerance, effort.tolerance), rows, said,
+                    data.broad, data.unknown, data.nothing_clear, max(tolerance, budget.tolerance), rows, said,
                 )  # fmt: skip
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
@@ -114,14 +114,14 @@ class Probe:
                     clear = verdict == _CLEAR
                     return Swept(_VERDICTS[verdict], lower, upper, None, None, 0, clear, visits, 0, not clear)
                 own, cloud = said[AVATAR:CLOUD].copy(), said[CLOUD:].copy()
-                exact = upper == lower or speed * (upper - lower) <= max(tolerance, effort.tolerance)
+                exact = upper == lower or speed * (upper - lower) <= max(tolerance, budget.tolerance)
                 unknown = not exact and _has_unknown(data)
                 return Swept(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown)
-        answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, effort=effort)
+        answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, budget=budget)
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
         touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
         # A budget may leave places unexamined too.
-        partial = effort.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
+        partial = budget.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
         return Swept(
             verdict,
             float(answers.lower[0]),
@@ -145,9 +145,9 @@ class Probe:
             self._used, self._again = rows, _AGAIN
         self._again -= 1
 
-    def collide(self, data: SceneData, pose: Pose, effort: Effort) -> tuple[Verdict, int]:
+    def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
         """Return verdict and node visits for a pose (4, 4); see server/queries/collide.py."""
-        if self.quick and not effort.limited and not data.nothing_clear and not len(data.unknown):
+        if self.quick and not budget.limited and not data.nothing_clear and not len(data.unknown):
             avatar, residency, rows = self.avatar, data.residency, self._rows
             poses, verdict, counts = self._poses, self._verdict, self._counts
             poses[0] = pose
@@ -163,7 +163,7 @@ class Probe:
             refuse(fault, at, found)
             if needed >= 0:
                 return _VERDICTS[verdict[0]], int(counts[1, 0])
-        answers = collide(data, self.avatar, pose[None], effort=effort)
+        answers = collide(data, self.avatar, pose[None], budget=budget)
         return _VERDICTS[answers.verdict[0]], int(answers.node_visits[0])
 
     def between(self, origin: Vec, pose_from: Pose, pose_to: Pose, fraction: float) -> tuple[Pose, bool]:

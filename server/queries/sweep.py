@@ -16,10 +16,8 @@ from ..kernels.core.voxels_in_reach import Reach
 from ..kernels.motion.sweep_advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import Stop
-from .context.proved_reach import prove
-from .context.query_budget import EXACT, Effort
-from .context.query_context import SceneData, as_held, kernel_poses, pieces, refuse, to_units
-from .context.query_cost import Spent
+from .context.query_budget import EXACT, CostCounter, QueryBudget
+from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
 
 # Motions of one kernel call if there is a deadline, which is checked between calls.
 _PER_CALL = 64
@@ -107,7 +105,7 @@ def sweep(
     pose_to: ArrayLike,
     margin: float = 0.0,
     tolerance: float = 1e-6,
-    effort: Effort = EXACT,
+    budget: QueryBudget = EXACT,
 ) -> SweepAnswers:
     """Find the first contact of the avatar with the scene on the screw motion between two poses.
 
@@ -118,7 +116,7 @@ def sweep(
     given.
     margin: distance at or below which two spheres are in contact [m].
     tolerance: how far any avatar point may move between `lower` and `upper` [m]; the tolerance of
-    `effort` if that is larger.
+    `budget` if that is larger.
     The verdict is CONTACT in [lower, upper]; CLEAR; or UNKNOWN from `lower` on: something is
     missing there, the budget was spent, or a graze of some hundredths of a micrometre cannot be
     distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
@@ -129,7 +127,7 @@ def sweep(
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
-    tolerance = max(tolerance, effort.tolerance)
+    tolerance = max(tolerance, budget.tolerance)
     first, last = kernel_poses(pose_from), kernel_poses(pose_to)
     if len(first) != len(last):
         raise BadRequestError(f"{len(first)} poses to begin at and {len(last)} to end at: expected as many")
@@ -139,13 +137,14 @@ def sweep(
     data, first, last, origin = _from_origin(data, first, last)
     progress = Progress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
-        np.full(k, effort.visits, np.int64),
+        np.full(k, budget.visits, np.int64),
     )  # fmt: skip
     counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
     proved = np.ones(k)
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
-    bounds, residency, spent, box = data.bounds, data.residency, Spent(begin), avatar_box(avatar.arrays)
+    bounds, residency, box = data.bounds, data.residency, avatar_box(avatar.arrays)
+    spent = CostCounter(begin, residency, data.broad.keys)
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
     asked: set[int] = set()  # rows loaded to prove the index
@@ -169,26 +168,26 @@ def sweep(
             if not 0 <= count <= len(index_rows):
                 index_starts[:] = 0
             doubted = _hidden_rows(
-                (starts, rows), (index_starts, index_rows), len(bounds.proved), effort.stop
+                (starts, rows), (index_starts, index_rows), len(bounds.proved), budget.stop
             )
             new = set(doubted) - asked
             if new:
                 asked |= new
-                prove(data, sorted(row for row in new if not bounds.proved[row]), effort, spent)
+                prove(data, sorted(row for row in new if not bounds.proved[row]), budget, spent)
                 progress.at[:] = begun
                 continue
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # unused here
         around = Reach(scales, units, starts, rows, boxes, outside)
-        for part, held_rows, reach in pieces(around, residency, effort.share, effort.stop):
-            chunk = len(part) if effort.deadline == np.inf else _PER_CALL
-            if effort.stop:
+        for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
+            chunk = len(part) if budget.deadline == np.inf else _PER_CALL
+            if budget.stop:
                 progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
                 continue
-            with residency.hold(held_rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+            with residency.hold(held_rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
                 for at in range(0, len(part), chunk):
-                    if effort.spent:
+                    if budget.spent:
                         progress.visits[part[at:]] = -1
                     sweep_segments(
                         box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
@@ -197,7 +196,7 @@ def sweep(
                     )  # fmt: skip
             spent.add(held)
         which = _next_round(which, progress, proved)
-        if effort.stop:
+        if budget.stop:
             break
     # Motions that were stopped before their end: nothing is known beyond.
     proved[which] = np.minimum(proved[which], progress.at[which])
@@ -225,7 +224,7 @@ def sweep(
     progress.witness[:, 0] = np.rint(progress.witness[:, 0] * UNITS_PER_METRE) / UNITS_PER_METRE
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
-    return msgspec.structs.replace(answers, **spent.cost(data))
+    return msgspec.structs.replace(answers, **spent.fields())
 
 
 def _hidden_rows(

@@ -13,25 +13,24 @@ from ..kernels.core.voxel_tree import Lists
 from ..kernels.rays.nearest_point import search_points
 from ..kernels.rays.rays import Nearest
 from .context.front_to_back import finish, look, make_origins
-from .context.query_budget import EXACT, Effort
+from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
-from .context.query_cost import Spent
 
 
-def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EXACT) -> WithinAnswers:
+def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT) -> WithinAnswers:
     """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
     kernels/rays/nearest_point.py has the definition. A point is `outside` if its reach, a cube of
-    exact units, leaves the box of all scan points. Verdicts, bounds and effort are as for
+    exact units, leaves the box of all scan points. Verdicts, bounds and budget are as for
     `raycast`. Raise BadRequestError.
     """
-    spent = Spent(time.perf_counter())
+    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
         raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
-    tolerance = effort.tolerance * UNITS_PER_METRE
+    tolerance = budget.tolerance * UNITS_PER_METRE
 
     def kernel(
         first: int,
@@ -42,10 +41,10 @@ def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EX
         best: Nearest,
     ) -> None:
         search_points(
-            units[first:last], reach_units, lists, cursor, held, data.arrays, tolerance, effort.visits, best
+            units[first:last], reach_units, lists, cursor, held, data.arrays, tolerance, budget.visits, best
         )
 
-    best = look(data, units, None, reach_units, 0, effort, kernel, spent)
+    best = look(data, units, None, reach_units, 0, budget, kernel, spent)
     near = np.where(best.square >= 0, np.sqrt(np.maximum(best.square, 0).astype(np.float64)), np.inf)
     verdict, lower, upper, exact = finish(near, best.unseen, reach_units)
     cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
@@ -58,5 +57,5 @@ def within(data: SceneData, points: ArrayLike, reach: float, effort: Effort = EX
     outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
     return WithinAnswers(
         verdict, upper, lower, upper.copy(), exact, cloud, outside, *best.counts,
-        **spent.cost(data),
+        **spent.fields(),
     )  # fmt: skip

@@ -20,12 +20,11 @@ from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..avatars.client_avatars import Avatars
 from ..observability.metrics import Metrics
-from ..queries.context.query_budget import Effort, make_effort
+from ..queries.context.query_budget import QueryBudget, ask_until_stopped, make_budget
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.engines import ENGINES
 from ..queries.objects import SCENE_GROUP
 from ..queries.path import PATH_THREADS, largest_part, path_parts
-from ..queries.stopped_answers import ask_until_stopped
 from ..runtime.path_threads import PathThreads
 from ..runtime.stop_flag import NEVER, Stop
 from ..served.asks import Asks
@@ -86,12 +85,12 @@ class SceneQuestions(Asks):
             return self._ask_placed(question, given, client, options)
         name, last, engine = given[0], given[len(question.arrays)], ENGINES[question.name]
         with self._alone.take() as opened:
-            data, effort = _terms(opened, **options)
+            data, budget = _terms(opened, **options)
             avatar = self.avatar(name, client)
             if opened.saw((client, name), avatar, last, _around(question, given)):
-                effort = effort._replace(scan=True)
+                budget = budget._replace(scan=True)
             answers = ask_until_stopped(
-                question, _count(last), effort, lambda: engine(data, avatar, *given[1:], effort=effort)
+                question, _count(last), budget, lambda: engine(data, avatar, *given[1:], budget=budget)
             )
         self._metrics.answered(client, name, answers)
         return answers
@@ -111,9 +110,9 @@ class SceneQuestions(Asks):
         def prepare(archive: PlacedArchive, opened: Opened) -> Prepared:
             own = [archive.poses_in(each) for each in arrays]
 
-            def ask(data: SceneData, effort: Effort, rows: Rows) -> _A:
+            def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
                 answers: _A = engine(
-                    data, avatar, *(rows_of(each, rows) for each in own), *what, effort=effort
+                    data, avatar, *(rows_of(each, rows) for each in own), *what, budget=budget
                 )
                 return answers
 
@@ -128,9 +127,9 @@ class SceneQuestions(Asks):
         engine = ENGINES[question.name]
         if self._alone is not None:
             with self._alone.take() as opened:
-                data, effort = _terms(opened, **options)
+                data, budget = _terms(opened, **options)
                 found: _A = ask_until_stopped(
-                    question, _count(given[0]), effort, lambda: engine(data, *given, effort=effort)
+                    question, _count(given[0]), budget, lambda: engine(data, *given, budget=budget)
                 )
             self._metrics.answered("", "", found)
             return found
@@ -148,8 +147,8 @@ class SceneQuestions(Asks):
                 for each, name in zip(arrays, names, strict=True)
             ]
 
-            def ask(data: SceneData, effort: Effort, rows: Rows) -> _A:
-                answers: _A = engine(data, *(rows_of(each, rows) for each in own), *what, effort=effort)
+            def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
+                answers: _A = engine(data, *(rows_of(each, rows) for each in own), *what, budget=budget)
                 return answers
 
             return ask, False
@@ -174,9 +173,9 @@ class SceneQuestions(Asks):
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
             mask = masks if first else masks & np.uint32(SCENE_GROUP)
 
-            def ask(data: SceneData, effort: Effort, rows: Rows) -> _A:
+            def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
                 k = slice(None) if rows is None else rows
-                answers: _A = engine(data, avatars[k], own[k], group[k], mask[k], *what, effort=effort)
+                answers: _A = engine(data, avatars[k], own[k], group[k], mask[k], *what, budget=budget)
                 return answers
 
             return ask, False
@@ -237,11 +236,11 @@ def _terms(
     budget_visits: int | None = None,
     radius_model: str | None = None,
     stop: Stop = NEVER,
-) -> tuple[SceneData, Effort]:
+) -> tuple[SceneData, QueryBudget]:
     """Return what a question with these options reads, and what it may cost."""
-    effort = make_effort(tolerance, budget_ms, budget_visits, stop)
+    budget = make_budget(tolerance, budget_ms, budget_visits, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
-    return with_stop(data, effort.stop), effort
+    return with_stop(data, budget.stop), budget
 
 
 def _count(rows: ArrayLike) -> int:

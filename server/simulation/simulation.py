@@ -23,7 +23,7 @@ from ...schemas.wire.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ...schemas.wire.requests import make_poses
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import EXACT, Effort
+from ..queries.context.query_budget import EXACT, QueryBudget
 from ..runtime.stop_flag import NEVER, Stop, StoppedError
 from ..served.answering_avatars import noted
 from ..served.served_scene import Outcome, Turn
@@ -47,7 +47,7 @@ class Pipeline(Protocol):
         body: Body,
         wish: Pose,
         seconds: float,
-        effort: Effort = EXACT,
+        budget: QueryBudget = EXACT,
         *,
         skip: Collection[str] | None = None,
     ) -> Moved: ...
@@ -169,7 +169,7 @@ class Simulation:
         wish = check_rigid(asked.pose_to[0], "pose_to")
         body = _body(user, self.scene.avatar(name, client), begin)
         try:
-            return self._pipeline.run(body, wish, asked.seconds, Effort(stop=stop))
+            return self._pipeline.run(body, wish, asked.seconds, QueryBudget(stop=stop))
         except StoppedError:
             left = size(wish[:3, 3] - begin[:3, 3])
             return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
@@ -245,7 +245,7 @@ class Simulation:
                 if self._bodies is None:
                     raise BadRequestError(f"{self.scene.name}: a wish moves objects: this scene has none")
                 refused.callback(self._bodies.tell(wish.objects, stop))
-            moved = self._pipeline.run(present.body, aim, seconds, Effort(stop=stop), skip=skip)
+            moved = self._pipeline.run(present.body, aim, seconds, QueryBudget(stop=stop), skip=skip)
             refused.pop_all()
         present.time = wish.time
         present.heard = present.heard if now is None else now

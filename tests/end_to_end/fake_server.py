@@ -58,7 +58,7 @@ class FloorPipeline:
     def __init__(self):
         self.frames = 0
 
-    def run(self, body, wish, seconds, effort=None, *, skip=None):
+    def run(self, body, wish, seconds, budget=None, *, skip=None):
         self.frames += 1
         if body.name.endswith("/crash"):
             raise RuntimeError("a secret of the server's own")

@@ -124,10 +124,10 @@ def holding(simulation):
     gate, entered = threading.Event(), threading.Event()
     run = simulation._pipeline.run
 
-    def held(body, aim, seconds, effort, *, skip=None):
+    def held(body, aim, seconds, budget, *, skip=None):
         entered.set()
         assert gate.wait(DEADLINE)
-        return run(body, aim, seconds, effort, skip=skip)
+        return run(body, aim, seconds, budget, skip=skip)
 
     simulation._pipeline.run = held
     return gate, entered

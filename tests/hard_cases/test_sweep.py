@@ -15,7 +15,7 @@ from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from sweep_poses import at, turn_z
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -282,7 +282,7 @@ def test_case_30_a_tolerance_widens_the_interval_and_no_more(
         fine = judged_sweeps.ask(data, body, 0.01, first, last)
         for tolerance in (1e-4, 1e-2):
             coarse = judged_sweeps.ask(data, body, 0.01, first, last, tolerance=tolerance)
-            same = judged_sweeps.ask(data, body, 0.01, first, last, effort=Effort(tolerance=tolerance))
+            same = judged_sweeps.ask(data, body, 0.01, first, last, budget=QueryBudget(tolerance=tolerance))
             assert coarse.lower.tolist() == same.lower.tolist()
             assert coarse.verdict.tolist() == fine.verdict.tolist()
             assert (coarse.lower <= fine.upper).all() and (fine.lower <= coarse.upper).all()

@@ -17,7 +17,7 @@ from point_clouds import KINDS, TREES, cloud
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from solidcloud.server.queries.context import anytime_search as bounded
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
-from solidcloud.server.queries.context.query_budget import NO_LIMIT, Effort
+from solidcloud.server.queries.context.query_budget import NO_LIMIT, QueryBudget
 from solidcloud.server.scene import Scene
 
 BUDGETS = (0, 1, 5, 30, 200, 2000, NO_LIMIT - 1)
@@ -54,11 +54,11 @@ def test_bounds_hold_and_a_larger_budget_never_gives_worse(
             last: DistanceAnswers | None = None
             before: CollideAnswers | None = None
             for visits in BUDGETS:
-                effort = Effort(tolerance, visits)
+                budget = QueryBudget(tolerance, visits)
                 ended = visits == BUDGETS[-1]
-                near = distance_bounded(data, model, poses, reach, effort)
+                near = distance_bounded(data, model, poses, reach, budget)
                 judge_distance(near, within, reach, tolerance, ended)
-                touch = collide_bounded(data, model, poses, margin, effort)
+                touch = collide_bounded(data, model, poses, margin, budget)
                 judge_collide(touch, signed, margin, tolerance, ended)
                 assert (near.node_visits <= visits).all() and (touch.node_visits <= visits).all()
                 if last is not None and before is not None:
@@ -92,19 +92,19 @@ def test_in_pieces_and_in_slices_the_bounds_hold_as_well(seed: int, kind: str, t
         case = archive_cases.build(Path(folder), points, voxel=0.5, **tree)
         with Scene.open(case.archive) as scene:
             info = scene.info()
-            budget = 2 * max(scene.residency.bytes_of([row]) for row in range(info.voxels))
+            cache_bytes = 2 * max(scene.residency.bytes_of([row]) for row in range(info.voxels))
             scan = (points, info.origin, info.lattice_step, info.radius)
         signed = _signed(naive_distance.distance(*scan, avatar, 0.02, poses, 0.8))
-        for options in ({}, {"budget_bytes": budget}):
+        for options in ({}, {"budget_bytes": cache_bytes}):
             with Scene.open(case.archive, **options) as scene:
                 scene.add_avatar("avatar", avatar, 0.02)
                 data, model = scene._data, scene.avatar("avatar", "")
                 for visits in (0, 40, 300, NO_LIMIT - 1):
                     for deadline in (math.inf, 1e12, 0.0):
-                        effort = Effort(0.01, visits, deadline)
+                        budget = QueryBudget(0.01, visits, deadline)
                         ended = visits == NO_LIMIT - 1 and deadline > 0
-                        near = distance_bounded(data, model, poses, 0.8, effort)
+                        near = distance_bounded(data, model, poses, 0.8, budget)
                         judge_distance(near, signed, 0.8, 0.01, ended)
-                        touch = collide_bounded(data, model, poses, 0.1, effort)
+                        touch = collide_bounded(data, model, poses, 0.1, budget)
                         judge_collide(touch, signed, 0.1, 0.01, ended)
                         scene.residency.check()

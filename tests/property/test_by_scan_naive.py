@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.distance_by_scan import gaps_by_scan
 
 SCANS = 4
@@ -75,7 +75,7 @@ def test_the_least_gap_of_each_scan_is_that_of_the_definition(
                 for number, gap in found.gaps.items():
                     assert gap == pytest.approx(expected[number], rel=1e-14, abs=1e-15)
                 for visits in (0, 20, 100):
-                    budget = gaps_by_scan(case.data, avatar, pose, margin, SCANS, Effort(visits=visits))
+                    budget = gaps_by_scan(case.data, avatar, pose, margin, SCANS, QueryBudget(visits=visits))
                     assert not budget.exact or budget.gaps == found.gaps
                     for number, gap in budget.gaps.items():
                         assert gap >= found.gaps[number]

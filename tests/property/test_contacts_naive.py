@@ -15,7 +15,7 @@ from solidcloud.schemas.wire.answers import ContactsAnswers
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import Effort, make_effort
+from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -121,7 +121,7 @@ def test_a_request_in_slices_and_pieces_says_the_same(
 ) -> None:
     """A deadline far off makes a kernel return in between; a small cache cuts a pose's voxels into runs."""
     monkeypatch.setattr(contacts_module, "FIRST_CELLS", 32)
-    later = make_effort(budget_ms=1e9)
+    later = make_budget(budget_ms=1e9)
     largest = int(rich.store.sizes.max())
     for slice_visits in (1, 7, 300):
         monkeypatch.setattr(contacts_module, "SLICE_VISITS", slice_visits)
@@ -146,7 +146,7 @@ def test_a_budget_leaves_out_and_never_invents(rich: ScanCase, visits: int) -> N
         avatar, radius, poses, _, margin = rich_question(rich, seed)
         model = make_avatar(avatar, radius)
         whole = contacts(rich.data, model, poses, 10_000, margin)
-        answers = contacts(rich.data, model, poses, 10_000, margin, None, Effort(visits=visits))
+        answers = contacts(rich.data, model, poses, 10_000, margin, None, QueryBudget(visits=visits))
         assert (answers.node_visits <= visits + 16).all() and (answers.pairs_found <= whole.pairs_found).all()
         for i in range(len(poses)):
             own, all_of = listed(answers, i), listed(whole, i)

@@ -14,7 +14,7 @@ from point_clouds import KINDS, cloud
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import make_scene_data
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
@@ -24,11 +24,11 @@ from solidcloud.server.residency.voxel_store import Store
 BUDGETS = (*range(0, 150, 7), 200, 300, 500, 1000, 5000)
 
 
-def judge(ask: Callable[[Effort], Any], tolerance: float, rounding: float = 0.0) -> None:
+def judge(ask: Callable[[QueryBudget], Any], tolerance: float, rounding: float = 0.0) -> None:
     """Assert that verdicts stay said and bounds get no worse, budget by budget."""
-    before = ask(Effort(tolerance, BUDGETS[0]))
+    before = ask(QueryBudget(tolerance, BUDGETS[0]))
     for visits in BUDGETS[1:]:
-        after = ask(Effort(tolerance, visits))
+        after = ask(QueryBudget(tolerance, visits))
         said = before.verdict != Verdict.UNKNOWN
         assert (after.verdict[said] == before.verdict[said]).all(), visits
         assert (after.lower >= before.lower - rounding).all() and (after.upper <= before.upper).all(), visits
@@ -47,10 +47,10 @@ def test_a_larger_budget_takes_nothing_back(tmp_path: Path, seed: int, tolerance
     store = Store(case.archive)
     data = make_scene_data(store.archive, Residency(store, 2 * int(store.sizes.max()) + 128))
     model = make_avatar(avatar, 0.02)
-    judge(lambda effort: distance_bounded(data, model, poses, 0.5, effort), tolerance)
-    judge(lambda effort: collide_bounded(data, model, poses, 0.05, effort), tolerance)
+    judge(lambda budget: distance_bounded(data, model, poses, 0.5, budget), tolerance)
+    judge(lambda budget: collide_bounded(data, model, poses, 0.05, budget), tolerance)
     at, along = rng.uniform(-1.5, 1.5, (2, 40, 3))
     # Bounds are compared in units and given in metres.
-    judge(lambda effort: raycast(data, at, along, 5.0, effort), tolerance, 1e-12)
-    judge(lambda effort: within(data, at, 5.0, effort), tolerance, 1e-12)
+    judge(lambda budget: raycast(data, at, along, 5.0, budget), tolerance, 1e-12)
+    judge(lambda budget: within(data, at, 5.0, budget), tolerance, 1e-12)
     store.close()

@@ -18,7 +18,7 @@ from solidcloud.schemas.wire.answers import ContactsAnswers
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import Effort, make_effort
+from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -124,14 +124,14 @@ def test_slices_pieces_and_budgets_say_no_pair_that_is_none(
     found = compare(case, avatar, radius, poses, limit, margin, 0.05).pairs_found
     assert found.max() > 20
     monkeypatch.setattr(contacts_module, "SLICE_VISITS", 7)
-    compare(case, avatar, radius, poses, limit, margin, 0.05, make_effort(budget_ms=1e9))
+    compare(case, avatar, radius, poses, limit, margin, 0.05, make_budget(budget_ms=1e9))
     small = tight(case, 3 * int(case.store.sizes.max()))
     compare(small, avatar, radius, poses, limit, margin, 0.05)
     assert small.data.residency.evictions > 0
     whole = contacts(case.data, make_avatar(avatar, radius), poses, 10_000, margin)
     for visits in (10, 200, 1000):
         answers = contacts(
-            case.data, make_avatar(avatar, radius), poses, 10_000, margin, None, Effort(visits=visits)
+            case.data, make_avatar(avatar, radius), poses, 10_000, margin, None, QueryBudget(visits=visits)
         )
         for i in range(len(poses)):
             own, all_of = listed(answers, i), listed(whole, i)

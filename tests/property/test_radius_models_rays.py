@@ -18,7 +18,7 @@ from point_clouds import TREES, cloud
 from ray_cases import KINDS, opened, same_points, same_rays, some_rays
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
@@ -93,22 +93,22 @@ def test_bounded_rays_hold_the_first_sphere(seed: int, kind: str, model: str, tr
             lattice, radii = stored * data.arrays.step + data.arrays.origin, units / naive.UNITS
             o, d = some_rays(rng, lattice, 1.0, radii, 70)
             right = naive_rays.raycast(lattice, data.arrays.origin, data.arrays.step, radii, o, d, 3.0)
-            for effort in (
-                Effort(tolerance=0.03),
-                Effort(visits=0),
-                Effort(visits=40),
-                Effort(0.1, visits=200),
+            for budget in (
+                QueryBudget(tolerance=0.03),
+                QueryBudget(visits=0),
+                QueryBudget(visits=40),
+                QueryBudget(0.1, visits=200),
             ):
-                found = raycast(data, o, d, 3.0, effort)
+                found = raycast(data, o, d, 3.0, budget)
                 # Of a ray that hits nothing within reach, `lower` is the reach at most.
                 assert (found.lower <= np.minimum(right.distance, 3.0)).all()
                 assert (found.upper >= right.distance).all()
                 assert (found.distance[found.exact] == right.distance[found.exact]).all()
                 assert not ((found.verdict == 0) & (right.row >= 0)).any()
                 assert not ((found.verdict == 1) & (right.row < 0)).any()
-                if effort.visits == Effort().visits:
+                if budget.visits == QueryBudget().visits:
                     hit = found.verdict == 1
-                    assert (found.upper[hit] <= found.lower[hit] + effort.tolerance * (1 + 1e-9)).all()
+                    assert (found.upper[hit] <= found.lower[hit] + budget.tolerance * (1 + 1e-9)).all()
                     assert (hit == (right.row >= 0)).all()
 
 
@@ -167,7 +167,7 @@ def test_objects_touch_the_scene_by_its_own_spheres_and_one_another_as_ever(
             asked = [models[i] for i in of], poses, np.ones(60, int), everything, 0.01
             found = objects(data, *asked)
             assert (found.verdict == 1).tolist() == expected
-            few = objects(data, *asked, Effort(visits=3))
+            few = objects(data, *asked, QueryBudget(visits=3))
             assert not (few.verdict == 1)[~np.array(expected)].any()
             assert not (few.verdict == 0)[expected].any()
             seen[model] = found.pairs.tolist()

@@ -20,7 +20,7 @@ from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSE
 from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.scene import Scene
 
 FOUND = ("verdict", "lower", "upper", "exact", "outside", "witness_avatar", "witness_cloud")
@@ -42,7 +42,9 @@ def columns(answers: SweepAnswers, names: tuple[str, ...] = FOUND) -> list[str]:
     way=st.sampled_from([0.0, 1e-3, 0.1, 2.0]),
     turn=st.sampled_from([0.0, 1e-6, 0.1, np.pi]),
     margin=st.sampled_from([0.0, 0.02]),
-    effort=st.sampled_from([Effort(), Effort(), Effort(tolerance=1e-3), Effort(visits=60)]),
+    budget=st.sampled_from(
+        [QueryBudget(), QueryBudget(), QueryBudget(tolerance=1e-3), QueryBudget(visits=60)]
+    ),
     model=st.sampled_from(radius_class_archives.MODELS),
     tree=TREES,
 )
@@ -55,7 +57,7 @@ def test_no_sampled_pose_contradicts_the_answer(
     way: float,
     turn: float,
     margin: float,
-    effort: Effort,
+    budget: QueryBudget,
     model: str | None,
     tree: dict[str, Any],
 ) -> None:
@@ -66,13 +68,13 @@ def test_no_sampled_pose_contradicts_the_answer(
     first, last = judged_sweeps.motions(
         rng, points, avatar, 8, float(rng.choice([0.05, 0.3])), way, turn, scale
     )
-    tolerance = max(1e-6, effort.tolerance)
+    tolerance = max(1e-6, budget.tolerance)
     with TemporaryDirectory() as folder, radius_class_archives.any_classes():
         case = archive_cases.build(
             Path(folder), points, resolution=step, models=radius_class_archives.STORED, **tree
         )
         with judged_sweeps.opened(case, model=model) as data:
-            answers = judged_sweeps.ask(data, avatar, radius, first, last, margin=margin, effort=effort)
+            answers = judged_sweeps.ask(data, avatar, radius, first, last, margin=margin, budget=budget)
             judged_sweeps.judge(
                 case, data, avatar, radius, first, last, answers, margin=margin, tolerance=tolerance, model=model,
                 samples=20,

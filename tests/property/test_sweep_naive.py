@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -133,8 +133,8 @@ def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
         case = archive_cases.build(Path(folder), points)
         with judged_sweeps.opened(case) as data:
             full = judged_sweeps.ask(data, avatar, 0.01, first, last)
-            part = judged_sweeps.ask(data, avatar, 0.01, first, last, effort=Effort(visits=visits))
-            late = judged_sweeps.ask(data, avatar, 0.01, first, last, effort=Effort(deadline=0.0))
+            part = judged_sweeps.ask(data, avatar, 0.01, first, last, budget=QueryBudget(visits=visits))
+            late = judged_sweeps.ask(data, avatar, 0.01, first, last, budget=QueryBudget(deadline=0.0))
             judged_sweeps.judge(case, data, avatar, 0.01, first, last, part, samples=20)
     assert (part.node_visits <= visits + 64).all()
     clear = part.verdict == Verdict.CLEAR

@@ -15,7 +15,7 @@ from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
 from solidcloud.server.archives.archive_info import describe
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.residency.voxel_store import Store
@@ -88,11 +88,11 @@ def compare(
     limit: int = 100,
     margin: float = 0.0,
     cluster_distance: float | None = None,
-    effort: Effort = EXACT,
+    budget: QueryBudget = EXACT,
 ) -> ContactsAnswers:
     """Ask, and compare every column with the judge, bit for bit. Returns the answers."""
     model = make_avatar(avatar, radius)
-    answers = contacts(case.data, model, poses, limit, margin, cluster_distance, effort)
+    answers = contacts(case.data, model, poses, limit, margin, cluster_distance, budget)
     assert answers.exact.all() and not answers.voxels_missing.any()
     expect(answers, case, model, poses, limit, margin, cluster_distance)
     return answers

@@ -8,16 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.kernels.core.voxel_layout import LANES, SceneArrays
 from solidcloud.server.queries.context.front_to_back import make_origins
-from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_budget import EXACT, CostCounter, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, to_units
-from solidcloud.server.queries.context.query_cost import Spent
 
 
 def count_within(
-    data: SceneData, points: ArrayLike, reach: float, effort: Effort = EXACT
+    data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> CountWithinAnswers:
     """Count the scan points of one archive within `reach` [m] of each of k points (k, 3)."""
-    spent = Spent(time.perf_counter())
+    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
     _, units = make_origins(data, points, "points")
     reach_units, k = to_units(reach, "reach"), len(units)
     scene = data.arrays
@@ -28,10 +27,10 @@ def count_within(
         low = cell * size
         away = np.maximum(np.maximum(low - units, units - (low + size)), 0.0)
         near = (away * away).sum(axis=1) <= float(reach_units + 1) ** 2
-        near &= visits < effort.visits
+        near &= visits < budget.visits
         if not near.any():
             continue
-        with data.residency.hold([row], effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+        with data.residency.hold([row], budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             if scene.where[row, 0] < 0 or held.late:
                 missing[near] += 1
             else:
@@ -43,14 +42,14 @@ def count_within(
                     tests[i] += len(stored)
                     visits[i] += 1
         spent.add(held)
-    exact &= (missing == 0) & (visits < effort.visits)
+    exact &= (missing == 0) & (visits < budget.visits)
     for low, high in data.unknown * scene.units_per_step:
         exact &= ((units + reach_units < low) | (units - reach_units > high)).any(axis=1)
     verdict = np.where(counts > 0, Verdict.CONTACT, np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN))
     low, high = (np.rint(b * scene.units_per_step) for b in (data.broad.scene_low, data.broad.scene_high))
     outside = ((units - reach_units < low) | (units + reach_units > high)).any(axis=1)
     return CountWithinAnswers(
-        verdict.astype(np.uint8), counts, exact, outside, missing, visits, tests, **spent.cost(data)
+        verdict.astype(np.uint8), counts, exact, outside, missing, visits, tests, **spent.fields()
     )
 
 

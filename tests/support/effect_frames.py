@@ -11,7 +11,7 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of
 from solidcloud.server.avatars.avatar_model import AvatarModel
-from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame
@@ -80,9 +80,11 @@ def flip_a_byte(archive: Path, voxel: tuple[int, int, int]) -> None:
         os.pwrite(file.fileno(), bytes([byte ^ 1]), offset)
 
 
-def report(runner: Any, world: Any, body: Body, pose: NDArray[np.float64], effort: Effort = EXACT) -> Any:
+def report(
+    runner: Any, world: Any, body: Body, pose: NDArray[np.float64], budget: QueryBudget = EXACT
+) -> Any:
     """What an effect says of a body at a pose, the world held as the pipeline holds it."""
-    frame = Frame(body, pose, 1 / 30, world, effort, pose)
+    frame = Frame(body, pose, 1 / 30, world, budget, pose)
     with world:
         runner.run(frame)
     assert list(frame.reports) == [runner.name]

@@ -10,14 +10,13 @@ from solidcloud.schemas.wire.answers import ContactsAnswers, ObjectsAnswers, Swe
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget, ask_until_stopped
 from solidcloud.server.queries.context.query_context import SceneData, with_stop
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.distance_by_scan import gaps_by_scan
 from solidcloud.server.queries.objects import objects
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.resident_distance import near
-from solidcloud.server.queries.stopped_answers import ask_until_stopped
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within
 
@@ -36,31 +35,31 @@ class Asked(NamedTuple):
     reach: float = 0.5
 
 
-def _ask(question: Any, k: int, a: Asked, effort: Effort, *what: Any) -> Any:
-    data = with_stop(a.data, effort.stop)
+def _ask(question: Any, k: int, a: Asked, budget: QueryBudget, *what: Any) -> Any:
+    data = with_stop(a.data, budget.stop)
     return ask_until_stopped(
-        questions.QUESTIONS[question.__name__], k, effort, lambda: question(data, *what, effort=effort)
+        questions.QUESTIONS[question.__name__], k, budget, lambda: question(data, *what, budget=budget)
     )
 
 
-def _objects(a: Asked, effort: Effort) -> ObjectsAnswers:
+def _objects(a: Asked, budget: QueryBudget) -> ObjectsAnswers:
     n, both = len(a.poses), np.full(len(a.poses), 0xFFFFFFFF, np.uint32)
-    found: ObjectsAnswers = _ask(objects, n, a, effort, [a.avatar] * n, a.poses, both, both, a.margin)
+    found: ObjectsAnswers = _ask(objects, n, a, budget, [a.avatar] * n, a.poses, both, both, a.margin)
     return found
 
 
-def _collide(a: Asked, effort: Effort, **more: Any) -> Any:
-    return _ask(collide, len(a.poses), a, effort._replace(**more), a.avatar, a.poses, a.margin)
+def _collide(a: Asked, budget: QueryBudget, **more: Any) -> Any:
+    return _ask(collide, len(a.poses), a, budget._replace(**more), a.avatar, a.poses, a.margin)
 
 
-def _distance(a: Asked, effort: Effort, **more: Any) -> Any:
-    return _ask(distance, len(a.poses), a, effort._replace(**more), a.avatar, a.poses, a.reach)
+def _distance(a: Asked, budget: QueryBudget, **more: Any) -> Any:
+    return _ask(distance, len(a.poses), a, budget._replace(**more), a.avatar, a.poses, a.reach)
 
 
-def _near(a: Asked, effort: Effort) -> Any:
-    data = with_stop(a.data, effort.stop)
+def _near(a: Asked, budget: QueryBudget) -> Any:
+    data = with_stop(a.data, budget.stop)
     return ask_until_stopped(
-        questions.DISTANCE, 1, effort, lambda: near(data, a.avatar, a.poses[0], a.reach, effort)
+        questions.DISTANCE, 1, budget, lambda: near(data, a.avatar, a.poses[0], a.reach, budget)
     )
 
 
@@ -68,7 +67,7 @@ def _places(a: Asked) -> NDArray[np.float64]:
     return np.ascontiguousarray(a.poses[:, :3, 3])
 
 
-QUESTIONS: dict[str, Callable[[Asked, Effort], Any]] = {
+QUESTIONS: dict[str, Callable[[Asked, QueryBudget], Any]] = {
     "collide": _collide,
     "collide of one pose": lambda a, e: _collide(a._replace(poses=a.poses[:1]), e),
     "collide bounded": lambda a, e: _collide(a, e, visits=PLENTY),
@@ -84,9 +83,9 @@ QUESTIONS: dict[str, Callable[[Asked, Effort], Any]] = {
 }
 
 
-def gaps(a: Asked, effort: Effort) -> Any:
+def gaps(a: Asked, budget: QueryBudget) -> Any:
     """`gaps_by_scan` of the first pose."""
-    return gaps_by_scan(with_stop(a.data, effort.stop), a.avatar, a.poses[0], a.reach, 2, effort)
+    return gaps_by_scan(with_stop(a.data, budget.stop), a.avatar, a.poses[0], a.reach, 2, budget)
 
 
 def assert_not_wrong(found: Any, truth: Any) -> None:

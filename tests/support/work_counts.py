@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.avatars import avatar_model as avatar
-from solidcloud.server.queries.context import query_budget as effort
+from solidcloud.server.queries.context import query_budget as budget
 from solidcloud.server.scene import Scene
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "work.json"
@@ -283,7 +283,7 @@ def opened(archive: Path) -> Iterator[Scene]:
 def measure(archive: Path, question: str, kind: str) -> Answers:
     """What a question is answered and costs when a scene has just been opened; calls only where interpreted."""
     # Interpreted, what is left to be said after a budget of no time takes longer than its grace.
-    with mock.patch.object(effort, "GRACE", 3600.0), opened(archive) as scene, counted_calls() as calls:
+    with mock.patch.object(budget, "GRACE", 3600.0), opened(archive) as scene, counted_calls() as calls:
         answers = QUESTIONS[question](scene, OPTIONS[kind])
     says, costs = zip(*map(told, answers), strict=True)
     return {

@@ -29,10 +29,8 @@ from ...kernels.nearest.best_first_search import (
 )
 from ...kernels.nearest.nearest_pair import Nearest
 from ...runtime.stop_flag import Stop
-from .proved_reach import find_proved_reach
-from .query_budget import Effort
-from .query_context import SceneData, as_held, in_unknown, kernel_poses, pieces, to_units
-from .query_cost import Spent
+from .query_budget import CostCounter, QueryBudget
+from .query_context import SceneData, as_held, find_proved_reach, in_unknown, kernel_poses, pieces, to_units
 from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
 
 # Capacity of the heap [pairs], beyond which the search is depth first: half a megabyte a request.
@@ -61,7 +59,7 @@ def _search_until(
     which: NDArray[np.int64],
     heap: int,
     goal: Goal,
-    effort: Effort,
+    budget: QueryBudget,
     known: Known,
     counts: NDArray[np.uint32],
 ) -> None:
@@ -69,12 +67,12 @@ def _search_until(
 
     data: with the arrays of the current hold.
     """
-    deadline = effort.deadline
+    deadline = budget.deadline
     search = make_search(avatar.arrays, data.arrays, heap)
     for done, pose in enumerate(which.tolist()):
         now = time.perf_counter()
-        if effort.spent:
-            _leave_open(data, part, which[done:], effort.stop, known, counts)
+        if budget.spent:
+            _leave_open(data, part, which[done:], budget.stop, known, counts)
             return
         share = now + (deadline - now) / (len(which) - done)
         fresh, until = True, SLICE_VISITS
@@ -84,7 +82,7 @@ def _search_until(
             )  # fmt: skip
             if status != OPEN:
                 break
-            if effort.stop or time.perf_counter() >= share:
+            if budget.stop or time.perf_counter() >= share:
                 end_search(search, pose, known, counts)
                 break
             fresh, until = False, until + SLICE_VISITS
@@ -129,8 +127,8 @@ def _gather(
     array: NDArray[np.float64],
     reach: Reach,
     goal: Goal,
-    effort: Effort,
-    spent: Spent,
+    budget: QueryBudget,
+    spent: CostCounter,
 ) -> _Gathered:
     """Search for all poses, piece by piece. Add the cost to `spent`."""
     k = len(array)
@@ -141,22 +139,22 @@ def _gather(
     counts = np.zeros((3, k), np.uint32)
     residency = data.residency
     for which, rows, part in (
-        pieces(reach, residency, effort.share, effort.stop) if len(avatar.points) else ()
+        pieces(reach, residency, budget.share, budget.stop) if len(avatar.points) else ()
     ):
-        if effort.stop:
-            _leave_open(data, part, which, effort.stop, known, counts)
+        if budget.stop:
+            _leave_open(data, part, which, budget.stop, known, counts)
             continue
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
-        with residency.hold(rows, effort.loads_until(), scan=effort.scan, stop=effort.stop) as held:
+        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            if effort.deadline < math.inf:
-                _search_until(seen, avatar, array, part, which, heap, goal, effort, known, counts)
+            if budget.deadline < math.inf:
+                _search_until(seen, avatar, array, part, which, heap, goal, budget, known, counts)
             else:
                 search_poses(
                     array, avatar.arrays, seen.arrays, data.broad, part, which, heap, goal, known, counts
                 )
         spent.add(held)
-    return _Gathered(known, counts, Cost(**spent.cost(data)))
+    return _Gathered(known, counts, Cost(**spent.fields()))
 
 
 def _fields(cost: Cost) -> dict[str, Any]:
@@ -175,7 +173,7 @@ def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[n
 
 
 def distance_bounded(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, effort: Effort
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget
 ) -> DistanceAnswers:
     """Answer `distance` with a budget, and optionally a tolerance.
 
@@ -185,11 +183,11 @@ def distance_bounded(
     """
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
-    spent = Spent(time.perf_counter())
-    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, effort, spent)
-    tolerance = max(0.0, effort.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
-    goal = Goal(False, 0, np.zeros(len(array)), tolerance, effort.visits)
-    known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
+    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, budget, spent)
+    tolerance = max(0.0, budget.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
+    goal = Goal(False, 0, np.zeros(len(array)), tolerance, budget.visits)
+    known, counts, cost = _gather(data, avatar, array, around, goal, budget, spent)
     if len(avatar.points):
         np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
     # Unfinished searches bound the distance like missing voxels.
@@ -201,7 +199,7 @@ def distance_bounded(
 
 
 def collide_bounded(
-    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, effort: Effort
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, budget: QueryBudget
 ) -> CollideAnswers:
     """Answer `collide` with a budget, and optionally a tolerance.
 
@@ -211,16 +209,16 @@ def collide_bounded(
     """
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
-    spent = Spent(time.perf_counter())
-    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, effort, spent)
+    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
     radii = around.units - margin_units
-    early = math.floor(min(effort.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
+    early = math.floor(min(budget.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
     # Both sides of the comparison are float64 sums: some units of slack make it valid for the exact
     # values.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
     enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
-    goal = Goal(True, early, enough, 0.0, effort.visits)
-    known, counts, cost = _gather(data, avatar, array, around, goal, effort, spent)
+    goal = Goal(True, early, enough, 0.0, budget.visits)
+    known, counts, cost = _gather(data, avatar, array, around, goal, budget, spent)
     upper = _upper(data, known, radii)
     found = known.square >= 0
     truly = (found & (known.square <= (around.units - known.drop) ** 2)) | (known.upper <= certain)

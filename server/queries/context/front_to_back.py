@@ -21,10 +21,8 @@ from ...kernels.core.voxel_tree import Lists, VoxelTree, list_voxels
 from ...kernels.rays.rays import Nearest
 from ...residency.index_proof import ENTRIES_AT_ONCE
 from ...runtime.stop_flag import Stop
-from .proved_reach import prove
-from .query_budget import Effort
-from .query_context import SceneData
-from .query_cost import Spent
+from .query_budget import CostCounter, QueryBudget
+from .query_context import SceneData, prove
 
 # Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14
@@ -79,9 +77,9 @@ def look(
     direction: NDArray[np.float64] | None,
     reach_units: int,
     radius_units: int,
-    effort: Effort,
+    budget: QueryBudget,
     kernel: Callable[..., Any],
-    spent: Spent,
+    spent: CostCounter,
 ) -> Nearest:
     """Answer k rays (direction (k, 3)) or query points (direction None) in rounds.
 
@@ -95,10 +93,10 @@ def look(
     best = make_best(k)
     bounds = data.bounds
     tree, index_tree = bounds.trees()
-    batch = BATCH if effort.deadline == math.inf else TIMED_BATCH
+    batch = BATCH if budget.deadline == math.inf else TIMED_BATCH
     for begin in range(0, k, batch):
         end = min(begin + batch, k)
-        if effort.spent:
+        if budget.spent:
             best.unseen[begin:] = 0.0
             break
         part = _part(best, begin, end)
@@ -111,7 +109,7 @@ def look(
         cursor = lists.starts[:-1].copy()
         looked: NDArray[np.bool_] = np.zeros(len(data.arrays.where), bool)
         while (open_ := cursor < lists.starts[1:]).any():
-            if effort.spent:
+            if budget.spent:
                 part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
                 break
             rows = _next_rows(data, lists, cursor, open_)
@@ -128,14 +126,14 @@ def look(
             held = np.zeros(len(looked), bool)
             held[rows] = True
             with data.residency.hold(
-                rows.tolist(), effort.deadline, scan=effort.scan, stop=effort.stop
+                rows.tolist(), budget.deadline, scan=budget.scan, stop=budget.stop
             ) as found:
                 held[list(found.late)] = False  # another thread may be writing them
                 kernel(begin, end, lists, cursor, held, part)
             spent.add(found, int(looked[rows].sum()))
             looked |= held
         if doubts is not None:
-            _settle_doubts(data, doubts, lists, part, reach_units, effort, spent)
+            _settle_doubts(data, doubts, lists, part, reach_units, budget, spent)
         best.counts[:, begin:end] = part.counts
     if data.nothing_clear:  # a load may have proved the index wrong
         best.unseen[:] = 0.0
@@ -174,20 +172,20 @@ def _settle_doubts(
     lists: Lists,
     part: Nearest,
     reach_units: int,
-    effort: Effort,
-    spent: Spent,
+    budget: QueryBudget,
+    spent: CostCounter,
 ) -> None:
     """Load the voxels that only the index excludes, unless something was found before their cells.
 
     doubts: voxels that rays or points reach by proved boxes and cells.  lists: those reached by the
     index, already examined. A voxel that cannot be read is counted as missing in `part`. If the
-    effort's stop flag is set, everything in `part` is unknown.
+    budget's stop flag is set, everything in `part` is unknown.
     """
     proved, v = data.bounds.proved, len(data.bounds.proved)
     found = np.where(part.square >= 0, np.sqrt(np.maximum(part.square, 0)), part.value)
     until = np.minimum(np.minimum(found, part.unseen), reach_units)
-    open_ = _open_doubts(doubts, until, proved, effort.stop)
-    if effort.stop:
+    open_ = _open_doubts(doubts, until, proved, budget.stop)
+    if budget.stop:
         part.unseen[:] = 0.0
         return
     if not len(open_):
@@ -196,7 +194,7 @@ def _settle_doubts(
     first = np.full(v, math.inf)
     np.minimum.at(first, rows, near)
     wanted = np.flatnonzero(first < math.inf)
-    prove(data, wanted[np.argsort(first[wanted], kind="stable")].tolist(), effort, spent)
+    prove(data, wanted[np.argsort(first[wanted], kind="stable")].tolist(), budget, spent)
     open_ = open_[~proved[rows]]
     if not len(open_):
         return
@@ -243,14 +241,14 @@ def _next_rows(
     later[lists.rows[: lists.starts[-1]]] = True
     later &= (data.arrays.where[:, 0] >= 0) & (wanted == 0)
     rows = np.concatenate([order, np.flatnonzero(later)])
-    residency, budget = data.residency, data.residency.buffer.total_bytes
-    if residency.bytes_of(rows.tolist()) <= budget:
+    residency, capacity = data.residency, data.residency.buffer.total_bytes
+    if residency.bytes_of(rows.tolist()) <= capacity:
         return rows
     rows = np.concatenate([order[np.argsort(-wanted[order], kind="stable")], np.flatnonzero(later)])
     chosen, taken = [], 0
     for row in rows.tolist():
         size = residency.bytes_of([row])
-        if taken + size <= budget:
+        if taken + size <= capacity:
             chosen.append(row)
             taken += size
     return np.array(chosen, np.int64)

@@ -1,21 +1,33 @@
-"""Tolerance and budgets of a query.
+"""What a query may cost, what it has cost, and its answer once it was stopped.
 
-Every query takes an `Effort`. Without a budget the work ends when the answer is exact, or known
-within the tolerance. With a budget it also ends when the budget is spent; the answer is then still
+Every query takes a `QueryBudget`. Without a limit the work ends when the answer is exact, or known
+within the tolerance. With a limit it also ends when the budget is spent; the answer is then still
 correct. See NUMERICS.md case 30.
 """
 
 import math
 import time
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError
+from ....schemas.wire.answers import Cost
+from ....schemas.wire.columns import unknown
+from ....schemas.wire.questions import Question
 from ....schemas.wire.requests import QuestionOptions
 from ...kernels.core.stop_flag_checks import (
     NO_LIMIT as NO_LIMIT,  # no budget: more node visits than any request could make
 )
+from ...residency.held import Held
+from ...residency.voxel_cache import Residency
 from ...runtime.deadlines import stop_at
-from ...runtime.stop_flag import NEVER, Stop
+from ...runtime.stop_flag import NEVER, Stop, StoppedError
+
+_A = TypeVar("_A", bound=Cost)
 
 # Share of the remaining time that loads may take; the rest is for searching resident voxels.
 LOAD_SHARE = 0.5
@@ -24,7 +36,7 @@ LOAD_SHARE = 0.5
 GRACE = 0.05
 
 
-class Effort(NamedTuple):
+class QueryBudget(NamedTuple):
     """Limits on the cost of one request.
 
     tolerance: separation at which contact may already be reported, and largest distance between
@@ -69,7 +81,7 @@ class Effort(NamedTuple):
         return now + (self.deadline - now) * LOAD_SHARE
 
 
-EXACT = Effort()
+EXACT = QueryBudget()
 
 
 class EngineOptions(QuestionOptions, total=False):
@@ -78,19 +90,19 @@ class EngineOptions(QuestionOptions, total=False):
     stop: Stop
 
 
-def make_effort(
+def make_budget(
     tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
     stop: Stop = NEVER,
-) -> Effort:
-    """Make the effort of a request that starts now.
+) -> QueryBudget:
+    """Make the budget of a request that starts now.
 
     tolerance: [m], finite and >= 0.
     budget_ms: time limit including waits for loads; None: no limit.
     budget_visits: limit in node visits a pose, independent of the clock; None: no limit.
     stop: the request's stop flag. A time budget sets it `GRACE` after its end, for kernels that do
-    not check the clock; if it is NEVER, the effort gets a new flag. Raise BadRequestError.
+    not check the clock; if it is NEVER, the budget gets a new flag. Raise BadRequestError.
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
@@ -104,4 +116,65 @@ def make_effort(
         stop = Stop() if stop is NEVER else stop
         stop_at(stop, deadline + GRACE, f"the request's budget of {budget_ms:g} ms was spent")
     visits = NO_LIMIT if budget_visits is None else int(budget_visits)
-    return Effort(float(tolerance), visits, deadline, stop=stop)
+    return QueryBudget(float(tolerance), visits, deadline, stop=stop)
+
+
+class CostCounter:
+    """Cost of one request, summed over its holds: the fields of `Cost`. Not thread-safe."""
+
+    __slots__ = ("_keys", "_residency", "begin", "faults", "hits", "late", "loaded", "misses", "waited")
+
+    def __init__(self, begin: float, residency: Residency, keys: NDArray[np.uint64]) -> None:
+        """Begin with zero cost.
+
+        begin: start time on time.perf_counter()'s clock [s].  keys: (v,) of the voxels, by their row
+        in the index.
+        """
+        self.begin, self._residency, self._keys = begin, residency, keys
+        self.hits = self.misses = 0
+        self.loaded = 0  # voxels the request itself has loaded for later holds: they are no hits
+        self.waited = 0.0
+        self.faults: dict[str, None] = {}
+        self.late: dict[int, None] = {}
+
+    def add(self, held: Held, again: int = 0) -> None:
+        """Add a hold. again: number of its hits on voxels that the request has held before."""
+        found = held.hits - again - self.loaded
+        self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
+        self.misses += held.misses
+        self.waited += held.waited
+        self.faults.update(dict.fromkeys(held.faults))
+        self.late.update(dict.fromkeys(held.late))
+
+    def add_cost(self, cost: Cost) -> None:
+        """Add the cost of another query of the same data."""
+        rows = [int(self._keys.searchsorted(key)) for key in cost.late]
+        self.add(Held(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of `Cost`; call it when the answer is complete."""
+        return {
+            "engine_seconds": time.perf_counter() - self.begin,
+            "hits": self.hits,
+            "misses": self.misses,
+            "resident": self._residency.resident,
+            "resident_bytes": self._residency.resident_bytes,
+            "faults": tuple(self.faults),
+            "wait_seconds": self.waited,
+            "late": tuple(self._keys[list(self.late)].tolist()) if self.late else (),
+        }
+
+
+def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: Callable[[], _A]) -> _A:
+    """Run a query of k items with `ask`. If the request is stopped, add the reason to the answer."""
+    try:
+        answers = ask()
+    except StoppedError:
+        return unknown_answers(question, k, budget)
+    return structs.replace(answers, stopped=budget.stop.reason) if budget.stop else answers
+
+
+def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
+    """Return `unknown` for the k items of a stopped request, with the reason of the stop."""
+    answers = unknown(question.answers, k, bounded=budget.limited or budget.tolerance > 0.0)
+    return structs.replace(answers, stopped=budget.stop.reason)

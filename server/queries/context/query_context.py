@@ -1,6 +1,13 @@
-"""Context of every query: the scene data it reads, checked poses, and its voxels in pieces."""
+"""Context of every query: the scene data it reads, checked poses, and its voxels in reach.
 
-from collections.abc import Iterator
+An answer relies on the index only where a load has proved it. A voxel whose cell is in reach, but by
+its box in the index is not, is therefore loaded first (`find_proved_reach`). If its record agrees
+with the index (index_proof.py), the voxel is not examined, and every answer and work count is that
+of the index. If the record cannot be read, the voxel stays in reach and is missing. Each voxel
+therefore costs at most one additional load, even if nothing comes near its points.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +28,13 @@ from ...residency.held import Held
 from ...residency.index_proof import Bounds
 from ...residency.voxel_cache import Residency
 from ...runtime.stop_flag import NEVER, Stop, StoppedError
+from .query_budget import CostCounter, QueryBudget
 
 # Most voxels in reach of one request, over all poses: 128 MB of row numbers. For 100,000 poses
 # whose reach covers thousands of voxels, there would be gigabytes.
-MOST_ROWS = 1 << 24
+MAX_ROWS = 1 << 24
 # Rows processed between two checks of the stop flag.
-_MARKED_AT_ONCE = 1 << 18
+_ROWS_AT_ONCE = 1 << 18
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
@@ -182,7 +190,7 @@ def check_request(
     """Check poses (k, 4, 4) and return the voxels in reach of each; none for an empty avatar.
 
     Raise BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for
-    more than MOST_ROWS voxels in reach of all poses, and StoppedError.
+    more than MAX_ROWS voxels in reach of all poses, and StoppedError.
     """
     needed = 16 * len(poses) + 64
     while True:
@@ -195,11 +203,71 @@ def check_request(
             raise StoppedError
         if needed <= len(reach.rows):
             return reach
-        if needed > MOST_ROWS:
+        if needed > MAX_ROWS:
             raise TooLargeError(
-                f"{needed} voxels in reach of {len(poses)} poses: at most {MOST_ROWS} in a request: ask about fewer "
+                f"{needed} voxels in reach of {len(poses)} poses: at most {MAX_ROWS} in a request: ask about fewer "
                 "poses, or with a smaller margin or reach"
             )
+
+
+def prove(data: SceneData, rows: Sequence[int], budget: QueryBudget, spent: CostCounter) -> None:
+    """Load voxels of distinct rows in order, as many at a time as fit, within the budget's time.
+
+    The voxels are not held afterwards. Add the cost to `spent`, without late voxels: the request
+    finds those itself.
+    """
+    residency = data.residency
+    for part in residency.parts_that_fit(rows, int(residency.buffer.total_bytes * budget.share)):
+        if budget.spent:
+            return
+        with residency.hold(part, budget.loads_until(), scan=True, stop=budget.stop) as held:
+            pass
+        spent.add(held._replace(late=()))
+
+
+def find_proved_reach(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    other_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+    settled: Callable[[Reach], Reach] = lambda reach: reach,
+) -> Reach:
+    """Return the reach of poses (k, 4, 4) with only voxels that are proved or unreadable.
+
+    Otherwise the same as `check_request`, errors included.
+    settled: removes pairs that need not be examined from a reach.
+    """
+    bounds, stop = data.bounds, budget.stop
+    unproved = bounds.unproved
+    reach = settled(check_request(data, avatar, poses, other_units))
+    doubted = bounds.rows_to_prove(reach, unproved, stop)
+    if not doubted:
+        return reach
+    likely = _likely(data, reach, doubted, budget)
+    prove(data, [*likely, *(row for row in doubted if not bounds.proved[row])], budget, spent)
+    reach = settled(check_request(data, avatar, poses, other_units))
+    left = distinct_rows(reach.rows[: reach.starts[-1]], len(bounds.proved), stop)
+    loaded = [*doubted, *(row for row in likely if data.residency.is_resident(row))]
+    spent.loaded += len(np.intersect1d(loaded, left))
+    return reach
+
+
+def _likely(data: SceneData, reach: Reach, doubted: list[int], budget: QueryBudget) -> list[int]:
+    """Return the rows to load before doubted ones: with a deadline, those in reach by the index.
+
+    Proofs may take half of the time, and voxels that are likely to be touched matter more. If the
+    likely voxels do not fit together, return none: they are loaded later, piece by piece.
+    """
+    if budget.deadline == np.inf:
+        return []
+    residency = data.residency
+    rows = distinct_rows(reach.rows[: reach.starts[-1]], len(data.bounds.proved), budget.stop)
+    if residency.bytes_of(rows.tolist()) > residency.buffer.total_bytes * budget.share:
+        return []
+    likely: list[int] = np.setdiff1d(rows, doubted, assume_unique=True).tolist()
+    return [row for row in likely if not residency.is_resident(row)]
 
 
 def pieces(
@@ -216,8 +284,8 @@ def pieces(
     k = len(reach.scales)
     rows = reach.rows[: reach.starts[k]]
     everything = (distinct_rows(rows, len(residency.where), stop) if k > 1 else rows).tolist()
-    budget = int(residency.buffer.total_bytes * share)
-    if residency.bytes_of(everything) <= budget:
+    capacity = int(residency.buffer.total_bytes * share)
+    if residency.bytes_of(everything) <= capacity:
         yield np.arange(k), everything, reach
         return
     which: list[int] = []
@@ -229,15 +297,15 @@ def pieces(
             return
         own = reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
         fresh = [row for row in own if row not in held]
-        if which and held_bytes + residency.bytes_of(fresh) > budget:
+        if which and held_bytes + residency.bytes_of(fresh) > capacity:
             yield np.array(which), list(held), reach
             which, held, held_bytes, fresh = [], {}, 0, own
-        if residency.bytes_of(own) <= budget:
+        if residency.bytes_of(own) <= capacity:
             which.append(pose)
             held.update(dict.fromkeys(fresh))
             held_bytes += residency.bytes_of(fresh)
             continue
-        for part in residency.parts_that_fit(own, budget):
+        for part in residency.parts_that_fit(own, capacity):
             yield np.array([pose]), part, _only(reach, pose, part)
     if which:
         yield np.array(which), list(held), reach
@@ -245,13 +313,13 @@ def pieces(
 
 def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
     """Return the distinct values of `rows`, ascending; perhaps not all after a stop."""
-    if len(rows) <= _MARKED_AT_ONCE:
+    if len(rows) <= _ROWS_AT_ONCE:
         return np.unique(rows)  # a sort in numpy lets other threads run
     met = np.zeros(voxels, bool)
-    for begin in range(0, len(rows), _MARKED_AT_ONCE):
+    for begin in range(0, len(rows), _ROWS_AT_ONCE):
         if stop:
             break
-        met[rows[begin : begin + _MARKED_AT_ONCE]] = True
+        met[rows[begin : begin + _ROWS_AT_ONCE]] = True
     return np.flatnonzero(met)
 
 

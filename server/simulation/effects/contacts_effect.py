@@ -41,7 +41,7 @@ class ContactsRunner:
         if farther(frame, effect.margin):
             return ContactsReport()
         of_archives = frame.world.contacts(
-            frame.body.avatar, frame.pose, 0, effect.margin, effect.cluster_distance, effort=frame.effort
+            frame.body.avatar, frame.pose, 0, effect.margin, effect.cluster_distance, budget=frame.budget
         )
         clusters = [cluster for answers in of_archives for cluster in _clusters(answers)]
         if len(of_archives) > 1:

@@ -54,7 +54,7 @@ class Others(Blocking):
 
     def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
         """Create the obstacle for a frame's mover."""
-        body, stop = frame.body, frame.effort.stop
+        body, stop = frame.body, frame.budget.stop
         super().__init__(
             name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
         )

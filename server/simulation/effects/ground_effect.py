@@ -239,7 +239,7 @@ class Grounded:
         deep = feet - world.lowest() + _BELOW
         if deep <= reach:
             return False
-        swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.effort)
+        swept = world.sweep(avatar, frame.pose, moved_by(frame.pose, -deep * up), _ROUGH, frame.budget)
         if swept.verdict != Verdict.CONTACT:
             return bool(swept.verdict == Verdict.UNKNOWN)
         # A hole's rim, or the ledge behind it, is met by the parts above the feet, which are wider.
@@ -270,7 +270,7 @@ class Grounded:
         steep = size(level)
         if hit.archive < 0 or rises <= _EDGE_RISES or steep == 0.0:
             return None
-        inner = frame.world.nearest(hit.cloud - EDGE / steep * level, EDGE_REACH, frame.effort)
+        inner = frame.world.nearest(hit.cloud - EDGE / steep * level, EDGE_REACH, frame.budget)
         if inner is None:
             return None
         top = frame.world.normal(

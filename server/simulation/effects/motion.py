@@ -23,7 +23,7 @@ _BACK, _GROWS = 1e-7, 4.0
 def first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
     """Return what would first end the motion from frame.pose to a pose, scene or obstacle."""
     avatar, found = frame.body.avatar, None
-    swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.effort)
+    swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget)
     if swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT
         if sure and not swept.exact:
@@ -41,9 +41,9 @@ def first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
 def touched_at(frame: Frame, pose: Pose) -> Hit | None:
     """Return what is touched at a pose, with fraction 0, or a hit with UNKNOWN, or None."""
     avatar = frame.body.avatar
-    verdict = frame.world.collide(avatar, pose, frame.effort)
+    verdict = frame.world.collide(avatar, pose, frame.budget)
     if verdict == Verdict.CONTACT:
-        return frame.world.deepest(avatar, pose, frame.effort) or Hit(0.0, verdict, None, None)
+        return frame.world.deepest(avatar, pose, frame.budget) or Hit(0.0, verdict, None, None)
     if verdict == Verdict.UNKNOWN:
         return Hit(0.0, verdict, None, None)
     return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
@@ -55,7 +55,7 @@ def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
     proved: known for the scene; only the other obstacles are then tested.
     """
     avatar = frame.body.avatar
-    if not proved and frame.world.collide(avatar, pose, frame.effort) != Verdict.CLEAR:
+    if not proved and frame.world.collide(avatar, pose, frame.budget) != Verdict.CLEAR:
         return False
     return not any(each.touches(avatar, pose) for each in frame.obstacles)
 

@@ -18,7 +18,7 @@ from ....schemas.scene.effect_options import Objects
 from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.moves import ObjectsReport
-from ...queries.context.query_budget import Effort
+from ...queries.context.query_budget import QueryBudget
 from ..world.frame import Frame, Hit, Pose, Vec, moved_by
 from ..world.vectors import dot, level, size
 from .blocking import Blocking, warm
@@ -80,9 +80,9 @@ class ObjectsRunner:
             bodies.begin()
             since, frame.kept[self.name] = frame.body.kept.get(self.name, 0), bodies.clock
             frame.obstacles.append(Things(self, frame, since))
-            frame.reports[self.name] = self.report(since, frame.effort)
+            frame.reports[self.name] = self.report(since, frame.budget)
 
-    def report(self, since: int, effort: Effort) -> ObjectsReport:
+    def report(self, since: int, budget: QueryBudget) -> ObjectsReport:
         """Return the objects that moved since a count of moves, and the contacts."""
         bodies = self.bodies
         poses = {
@@ -92,14 +92,14 @@ class ObjectsRunner:
         }
         names = {-1: ""} | dict(enumerate(bodies.names))
         return ObjectsReport(
-            poses, [(names[one], names[other]) for one, other in self._find_touching(effort)]
+            poses, [(names[one], names[other]) for one, other in self._find_touching(budget)]
         )
 
     def _objects(self) -> list[int]:
         """Return the objects' rows, which precede those of users."""
         return np.flatnonzero(self.bodies.kinds != USER).tolist()
 
-    def _find_touching(self, effort: Effort) -> list[tuple[int, int]]:
+    def _find_touching(self, budget: QueryBudget) -> list[tuple[int, int]]:
         """Return the contacts, by rows; recompute those of objects that have moved."""
         bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
         for row in rows:
@@ -108,21 +108,21 @@ class ObjectsRunner:
                 continue
             shape, pose = bodies.shapes[row], bodies.poses[row]
             self._touching = {pair for pair in self._touching if row not in pair}
-            verdict = self._world.collide(shape.model, pose, effort)
+            verdict = self._world.collide(shape.model, pose, budget)
             if verdict == Verdict.CONTACT:
                 self._touching.add((-1, row))
             apart = (bodies.bounds[:, 0] > bodies.bounds[row, 1]) | (
                 bodies.bounds[:, 1] < bodies.bounds[row, 0]
             )
             near = np.array([other for other in rows if other != row and not apart[other].any()], np.int64)
-            for other in near[bodies.touching(shape, pose, near, 0, effort.stop)].tolist():
+            for other in near[bodies.touching(shape, pose, near, 0, budget.stop)].tolist():
                 self._touching.add((min(row, other), max(row, other)))
-            if verdict == Verdict.UNKNOWN or effort.stop:
+            if verdict == Verdict.UNKNOWN or budget.stop:
                 continue  # query again, once missing voxels may be there
             self._asked[row] = now
         return sorted(self._touching)
 
-    def push(self, name: str, way: Vec, user: str, effort: Effort) -> bool:
+    def push(self, name: str, way: Vec, user: str, budget: QueryBudget) -> bool:
         """Move an object by a level displacement; return whether it moved.
 
         It moves as far as nothing is touched.
@@ -134,10 +134,10 @@ class ObjectsRunner:
             return False
         model, pose = bodies.shapes[row].model, bodies.poses[row].copy()
         to = moved_by(pose, way)
-        swept = self._world.sweep(model, pose, to, _TOLERANCE, effort)
+        swept = self._world.sweep(model, pose, to, _TOLERANCE, budget)
         clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
         others = Blocking(
-            self.name, bodies, USER | TOLD | PUSHED, name, model, pose, user=False, skip=user, stop=effort.stop
+            self.name, bodies, USER | TOLD | PUSHED, name, model, pose, user=False, skip=user, stop=budget.stop
         )  # fmt: skip
         hit = others.sweep(model, pose, to, _TOLERANCE)
         if hit is not None:
@@ -147,7 +147,7 @@ class ObjectsRunner:
             if clear * length < _LEAST:
                 return False
             to = moved_by(pose, way * clear)
-        if effort.stop:
+        if budget.stop:
             return False  # the result may be incomplete
         bodies.put(row, to)
         return True
@@ -158,7 +158,7 @@ class Things(Blocking):
 
     def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
         """Create the obstacle for a frame. since: the count of moves its user knows of."""
-        body, stop = frame.body, frame.effort.stop
+        body, stop = frame.body, frame.budget.stop
         super().__init__(
             runner.name, runner.bodies, TOLD | PUSHED, body.name, body.avatar, body.pose, stop=stop
         )
@@ -182,7 +182,7 @@ class Things(Blocking):
             inward = level(hit.cloud - hit.avatar, bodies.up)
             if not dot(left, inward) > _HEAD_ON * size(left) * size(inward):
                 return False
-            if not self._runner.push(hit.what, left, frame.body.name, frame.effort):
+            if not self._runner.push(hit.what, left, frame.body.name, frame.budget):
                 return False
-            frame.reports[self._runner.name] = self._runner.report(self._since, frame.effort)
+            frame.reports[self._runner.name] = self._runner.report(self._since, frame.budget)
             return True

@@ -20,7 +20,7 @@ from ....schemas.scene.effect_order import NEVER_SKIPPED, ORDER
 from ....schemas.scene.scene_file import SceneFile, effect_name
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.moves import FRAME_SECONDS, Moved, Touched
-from ...queries.context.query_budget import EXACT, Effort
+from ...queries.context.query_budget import EXACT, QueryBudget
 from ...runtime.stop_flag import NEVER, StoppedError
 from ..world.collision_world import World
 from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
@@ -94,7 +94,7 @@ class Pipeline:
         body: Body,
         wish: Pose,
         seconds: float = FRAME_SECONDS,
-        effort: Effort = EXACT,
+        budget: QueryBudget = EXACT,
         *,
         skip: Collection[str] | None = None,
     ) -> Moved:
@@ -114,10 +114,10 @@ class Pipeline:
                 f"the commanded pose is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the "
                 "scene's longest_move: send a nearer pose, or begin there"
             )
-        frame = Frame(body, wish, seconds, self.world, effort, body.pose)
+        frame = Frame(body, wish, seconds, self.world, budget, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
-        self.world.begin(effort.stop)
-        with self._undone_if_stopped(body, effort), self.world as seen:
+        self.world.begin(budget.stop)
+        with self._undone_if_stopped(body, budget), self.world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
             for runner in self._beginners:
                 runner.begin(frame)
@@ -125,7 +125,7 @@ class Pipeline:
                 frame.pose = frame.wish
             since = self.world.visits
             for runner in self.runners:
-                if effort.stop:
+                if budget.stop:
                     raise StoppedError
                 if self._free and not skip:
                     runner.run(frame)
@@ -133,12 +133,12 @@ class Pipeline:
                 else:
                     self._run_one(runner, frame, begin, since, skip)
             if not self._stops:
-                frame.verdict = self.world.collide(body.avatar, frame.pose, effort)
+                frame.verdict = self.world.collide(body.avatar, frame.pose, budget)
             # A body that came into the avatar, for example an object, blocks nothing: only the
             # verdict reports it.
             if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
                 frame.verdict = Verdict.CONTACT
-            if effort.stop:  # results of effects from incomplete answers are discarded
+            if budget.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError
             self.world.saw(body.user, body.avatar, frame.pose)
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
@@ -147,12 +147,12 @@ class Pipeline:
         return _moved(frame, self.world.unknown)
 
     @contextmanager
-    def _undone_if_stopped(self, body: Body, effort: Effort) -> Iterator[None]:
+    def _undone_if_stopped(self, body: Body, budget: QueryBudget) -> Iterator[None]:
         """Restore the poses of pushed objects if the frame is stopped.
 
         A clock decides when a frame is stopped, and no pose may depend on a clock.
         """
-        if effort.stop is NEVER or self.bodies is None or not self.bodies.remembers(body):
+        if budget.stop is NEVER or self.bodies is None or not self.bodies.remembers(body):
             yield
             return
         standing = self.bodies.standing()

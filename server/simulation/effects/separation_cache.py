@@ -86,7 +86,7 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
             if ahead is not None:
                 body.kept[KEPT] = Known(world, generations, avatar, rows, looked, ahead)
                 return ahead
-    answers: DistanceAnswers = world.distance(avatar, frame.pose, reach, effort=frame.effort)
+    answers: DistanceAnswers = world.distance(avatar, frame.pose, reach, budget=frame.budget)
     if answers.exact[0] and len(avatar.points):
         body.kept[KEPT] = Known(world, generations, avatar, rows, reach, answers)
     else:
@@ -98,7 +98,7 @@ def _ahead(frame: Frame, reach: float, looked: float) -> DistanceAnswers | None:
     """Return the answer of a search up to `looked` if it also answers for `reach`, else None."""
     try:
         answers: DistanceAnswers = frame.world.distance(
-            frame.body.avatar, frame.pose, looked, effort=frame.effort
+            frame.body.avatar, frame.pose, looked, budget=frame.budget
         )
     except SolidcloudError:  # too far to search; `reach` may not be
         return None

@@ -191,10 +191,10 @@ class UncertaintyRunner:
         inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin + UNIT
         pose = frame.pose if inverse is None else under(inverse, frame.pose[None])[0]
         if scans.one is None:
-            found = gaps_by_scan(each.data, avatar, pose, margin, len(scans.names), frame.effort)
+            found = gaps_by_scan(each.data, avatar, pose, margin, len(scans.names), frame.budget)
             frame.world.count(found.node_visits, not found.exact)
             return found.gaps, found.exact
-        answers = near(each.data, avatar, pose, margin, frame.effort)
+        answers = near(each.data, avatar, pose, margin, frame.budget)
         frame.world.count(int(answers.node_visits[0]), not answers.exact[0])
         gap = float(answers.signed_distance[0])
         return {scans.one: gap} if gap <= margin else {}, bool(answers.exact[0])

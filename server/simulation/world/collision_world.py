@@ -22,7 +22,7 @@ from ...archives.placed_archive import PlacedArchive
 from ...archives.rigid_transform import moved, turned, under
 from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts
-from ...queries.context.query_budget import EXACT, Effort
+from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import SceneData, with_stop
 from ...queries.resident_distance import near
 from ...queries.resident_motion import Probe, Swept
@@ -164,12 +164,12 @@ class World:
                 self._held.points -= len(oldest.avatar.points)
         return probe
 
-    def collide(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Verdict:
+    def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
         """Whether the avatar touches any archive under a pose (4, 4); see server/queries/collide.py."""
         found, probe = Verdict.CLEAR, self._probe(avatar)
         with self as seen:
             for each in seen:
-                verdict, visits = probe.collide(each.data, _into(each, pose), effort)
+                verdict, visits = probe.collide(each.data, _into(each, pose), budget)
                 self.count(visits, verdict == Verdict.UNKNOWN)
                 if verdict == Verdict.CONTACT:
                     return verdict
@@ -183,7 +183,7 @@ class World:
         pose_from: Pose,
         pose_to: Pose,
         tolerance: float = 1e-6,
-        effort: Effort = EXACT,
+        budget: QueryBudget = EXACT,
     ) -> Swept:
         """Return when the avatar first touches any archive on its way between two poses.
 
@@ -192,14 +192,14 @@ class World:
         """
         probe, held = self._probe(avatar), self._held
         if self._alone and held.depth:
-            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, effort)
+            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, budget)
             self.count(swept.visits, swept.unknown)
             return swept
         with self as seen:
             found: Swept | None = None
             for number, each in enumerate(seen):
                 swept = probe.sweep(
-                    each.data, _into(each, pose_from), _into(each, pose_to), tolerance, effort
+                    each.data, _into(each, pose_from), _into(each, pose_to), tolerance, budget
                 )
                 self.count(swept.visits, swept.unknown)
                 if not self._alone:
@@ -231,13 +231,13 @@ class World:
                 least = min(least, lowest_of(corners, self.up) - radius)
         return least
 
-    def deepest(self, avatar: AvatarModel, pose: Pose, effort: Effort = EXACT) -> Hit | None:
+    def deepest(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Hit | None:
         """Return the deepest contact at a pose, with fraction 0, or None; of equals the least witness."""
         found: Hit | None = None
         depth = np.inf
         with self as seen:
             for number, each in enumerate(seen):
-                answers = contacts(each.data, avatar, _into(each, pose)[None], 1, effort=effort)
+                answers = contacts(each.data, avatar, _into(each, pose)[None], 1, budget=budget)
                 self._count_of(answers)
                 if len(answers.signed_distance):
                     value = float(answers.signed_distance[0])
@@ -248,7 +248,7 @@ class World:
                         depth, found = value, Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
         return found
 
-    def nearest(self, place: Vec, reach: float, effort: Effort = EXACT) -> Hit | None:
+    def nearest(self, place: Vec, reach: float, budget: QueryBudget = EXACT) -> Hit | None:
         """Return the scan point nearest to a place (3,), within a reach [m], as a Hit without an avatar.
 
         Of several at the same distance, the least (x, y, z).
@@ -258,7 +258,7 @@ class World:
         with self as seen:
             for number, each in enumerate(seen):
                 there = place if each.placed.inverse is None else moved(each.placed.inverse, place[None])[0]
-                answers = within(each.data, there[None], reach, effort)
+                answers = within(each.data, there[None], reach, budget)
                 self._count_of(answers)
                 value = float(answers.distance[0])
                 if value > least or value == np.inf:
@@ -270,7 +270,7 @@ class World:
         return found
 
     def distance(
-        self, avatar: AvatarModel, pose: Pose, reach: float, effort: Effort = EXACT
+        self, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget = EXACT
     ) -> DistanceAnswers:
         """Return how far the avatar is from what is nearest of all archives, of one pose.
 
@@ -279,7 +279,7 @@ class World:
         found: DistanceAnswers | None = None
         with self as seen:
             for each in seen:
-                answers = near(each.data, avatar, _into(each, pose), reach, effort)
+                answers = near(each.data, avatar, _into(each, pose), reach, budget)
                 self._count_of(answers)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
@@ -299,14 +299,14 @@ class World:
         limit: int = 100,
         margin: float = 0.0,
         cluster_distance: float | None = None,
-        effort: Effort = EXACT,
+        budget: QueryBudget = EXACT,
     ) -> list[ContactsAnswers]:
         """What is touched at a pose, of each archive; see server/queries/contacts.py."""
         found = []
         with self as seen:
             for each in seen:
                 answers = contacts(
-                    each.data, avatar, _into(each, pose)[None], limit, margin, cluster_distance, effort
+                    each.data, avatar, _into(each, pose)[None], limit, margin, cluster_distance, budget
                 )
                 self._count_of(answers)
                 if each.placed.pose is not None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...queries.context.query_budget import EXACT, Effort
+from ...queries.context.query_budget import EXACT, QueryBudget
 from .vectors import dot, lowest_of, turned_back
 
 Vec = NDArray[np.float64]  # (3,) [m]
@@ -109,7 +109,7 @@ class Frame:
     wish: Pose
     seconds: float
     world: Any
-    effort: Effort = EXACT
+    budget: QueryBudget = EXACT
     pose: Pose = field(default_factory=lambda: np.eye(4))
     verdict: Verdict = Verdict.CLEAR
     generations: tuple[int, ...] = ()

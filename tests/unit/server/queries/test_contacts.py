@@ -22,7 +22,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.voxel_layout import LANES
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import Effort, make_effort
+from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 from solidcloud.server.queries.context.query_context import make_scene_data
 from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.residency.voxel_store import Store
@@ -178,8 +178,8 @@ def test_where_a_scan_was_left_out_nothing_is_exact(row: ScanCase) -> None:
     assert nobody.verdict.tolist() == [CLEAR] * 4 and nobody.exact.all()
 
 
-class Stops(Effort):
-    """An effort whose time is up at a given look at the clock."""
+class Stops(QueryBudget):
+    """An budget whose time is up at a given look at the clock."""
 
     looks: Iterator[bool]
 
@@ -204,9 +204,9 @@ def test_a_deadline_leaves_out_and_never_invents(
     for own in (case, tight(case, 2 * int(case.store.sizes.max()))):
         looks, unfinished = 0, True
         while unfinished:
-            effort = Stops(deadline=1e300)
-            effort.looks = iter([False] * looks + [True] * 10_000)
-            answers = contacts(own.data, avatar, poses, MAX_CONTACTS, 0.0, None, effort)
+            budget = Stops(deadline=1e300)
+            budget.looks = iter([False] * looks + [True] * 10_000)
+            answers = contacts(own.data, avatar, poses, MAX_CONTACTS, 0.0, None, budget)
             own.data.residency.check()
             for i in range(len(poses)):
                 if answers.exact[i]:
@@ -223,7 +223,7 @@ def test_a_deadline_leaves_out_and_never_invents(
             unfinished = not answers.exact.all()
             looks += 1
         assert looks > 5
-    assert not contacts(case.data, avatar, poses, effort=make_effort(budget_ms=0.0)).exact[[0, 2, 3, 4]].any()
+    assert not contacts(case.data, avatar, poses, budget=make_budget(budget_ms=0.0)).exact[[0, 2, 3, 4]].any()
 
 
 @pytest.mark.interpreted

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from effect_frames import flip_a_byte
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.distance_by_scan import ANY_SCAN, ScanGaps, gaps_by_scan
 
 BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
@@ -51,8 +51,8 @@ def test_what_is_missing_or_not_looked_at_is_not_exact(tmp_path: Path) -> None:
     case = row(tmp_path)
     with closing(case.store):
         assert gaps_by_scan(case.data, make_avatar(np.empty((0, 3))), POSE, 0.1, 2) == ScanGaps({}, True)
-        assert not gaps_by_scan(case.data, BALL, POSE, 0.1, 2, Effort(visits=1)).exact
-        late = gaps_by_scan(case.data, BALL, POSE, 0.1, 2, Effort(deadline=0.0))
+        assert not gaps_by_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(visits=1)).exact
+        late = gaps_by_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(deadline=0.0))
         assert late == ScanGaps({}, False)
         lost = case.data._replace(unknown_everywhere=True)
         assert not gaps_by_scan(lost, BALL, POSE, 0.1, 2).exact

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.residency.voxel_cache import Residency
@@ -69,7 +69,7 @@ def test_stopped_only_pairs_that_could_touch_are_listed_and_none_is_looked_for(d
     groups = np.array([1, 2] * 20, np.uint32)
     stop = Counting()
     stop.set("the client is gone")
-    found = objects(data, models, at(*places), groups, groups, effort=Effort(stop=stop))
+    found = objects(data, models, at(*places), groups, groups, budget=QueryBudget(stop=stop))
     expected = [
         [i, j] for i in range(40) for j in range(i + 1, 40) if (i - j) % 2 == 0 and (i < 20) == (j < 20)
     ]
@@ -91,7 +91,7 @@ def test_pairs_cut_off_by_a_budget_are_listed_as_unknown(data: SceneData, rng: n
     truth = {tuple(pair) for pair in objects(data, [model] * 12, poses, ones, ones).pairs.tolist()}
     unknown = []
     for visits in (0, 10, 100, 1000, 10**6):
-        answers = objects(data, [model] * 12, poses, ones, ones, effort=Effort(visits=visits))
+        answers = objects(data, [model] * 12, poses, ones, ones, budget=QueryBudget(visits=visits))
         said = dict(zip(map(tuple, answers.pairs.tolist()), answers.pair_verdict.tolist(), strict=True))
         assert {pair for pair, verdict in said.items() if verdict == CONTACT} <= truth <= set(said)
         unknown.append(sum(verdict == UNKNOWN for verdict in said.values()))
@@ -100,20 +100,20 @@ def test_pairs_cut_off_by_a_budget_are_listed_as_unknown(data: SceneData, rng: n
 
 
 def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
-    late = Effort(deadline=time.perf_counter() - 1)
-    answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], effort=late)
+    late = QueryBudget(deadline=time.perf_counter() - 1)
+    answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], budget=late)
     assert answers.verdict.tolist() == [CLEAR, UNKNOWN, CLEAR]
     assert answers.pairs.tolist() == [[0, 1]] and answers.pair_verdict.tolist() == [UNKNOWN]
     assert answers.pairs_tested == 0 and answers.misses == 0
-    soon = Effort(deadline=time.perf_counter() + 600)
-    answers = objects(data, [BALL] * 300, np.repeat(at(0), 300, axis=0), [1] * 300, [1] * 300, effort=soon)
+    soon = QueryBudget(deadline=time.perf_counter() + 600)
+    answers = objects(data, [BALL] * 300, np.repeat(at(0), 300, axis=0), [1] * 300, [1] * 300, budget=soon)
     assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
 
 
 def test_a_budget_holds_against_the_scene_too(data: SceneData) -> None:
     pose = archive_cases.pose_of(np.eye(3), synthetic_scans.make_scan("plane", 1, 50)[0])[None]
     said = [
-        objects(data, [BALL], pose, [1], [SCENE_GROUP], effort=Effort(visits=visits)).verdict[0]
+        objects(data, [BALL], pose, [1], [SCENE_GROUP], budget=QueryBudget(visits=visits)).verdict[0]
         for visits in (0, 10**6)
     ]
     assert said == [UNKNOWN, CONTACT]

@@ -18,7 +18,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
@@ -154,17 +154,17 @@ def test_where_all_is_unknown_only_hits_are_said(tmp_path: Path) -> None:
 def test_budgets_and_tolerances_bound_the_truth(noise: Path, rng: np.random.Generator, question: str) -> None:
     origins, directions = free_rays(rng, 300)
 
-    def ask(effort: Effort):  # type: ignore[no-untyped-def]
+    def ask(budget: QueryBudget):  # type: ignore[no-untyped-def]
         if question == "raycast":
-            return raycast(data, origins, directions, 2.0, effort)
-        return within(data, origins, 0.35, effort)
+            return raycast(data, origins, directions, 2.0, budget)
+        return within(data, origins, 0.35, budget)
 
     with opened(noise) as data:
-        truth = ask(Effort())
+        truth = ask(QueryBudget())
         assert 50 < truth.verdict.sum() < 290
         before = np.full(300, UNKNOWN)
         for visits in (0, 1, 8, 30, 100, 400, 3000, 10**6):
-            cut = ask(Effort(visits=visits))
+            cut = ask(QueryBudget(visits=visits))
             assert (cut.lower <= np.minimum(truth.distance, truth.lower)).all()
             assert (cut.upper >= truth.upper).all()
             assert (cut.distance[cut.exact] == truth.distance[cut.exact]).all()
@@ -179,7 +179,7 @@ def test_budgets_and_tolerances_bound_the_truth(noise: Path, rng: np.random.Gene
                 assert cut.misses == 0 and (cut.verdict == UNKNOWN).sum() > 100
         assert cut.exact.all()
         for tolerance in (1e-3, 0.05, 0.5):
-            loose = ask(Effort(tolerance=tolerance))
+            loose = ask(QueryBudget(tolerance=tolerance))
             assert (loose.lower <= truth.lower).all() and (loose.upper >= truth.upper).all()
             assert (loose.verdict == truth.verdict).all()
             hit = loose.verdict == CONTACT
@@ -190,7 +190,7 @@ def test_budgets_and_tolerances_bound_the_truth(noise: Path, rng: np.random.Gene
 
 def test_a_deadline_that_has_passed_leaves_all_unknown_and_loads_nothing(noise: Path) -> None:
     with opened(noise) as data:
-        late = Effort(deadline=time.perf_counter() - 1)
+        late = QueryBudget(deadline=time.perf_counter() - 1)
         rays, near = raycast(data, [(-1.0, 1, 1)], [X], 9, late), within(data, [(1.0, 1, 1)], 9, late)
         for answers in (rays, near):
             assert answers.verdict.tolist() == [UNKNOWN] and answers.lower.tolist() == [0]
@@ -207,7 +207,7 @@ def test_what_is_loaded_too_late_is_unknown(beads: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(Store, "load", slow)
     with opened(beads) as data:
         origins = [(x, -1.0, 0.0) for x in (0.0, 1.0, 2.0, 3.0)]
-        answers = raycast(data, origins, [Y] * 4, 5, Effort(deadline=time.perf_counter() + 0.2))
+        answers = raycast(data, origins, [Y] * 4, 5, QueryBudget(deadline=time.perf_counter() + 0.2))
         late = answers.verdict == UNKNOWN
         assert late.sum() >= 3 and (answers.verdict[~late] == CONTACT).all() and answers.exact[~late].all()
         assert (answers.lower[late] <= 0.99).all() and not answers.exact[late].any() and answers.resident <= 1

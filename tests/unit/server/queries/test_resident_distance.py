@@ -9,7 +9,7 @@ from solidcloud.schemas.errors import BadTransformError
 from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import resident_distance as module
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.resident_distance import QUICK_REACH, QUICK_ROWS, near
 from solidcloud.server.scene import Scene
@@ -67,7 +67,7 @@ def test_what_one_call_cannot_answer_is_left_to_distance(
         assert left.count == 0
         near(data, BALL, above(2.0, 0.0), QUICK_REACH + 0.01)
         assert left.count == 1, "too far to keep others waiting"
-        near(data, BALL, above(2.0, 0.0), 0.1, Effort(visits=1))
+        near(data, BALL, above(2.0, 0.0), 0.1, QueryBudget(visits=1))
         assert left.count == 2, "a budget"
         box = np.array([[[0, 0, 0], [9, 9, 9]]], np.int64)
         answers = near(data._replace(unknown=box), BALL, above(2.0, 0.0), 0.1)

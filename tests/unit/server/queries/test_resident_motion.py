@@ -17,7 +17,7 @@ from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
 from solidcloud.server.kernels.motion import sweep_resident as kernel
 from solidcloud.server.queries import resident_motion as module
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.resident_motion import Probe, Swept
 from solidcloud.server.queries.sweep import sweep
@@ -88,7 +88,7 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
         probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
         same(probe, data, first, long)
         same(probe, data, large, large)
-        spent = Effort(visits=0)
+        spent = QueryBudget(visits=0)
         assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
         unseen = data._replace(unknown_everywhere=True)
         for seen in (unseen, data._replace(unknown=np.array([[[-(10**6)] * 3, [10**6] * 3]]))):

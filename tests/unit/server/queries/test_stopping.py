@@ -17,7 +17,7 @@ import synthetic_scans
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core import stop_flag_checks as stopping
 from solidcloud.server.kernels.overlap import overlap
-from solidcloud.server.queries.context.query_budget import EXACT, Effort
+from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.objects import find_pairs
 from solidcloud.server.queries.sweep import sweep
@@ -29,7 +29,7 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 WHY = "the test says so"
 
 
-def effort_of(stop: Stop) -> Effort:
+def effort_of(stop: Stop) -> QueryBudget:
     return EXACT._replace(stop=stop)
 
 
@@ -82,7 +82,7 @@ def test_a_stopped_motion_inside_is_not_said_to_leave(asked: Asked) -> None:
     middle = (data.broad.scene_low + data.broad.scene_high) // 2
     pose[0, :3, 3] = data.arrays.origin + data.arrays.step * middle
     for stop in (NEVER, stopped_already(WHY)):
-        found = sweep(with_stop(data, stop), ball, pose, pose, effort=effort_of(stop))
+        found = sweep(with_stop(data, stop), ball, pose, pose, budget=effort_of(stop))
         assert found.outside.tolist() == [False]
     assert found.lower.tolist() == [0.0] and found.verdict.tolist() == [UNKNOWN]
 
@@ -214,17 +214,17 @@ def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int], Asked]
 
 @pytest.mark.skipif(INTERPRETED, reason="to build the avatar takes too long")
 def test_a_budget_ends_a_kernel_that_does_not_look_at_the_clock(crowded: Callable[[int], Asked]) -> None:
-    from solidcloud.server.queries.context.query_budget import make_effort
+    from solidcloud.server.queries.context.query_budget import make_budget
 
     asked = crowded(1)._replace(margin=1.0)
     begin = time.perf_counter()
-    found = stopped_queries.QUESTIONS["contacts"](asked, make_effort(budget_ms=50.0))
+    found = stopped_queries.QUESTIONS["contacts"](asked, make_budget(budget_ms=50.0))
     assert time.perf_counter() - begin < 2.0
     assert not found.exact.any()
     # All of a sweep's motions are one kernel call here.
     long = crowded(2_000)
     begin = time.perf_counter()
-    found = stopped_queries.QUESTIONS["sweep"](long, make_effort(budget_ms=50.0))
+    found = stopped_queries.QUESTIONS["sweep"](long, make_budget(budget_ms=50.0))
     assert time.perf_counter() - begin < 2.0
     assert found.verdict[-1] == UNKNOWN
 

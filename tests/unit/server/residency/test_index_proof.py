@@ -14,7 +14,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.voxels_in_reach import Reach
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context import front_to_back as rounds
-from solidcloud.server.queries.context.query_budget import make_effort
+from solidcloud.server.queries.context.query_budget import make_budget
 from solidcloud.server.residency.index_proof import Bounds
 from solidcloud.server.residency.voxel_store import Store
 from solidcloud.server.runtime.stop_flag import Stop
@@ -152,7 +152,7 @@ def test_what_the_index_has_in_reach_is_loaded_first_where_there_is_a_deadline(
             break
     else:
         raise AssertionError("no pose has both")
-    collide(data, avatar, pose, 0.0, make_effort(budget_ms=1e6))
+    collide(data, avatar, pose, 0.0, make_budget(budget_ms=1e6))
     assert loads == [*likely, *doubted]
 
 

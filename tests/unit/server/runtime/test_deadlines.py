@@ -18,7 +18,7 @@ from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context import anytime_search as bounded
 from solidcloud.server.queries.context import front_to_back as rounds
-from solidcloud.server.queries.context.query_budget import LOAD_SHARE, Effort
+from solidcloud.server.queries.context.query_budget import LOAD_SHARE, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.sweep import sweep
@@ -29,10 +29,10 @@ CLEAR, CONTACT, UNKNOWN = Verdict
 FAR = archive_cases.pose_of(np.eye(3), np.array([99.0, 0, 0]))
 
 QUESTIONS: dict[str, Callable[..., Any]] = {
-    "collide": lambda data, avatar, poses, effort: collide(data, avatar, poses, 0.0, effort),
-    "distance": lambda data, avatar, poses, effort: distance(data, avatar, poses, 0.1, effort),
-    "contacts": lambda data, avatar, poses, effort: contacts(data, avatar, poses, effort=effort),
-    "sweep": lambda data, avatar, poses, effort: sweep(data, avatar, poses, poses, effort=effort),
+    "collide": lambda data, avatar, poses, budget: collide(data, avatar, poses, 0.0, budget),
+    "distance": lambda data, avatar, poses, budget: distance(data, avatar, poses, 0.1, budget),
+    "contacts": lambda data, avatar, poses, budget: contacts(data, avatar, poses, budget=budget),
+    "sweep": lambda data, avatar, poses, budget: sweep(data, avatar, poses, poses, budget=budget),
 }
 
 
@@ -55,7 +55,7 @@ def test_what_is_left_when_the_time_is_up_takes_no_kernel(
     case: contact_cases.ScanCase, rng: np.random.Generator, question: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     avatar, poses = near(case, rng)
-    exact = QUESTIONS[question](case.data, avatar, poses, Effort())
+    exact = QUESTIONS[question](case.data, avatar, poses, QueryBudget())
     truth = distance(case.data, avatar, poses, 15.0).signed_distance
     assert (exact.verdict[:-1] == CONTACT).any()
 
@@ -63,7 +63,7 @@ def test_what_is_left_when_the_time_is_up_takes_no_kernel(
         raise AssertionError("searched")
 
     monkeypatch.setattr(bounded, "go_on", kernel)
-    late = QUESTIONS[question](case.data, avatar, poses, Effort(deadline=0.0))
+    late = QUESTIONS[question](case.data, avatar, poses, QueryBudget(deadline=0.0))
     assert late.verdict.tolist() == [UNKNOWN] * 5 + [CLEAR]
     assert (late.lower <= truth).all() and np.isinf(late.upper).all()
     assert late.exact.tolist() == [False] * 5 + [True]
@@ -75,7 +75,7 @@ def test_what_is_not_resident_when_the_time_is_up_is_counted(
     case: contact_cases.ScanCase, rng: np.random.Generator, question: str
 ) -> None:
     avatar, poses = near(case, rng)
-    late = QUESTIONS[question](case.data, avatar, poses, Effort(deadline=0.0))
+    late = QUESTIONS[question](case.data, avatar, poses, QueryBudget(deadline=0.0))
     assert (late.voxels_missing[:-1] > 1).all() and late.voxels_missing[-1] == 0
     assert late.verdict.tolist() == [UNKNOWN] * 5 + [CLEAR]
     assert case.data.residency.resident == 0
@@ -87,19 +87,19 @@ def test_no_load_is_begun_once_the_time_for_loads_is_up(
 ) -> None:
     """The first load ends when the whole time is up."""
     avatar, poses = near(case, rng)
-    exact = QUESTIONS[question](contact_cases.tight(case, 64 << 20).data, avatar, poses, Effort())
+    exact = QUESTIONS[question](contact_cases.tight(case, 64 << 20).data, avatar, poses, QueryBudget())
     data: SceneData = case.data
-    effort = Effort(deadline=time.perf_counter() + 0.3)
+    budget = QueryBudget(deadline=time.perf_counter() + 0.3)
     load, begun = case.store.load, []
 
     def slow(row: int, *where: Any) -> Any:
         begun.append(row)
-        while not effort.spent:
+        while not budget.spent:
             time.sleep(0.01)
         return load(row, *where)
 
     monkeypatch.setattr(case.store, "load", slow)
-    found = QUESTIONS[question](data, avatar, poses, effort)
+    found = QUESTIONS[question](data, avatar, poses, budget)
     assert len(begun) == 1 and data.residency.resident == 1
     data.residency.check()
     assert found.verdict[-1] == CLEAR and (found.verdict[:-1] != CLEAR).all()
@@ -107,8 +107,8 @@ def test_no_load_is_begun_once_the_time_for_loads_is_up(
     assert (exact.verdict[found.verdict == CONTACT] == CONTACT).all()
 
 
-class Stops(Effort):
-    """An effort whose time is up after so many looks at the clock."""
+class Stops(QueryBudget):
+    """An budget whose time is up after so many looks at the clock."""
 
     looks: list[int]
 
@@ -125,9 +125,9 @@ def test_loose_points_are_looked_at_some_at_a_time(
     """Two batches of four, each with a look before it and before its one round; the third comes too late."""
     monkeypatch.setattr(rounds, "TIMED_BATCH", 4)
     exact = within(case.data, case.points[:12], 0.2)
-    effort = Stops(deadline=1e300)
-    effort.looks = [4]
-    found = within(case.data, case.points[:12], 0.2, effort)
+    budget = Stops(deadline=1e300)
+    budget.looks = [4]
+    found = within(case.data, case.points[:12], 0.2, budget)
     assert exact.verdict.tolist() == [CONTACT] * 12
     assert found.verdict.tolist() == [CONTACT] * 8 + [UNKNOWN] * 4
     assert (found.lower <= exact.distance).all()
@@ -135,7 +135,7 @@ def test_loose_points_are_looked_at_some_at_a_time(
 
 def test_loads_have_half_of_the_time() -> None:
     begin = time.perf_counter()
-    until = Effort(deadline=begin + 1000.0).loads_until()
+    until = QueryBudget(deadline=begin + 1000.0).loads_until()
     assert begin + 1000.0 * LOAD_SHARE <= until <= begin + (1000.0 + time.perf_counter() - begin) * LOAD_SHARE
-    assert Effort(visits=1, tolerance=1.0).loads_until() == math.inf
-    assert Effort(deadline=begin - 1.0).loads_until() < begin, "and none where it is past"
+    assert QueryBudget(visits=1, tolerance=1.0).loads_until() == math.inf
+    assert QueryBudget(deadline=begin - 1.0).loads_until() < begin, "and none where it is past"

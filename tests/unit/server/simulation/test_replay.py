@@ -26,7 +26,7 @@ class Drifting:
     def __init__(self):
         self.total, self.skips, self.reloads = 0.0, True, 0
 
-    def run(self, body, wish, seconds, effort=None, *, skip=None):
+    def run(self, body, wish, seconds, budget=None, *, skip=None):
         skipped = (["proximity"] if self.skips else []) if skip is None else list(skip)
         self.total += float(wish[0, 3]) * seconds + len(body.avatar.points) + 0.1 * len(skipped)
         body.pose = wish.copy()

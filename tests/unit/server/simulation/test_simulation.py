@@ -206,7 +206,7 @@ def test_warming_simulates_a_frame_and_leaves_nothing(floor):
 def test_frames_come_one_at_a_time(floor):
     inside, most = [], []
 
-    def run(body, aim, seconds, effort, *, skip=None):
+    def run(body, aim, seconds, budget, *, skip=None):
         inside.append(body.name)
         most.append(len(inside))
         threading.Event().wait(0.001)

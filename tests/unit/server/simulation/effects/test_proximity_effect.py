@@ -13,7 +13,7 @@ from solidcloud.schemas.scene.effect_options import Proximity
 from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.moves import ProximityReport
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import Effort
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.proximity_effect import make
 from solidcloud.server.simulation.effects.separation_cache import KEPT, went
@@ -128,7 +128,7 @@ def test_a_budget_that_is_too_small_is_unknown(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, GRID)
     with Scene.open(case.archive, "scene") as scene:
         runner, world = make(Proximity(reach=0.2), None), world_of(scene)
-        found = report(runner, world, body_of(BALL), at(0.5, 0.5, 0.2), Effort(visits=0))
+        found = report(runner, world, body_of(BALL), at(0.5, 0.5, 0.2), QueryBudget(visits=0))
         assert found.unknown
 
 

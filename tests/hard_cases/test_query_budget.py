@@ -8,7 +8,7 @@ import pytest
 import synthetic_scans
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
-from solidcloud.server.queries.context.query_budget import NO_LIMIT, Effort
+from solidcloud.server.queries.context.query_budget import NO_LIMIT, QueryBudget
 from solidcloud.server.scene import Scene
 
 CLEAR, CONTACT, UNKNOWN = Verdict
@@ -30,7 +30,7 @@ def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Gene
         data, model = scene._data, scene.avatar("avatar", "")
         told = []
         for visits in (0, 3, 10, 30, 100, 300, NO_LIMIT - 1):
-            verdict = collide_bounded(data, model, poses, 0.0, Effort(visits=visits)).verdict
+            verdict = collide_bounded(data, model, poses, 0.0, QueryBudget(visits=visits)).verdict
             assert (verdict[known != UNKNOWN] == known[known != UNKNOWN]).all()
             assert not truth[verdict == CLEAR].any() and truth[verdict == CONTACT].all()
             known = verdict
@@ -49,8 +49,8 @@ def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
         data, model = scene._data, scene.avatar("ball", "")
-        answers = collide_bounded(data, model, poses, 0.0, Effort(tolerance=0.125))
-        near = distance_bounded(data, model, poses, 1.0, Effort(tolerance=0.125))
+        answers = collide_bounded(data, model, poses, 0.0, QueryBudget(tolerance=0.125))
+        near = distance_bounded(data, model, poses, 1.0, QueryBudget(tolerance=0.125))
     assert answers.verdict[0] == CONTACT
     # Whether it is called early is the engine's choice; not after the tolerance, and said not to be exact.
     assert not (answers.exact & (answers.verdict == CONTACT))[1:].any()
@@ -69,7 +69,7 @@ def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path)
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.1)
         data, model = scene._data, scene.avatar("ball", "")
-        over = Effort(deadline=0.0)
+        over = QueryBudget(deadline=0.0)
         answers = collide_bounded(data, model, poses, 0.4, over)
         assert answers.verdict.tolist() == [UNKNOWN, UNKNOWN, CLEAR] and answers.misses == 2
         # Named, for they are being loaded now: who asks again may find them.
@@ -79,7 +79,7 @@ def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path)
         # Where in their cells the points are is known as soon as the voxels, which are being loaded, were read.
         assert not near.exact[:2].any() and near.exact[2] and (near.lower[:2] <= 0.39).all()
         assert ((near.verdict == CLEAR) == (near.lower > 0)).all() and near.verdict[2] == CLEAR
-        later = collide_bounded(data, model, poses, 0.4, Effort(deadline=1e12))
+        later = collide_bounded(data, model, poses, 0.4, QueryBudget(deadline=1e12))
         assert later.verdict.tolist() == [CONTACT, CONTACT, CLEAR] and later.exact.all()
         again = collide_bounded(data, model, poses, 0.4, over)
         assert again.voxels_missing.tolist() == [0, 0, 0], "resident now, though there is no time to look"

@@ -16,22 +16,10 @@ from cosmic_ray.mutating import mutate_code
 
 Position = tuple[int, int]  # line from 1, column from 0
 
-# Excluded operators: name -> (what it does, the reason); shown in the document.
-LEFT_OUT = {
-    "NoOp": ("changes of nothing", "they are for trying the tool itself"),
-    "RemoveDecorator": ("removed decorators", "interpreted, a kernel's decorator does nothing"),
-    "_Is": (
-        "`is` for another comparison",
-        "it asks for a number's identity, which compiled code does not have",
-    ),
-}
-# Excluded parts of a file, with the reason; shown in the document.
-PARTS_LEFT_OUT = {
-    "annotations": "nothing reads them when a kernel runs",
-    "NamedTuple classes": "they declare fields and hold no code",
-    "decorators": "their options are the compiler's",
-    "texts": "docstrings and other strings are not what a kernel computes with",
-}
+# Excluded operators: changes of nothing; removed decorators, which do nothing interpreted; and `is`
+# for another comparison, because compiled code has no identity of numbers.
+LEFT_OUT = ("NoOp", "RemoveDecorator")
+IDENTITY = ("_Is", "_IsNot")
 
 
 class Mutant(NamedTuple):
@@ -62,14 +50,17 @@ def operators() -> dict[str, type]:
     for name in cosmic_ray.plugins.operator_names():
         operator = cosmic_ray.plugins.get_operator(name)
         short = name.split("/")[-1]
-        identity = short.endswith(("_Is", "_IsNot")) or "_Is_" in short or "_IsNot_" in short
+        identity = any(f"{name}_" in f"{short}_" for name in IDENTITY)
         if not operator.arguments() and short not in LEFT_OUT and not identity:
             found[short] = operator
     return found
 
 
 def spans_left_out(source: str) -> list[tuple[Position, Position]]:
-    """Return begin and end of every part of a source where no mutant may begin: see PARTS_LEFT_OUT."""
+    """Return begin and end of every part of a source where no mutant may begin.
+
+    These are annotations, NamedTuple classes, decorators and strings: no kernel computes with them.
+    """
     spans: list[ast.AST] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.AnnAssign):

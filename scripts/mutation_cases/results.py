@@ -1,15 +1,16 @@
-"""Outcomes of all trials, kept in results.json beside this file; an interrupted run continues there."""
+"""Outcomes of all trials, kept in a JSON file where an interrupted run continues."""
 
 import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .mutants import Mutant
 from .trial import PASSED, REFUSED, Outcome
 
-PLACE = Path(__file__).with_name("results.json")
+if TYPE_CHECKING:
+    from .mutants import Mutant  # needs cosmic-ray
+
 EVERY = 20  # trials between two writes
 
 
@@ -50,7 +51,7 @@ class FileResults:
     again: list[str] = field(default_factory=list)
     owner: "Results | None" = None
 
-    def wants(self, mutant: Mutant, sample: int, under_way: int) -> bool:
+    def wants(self, mutant: "Mutant", sample: int, under_way: int) -> bool:
         """Return whether to try a mutant, in a sample of this size, with other trials running."""
         if mutant.key in self.again:
             return True
@@ -60,7 +61,7 @@ class FileResults:
         """Return whether a sample of this size needs mutants beyond those tried and running."""
         return self.counted() + under_way < sample
 
-    def add(self, mutant: Mutant, outcome: Outcome) -> None:
+    def add(self, mutant: "Mutant", outcome: Outcome) -> None:
         """Record an outcome."""
         self.again = [key for key in self.again if key != mutant.key]
         survivor = {name: getattr(mutant, name) for name in ("line", "function", "was", "now")}
@@ -86,10 +87,13 @@ class FileResults:
 
 
 class Results:
-    """Results of all files."""
+    """Results of all files.
 
-    def __init__(self, files: dict[str, FileResults]) -> None:
-        self.files = files
+    place: where they are kept.
+    """
+
+    def __init__(self, place: Path, files: dict[str, FileResults]) -> None:
+        self.place, self.files = place, files
         for own in files.values():
             own.owner = self
 
@@ -110,15 +114,15 @@ class Results:
         return own
 
     def save(self) -> None:
-        """Write results.json."""
+        """Write the file."""
         data = {
             name: {key: value for key, value in vars(own).items() if key != "owner"}
             for name, own in sorted(self.files.items())
         }
-        PLACE.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n")
+        self.place.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n")
 
 
-def load() -> Results:
-    """Read results.json; return empty results where it is missing."""
-    data = json.loads(PLACE.read_text()) if PLACE.is_file() else {}
-    return Results({name: FileResults(**own) for name, own in data.items()})
+def load(place: Path) -> Results:
+    """Read a file of results; return empty results where it is missing."""
+    data = json.loads(place.read_text()) if place.is_file() else {}
+    return Results(place, {name: FileResults(**own) for name, own in data.items()})

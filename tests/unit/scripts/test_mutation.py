@@ -1,4 +1,4 @@
-"""The helpers of scripts/mutation: what is drawn, what is left out, what is kept, how a trial ends."""
+"""The parts of scripts/mutation that need cosmic-ray: what is drawn, and how a trial ends."""
 
 import subprocess
 import sys
@@ -8,9 +8,8 @@ import pytest
 
 pytest.importorskip("cosmic_ray", reason="scripts/mutation_cases/requirements.txt is not installed")
 
-from mutation_cases import document, results, trial
+from mutation_cases import trial
 from mutation_cases.mutants import Mutant, draw
-from mutation_cases.plan import NONE, TESTS
 
 SOURCE = '''"""Doubled - or not."""
 import numba as nb
@@ -64,57 +63,6 @@ def test_every_place_comes_once_before_any_comes_twice() -> None:
         "ReplaceComparisonOperator",
     ]
     assert sorted(kinds[: len(places)]) == places
-
-
-def outcome(kind: str) -> trial.Outcome:
-    """An outcome."""
-    return trial.Outcome(kind, "test", "what", 1.0)
-
-
-def test_what_the_compiler_would_refuse_counts_for_nothing() -> None:
-    own = results.FileResults("source", "tests", 1)
-    kinds = [trial.FAILED, trial.ERROR, trial.TIME, trial.PASSED, trial.REFUSED]
-    for mutant, kind in zip(drawn(), kinds, strict=False):
-        own.add(mutant, outcome(kind))
-    assert (own.counted(), own.killed(), document.share(own)) == (4, 3, 0.75)
-    assert not own.wants(drawn()[0], 9, 0) and own.wants(drawn()[9], 9, 0)
-    assert not own.wants(drawn()[9], 9, 5) and not own.wants(drawn()[9], 4, 0)
-
-
-def test_results_hold_for_one_source_and_survivors_for_one_set_of_tests() -> None:
-    kept = results.Results({})
-    own = kept.take("a.py", SOURCE, "tests", 1)
-    own.add(drawn()[0], outcome(trial.FAILED))
-    own.add(drawn()[1], outcome(trial.PASSED))
-    assert kept.take("a.py", SOURCE, "tests", 1).counted() == 2
-    own = kept.take("a.py", SOURCE, "other tests", 1)
-    assert own.counted() == 1 and own.again == [drawn()[1].key]
-    assert own.wants(drawn()[1], 1, 0) and not own.wants(drawn()[2], 2, 0), "the sample stays what it was"
-    own.add(drawn()[1], outcome(trial.PASSED))
-    assert own.counted() == 2 and not own.again
-    assert kept.take("a.py", SOURCE, "other tests", 2).counted() == 0
-    assert kept.take("a.py", SOURCE + "\n", "other tests", 2).counted() == 0
-
-
-def test_a_long_change_is_shown_where_it_is() -> None:
-    was = "x" * 90 + " a + b " + "y" * 90
-    assert document.differing(was, was.replace("+", "-")) == tuple(
-        f"… {'x' * 27} a {sign} b {'y' * 27} …" for sign in "+-"
-    )
-
-
-def test_every_kernel_file_is_planned_and_every_test_planned_is_there() -> None:
-    kernels = {
-        path.relative_to(trial.ROOT).as_posix()
-        for package in trial.PACKAGES
-        for path in (trial.ROOT / package / "kernels").rglob("*.py")
-        if path.name != "__init__.py"
-    }
-    assert set(TESTS) | set(NONE) == kernels
-    for test in {test for tests in TESTS.values() for test in tests}:
-        path, _, name = test.partition("::")
-        text = (trial.ROOT / path).read_text()
-        assert not name or f"def {name.split('[')[0]}(" in text, test
 
 
 @pytest.mark.parametrize(

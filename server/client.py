@@ -27,7 +27,7 @@ from ..schemas.errors import (
     UnknownSceneError,
     error_from_code,
 )
-from ..schemas.wire import keys
+from ..schemas.wire import key_expressions
 from ..schemas.wire.answers import Part
 from ..schemas.wire.columns import as_part, check_answers, unknown
 from ..schemas.wire.messages import (
@@ -48,13 +48,13 @@ from ..schemas.wire.messages import (
 from ..schemas.wire.path_request import check_path_parameters
 from ..schemas.wire.questions import QUESTIONS, Question
 from ..schemas.wire.requests import is_bounded, make_poses, make_positions
-from .network.endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
-from .network.replies import Anchor, Asked, OtherAvatarError
-from .network.zenoh_settings import session_config
-from .remote.added_avatars import Added, AddedAvatars
-from .remote.client_identity import OPEN_SECONDS, Identity
-from .remote.client_session import ClientSession, WishNumbers
-from .remote.request_batches import Questions
+from .zenoh_client.added_avatars import Added, AddedAvatars
+from .zenoh_client.client_identity import OPEN_SECONDS, Identity
+from .zenoh_client.client_session import ClientSession, WishNumbers
+from .zenoh_client.request_batches import BatchedQueries
+from .zenoh_common.endpoints import DEFAULT_ENDPOINT, check_endpoint, zenoh_words
+from .zenoh_common.sealed_replies import OtherAvatarError, SealedQuery, TrustAnchor
+from .zenoh_common.zenoh_settings import session_config
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ _MOST_TRIES = 3
 _ENCODING = zenoh.Encoding(MSGPACK)
 
 
-class Client(Questions):
+class Client(BatchedQueries):
     """A scene served elsewhere; a context manager, thread-safe, with the methods of `Scene`.
 
     endpoint: where the server listens.  scene: the name it is served under.
@@ -93,11 +93,11 @@ class Client(Questions):
         timeout: float = 5.0,
         key_file: Path | str | None = None,
     ) -> None:
-        self.name = keys.check_name(scene, "scene")
+        self.name = key_expressions.check_name(scene, "scene")
         if not timeout > 0:
             raise BadRequestError(f"timeout is {timeout}: expected seconds above 0")
         self._endpoint, self._timeout = endpoint, timeout
-        self._anchor = Anchor(endpoint, key_file)
+        self._anchor = TrustAnchor(endpoint, key_file)
         self._added = AddedAvatars()
         self._numbers: dict[str, WishNumbers] = {}  # by avatar
         self._lock = threading.Lock()
@@ -155,7 +155,9 @@ class Client(Questions):
 
         BusyError: nobody answered.
         """
-        return decode_answer(StatsAnswer, self._answered("stats", self._timeout, encode(StatsRequest(keys))))
+        return decode_answer(
+            StatsAnswer, self._answered("stats", self._timeout, encode(StatsRequest(key_expressions)))
+        )
 
     def _answered(self, operation: str, seconds: float, request: bytes = b"") -> bytes:
         """The answer to a question about the scene itself; BusyError: nobody answered."""
@@ -284,13 +286,13 @@ class Client(Questions):
         avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.  The scene's server simulates the effects that it calls for.
         """
         self._check_open()
-        keys.check_name(avatar, "avatar of a session")
+        key_expressions.check_name(avatar, "avatar of a session")
         with self._lock:
             numbers = self._numbers.setdefault(avatar, WishNumbers())
         return ClientSession(
             self._session,
             self.name,
-            lambda: keys.User(self._id, avatar),
+            lambda: key_expressions.User(self._id, avatar),
             numbers,
             self._anchor,
             lambda: self._added.about([avatar]),
@@ -411,11 +413,15 @@ class Client(Questions):
         if not answered and not self._seen:
             self._check_served()
 
-    def _asked(self, operation: str, request: bytes, names: Sequence[str]) -> tuple[zenoh.Querier, Asked]:
+    def _asked(
+        self, operation: str, request: bytes, names: Sequence[str]
+    ) -> tuple[zenoh.Querier, SealedQuery]:
         """Return what asks one operation under the present id, and what reads the replies."""
         self._check_open()
         identity = self._identity
-        asked = Asked(self._anchor, identity.keys[operation], request, partial(self._added.about, names))
+        asked = SealedQuery(
+            self._anchor, identity.keys[operation], request, partial(self._added.about, names)
+        )
         return identity.queriers[operation], asked
 
     def _querier(self, operation: str) -> zenoh.Querier:
@@ -447,7 +453,7 @@ def scenes_at(
     endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0, key_file: Path | str | None = None
 ) -> list[str]:
     """The names of the scenes that are served at an endpoint, in order. BusyError: nobody answered."""
-    anchor = Anchor(endpoint, key_file)
+    anchor = TrustAnchor(endpoint, key_file)
     with _session(endpoint) as session:
         served, versions = _ask_scenes(session, timeout, anchor)
     if not versions:
@@ -469,13 +475,13 @@ def _session(endpoint: str) -> zenoh.Session:
         ) from None
 
 
-def _ask_scenes(session: zenoh.Session, timeout: float, anchor: Anchor) -> tuple[set[str], set[int]]:
+def _ask_scenes(session: zenoh.Session, timeout: float, anchor: TrustAnchor) -> tuple[set[str], set[int]]:
     """The scenes that are served, and the wire versions of the servers that answered."""
     served: set[str] = set()
     versions: set[int] = set()
-    asked = Asked(anchor, keys.scenes_key())
+    asked = SealedQuery(anchor, key_expressions.scenes_key())
     replies = session.get(
-        keys.scenes_key(),
+        key_expressions.scenes_key(),
         attachment=asked.nonce,
         # Several servers answer under the one key, and all of them count.
         target=zenoh.QueryTarget.ALL,
@@ -501,7 +507,7 @@ def _next(came: "queue.SimpleQueue[Any]", until: float) -> Any:
         return None
 
 
-def _answer_of(reply: zenoh.Reply, asked: Asked) -> bytes | None:
+def _answer_of(reply: zenoh.Reply, asked: SealedQuery) -> bytes | None:
     """Return the bytes of an answer to what was asked; None: it is not the server's.
 
     Raises the error of an error reply.

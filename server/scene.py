@@ -10,18 +10,19 @@ from numpy.typing import ArrayLike
 
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
-from ..schemas.wire.keys import User, check_name
+from ..schemas.wire.key_expressions import User, check_name
 from ..schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
-from ..schemas.wire.moves import FRAME_SECONDS, Moved
+from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved
 from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats
-from .observability.metrics import Metrics
+from .observability.request_stats import RequestStats
 from .queries.context.query_context import SceneData
 from .residency.voxel_cache import Residency
 from .residency.voxel_store import OpenStore, Store
 from .runtime.process_heap import give_back_freed_memory
-from .runtime.stop_flag import NEVER, Stop
+from .runtime.stop_flag import NO_STOP, StopFlag
+from .scene_interface import EVERYBODY, AvatarLimits
 from .scenes.scene_archives import (
     ReadPoints,
     at_place,
@@ -31,7 +32,6 @@ from .scenes.scene_archives import (
     read_avatars,
 )
 from .scenes.scene_questions import SceneQuestions
-from .served.avatar_limits import EVERYBODY, AvatarLimits
 from .simulation.assembly import simulate
 from .simulation.local_session import LocalSession
 from .simulation.simulation import Simulation
@@ -51,7 +51,7 @@ class Scene(SceneQuestions):
         self,
         archives: Sequence[PlacedArchive],
         name: str,
-        metrics: Metrics | None = None,
+        metrics: RequestStats | None = None,
         file: SceneFile | None = None,
         avatars: Mapping[str, tuple[ArrayLike, float | None]] | None = None,
     ) -> None:
@@ -64,7 +64,7 @@ class Scene(SceneQuestions):
         """
         if not archives:
             raise BadRequestError(f"{name}: a scene without archives: expected at least one")
-        super().__init__(archives, name, Metrics() if metrics is None else metrics)
+        super().__init__(archives, name, RequestStats() if metrics is None else metrics)
         self._file = scene_of(name) if file is None else file
         self._simulation: Simulation | None = None
         self._making = threading.Lock()
@@ -103,7 +103,7 @@ class Scene(SceneQuestions):
             if open_store is not None or radius_model is not None:
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
             return cls._open_file(path, name, budget_bytes, policy, read_points)
-        metrics = Metrics()
+        metrics = RequestStats()
         archive = PlacedArchive.open(
             path,
             name,
@@ -129,7 +129,7 @@ class Scene(SceneQuestions):
         found = find_archives(file, path)
         avatars = read_avatars(file, path, read_points)
         own = {each.info.name: (each.points, each.info.radius) for each in avatars}
-        metrics = Metrics()
+        metrics = RequestStats()
         with ExitStack() as stack:
             archives = open_archives(file, path, name, found, budget_bytes, policy, metrics.loaded)
             for archive in archives:
@@ -255,7 +255,7 @@ class Scene(SceneQuestions):
         seconds: float = FRAME_SECONDS,
         *,
         client: str = "",
-        stop: Stop = NEVER,
+        stop: StopFlag = NO_STOP,
     ) -> Moved:
         """Return where avatar `name` gets from one pose (1, 4, 4) towards another in a frame.
 

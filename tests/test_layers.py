@@ -39,42 +39,42 @@ ALLOWED = {
     "server/kernels/overlap": "kernels/core",
     "server/kernels/prediction": "kernels/core",
     "server/kernels/rays": "kernels/core",
-    "server/served": "runtime",
+    "server/scene_interface.py": "runtime",
     "server/kernels/contacts": "kernels/core kernels/overlap",
     "server/kernels/motion": "kernels/core kernels/overlap",
     "server/kernels/nearest": "kernels/core kernels/overlap",
-    "server/network": "served",
     "server/kernels/bodies": "kernels/core kernels/motion",
-    "server/remote": "network served",
-    "server/service": "observability runtime served network",
-    "server/avatars": "kernels served",
-    "server/client.py": "network remote",
+    "server/zenoh_common": "scene_interface.py",
+    "server/zenoh_client": "zenoh_common scene_interface.py",
+    "server/zenoh_server": "observability runtime scene_interface.py zenoh_common",
+    "server/avatars": "kernels scene_interface.py",
+    "server/client.py": "zenoh_common zenoh_client",
     "server/report/kernels": "kernels",
     "server/residency": "kernels runtime",
     "server/cli/output": "residency",
     "server/queries/context": "kernels runtime avatars residency",
     "server/queries": "kernels runtime avatars residency queries/context",
     "server/archives": "observability runtime avatars residency queries/context queries",
-    "server/simulation/world": "kernels runtime served avatars queries/context queries archives",
+    "server/simulation/world": "kernels runtime scene_interface.py avatars queries/context queries archives",
     "server/simulation/effects": (
         "kernels runtime avatars residency queries/context queries archives simulation/world"
     ),
     "server/simulation": (
-        "runtime served avatars queries/context queries archives simulation/world simulation/effects"
+        "runtime scene_interface.py avatars queries/context queries archives simulation/world simulation/effects"
     ),
     "server/scenes": (
-        "kernels observability runtime served avatars residency queries/context queries archives "
+        "kernels observability runtime scene_interface.py avatars residency queries/context queries archives "
         "simulation/effects"
     ),
     "server/scene.py": (
-        "cli/input observability runtime served residency queries/context archives simulation scenes"
+        "cli/input observability runtime scene_interface.py residency queries/context archives simulation scenes"
     ),
     "server/report/common": "cli/input scene.py",
     "server/cli/scene_files": "residency archives scenes",
     "server/report/accuracy": "cli/input kernels avatars report/kernels residency scene.py report/common",
     "server/report/walk": "cli/input client.py residency cli/output scene.py report/common",
     "server/cli/commands": (
-        "cli/input network service client.py residency cli/output archives simulation scene.py "
+        "cli/input zenoh_common zenoh_server client.py residency cli/output archives simulation scene.py "
         "cli/scene_files report/accuracy"
     ),
     "server/cli": "cli/commands",
@@ -100,11 +100,11 @@ DOORS = {
     "zstandard": ("schemas/archive/zstd_frame.py",),
     "zenoh": (
         "server/client.py",
-        "server/network/",
-        "server/remote/",
-        "server/service/session_transport.py",
-        "server/service/state_streams.py",
-        "server/service/transport.py",
+        "server/zenoh_client/",
+        "server/zenoh_common/",
+        "server/zenoh_server/session_transport.py",
+        "server/zenoh_server/state_streams.py",
+        "server/zenoh_server/transport.py",
     ),
     "numba": ("schemas/kernels/compiling.py",),
     "llvmlite": ("schemas/kernels/compiling.py",),
@@ -115,7 +115,7 @@ DOORS = {
     "tomli_w": ("builder/sources/scan_list.py",),
     "trimesh": ("builder/sources/formats/surface.py", "builder/synthetic/"),
     "embreex": ("builder/synthetic/scanner.py",),
-    "prometheus_client": ("server/observability/prometheus.py",),
+    "prometheus_client": ("server/observability/prometheus_metrics.py",),
     "distributed": ("builder/run/dask_cluster.py",),
     "dask": ("builder/run/dask_cluster.py",),
     "matplotlib": ("server/report/",),
@@ -134,13 +134,13 @@ LONG = {
     "builder/sources/scan_list.py": 409,
     "builder/spool/spool.py": 427,
     "builder/voxel/dense_voxel.py": 438,
-    "server/client.py": 517,
+    "server/client.py": 522,
     "server/kernels/contacts/contact_pairs.py": 418,
     "server/kernels/motion/sweep_advance.py": 436,
     "server/kernels/nearest/best_first_search.py": 414,
     "server/kernels/overlap/overlap.py": 475,
-    "server/residency/voxel_cache.py": 522,
-    "server/service/request_lanes.py": 401,
+    "server/residency/voxel_cache.py": 524,
+    "server/zenoh_server/request_lanes.py": 403,
 }
 
 
@@ -362,7 +362,7 @@ def test_every_room_says_what_it_may_import() -> None:
         ("schemas/archive/codec.py", "from ...builder.voxel.voxel_octree import x", "imports point down"),
         ("server/scene.py", "from ..builder.pipeline import build_archive", "may import nothing"),
         ("server/scene.py", "from .report.walk.demo_walk import main", "it may import cli/input"),
-        ("server/queries/collide.py", "from ..service.jobs import Job", "it may import kernels"),
+        ("server/queries/collide.py", "from ..zenoh_server.jobs import RequestJob", "it may import kernels"),
         ("server/kernels/core/voxel_layout.py", "from ..rays.rays import STACK", "no other room"),
         ("server/scene.py", "from . import queries", "as a whole"),
         ("server/scene.py", "import h5py", "its door is schemas/process/new_file.py"),
@@ -395,7 +395,7 @@ def test_a_stray_import_is_named(file: str, source: str, said: str) -> None:
         ("server/cli/main.py", "from ...builder.passes.verify import verify_archive"),
         ("server/kernels/overlap/overlap.py", "from ....schemas.kernels import compiling as nb"),
         ("server/kernels/overlap/overlap.py", "from ..core.voxel_layout import LANES"),
-        ("builder/pipeline.py", "from ..schemas.wire import keys"),
+        ("builder/pipeline.py", "from ..schemas.wire import key_expressions"),
     ],
 )
 def test_an_allowed_import_is_not(file: str, source: str) -> None:

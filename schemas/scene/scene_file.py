@@ -16,7 +16,7 @@ from msgspec import structs
 from ..archive.radius_model import parse_radius_model
 from ..archive.voxel_grid import MAX_COORDINATE
 from ..errors import BadRequestError
-from ..wire.keys import check_name
+from ..wire.key_expressions import check_name
 from .effect_options import AnyEffect, Stop, Through, Vector
 from .toml_faults import MOST_BYTES, decode, fault, nearest, shown
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InternalError
 from .answers import Cost, Verdict
 from .arrays import array_fields
-from .questions import Column, Rows, question_of
+from .questions import ColumnRules, Rows, question_of
 
 _LAST_VERDICT = int(max(Verdict))
 _A = TypeVar("_A", bound=Cost)
@@ -142,7 +142,7 @@ def check_answers(answers: _A, k: int) -> _A:
 
 
 @cache
-def _checks(kind: type) -> tuple[tuple[str, bool, Column | None], ...]:
+def _checks(kind: type) -> tuple[tuple[str, bool, ColumnRules | None], ...]:
     """Return each column's name, whether it has verdicts, and its rules; None for one row per item."""
     rules = question_of(kind).columns
     return tuple(
@@ -151,7 +151,7 @@ def _checks(kind: type) -> tuple[tuple[str, bool, Column | None], ...]:
     )
 
 
-def _expected_rows(answers: Cost, rule: Column, k: int) -> int:
+def _expected_rows(answers: Cost, rule: ColumnRules, k: int) -> int:
     """Return how many rows a column of answers to k poses has, where they are not one per pose."""
     if rule.rows is Rows.STARTS:
         return k + 1

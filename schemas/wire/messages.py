@@ -1,6 +1,6 @@
 """Message types of the wire protocol, gathered from their modules, and their JSON Schemas.
 
-WIRE.md documents this file, questions.py, requests.py, answers.py, moves.py, stats.py and
+WIRE.md documents this file, questions.py, requests.py, answers.py, motion_messages.py, stats.py and
 encoding.py. No zenoh here.
 """
 
@@ -22,7 +22,7 @@ from .encoding import (
     encode,
     wire_encoding,
 )
-from .moves import Moved, MoveRequest, State, Wish
+from .motion_messages import Moved, MoveRequest, State, Wish
 from .path_request import PathRequest
 from .questions import QUESTIONS, path_questions
 from .requests import (

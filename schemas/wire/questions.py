@@ -50,7 +50,7 @@ class Rows(Enum):
     ITEMS = auto()  # one per item: pose, motion, ray, point or object
     BOUNDED = auto()  # one per item, or none: if neither a tolerance nor a budget was given
     STARTS = auto()  # one more than items: item i has the rows [starts[i], starts[i + 1])
-    LISTED = auto()  # as many as the column of starts `Column.of` says
+    LISTED = auto()  # as many as the column of starts `ColumnRules.of` says
     PAIRS = auto()  # one per listed pair of items
 
 
@@ -69,7 +69,7 @@ class Merge(Enum):
     EXACT_INTERVAL = auto()  # an exact contact that begins first, or clear of all
 
 
-class Frame(Enum):
+class ColumnFrame(Enum):
     """What the values of an archive at a pose are, and so how they are carried to the world."""
 
     NONE = auto()  # the same in every frame
@@ -80,7 +80,7 @@ class Frame(Enum):
     SCAN = auto()  # rows of the archive's scans, -1: not known
 
 
-class Column(NamedTuple):
+class ColumnRules(NamedTuple):
     """Rules of one column of answers.
 
     merge, frame, rows: see there.  of: column of starts of a column with `Rows.LISTED`.
@@ -88,32 +88,32 @@ class Column(NamedTuple):
     """
 
     merge: Merge
-    frame: Frame = Frame.NONE
+    frame: ColumnFrame = ColumnFrame.NONE
     rows: Rows = Rows.ITEMS
     of: str = ""
     unknown: float = 0
 
 
 # Columns that every answer has.
-COMMON: dict[str, Column] = {
-    "verdict": Column(Merge.VERDICT, unknown=Verdict.UNKNOWN),
-    "outside": Column(Merge.ALL),
-    "voxels_missing": Column(Merge.SUM),
-    "node_visits": Column(Merge.SUM),
-    "point_tests": Column(Merge.SUM),
+COMMON: dict[str, ColumnRules] = {
+    "verdict": ColumnRules(Merge.VERDICT, unknown=Verdict.UNKNOWN),
+    "outside": ColumnRules(Merge.ALL),
+    "voxels_missing": ColumnRules(Merge.SUM),
+    "node_visits": ColumnRules(Merge.SUM),
+    "point_tests": ColumnRules(Merge.SUM),
 }
-_POINT = Column(Merge.NEAREST, Frame.POINT)
-_DIRECTION = Column(Merge.NEAREST, Frame.DIRECTION)
+_POINT = ColumnRules(Merge.NEAREST, ColumnFrame.POINT)
+_DIRECTION = ColumnRules(Merge.NEAREST, ColumnFrame.DIRECTION)
 # Columns of the nearest thing along a ray or around a point.
 _NEAREST = {
-    "distance": Column(Merge.NEAREST, unknown=inf),
-    "lower": Column(Merge.LEAST),
-    "upper": Column(Merge.LEAST, unknown=inf),
-    "exact": Column(Merge.EXACT_NEAREST),
+    "distance": ColumnRules(Merge.NEAREST, unknown=inf),
+    "lower": ColumnRules(Merge.LEAST),
+    "upper": ColumnRules(Merge.LEAST, unknown=inf),
+    "exact": ColumnRules(Merge.EXACT_NEAREST),
     "cloud_point": _POINT,
 }
-_PAIR = Column(Merge.LISTED, rows=Rows.LISTED, of="pair_starts")
-_CLUSTER = Column(Merge.LISTED, rows=Rows.LISTED, of="cluster_starts")
+_PAIR = ColumnRules(Merge.LISTED, rows=Rows.LISTED, of="pair_starts")
+_CLUSTER = ColumnRules(Merge.LISTED, rows=Rows.LISTED, of="cluster_starts")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Question(Generic[A]):
     request: type[QuestionRequest]
     answers: type[A]
     items: str
-    columns: Mapping[str, Column]
+    columns: Mapping[str, ColumnRules]
     nearest: tuple[str, tuple[str, ...]] | None = None
     part: Any = None
     slow: bool = False
@@ -259,9 +259,9 @@ COLLIDE = Question(
     CollideAnswers,
     "poses",
     {
-        "lower": Column(Merge.LEAST, rows=Rows.BOUNDED, unknown=-inf),
-        "upper": Column(Merge.LEAST, rows=Rows.BOUNDED, unknown=inf),
-        "exact": Column(Merge.EXACT_VERDICT, rows=Rows.BOUNDED),
+        "lower": ColumnRules(Merge.LEAST, rows=Rows.BOUNDED, unknown=-inf),
+        "upper": ColumnRules(Merge.LEAST, rows=Rows.BOUNDED, unknown=inf),
+        "exact": ColumnRules(Merge.EXACT_VERDICT, rows=Rows.BOUNDED),
     },
     part=CollidePart,
 )
@@ -271,10 +271,10 @@ DISTANCE = Question(
     DistanceAnswers,
     "poses",
     {
-        "signed_distance": Column(Merge.NEAREST, unknown=inf),
-        "lower": Column(Merge.LEAST, unknown=-inf),
-        "upper": Column(Merge.LEAST, unknown=inf),
-        "exact": Column(Merge.EXACT_NEAREST),
+        "signed_distance": ColumnRules(Merge.NEAREST, unknown=inf),
+        "lower": ColumnRules(Merge.LEAST, unknown=-inf),
+        "upper": ColumnRules(Merge.LEAST, unknown=inf),
+        "exact": ColumnRules(Merge.EXACT_NEAREST),
         "witness_avatar": _POINT,
         "witness_cloud": _POINT,
         "normal": _DIRECTION,
@@ -288,23 +288,23 @@ CONTACTS = Question(
     ContactsAnswers,
     "poses",
     {
-        "exact": Column(Merge.ALL),
-        "pairs_found": Column(Merge.SUM),
-        "pair_starts": Column(Merge.LISTED, rows=Rows.STARTS),
-        "avatar_point": _PAIR._replace(frame=Frame.POINT),
-        "cloud_point": _PAIR._replace(frame=Frame.POINT),
+        "exact": ColumnRules(Merge.ALL),
+        "pairs_found": ColumnRules(Merge.SUM),
+        "pair_starts": ColumnRules(Merge.LISTED, rows=Rows.STARTS),
+        "avatar_point": _PAIR._replace(frame=ColumnFrame.POINT),
+        "cloud_point": _PAIR._replace(frame=ColumnFrame.POINT),
         "signed_distance": _PAIR,
         "avatar_index": _PAIR,
-        "scan_index": _PAIR._replace(frame=Frame.SCAN),
+        "scan_index": _PAIR._replace(frame=ColumnFrame.SCAN),
         "cluster": _PAIR,
-        "cluster_starts": Column(Merge.LISTED, rows=Rows.STARTS),
+        "cluster_starts": ColumnRules(Merge.LISTED, rows=Rows.STARTS),
         "cluster_count": _CLUSTER,
         "cluster_deepest": _CLUSTER,
-        "cluster_avatar": _CLUSTER._replace(frame=Frame.POINT),
-        "cluster_cloud": _CLUSTER._replace(frame=Frame.POINT),
-        "cluster_scan": _CLUSTER._replace(frame=Frame.SCAN),
-        "cluster_low": _CLUSTER._replace(frame=Frame.BOX_LOW),
-        "cluster_high": _CLUSTER._replace(frame=Frame.BOX_HIGH),
+        "cluster_avatar": _CLUSTER._replace(frame=ColumnFrame.POINT),
+        "cluster_cloud": _CLUSTER._replace(frame=ColumnFrame.POINT),
+        "cluster_scan": _CLUSTER._replace(frame=ColumnFrame.SCAN),
+        "cluster_low": _CLUSTER._replace(frame=ColumnFrame.BOX_LOW),
+        "cluster_high": _CLUSTER._replace(frame=ColumnFrame.BOX_HIGH),
     },
     part=ContactsPart,
     slow=True,
@@ -317,12 +317,12 @@ SWEEP = Question(
     SweepAnswers,
     "motions",
     {
-        "lower": Column(Merge.LEAST),
-        "upper": Column(Merge.NEAREST, unknown=inf),
-        "exact": Column(Merge.EXACT_INTERVAL),
+        "lower": ColumnRules(Merge.LEAST),
+        "upper": ColumnRules(Merge.NEAREST, unknown=inf),
+        "exact": ColumnRules(Merge.EXACT_INTERVAL),
         "witness_avatar": _POINT,
         "witness_cloud": _POINT,
-        "steps": Column(Merge.SUM),
+        "steps": ColumnRules(Merge.SUM),
     },
     nearest=("upper", ("witness_cloud", "witness_avatar")),
     part=SweepPart,
@@ -351,8 +351,8 @@ OBJECTS = Question(
     ObjectsAnswers,
     "objects",
     {
-        "pairs": Column(Merge.FIRST, rows=Rows.PAIRS),
-        "pair_verdict": Column(Merge.FIRST, rows=Rows.PAIRS, unknown=Verdict.UNKNOWN),
+        "pairs": ColumnRules(Merge.FIRST, rows=Rows.PAIRS),
+        "pair_verdict": ColumnRules(Merge.FIRST, rows=Rows.PAIRS, unknown=Verdict.UNKNOWN),
     },
     whole=True,
 )

@@ -195,7 +195,7 @@ class WithinRequest(QuestionRequest, frozen=True):
     reach: Length
 
 
-class ObjectItem(Request, frozen=True):
+class ObjectEntry(Request, frozen=True):
     """One avatar among several in an ObjectsRequest.
 
     avatar: the name under which it was added.
@@ -214,7 +214,7 @@ class ObjectsRequest(QuestionRequest, frozen=True):
     poses: (n, 4, 4) float64, one per object.  margin: as in CollideRequest.
     """
 
-    objects: list[ObjectItem]
+    objects: list[ObjectEntry]
     poses: Poses
     margin: Length = 0.0
 
@@ -272,7 +272,7 @@ def check_one_pose(what: str, poses: Poses) -> None:
         raise BadRequestError(f"{what} of shape {poses.shape}: expected (1, 4, 4), avatar to world")
 
 
-def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Poses]:
+def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectEntry], Poses]:
     """Return objects and their poses as the wire has them.
 
     objects: (name, pose, group = 1, mask = all groups), poses (4, 4) float64.
@@ -285,7 +285,7 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectItem], Po
             raise BadRequestError(
                 f"object {number} of {len(entry)} values: expected name, pose and optionally group and mask"
             )
-        items.append(ObjectItem(entry[0], *(_as_bits(number, value) for value in entry[2:])))
+        items.append(ObjectEntry(entry[0], *(_as_bits(number, value) for value in entry[2:])))
     if not items:
         return items, make_poses(np.zeros((0, 4, 4)))
     return items, make_poses([entry[1] for entry in objects])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from solidcloud.schemas.errors import BusyError
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.client import Client
 
 from . import board as b

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from solidcloud.schemas.wire.answers import ContactsAnswers, Cost, ObjectsAnswers, SweepAnswers, Verdict
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.schemas.wire.questions import CONTACTS
 
 # What is judged by itself, what depends on what was in memory, and what says how sure the rest is.

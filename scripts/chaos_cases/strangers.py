@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import zenoh
 from rogues.tools import widths, zeros
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.messages import (
     MSGPACK,
     AddAvatarRequest,
@@ -24,7 +24,7 @@ from solidcloud.schemas.wire.messages import (
     encode,
 )
 from solidcloud.schemas.wire.requests import make_poses
-from solidcloud.server.network.zenoh_settings import session_config
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
 from .ground import SCENE
 
@@ -81,12 +81,15 @@ def flood(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
     poses = make_poses(np.tile(np.eye(4), (20, 1, 1)))
     with (
         _open(endpoint, "peer") as session,
-        session.liveliness().declare_token(keys.client_alive_key(SCENE, client)),
+        session.liveliness().declare_token(key_expressions.client_token_key(SCENE, client)),
     ):
         add = encode(AddAvatarRequest("ball", np.zeros((1, 3)), 0.1))
         list(
             session.get(
-                keys.question_key(SCENE, client, "add_avatar"), payload=add, encoding=ENCODING, timeout=2.0
+                key_expressions.query_key(SCENE, client, "add_avatar"),
+                payload=add,
+                encoding=ENCODING,
+                timeout=2.0,
             )
         )
         request = encode(CollideRequest(avatar="ball", poses=poses))
@@ -95,7 +98,7 @@ def flood(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
         while time.monotonic() < end:
             if free.acquire(timeout=0.1):
                 handler = zenoh.handlers.Callback(lambda _: None, free.release)
-                key = keys.question_key(SCENE, client, "collide")
+                key = key_expressions.query_key(SCENE, client, "collide")
                 session.get(key, handler, payload=request, encoding=ENCODING, timeout=5.0)
 
 
@@ -107,13 +110,15 @@ def heavy(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
     with _open(endpoint, "peer") as session, ExitStack() as stack:
         for number in range(2):
             client = f"heavy{seed}-{number}"
-            stack.enter_context(session.liveliness().declare_token(keys.client_alive_key(SCENE, client)))
+            stack.enter_context(
+                session.liveliness().declare_token(key_expressions.client_token_key(SCENE, client))
+            )
             for op, request in (
                 ("add_avatar", AddAvatarRequest("crowd", points, 0.01)),
                 ("contacts", ContactsRequest(avatar="crowd", poses=poses, margin=3.0)),
             ):
                 handler = zenoh.handlers.Callback(lambda _: None, lambda: None)
-                key = keys.question_key(SCENE, client, op)
+                key = key_expressions.query_key(SCENE, client, op)
                 session.get(key, handler, payload=encode(request), encoding=ENCODING, timeout=5.0)
                 time.sleep(1.0)
         time.sleep(seconds)
@@ -128,7 +133,7 @@ def invented(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
         for number in itertools.count():
             if time.monotonic() > end:
                 return
-            key = keys.question_key(SCENE, f"nobody-{seed}-{number}", "add_avatar")
+            key = key_expressions.query_key(SCENE, f"nobody-{seed}-{number}", "add_avatar")
             list(session.get(key, payload=request, encoding=ENCODING, timeout=1.0))
 
 

@@ -26,10 +26,10 @@ from solidcloud.schemas.wire.answers import (
 from solidcloud.schemas.wire.columns import unknown
 from solidcloud.schemas.wire.encoding import decode_request, encode
 from solidcloud.schemas.wire.messages import AvatarInfo, CollideRequest, ErrorReply, ScenesAnswer
-from solidcloud.schemas.wire.moves import State, Wish
+from solidcloud.schemas.wire.motion_messages import State, Wish
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.remote.client_session import ClientSession
+from solidcloud.server.zenoh_client.client_session import ClientSession
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
 MODES = ("client", "peer", "router")
 AVATAR = "al"

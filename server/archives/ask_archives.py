@@ -21,7 +21,7 @@ from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stopped, make_budget
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.path import part_stop, path_question
-from ..runtime.stop_flag import NEVER, Stop
+from ..runtime.stop_flag import NO_STOP, StopFlag
 from .archive_generation import Opened
 from .merge_answers import carried, limited, merged
 from .placed_archive import PlacedArchive
@@ -61,7 +61,7 @@ def ask_each(
     budget_ms: float | None = None,
     budget_visits: int | None = None,
     radius_model: str | None = None,
-    stop: Stop = NEVER,
+    stop: StopFlag = NO_STOP,
 ) -> _A:
     """Ask every archive a question of k poses (rays, points, motions, objects), and merge the answers."""
     budget = make_budget(tolerance, budget_ms, budget_visits, stop)
@@ -126,7 +126,7 @@ def rows_of(column: Any, rows: Rows) -> Any:
 
 
 def along(
-    legs: Sequence[Leg], avatar: AvatarModel, op: str, parameters: dict[str, Any], stop: Stop = NEVER
+    legs: Sequence[Leg], avatar: AvatarModel, op: str, parameters: dict[str, Any], stop: StopFlag = NO_STOP
 ) -> tuple[Callable[[int, int], Cost], int]:
     """Return what answers [start, stop) of a path through all archives, and how many answers there are.
 
@@ -138,7 +138,7 @@ def along(
     visits, budget_ms = parameters.get("budget_visits"), parameters.get("budget_ms")
     limit = parameters.get("limit")
 
-    def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: Stop | None) -> Cost:
+    def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: StopFlag | None) -> Cost:
         """Ask with what is left of the visits of each answer from `start` on, and of the time."""
 
         def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> Cost:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...schemas.wire.answers import ContactsAnswers, Cost, Verdict
 from ...schemas.wire.arrays import array_fields
-from ...schemas.wire.questions import CONTACTS, Frame, Merge, Question, Rows, question_of
+from ...schemas.wire.questions import CONTACTS, ColumnFrame, Merge, Question, Rows, question_of
 from .rigid_transform import Pose, moved, moved_boxes, turned
 
 _A = TypeVar("_A", bound=Cost)
@@ -29,18 +29,18 @@ def carried(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
     fields: dict[str, Any] = {}
     low = ""
     for name, rule in question_of(type(answers)).columns.items():
-        if rule.frame is Frame.SCAN and first_source:
+        if rule.frame is ColumnFrame.SCAN and first_source:
             numbers = _of(answers, name)
             fields[name] = np.where(numbers >= 0, numbers + np.int32(first_source), numbers)
         if pose is None:
             continue
-        if rule.frame is Frame.POINT:
+        if rule.frame is ColumnFrame.POINT:
             fields[name] = moved(pose, _of(answers, name))
-        elif rule.frame is Frame.DIRECTION:
+        elif rule.frame is ColumnFrame.DIRECTION:
             fields[name] = turned(pose, _of(answers, name))
-        elif rule.frame is Frame.BOX_LOW:
+        elif rule.frame is ColumnFrame.BOX_LOW:
             low = name
-        elif rule.frame is Frame.BOX_HIGH:
+        elif rule.frame is ColumnFrame.BOX_HIGH:
             fields[low], fields[name] = moved_boxes(pose, _of(answers, low), _of(answers, name))
     return structs.replace(answers, **fields) if fields else answers
 

@@ -8,7 +8,7 @@ from msgspec import structs
 
 from ...schemas.wire.messages import SceneInfo, StatsAnswer
 from ...schemas.wire.stats import AvatarStats, Counters
-from ..observability.metrics import Metrics, times_of
+from ..observability.request_stats import RequestStats, times_of
 from .archive_generation import Opened
 from .archive_info import listed_sources
 from .rigid_transform import Pose, moved_boxes, under
@@ -73,7 +73,7 @@ def _box(box: list[list[float]], pose: Pose | None) -> Any:
 
 
 def make_stats(
-    name: str, each: Sequence[Opened], metrics: Metrics, avatars: AvatarStats, *, keys: bool = False
+    name: str, each: Sequence[Opened], metrics: RequestStats, avatars: AvatarStats, *, keys: bool = False
 ) -> StatsAnswer:
     """Return what a scene keeps in memory, all archives together, and what it answered so far.
 

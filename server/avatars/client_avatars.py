@@ -13,8 +13,7 @@ from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
 from ...schemas.wire.messages import make_positions
 from ...schemas.wire.seals import avatar_digest
 from ...schemas.wire.stats import AvatarStats
-from ..served.answering_avatars import note
-from ..served.avatar_limits import EVERYBODY, THIS_PROCESS, AvatarLimits
+from ..scene_interface import EVERYBODY, THIS_PROCESS, AvatarLimits, record_avatar
 from .avatar_model import AvatarModel, make_avatar
 
 # Upper bound of the arrays of an avatar [bytes]: measured 53.5 a point, and one block for a few
@@ -70,7 +69,7 @@ class Avatars:
                 entry = self._clients.get(owner, {}).get(name)
                 if entry is not None and entry.model is not None:
                     entry.used = time.monotonic()
-                    note(entry.model.digest)
+                    record_avatar(entry.model.digest)
                     return entry.model
         raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
 

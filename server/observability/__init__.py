@@ -1,5 +1,5 @@
 """Counters of a scene, and their export as Prometheus metrics.
 
 May import schemas.
-Begin with metrics.py.
+Begin with request_stats.py.
 """

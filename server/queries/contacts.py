@@ -40,7 +40,7 @@ from ..kernels.contacts.contact_pairs import Asked, Tally, gather_contacts
 from ..kernels.core.voxel_layout import LANES
 from ..kernels.core.voxels_in_reach import Reach
 from ..kernels.overlap.overlap import STACK
-from ..runtime.stop_flag import NEVER
+from ..runtime.stop_flag import NO_STOP
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -154,7 +154,7 @@ def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArr
 def _empty_memory(limit: int) -> Memory:
     """Return the memory of a search that has not begun."""
     return Memory(
-        make_cells(FIRST_CELLS, NEVER.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
+        make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
         np.zeros(3, np.int64), np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
         np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip

@@ -17,7 +17,7 @@ from ...schemas.wire.answers import ObjectsAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.pose_transform import MAX_REACH_UNITS, check_poses
-from ..runtime.stop_flag import NEVER
+from ..runtime.stop_flag import NO_STOP
 from .collide import collide
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
@@ -116,7 +116,7 @@ def _check(
 
     This takes milliseconds for the largest request, so it does not check the stop flag.
     """
-    data = with_stop(data, NEVER)
+    data = with_stop(data, NO_STOP)
     array = kernel_poses(poses)
     n = len(array)
     group, mask = np.asarray(groups, np.uint32), np.asarray(masks, np.uint32)
@@ -195,7 +195,9 @@ def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[n
     capacity = 8 * len(present)
     while True:
         pairs = np.empty((capacity, 2), np.int32)
-        found, filtered = sweep_and_prune(order, low, high, placing.groups, placing.masks, NEVER.flag, pairs)
+        found, filtered = sweep_and_prune(
+            order, low, high, placing.groups, placing.masks, NO_STOP.flag, pairs
+        )
         if found <= capacity:
             break
         capacity = found

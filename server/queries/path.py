@@ -23,7 +23,7 @@ from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.pose_transform import check_poses
 from ..runtime.deadlines import stop_at
-from ..runtime.stop_flag import NEVER, Stop
+from ..runtime.stop_flag import NO_STOP, StopFlag
 from .context.query_budget import ask_until_stopped, make_budget, unknown_answers
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .engines import ENGINES
@@ -49,7 +49,7 @@ class AskPart(Protocol):
     part: stop flag of the part that contains them; None: they form a part.
     """
 
-    def __call__(self, start: int, end: int, part: Stop | None = None) -> Cost: ...
+    def __call__(self, start: int, end: int, part: StopFlag | None = None) -> Cost: ...
 
 
 def path_question(
@@ -58,7 +58,7 @@ def path_question(
     poses: Poses,
     op: str,
     parameters: dict[str, Any],
-    stop: Stop = NEVER,
+    stop: StopFlag = NO_STOP,
 ) -> tuple[AskPart, int]:
     """Return the function that answers a range of a path, and the total number of answers.
 
@@ -87,7 +87,7 @@ def path_question(
     )
     refuse(fault, pose, found)
 
-    def ask(start: int, end: int, part: Stop | None = None) -> Cost:
+    def ask(start: int, end: int, part: StopFlag | None = None) -> Cost:
         if budget.spent:
             return unknown_answers(question, end - start, budget)
         what = [poses[start:end], poses[start + 1 : end + 1]] if question.moving else [poses[start:end]]
@@ -102,7 +102,7 @@ def path_question(
     return ask, question.items_along(len(poses))
 
 
-def part_stop(stop: Stop, seconds: float) -> Stop:
+def part_stop(stop: StopFlag, seconds: float) -> StopFlag:
     """Return the stop flag of a part that begins now: set after `seconds` or with the path's."""
     if seconds == math.inf:
         return stop

@@ -15,7 +15,7 @@ from ...schemas.kernels.normal_codes import NONE, decode_normal
 from ..kernels.core.voxel_layout import LANES
 from ..kernels.rays.stored_normals import UNASKED, code_at, find_voxel, stored_code_at
 from ..residency.voxel_store import Store
-from ..runtime.stop_flag import NEVER, Stop, StoppedError
+from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .context.query_context import SceneData, with_stop
 
 # Memory for normals, as a share of the budget for voxels, in addition to it.
@@ -52,7 +52,7 @@ class Normals:
         self.most_bytes = int(data.residency.budget_bytes * SHARE) if most_bytes is None else most_bytes
         self.used_bytes = self.estimated = self.visits = 0
         # Shared by all requests, so the stop flag of the first one must not apply.
-        self._data, self._leaves = with_stop(data, NEVER), rows["leaves"]
+        self._data, self._leaves = with_stop(data, NO_STOP), rows["leaves"]
         self._most_points = int(rows["rows"][:, 2].max(initial=0))
         self._origin = tuple(data.arrays.origin.tolist())
         self._codes: OrderedDict[tuple[int, int], NDArray[np.uint16]] = OrderedDict()
@@ -65,7 +65,7 @@ class Normals:
             )
 
     def at(
-        self, cloud: ArrayLike, toward: ArrayLike, reach: float, stop: Stop = NEVER
+        self, cloud: ArrayLike, toward: ArrayLike, reach: float, stop: StopFlag = NO_STOP
     ) -> NDArray[np.float64] | None:
         """Return the unit normal (3,) of the surface at a scan point, on the side of `toward`.
 
@@ -86,7 +86,7 @@ class Normals:
         side = -1.0 if x * a + y * b + z * c < 0.0 else 1.0
         return np.array([side * x, side * y, side * z])
 
-    def code(self, cloud: ArrayLike, reach: float, stop: Stop = NEVER) -> int:
+    def code(self, cloud: ArrayLike, reach: float, stop: StopFlag = NO_STOP) -> int:
         """Return the code of the normal (schemas/kernels/normal_codes.py); NONE if there is none.
 
         stop: ends a wait for a load. Raise CorruptError, StoppedError.

@@ -15,7 +15,7 @@ from ..kernels.core.pose_transform import SIMILARITY_TOLERANCE, check_poses
 from ..kernels.core.voxels_in_reach import Reach
 from ..kernels.motion.sweep_advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
-from ..runtime.stop_flag import Stop
+from ..runtime.stop_flag import StopFlag
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
 
@@ -231,7 +231,7 @@ def _hidden_rows(
     planned: tuple[NDArray[np.int64], NDArray[np.int64]],
     by_index: tuple[NDArray[np.int64], NDArray[np.int64]],
     voxels: int,
-    stop: Stop,
+    stop: StopFlag,
 ) -> list[int]:
     """Return the distinct rows, ascending, in reach of a motion by `planned` but not by the index.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ..kernels.core.voxel_tree import VoxelTree, make_voxel_tree, tighten
 from ..kernels.core.voxels_in_reach import Reach, SceneIndex
-from ..runtime.stop_flag import NEVER, Stop
+from ..runtime.stop_flag import NO_STOP, StopFlag
 
 _Int64 = NDArray[np.int64]
 
@@ -99,7 +99,7 @@ class Bounds:
                     self._trees = trees
         return trees
 
-    def rows_to_prove(self, reach: Reach, unproved: int, stop: Stop = NEVER) -> list[int]:
+    def rows_to_prove(self, reach: Reach, unproved: int, stop: StopFlag = NO_STOP) -> list[int]:
         """Find the rows in `reach` that would not be in it by the boxes in the index.
 
         Return them ascending, each once.

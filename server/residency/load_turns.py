@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 
-from ..runtime.stop_flag import Stop, seconds_to
+from ..runtime.stop_flag import StopFlag, seconds_to
 
 # A turn that takes longer, for a slow disk or a wait for memory, does not block others [s].
 MAX_TURN_SECONDS = 0.025
@@ -41,7 +41,7 @@ class LoadTurns:
         self._current: LoadTurn | None = None
         self._since = 0.0  # when the current turn began, on the monotonic clock [s]
 
-    def take(self, deadline: float, stop: Stop) -> LoadTurn | None:
+    def take(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
         """Wait for a turn and return it; return None if the deadline or the stop flag comes first.
 
         `give_back` ends the turn.

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
 from ...schemas.wire.stats import Counters
-from ..runtime.stop_flag import NEVER, Stop, seconds_to
+from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
 from .allocator import Room
 from .arena import ArenaBuffer
 from .cache_stats import Accounts
@@ -40,7 +40,7 @@ class Hold:
     __slots__ = ("_deadline", "_residency", "_rows", "_scan", "_stop")
 
     def __init__(
-        self, residency: "Residency", rows: Sequence[int], deadline: float, scan: bool, stop: Stop
+        self, residency: "Residency", rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag
     ) -> None:
         """Make a hold; call `Residency.hold` instead."""
         self._residency, self._rows, self._deadline, self._scan = residency, rows, deadline, scan
@@ -169,7 +169,7 @@ class Residency:
     # --- requests -----------------------------------------------------------------------------------------
 
     def hold(
-        self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: Stop = NEVER
+        self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
     ) -> "Hold":
         """Load the voxels of distinct index rows and pin them inside a `with` that yields a `Held`.
 
@@ -192,7 +192,7 @@ class Residency:
         self._accounts.found(rows)
 
     def acquire(
-        self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: Stop = NEVER
+        self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
     ) -> Held:
         """Begin a hold; the caller must call `release` unless this raises."""
         begin = time.perf_counter()
@@ -207,7 +207,7 @@ class Residency:
         offsets = self._room.offsets
         return sum(row not in offsets and not self._fault(row) for row in rows)
 
-    def _take_turn(self, deadline: float, stop: Stop) -> LoadTurn | None:
+    def _take_turn(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
         """Wait for a turn to load; `_demands` counts the request meanwhile."""
         with self._changed:
             self._demands += 1
@@ -218,7 +218,9 @@ class Residency:
                 self._demands -= 1
                 self._changed.notify_all()
 
-    def _acquire(self, rows: Sequence[int], deadline: float, scan: bool, stop: Stop, begin: float) -> Held:
+    def _acquire(
+        self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag, begin: float
+    ) -> Held:
         """Begin a hold. begin: time of the call of `acquire` on time.perf_counter()'s clock [s]."""
         mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
         if settled:
@@ -271,7 +273,7 @@ class Residency:
             self._changed.notify_all()
 
     def _reserve(
-        self, rows: Sequence[int], deadline: float, scan: bool, stop: Stop
+        self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag
     ) -> tuple[list[int], int, bool, bool]:
         """Pin all rows and make room for those that this caller is to load.
 
@@ -316,7 +318,7 @@ class Residency:
         return not (self._faults or self._passing) or not any(map(self._fault, rows))
 
     def _make_room(
-        self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool, stop: Stop
+        self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool, stop: StopFlag
     ) -> list[int]:
         """Make room for the rows `mine` among `rows`, which this caller has pinned; wait if needed.
 
@@ -343,7 +345,7 @@ class Residency:
             if not roomy:
                 return []
 
-    def _wait(self, deadline: float, stop: Stop) -> bool:
+    def _wait(self, deadline: float, stop: StopFlag) -> bool:
         """Wait until another thread changes the state; return False at the deadline or on stop."""
         while (left := seconds_to(deadline, stop)) != 0:
             if self._changed.wait(left):
@@ -415,7 +417,7 @@ class Residency:
 
     # --- loads --------------------------------------------------------------------------------------------
 
-    def _load(self, rows: list[int], deadline: float, stop: Stop) -> None:
+    def _load(self, rows: list[int], deadline: float, stop: StopFlag) -> None:
         """Load reserved rows: each leaves `_loading`, loaded or faulty, or is left to others."""
         for number, row in enumerate(rows):
             if seconds_to(deadline, stop) == 0:

@@ -11,7 +11,7 @@ import threading
 import time
 import weakref
 
-from .stop_flag import Stop
+from .stop_flag import StopFlag
 from .threads import start_thread
 
 # Entries whose request has ended stay until their time, or until the heap has grown by this factor
@@ -29,7 +29,7 @@ class Deadlines:
     def __init__(self) -> None:
         """Start without a thread."""
         self._changed = threading.Condition()
-        self._heap: list[tuple[float, int, weakref.ref[Stop], str]] = []
+        self._heap: list[tuple[float, int, weakref.ref[StopFlag], str]] = []
         self._numbers = itertools.count()
         self._compact_at = _LEAST_ENTRIES
         self._thread: threading.Thread | None = None
@@ -39,7 +39,7 @@ class Deadlines:
         with self._changed:
             self._start()
 
-    def add(self, stop: Stop, when: float, reason: str) -> None:
+    def add(self, stop: StopFlag, when: float, reason: str) -> None:
         """Set `stop` with this reason at `when`, on time.perf_counter()'s clock [s]."""
         with self._changed:
             heapq.heappush(self._heap, (when, next(self._numbers), weakref.ref(stop), reason))
@@ -76,7 +76,7 @@ class Deadlines:
 _DEADLINES = Deadlines()
 
 
-def stop_at(stop: Stop, when: float, reason: str) -> None:
+def stop_at(stop: StopFlag, when: float, reason: str) -> None:
     """Set `stop` at `when`, on time.perf_counter()'s clock [s], if it is still referenced then."""
     _DEADLINES.add(stop, when, reason)
 

@@ -16,7 +16,7 @@ _PARTS = threading.Lock()
 _LOOK_SECONDS = 0.005
 
 
-class Stop:
+class StopFlag:
     """Flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
 
     flag: (1,) int64, 0 until it is set; kernels read it without a lock.
@@ -31,7 +31,7 @@ class Stop:
         self.flag = np.zeros(1, np.int64)
         self.reason = ""
         self.part_seconds = part_seconds
-        self._parts: list[weakref.ref[Stop]] = []
+        self._parts: list[weakref.ref[StopFlag]] = []
 
     def set(self, reason: str) -> None:
         """Set the flag, and those of its parts. The first reason is kept."""
@@ -44,9 +44,9 @@ class Stop:
         for part in parts:
             part.set(reason)
 
-    def part(self) -> "Stop":
+    def part(self) -> "StopFlag":
         """Return a flag for a part of the work; setting this flag sets the part's flag too."""
-        part = Stop()
+        part = StopFlag()
         with _PARTS:
             self._parts = [each for each in self._parts if each() is not None]
             self._parts.append(weakref.ref(part))
@@ -59,7 +59,7 @@ class Stop:
         return self.flag.item(0) != 0
 
 
-class _Never(Stop):
+class _Never(StopFlag):
     """Flag that cannot be set, shared by all requests without a time limit or watchdog."""
 
     __slots__ = ()
@@ -67,23 +67,23 @@ class _Never(Stop):
     def set(self, reason: str) -> None:
         """Raise RuntimeError: the flag is shared."""
         raise RuntimeError(
-            f"the stop flag of all requests was to be set ({reason}): make a Stop for the request"
+            f"the stop flag of all requests was to be set ({reason}): make a StopFlag for the request"
         )
 
-    def part(self) -> Stop:
+    def part(self) -> StopFlag:
         """Return an independent flag: this one is never set."""
-        return Stop()
+        return StopFlag()
 
 
 # Stop flag of requests that nothing stops.
-NEVER: Stop = _Never()
+NO_STOP: StopFlag = _Never()
 
 
 class StoppedError(Exception):
     """Request stopped before any of its poses was examined. The scene answers `unknown` for all."""
 
 
-def seconds_to(deadline: float, stop: Stop) -> float | None:
+def seconds_to(deadline: float, stop: StopFlag) -> float | None:
     """Return how long a request may wait before it checks again [s]; None: without limit.
 
     deadline: on time.perf_counter()'s clock [s]. The result is 0 after the deadline or once the
@@ -91,7 +91,7 @@ def seconds_to(deadline: float, stop: Stop) -> float | None:
     """
     if stop:
         return 0.0
-    most = math.inf if stop is NEVER else _LOOK_SECONDS
+    most = math.inf if stop is NO_STOP else _LOOK_SECONDS
     if deadline < math.inf:
         most = min(most, max(0.0, deadline - time.perf_counter()))
     return None if most == math.inf else min(most, threading.TIMEOUT_MAX)

@@ -19,26 +19,26 @@ from ..archives.merge_answers import limited
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..avatars.client_avatars import Avatars
-from ..observability.metrics import Metrics
+from ..observability.request_stats import RequestStats
 from ..queries.context.query_budget import QueryBudget, ask_until_stopped, make_budget
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.engines import ENGINES
 from ..queries.objects import SCENE_GROUP
 from ..queries.path import PATH_THREADS, largest_part, path_parts
 from ..runtime.path_threads import PathThreads
-from ..runtime.stop_flag import NEVER, Stop
-from ..served.asks import Asks
+from ..runtime.stop_flag import NO_STOP, StopFlag
+from ..scene_interface import QueryMethods
 
 _A = TypeVar("_A", bound=Cost)
 
 
-class SceneQuestions(Asks):
+class SceneQuestions(QueryMethods):
     """The archives of a scene, the avatars of its clients, and the questions. Thread-safe.
 
     name: of the scene.  archives: at least one.
     """
 
-    def __init__(self, archives: Sequence[PlacedArchive], name: str, metrics: Metrics) -> None:
+    def __init__(self, archives: Sequence[PlacedArchive], name: str, metrics: RequestStats) -> None:
         """Ask these archives; see `Scene`."""
         self.name, self.archives = name, list(archives)
         # A single archive at the identity: its questions take a request as it is.
@@ -193,7 +193,7 @@ class SceneQuestions(Asks):
         threads: int = PATH_THREADS,
         radius_model: str | None = None,
         client: str = "",
-        stop: Stop = NEVER,
+        stop: StopFlag = NO_STOP,
         **parameters: Any,
     ) -> Iterator[Part]:
         """Ask `op` (collide, distance, contacts, sweep) along the poses; the answers come in parts, in order.
@@ -235,7 +235,7 @@ def _terms(
     budget_ms: float | None = None,
     budget_visits: int | None = None,
     radius_model: str | None = None,
-    stop: Stop = NEVER,
+    stop: StopFlag = NO_STOP,
 ) -> tuple[SceneData, QueryBudget]:
     """Return what a question with these options reads, and what it may cost."""
     budget = make_budget(tolerance, budget_ms, budget_visits, stop)

@@ -1,6 +1,6 @@
 """Frames: motion commands in, poses out; the replay log.
 
 May import server.archives, server.avatars, server.queries, server.queries.context, server.runtime,
-server.served, server.simulation.effects, server.simulation.world, schemas.
+server/scene_interface.py, server.simulation.effects, server.simulation.world, schemas.
 Begin with simulation.py; assembly.py builds a simulation from a scene file.
 """

@@ -13,9 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError
-from ...schemas.wire.keys import User
-from ...schemas.wire.moves import State, Wish
-from ..served.served_scene import Latest, Turn
+from ...schemas.wire.key_expressions import User
+from ...schemas.wire.motion_messages import State, Wish
+from ..scene_interface import FrameCommand, LatestState
 from .simulation import Simulation
 
 # Maximum number of states kept for `states`; of more, the oldest are dropped.
@@ -92,7 +92,7 @@ class LocalSession:
                 objects=dict(objects or {}),
             )
             self._seq = wish.seq
-            (outcome,) = self._simulation.step([Turn(self._user, wish)], now)
+            (outcome,) = self._simulation.step([FrameCommand(self._user, wish)], now)
             self._keep(outcome.state)
         return wish.seq
 
@@ -112,11 +112,11 @@ class LocalSession:
         if error is not None:
             raise error
 
-    def latest(self) -> Latest | None:
+    def latest(self) -> LatestState | None:
         """Return the last state and its age; None: there is none yet. Raise, once, a refusal since."""
         with self._changed:
             self._raise_error()
-            return None if self._latest is None else Latest(self._latest, monotonic() - self._when)
+            return None if self._latest is None else LatestState(self._latest, monotonic() - self._when)
 
     def wait(self, seq: int, timeout: float = 5.0) -> State:
         """Return the state of a command, or of a newer one. BusyError: none came within `timeout` [s].

@@ -13,10 +13,10 @@ import numpy as np
 
 from ...schemas.errors import BadRequestError, ErrorCode, SolidcloudError
 from ...schemas.wire.encoding import decode_request
-from ...schemas.wire.keys import User
-from ...schemas.wire.moves import Wish
-from ..runtime.stop_flag import NEVER, Stop
-from ..served.served_scene import SceneLike, Turn
+from ...schemas.wire.key_expressions import User
+from ...schemas.wire.motion_messages import Wish
+from ..runtime.stop_flag import NO_STOP, StopFlag
+from ..scene_interface import FrameCommand, ServedScene
 from .replay_log import Begin, Dropped, Ended, Entered, Frame, FrameLog, Points, Record, Said, said
 from .simulation import Simulation
 
@@ -88,11 +88,11 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
 
 def _differences(simulation: Simulation, record: Frame) -> list[Difference]:
     """Run one frame; what comes out otherwise."""
-    wished = [Turn(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
+    wished = [FrameCommand(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
     # A turn that the server ended early depended on a clock: it is ended again, and moves nobody.
-    ended = Stop()
+    ended = StopFlag()
     ended.set("ended early when it was logged")
-    stops = [ended if logged.error == ErrorCode.EXPIRED else NEVER for logged in record.said]
+    stops = [ended if logged.error == ErrorCode.EXPIRED else NO_STOP for logged in record.said]
     outcomes = simulation.step(wished, skips=[logged.skipped for logged in record.said], stops=stops)
     return [
         Difference(record.number, outcome.user, logged, found)
@@ -150,7 +150,7 @@ def begin_of(simulation: Simulation, path: Path) -> Begin:
 
 
 @contextmanager
-def recorded(scene: SceneLike, path: Path, log: Path) -> Iterator[None]:
+def recorded(scene: ServedScene, path: Path, log: Path) -> Iterator[None]:
     """Log the frames of a scene to a new file while inside. path: of its archive or scene file. BadRequestError."""
     simulation: Any = scene.simulation
     with FrameLog(log, begin_of(simulation, path)) as frames:

@@ -20,9 +20,9 @@ import numpy as np
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ...schemas.process.os_errors import write_error_words
 from ...schemas.wire.encoding import encode
-from ...schemas.wire.keys import User
+from ...schemas.wire.key_expressions import User
 from ..avatars.avatar_model import AvatarModel
-from ..served.served_scene import Outcome, Turn
+from ..scene_interface import FrameCommand, FrameResult
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +103,7 @@ _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)
 
 
-def said(outcome: Outcome, opened: Sequence[int] = ()) -> Said:
+def said(outcome: FrameResult, opened: Sequence[int] = ()) -> Said:
     """What a log says of an outcome. opened: how often each archive had been reloaded."""
     if isinstance(outcome.state, SolidcloudError):
         return Said(b"", str(outcome.state.code))
@@ -176,8 +176,8 @@ class FrameLog:
     def frame(
         self,
         number: int,
-        turns: Sequence[Turn],
-        outcomes: Sequence[Outcome],
+        turns: Sequence[FrameCommand],
+        outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
     ) -> None:
         """One frame. opened: of each turn, how often each archive had been reloaded."""

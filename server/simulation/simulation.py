@@ -17,16 +17,15 @@ import numpy as np
 from ...schemas.errors import BadRequestError, BusyError, ExpiredError, InternalError, SolidcloudError
 from ...schemas.scene.scene_file import SceneFile
 from ...schemas.wire.answers import Verdict
-from ...schemas.wire.keys import User, public_id
+from ...schemas.wire.key_expressions import User, public_id
 from ...schemas.wire.messages import AvatarInfo, SceneInfo
-from ...schemas.wire.moves import FRAME_SECONDS, Moved, MoveRequest, State, Wish
+from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ...schemas.wire.requests import make_poses
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import EXACT, QueryBudget
-from ..runtime.stop_flag import NEVER, Stop, StoppedError
-from ..served.answering_avatars import noted
-from ..served.served_scene import Outcome, Turn
+from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
+from ..scene_interface import FrameCommand, FrameResult, recording_avatars
 from .world.frame import Body
 from .world.motion_commands import Pose, check_rigid, first_pose, frame_seconds, wished_pose
 from .world.vectors import size, unit
@@ -75,7 +74,7 @@ class Bodies(Protocol):
 
     def __setitem__(self, user: User, body: Body) -> None: ...
     def pop(self, user: User, default: None = None) -> Any: ...
-    def tell(self, poses: dict[str, list[list[float]]], stop: Stop) -> Callable[[], None]: ...
+    def tell(self, poses: dict[str, list[list[float]]], stop: StopFlag) -> Callable[[], None]: ...
 
 
 class Recorder(Protocol):
@@ -87,8 +86,8 @@ class Recorder(Protocol):
     def frame(
         self,
         number: int,
-        turns: Sequence[Turn],
-        outcomes: Sequence[Outcome],
+        turns: Sequence[FrameCommand],
+        outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
     ) -> None: ...
     def reloaded(self, generation: int) -> None: ...
@@ -151,7 +150,7 @@ class Simulation:
         seconds: float = FRAME_SECONDS,
         *,
         client: str = "",
-        stop: Stop = NEVER,
+        stop: StopFlag = NO_STOP,
     ) -> Moved:
         """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
 
@@ -176,11 +175,11 @@ class Simulation:
 
     def step(
         self,
-        turns: Sequence[Turn],
+        turns: Sequence[FrameCommand],
         now: float | None = None,
         skips: Sequence[Collection[str]] | None = None,
-        stops: Sequence[Stop] | None = None,
-    ) -> list[Outcome]:
+        stops: Sequence[StopFlag] | None = None,
+    ) -> list[FrameResult]:
         """One frame of everybody who wished, one after the other in the order of `turns`; what came of each.
 
         A user's first wish puts its body where the scene's spawn is, or else where it wishes to be. What a wish is
@@ -196,20 +195,20 @@ class Simulation:
             outcomes, opened = [], []
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
-                stop = NEVER if stops is None else stops[number]
+                stop = NO_STOP if stops is None else stops[number]
                 used: list[bytes] = []
-                with noted(used):
+                with recording_avatars(used):
                     said = self._turn(turn, now, skip, stop)
                 there = self._present.get(turn.user)
                 about = b"".join(used) if there is None else there.body.avatar.digest
-                outcomes.append(Outcome(turn.user, said, about))
+                outcomes.append(FrameResult(turn.user, said, about))
                 opened.append(() if there is None else there.body.generations)
             if self._recorder is not None:
                 self._recorder.frame(self._frames, turns, outcomes, opened)
             return outcomes
 
     def _turn(
-        self, turn: Turn, now: float | None, skip: Collection[str] | None, stop: Stop
+        self, turn: FrameCommand, now: float | None, skip: Collection[str] | None, stop: StopFlag
     ) -> State | SolidcloudError:
         """One user's frame; what it is refused for is returned."""
         begin = time.perf_counter()
@@ -233,7 +232,7 @@ class Simulation:
         )
 
     def _moved(
-        self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None, stop: Stop
+        self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None, stop: StopFlag
     ) -> Moved:
         """What comes of one wish; its user's body is begun with it, and not where it is refused."""
         there = self._present.get(user)

@@ -31,8 +31,8 @@ from solidcloud.schemas.wire.requests import make_objects
 from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0], [0.05, 0.05, 0.3]])
 POINTS = synthetic_scans.make_scan("corner", 4, 300)

@@ -21,7 +21,7 @@ from solidcloud.schemas.wire.answers import (
     WithinAnswers,
 )
 from solidcloud.schemas.wire.columns import as_part, unknown
-from solidcloud.schemas.wire.keys import User
+from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.messages import (
     WIRE_VERSION,
     AvatarInfo,
@@ -30,16 +30,16 @@ from solidcloud.schemas.wire.messages import (
     SourceInfo,
     StatsAnswer,
 )
-from solidcloud.schemas.wire.moves import Moved, Touched
+from solidcloud.schemas.wire.motion_messages import Moved, Touched
 from solidcloud.schemas.wire.seals import avatar_digest
 from solidcloud.server.archives.archive_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.served.answering_avatars import note
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serve
+from solidcloud.server.scene_interface import record_avatar
 from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import Begin, FrameLog
 from solidcloud.server.simulation.simulation import Simulation
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serve
 
 PART = 10  # poses in a part of a path
 
@@ -153,7 +153,7 @@ class FloorScene:
         if found is None:
             raise UnknownAvatarError(f"avatar {name!r}")
         digest = b"" if own is None or client == "*" else avatar_digest(*own)
-        note(digest)
+        record_avatar(digest)
         return make_avatar(*found)._replace(digest=digest)
 
     def move(self, name, pose_from, pose_to, seconds, *, client="", **options):
@@ -243,7 +243,7 @@ class FloorScene:
     def check(self, name, poses, client):
         if (client, name) not in self.avatars:
             raise UnknownAvatarError(f"avatar {name!r}")
-        note(avatar_digest(*self.avatars[client, name]))
+        record_avatar(avatar_digest(*self.avatars[client, name]))
         self.check_poses(poses)
 
     def check_poses(self, poses):

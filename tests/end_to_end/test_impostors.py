@@ -11,17 +11,17 @@ import zenoh
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
 from rogues.tools import Impostor
 from solidcloud.schemas.errors import BadRequestError, BusyError
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
 from solidcloud.schemas.wire.messages import AvatarInfo, ErrorReply
-from solidcloud.schemas.wire.moves import State
+from solidcloud.schemas.wire.motion_messages import State
 from solidcloud.schemas.wire.seals import Sealer, hash_of
 from solidcloud.server.client import Client, scenes_at
-from solidcloud.server.network.key_files import find_key, key_paths
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_common.key_files import find_key, key_paths
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at
 
 POSES = heights([-1.0, -2.0])
@@ -88,7 +88,7 @@ def test_a_rogue_at_a_dead_servers_port_is_never_believed(endpoint, seal, caplog
 def seal_of_the_server(client):
     """A seal as the server gives it, for another question."""
     replies = client._session.get(
-        keys.question_key("floor", client._id, "info"), attachment=bytes(16), encoding=MSGPACK
+        key_expressions.query_key("floor", client._id, "info"), attachment=bytes(16), encoding=MSGPACK
     )
     return next(iter(replies)).ok.attachment.to_bytes()
 

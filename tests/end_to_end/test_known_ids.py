@@ -13,16 +13,16 @@ from rogues.tools import Impostor
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
 from solidcloud.schemas.wire.messages import AddAvatarRequest
-from solidcloud.schemas.wire.moves import Wish
+from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])
@@ -78,7 +78,7 @@ def rogue_session(endpoint):
 
 def add(session, client, points, radius, name="al"):
     """Add an avatar in the name of a client."""
-    key = keys.question_key("floor", client, "add_avatar")
+    key = key_expressions.query_key("floor", client, "add_avatar")
     payload = encode(AddAvatarRequest(name, points, radius))
     replies = list(session.get(key, payload=payload, encoding=MSGPACK, timeout=DEADLINE))
     assert replies and replies[0].ok is not None
@@ -167,9 +167,9 @@ def test_a_session_does_not_walk_as_an_avatar_that_somebody_else_added(archive, 
             session.__enter__()
         with served(archive, endpoint), rogue_session(endpoint) as rogue:
             add(rogue, known, *LIES["high"])
-            user = keys.User(known, "al")
+            user = key_expressions.User(known, "al")
             wish = Wish(seq=1, time=0.0, pose=pose_at(0.0, -3.0)[None])
-            rogue.put(keys.wish_key("floor", user), encode(wish), encoding=MSGPACK)
+            rogue.put(key_expressions.command_key("floor", user), encode(wish), encoding=MSGPACK)
             rogue_began = time.monotonic()
             eventually(lambda: time.monotonic() - rogue_began > 0.2)
             if begun == "after":
@@ -192,7 +192,7 @@ def test_a_session_goes_on_when_a_question_found_out(archive, endpoint):
     ):
         eventually(lambda: states_after(session, 1, 2.0) == [2.0])
         # The avatar is taken from the client and replaced: as by a token that ends.
-        token = rogue.liveliness().declare_token(keys.client_alive_key("floor", known))
+        token = rogue.liveliness().declare_token(key_expressions.client_token_key("floor", known))
         token.undeclare()
         eventually(lambda: list(rogue.get("solidcloud/1/scenes", timeout=DEADLINE)))
         time.sleep(0.1)

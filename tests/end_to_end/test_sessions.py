@@ -15,15 +15,15 @@ from solidcloud.schemas.errors import (
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.messages import ErrorReply
-from solidcloud.schemas.wire.moves import State, Wish
+from solidcloud.schemas.wire.motion_messages import State, Wish
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.service import state_streams
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server import state_streams
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 from walkers import REST, outcome, pose_at, walking
 
 
@@ -259,22 +259,24 @@ def reached(session):
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
 def test_plain_zenoh_is_enough_to_walk(served, endpoint, encoding):
-    user, heard, ended = keys.User("me", "al"), [], threading.Event()
+    user, heard, ended = key_expressions.User("me", "al"), [], threading.Event()
     served.scene.add_avatar("al", POINTS, 0.125, client="me")
     with zenoh.open(session_config(connect=endpoint)) as session:
         session.get(
-            keys.state_key("floor", user),
+            key_expressions.state_key("floor", user),
             zenoh.handlers.Callback(heard.append, ended.set),
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=600.0,
         )
         wish = Wish(seq=7, time=1.0, pose=pose_at(0.0, -2.0)[None])
-        key = keys.wish_key("floor", user)
+        key = key_expressions.command_key("floor", user)
         session.put(key, encode(wish, encoding), encoding=encoding)
         eventually(lambda: len(heard) == 1)
         sample = heard[0].ok
         state = decode_answer(State, sample.payload.to_bytes(), encoding)
-        assert str(sample.encoding) == encoding and str(sample.key_expr) == keys.state_key("floor", user)
+        assert str(sample.encoding) == encoding and str(sample.key_expr) == key_expressions.state_key(
+            "floor", user
+        )
         assert (state.seq, state.frame) == (7, 1) and np.array_equal(state.pose[0], outcome(wish.pose[0]))
         for number, payload in enumerate((b"\xc1", b"{}", b"", b"\x80")):
             session.put(key, payload, encoding=encoding)
@@ -289,20 +291,20 @@ def test_plain_zenoh_is_enough_to_walk(served, endpoint, encoding):
         session.delete(key)
         eventually(lambda: not served.users)
         assert not ended.is_set()
-        session.get(keys.state_key("floor", user))
+        session.get(key_expressions.state_key("floor", user))
         assert ended.wait(DEADLINE), "a second query takes the place of the first"
         assert not list(session.get("solidcloud/1/state/floor/me/*", timeout=DEADLINE)), "of nobody"
 
 
 def test_a_state_that_comes_before_its_query_is_kept_for_it(served, endpoint):
-    user, heard = keys.User("me", "al"), []
+    user, heard = key_expressions.User("me", "al"), []
     served.scene.add_avatar("al", POINTS, 0.125, client="me")
     with zenoh.open(session_config(connect=endpoint)) as session:
         wish = Wish(seq=7, time=1.0, pose=pose_at(0.0, 2.0)[None])
-        session.put(keys.wish_key("floor", user), encode(wish))
+        session.put(key_expressions.command_key("floor", user), encode(wish))
         eventually(lambda: served.users)
         session.get(
-            keys.state_key("floor", user),
+            key_expressions.state_key("floor", user),
             heard.append,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=600.0,
@@ -319,12 +321,14 @@ def test_a_large_number_locks_nobody_out(served, endpoint):
             session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
             (user,) = served.users
             far = Wish(seq=10**9, time=1.0, pose=pose_at(0.0, 5.0)[None])
-            client._session.put(keys.wish_key("floor", user), encode(far))
+            client._session.put(key_expressions.command_key("floor", user), encode(far))
             session.wait(10**9, DEADLINE)
             # The session counts on above what it heard.
             seq = session.wish(pose_at(0.0, 2.0))
             assert seq > 10**9 and session.wait(seq, DEADLINE).pose[0, 2, 3] == 2.0
-            client._session.put(keys.wish_key("floor", user), encode(msgspec.structs.replace(far, seq=2**62)))
+            client._session.put(
+                key_expressions.command_key("floor", user), encode(msgspec.structs.replace(far, seq=2**62))
+            )
             eventually(lambda: session.latest().state.seq == 2**62)
         client._numbers.clear()
         with client.session("al") as session:
@@ -388,5 +392,5 @@ def test_others_are_told_of_by_another_name_than_their_id(served, endpoint):
     with walking(endpoint) as session:
         session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
         ((user, present),) = served._present.items()
-        assert present.body.name == f"{keys.public_id(user.client)}/al"
+        assert present.body.name == f"{key_expressions.public_id(user.client)}/al"
         assert present.body.user == user

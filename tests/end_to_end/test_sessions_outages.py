@@ -12,14 +12,14 @@ import pytest
 from fake_server import floor_simulation
 from floor import DEADLINE, POINTS, eventually, server_process
 from frozen_processes import freeze
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.encoding import encode
-from solidcloud.schemas.wire.moves import Wish
+from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.client import Client
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
 from solidcloud.server.simulation.replay import replay
 from solidcloud.server.simulation.replay_log import Frame, read_log
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at, walking
 
 
@@ -65,7 +65,7 @@ def test_a_frozen_client_stops_nobody(served, endpoint):
     """It is sent 20 MB of states, more than sockets and queues hold. Its query asks for replies that wait for room."""
     with other_client(endpoint) as other, walking(endpoint) as session:
         (frozen,) = [user for user in served.users if user.avatar == "large"]
-        key, stranger = keys.wish_key("floor", frozen), session._session
+        key, stranger = key_expressions.command_key("floor", frozen), session._session
         freeze(other.pid)
         try:
             for number in range(250):

@@ -11,11 +11,11 @@ from floor import DEADLINE, POINTS, eventually, heights
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.messages import CollideRequest, ErrorReply, decode_answer, encode
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.service import request_lanes as lanes_module
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import Service, serving
-from solidcloud.server.service.transport import Transport
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server import request_lanes as lanes_module
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import Service, serving
+from solidcloud.server.zenoh_server.transport import Transport
 
 ASKED = 50
 _WORK = bytes(1 << 20)

@@ -21,7 +21,7 @@ import pytest
 import synthetic_scans
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.keys import public_id, question_key
+from solidcloud.schemas.wire.key_expressions import public_id, query_key
 from solidcloud.schemas.wire.messages import (
     JSON,
     MSGPACK,
@@ -35,8 +35,8 @@ from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client, scenes_at
 from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import Service, serving
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import Service, serving
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_server import FloorScene
@@ -44,7 +44,7 @@ from fake_server import FloorScene
 BODY = np.array([[0.0, 0, 0], [0.15, 0, 0], [0.0, 0.1, 0.2]])
 RADIUS = 0.03
 DEADLINE = 60.0
-KEY = question_key("floor", "c", "stats")
+KEY = query_key("floor", "c", "stats")
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from fake_server import FloorScene, floor_simulation
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.cli.main import run
-from solidcloud.server.remote import request_batches as questions_module
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_client import request_batches as questions_module
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 OPS = [
     "collide",

@@ -23,18 +23,18 @@ from solidcloud.schemas.scene.effect_options import (
 )
 from solidcloud.schemas.scene.scene_file import SceneFile, scene_of
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.keys import User
-from solidcloud.schemas.wire.moves import Wish
+from solidcloud.schemas.wire.key_expressions import User
+from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
-from solidcloud.server.served.served_scene import Turn
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.scene_interface import FrameCommand
 from solidcloud.server.simulation.assembly import simulate
 from solidcloud.server.simulation.replay import recorded, replay
 from solidcloud.server.simulation.replay_log import MAGIC, Frame, read_log
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 # A body of a metre and a half, of three spheres.
 BODY = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.8], [0.0, 0.0, 1.3]])
@@ -232,7 +232,9 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
             for at, user in enumerate(users):
                 pose = pose_at(-1.0 + number / 40, 0.7 * at + 0.05 * rng.normal())
                 told = {"door": pose_at(0.0, 1.0 + 0.1 * rng.normal()).tolist()} if number % 7 == 3 else {}
-                turns.append(Turn(user, Wish(seq=number, time=number * STEP, pose=pose[None], objects=told)))
+                turns.append(
+                    FrameCommand(user, Wish(seq=number, time=number * STEP, pose=pose[None], objects=told))
+                )
             for outcome in scene.simulation.step(turns):
                 moved.update(outcome.state.objects.poses)
     assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"

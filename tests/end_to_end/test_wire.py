@@ -28,10 +28,10 @@ from solidcloud.schemas.wire.messages import (
     encode,
 )
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.remote import request_batches as questions_module
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_client import request_batches as questions_module
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 
 def test_client_answers_as_the_judge_does(client):

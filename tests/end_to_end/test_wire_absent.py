@@ -16,9 +16,9 @@ from solidcloud.schemas.wire.messages import (
     AvatarInfo,
 )
 from solidcloud.server.client import Client
-from solidcloud.server.remote import request_batches as questions_module
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_client import request_batches as questions_module
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 
 def test_nobody_there_is_unknown_until_a_server_comes(scene, endpoint):

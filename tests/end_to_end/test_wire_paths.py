@@ -21,10 +21,10 @@ from solidcloud.schemas.wire.messages import (
     encode,
 )
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.service import request_lanes as lanes_module
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server import request_lanes as lanes_module
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 
 def test_a_path_comes_in_parts_and_in_order(client):

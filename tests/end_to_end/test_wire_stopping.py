@@ -15,9 +15,9 @@ from solidcloud.schemas.wire.messages import (
     encode,
 )
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serve, serving
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serve, serving
 
 
 def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):

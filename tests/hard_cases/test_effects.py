@@ -21,9 +21,9 @@ from solidcloud.schemas.scene.effect_order import ORDER
 from solidcloud.schemas.scene.scene_file import SceneFile
 from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, encode
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import Service
 from solidcloud.server.simulation.assembly import simulate
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import Service
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
@@ -171,8 +171,9 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
     # What a frame is made of, and their order, are types; nothing that would simulate one.
     assert not {name for name in ours if name.startswith("server.simulation.effects")}
     assert not {"server.simulation.world.collision_world", "server.queries.resident_motion", *HELPERS} & ours
-    for part in ("server.report", "server.service", "server.network", "server.remote", "server.client", "server.cli",
-                 "builder.synthetic", "builder.sources", "builder.pipeline"):  # fmt: skip
+    for part in ("server.report", "server.zenoh_server", "server.zenoh_common", "server.zenoh_client",
+                 "server.client", "server.cli", "builder.synthetic", "builder.sources",
+                 "builder.pipeline"):  # fmt: skip
         assert not [name for name in ours if name == part or name.startswith(part + ".")], part
     for library in (
         "zenoh",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.scene.effect_options import AnyEffect
 from solidcloud.schemas.scene.scene_file import ArchiveItem, Limits, SceneFile
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.pipeline import Pipeline, make_pipeline

@@ -13,11 +13,11 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.builder.synthetic.truth import FacadeTruth, read_truth
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import serving
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import serving
 
 WALKING = ("stop", "sweep", "slide", "step", "ground")
 FRAME = 1 / 30

@@ -38,10 +38,10 @@ from solidcloud.schemas.wire.messages import (
     decode_answer,
     encode,
 )
-from solidcloud.schemas.wire.requests import ObjectItem, QuestionRequest
+from solidcloud.schemas.wire.requests import ObjectEntry, QuestionRequest
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import Service
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import Service
 
 SCAN = ("corner", 21, 500)
 MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")
@@ -91,7 +91,7 @@ def question(
     elif op == "within":
         asked = WithinRequest(starts, 0.3, **effort)
     else:
-        asked = ObjectsRequest([ObjectItem("body")] * len(poses), poses, 0.01, **effort)
+        asked = ObjectsRequest([ObjectEntry("body")] * len(poses), poses, 0.01, **effort)
     return op, asked
 
 

@@ -10,7 +10,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from point_clouds import signed_permutations
 from solidcloud.server.archives.placed_archive import PlacedArchive
-from solidcloud.server.observability.metrics import Metrics
+from solidcloud.server.observability.request_stats import RequestStats
 from solidcloud.server.scene import DEFAULT_BUDGET, Scene
 
 STEP = archive_cases.BINARY_STEP
@@ -51,7 +51,7 @@ class Built:
 
 def several(*archives: tuple[Path, Any], **options: Any) -> Scene:
     """A scene of archives at poses, with an avatar."""
-    metrics, how = Metrics(), {"budget_bytes": DEFAULT_BUDGET, **options}
+    metrics, how = RequestStats(), {"budget_bytes": DEFAULT_BUDGET, **options}
     opened = [
         PlacedArchive.open(path, "hall", pose=pose, took=metrics.loaded, **how) for path, pose in archives
     ]

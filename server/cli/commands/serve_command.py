@@ -82,11 +82,11 @@ def serve(
     from contextlib import ExitStack
 
     from ....schemas.kernels.compiling import kernel_files
-    from ...network.key_files import read_given_key
     from ...scene import Scene
-    from ...service.server_config import ServerConfig
-    from ...service.service import serve as serve_scenes
     from ...simulation.replay import recorded
+    from ...zenoh_common.key_files import read_given_key
+    from ...zenoh_server.server_config import ServerConfig
+    from ...zenoh_server.service import serve as serve_scenes
     from .kernel_rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")

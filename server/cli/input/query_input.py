@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
 from ....schemas.wire.columns import join, without_part
-from ....schemas.wire.moves import LONGEST_SECONDS, Moved
+from ....schemas.wire.motion_messages import LONGEST_SECONDS, Moved
 from ....schemas.wire.questions import OBJECTS, QUESTIONS, Question, path_questions
 from ....schemas.wire.requests import QuestionRequest
 from .pose_file import read_objects, read_poses, read_rays

@@ -20,7 +20,7 @@ from ....schemas.wire.answers import (
     WithinAnswers,
 )
 from ....schemas.wire.arrays import array_fields
-from ....schemas.wire.moves import Moved
+from ....schemas.wire.motion_messages import Moved
 from ....schemas.wire.questions import COMMON, CONTACTS, Question, Rows, question_of
 
 _NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}

@@ -12,7 +12,7 @@ from ....schemas.archive.radius_model import STORED_MODELS
 from ....schemas.errors import BadRequestError, SolidcloudError
 from ....schemas.process.os_errors import write_error_words
 from ....schemas.scene.scene_file import SUFFIX, parse_scene, scene_name
-from ....schemas.wire.keys import check_name
+from ....schemas.wire.key_expressions import check_name
 from ...archives.archive_info import describe
 from ...residency.voxel_store import Store
 from .scene_text import Beginning, scene_text

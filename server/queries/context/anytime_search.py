@@ -28,7 +28,7 @@ from ...kernels.nearest.best_first_search import (
     search_poses,
 )
 from ...kernels.nearest.nearest_pair import Nearest
-from ...runtime.stop_flag import Stop
+from ...runtime.stop_flag import StopFlag
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, as_held, find_proved_reach, in_unknown, kernel_poses, pieces, to_units
 from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
@@ -92,7 +92,7 @@ def _leave_open(
     data: SceneData,
     part: Reach,
     left: NDArray[np.int64],
-    stop: Stop,
+    stop: StopFlag,
     known: Known,
     counts: NDArray[np.uint32],
 ) -> None:

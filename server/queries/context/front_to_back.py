@@ -20,7 +20,7 @@ from ....schemas.wire.requests import make_vectors
 from ...kernels.core.voxel_tree import Lists, VoxelTree, list_voxels
 from ...kernels.rays.rays import Nearest
 from ...residency.index_proof import ENTRIES_AT_ONCE
-from ...runtime.stop_flag import Stop
+from ...runtime.stop_flag import StopFlag
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, prove
 
@@ -208,7 +208,7 @@ def _settle_doubts(
 
 
 def _open_doubts(
-    doubts: Lists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: Stop
+    doubts: Lists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: StopFlag
 ) -> NDArray[np.int64]:
     """Return the entries of `doubts`, ascending, with an unproved voxel no farther than `until`.
 

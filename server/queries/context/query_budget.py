@@ -25,7 +25,7 @@ from ...kernels.core.stop_flag_checks import (
 from ...residency.held import Held
 from ...residency.voxel_cache import Residency
 from ...runtime.deadlines import stop_at
-from ...runtime.stop_flag import NEVER, Stop, StoppedError
+from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 
 _A = TypeVar("_A", bound=Cost)
 
@@ -56,7 +56,7 @@ class QueryBudget(NamedTuple):
     deadline: float = math.inf
     scan: bool = False
     share: float = 1.0
-    stop: Stop = NEVER
+    stop: StopFlag = NO_STOP
 
     @property
     def limited(self) -> bool:
@@ -87,14 +87,14 @@ EXACT = QueryBudget()
 class EngineOptions(QuestionOptions, total=False):
     """Options of a query to a scene: those of the wire, and the caller's stop flag."""
 
-    stop: Stop
+    stop: StopFlag
 
 
 def make_budget(
     tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
-    stop: Stop = NEVER,
+    stop: StopFlag = NO_STOP,
 ) -> QueryBudget:
     """Make the budget of a request that starts now.
 
@@ -113,7 +113,7 @@ def make_budget(
     deadline = math.inf
     if budget_ms is not None:
         deadline = time.perf_counter() + budget_ms / 1e3
-        stop = Stop() if stop is NEVER else stop
+        stop = StopFlag() if stop is NO_STOP else stop
         stop_at(stop, deadline + GRACE, f"the request's budget of {budget_ms:g} ms was spent")
     visits = NO_LIMIT if budget_visits is None else int(budget_visits)
     return QueryBudget(float(tolerance), visits, deadline, stop=stop)

@@ -27,7 +27,7 @@ from ...residency.coarse_bounds import Coarse
 from ...residency.held import Held
 from ...residency.index_proof import Bounds
 from ...residency.voxel_cache import Residency
-from ...runtime.stop_flag import NEVER, Stop, StoppedError
+from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .query_budget import CostCounter, QueryBudget
 
 # Most voxels in reach of one request, over all poses: 128 MB of row numbers. For 100,000 poses
@@ -132,7 +132,7 @@ def make_scene_data(
         lattice.voxel_steps,
         block_words(header.radius_class),
         np.zeros(1, np.int64),
-        NEVER.flag,
+        NO_STOP.flag,
     )
     return SceneData(
         residency,
@@ -162,7 +162,7 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
     return data._replace(arrays=data.arrays._replace(drop=drop), radius_units=largest)
 
 
-def with_stop(data: SceneData, stop: Stop) -> SceneData:
+def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
     """Return the same scene for a request that only `stop` ends early."""
     return (
         data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
@@ -271,7 +271,7 @@ def _likely(data: SceneData, reach: Reach, doubted: list[int], budget: QueryBudg
 
 
 def pieces(
-    reach: Reach, residency: Residency, share: float = 1.0, stop: Stop = NEVER
+    reach: Reach, residency: Residency, share: float = 1.0, stop: StopFlag = NO_STOP
 ) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
     """Split a request into pieces whose voxels fit in the budget: (pose numbers, rows, reach) each.
 
@@ -311,7 +311,7 @@ def pieces(
         yield np.array(which), list(held), reach
 
 
-def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: Stop) -> NDArray[np.int64]:
+def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: StopFlag) -> NDArray[np.int64]:
     """Return the distinct values of `rows`, ascending; perhaps not all after a stop."""
     if len(rows) <= _ROWS_AT_ONCE:
         return np.unique(rows)  # a sort in numpy lets other threads run

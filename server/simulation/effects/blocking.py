@@ -20,7 +20,7 @@ from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel, make_avatar
 from ...kernels.bodies.body_sweep import sweep_bodies
 from ...kernels.bodies.near_bodies import find_near
-from ...runtime.stop_flag import NEVER, Stop
+from ...runtime.stop_flag import NO_STOP, StopFlag
 from ..world.frame import Body, Frame, Hit, Pose, Vec
 from ..world.vectors import dot, level, size, turned_by
 from .bodies import USER, Bodies, Shape
@@ -47,7 +47,7 @@ class Blocking:
 
     def __init__(
         self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
-        *, user: bool = True, margin_units: int = 0, skip: str = "", stop: Stop = NEVER,
+        *, user: bool = True, margin_units: int = 0, skip: str = "", stop: StopFlag = NO_STOP,
     ) -> None:  # fmt: skip
         """Prepare the obstacle.
 

@@ -22,7 +22,7 @@ from ...kernels.bodies.near_bodies import bound_body
 from ...kernels.core.pose_transform import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ...kernels.core.stop_flag_checks import NO_LIMIT
 from ...queries.context.query_context import kernel_poses, to_units
-from ...runtime.stop_flag import NEVER, Stop
+from ...runtime.stop_flag import NO_STOP, StopFlag
 from ..world.frame import Body, Pose, Vec
 from ..world.vectors import level, turned_back, turned_by
 
@@ -250,7 +250,9 @@ class Bodies:
             self.clock += 1
             self.changed[row] = self.clock
 
-    def tell(self, poses: Mapping[str, Sequence[Sequence[float]]], stop: Stop = NEVER) -> Callable[[], None]:
+    def tell(
+        self, poses: Mapping[str, Sequence[Sequence[float]]], stop: StopFlag = NO_STOP
+    ) -> Callable[[], None]:
         """Place objects where a motion command puts them, even into users.
 
         A user that is touched then starts its next frame in contact.
@@ -286,7 +288,7 @@ class Bodies:
             )
         return row
 
-    def _remember_way(self, thing: int, before: Pose, stop: Stop) -> None:
+    def _remember_way(self, thing: int, before: Pose, stop: StopFlag) -> None:
         """Store the direction from which a placed object has moved into users.
 
         The direction is in the object's frame; `way_out` uses it.
@@ -316,7 +318,7 @@ class Bodies:
         return level(way, self.up)
 
     def touching(
-        self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: Stop = NEVER
+        self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: StopFlag = NO_STOP
     ) -> NDArray[np.bool_]:
         """Return whether an avatar at a pose touches the bodies of each of rows (m,).
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from ....schemas.scene.effect_options import Contacts
 from ....schemas.wire.answers import ContactsAnswers
-from ....schemas.wire.moves import ContactCluster, ContactsReport
+from ....schemas.wire.motion_messages import ContactCluster, ContactsReport
 from ..world.frame import Frame
 from .separation_cache import farther
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_options import Crowd
-from ....schemas.wire.moves import CrowdReport
+from ....schemas.wire.motion_messages import CrowdReport
 from ...queries.context.query_context import to_units
 from ..world.frame import Frame, Hit, Pose
 from .blocking import Blocking, warm

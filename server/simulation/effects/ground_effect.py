@@ -22,7 +22,7 @@ import numpy as np
 
 from ....schemas.scene.effect_options import Ground, Slide, Step, Sweep
 from ....schemas.wire.answers import Verdict
-from ....schemas.wire.moves import GroundReport
+from ....schemas.wire.motion_messages import GroundReport
 from ...queries.surface_normals import warm
 from ..world.collision_world import World
 from ..world.frame import Frame, Hit, Vec, lowest, moved_by

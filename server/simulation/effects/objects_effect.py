@@ -17,7 +17,7 @@ import numpy as np
 from ....schemas.scene.effect_options import Objects
 from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
-from ....schemas.wire.moves import ObjectsReport
+from ....schemas.wire.motion_messages import ObjectsReport
 from ...queries.context.query_budget import QueryBudget
 from ..world.frame import Frame, Hit, Pose, Vec, moved_by
 from ..world.vectors import dot, level, size

@@ -19,9 +19,9 @@ from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_order import NEVER_SKIPPED, ORDER
 from ....schemas.scene.scene_file import SceneFile, effect_name
 from ....schemas.wire.answers import Verdict
-from ....schemas.wire.moves import FRAME_SECONDS, Moved, Touched
+from ....schemas.wire.motion_messages import FRAME_SECONDS, Moved, Touched
 from ...queries.context.query_budget import EXACT, QueryBudget
-from ...runtime.stop_flag import NEVER, StoppedError
+from ...runtime.stop_flag import NO_STOP, StoppedError
 from ..world.collision_world import World
 from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
 from ..world.vectors import size
@@ -152,7 +152,7 @@ class Pipeline:
 
         A clock decides when a frame is stopped, and no pose may depend on a clock.
         """
-        if budget.stop is NEVER or self.bodies is None or not self.bodies.remembers(body):
+        if budget.stop is NO_STOP or self.bodies is None or not self.bodies.remembers(body):
             yield
             return
         standing = self.bodies.standing()

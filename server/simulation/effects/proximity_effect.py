@@ -7,7 +7,7 @@ are not included.
 from typing import Any
 
 from ....schemas.scene.effect_options import Proximity
-from ....schemas.wire.moves import ProximityReport
+from ....schemas.wire.motion_messages import ProximityReport
 from ..world.frame import Frame
 from .separation_cache import nearest
 

@@ -16,7 +16,7 @@ from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_options import Uncertainty
 from ....schemas.wire.messages import SceneInfo, SourceInfo
-from ....schemas.wire.moves import UncertaintyReport
+from ....schemas.wire.motion_messages import UncertaintyReport
 from ...archives.rigid_transform import under
 from ...avatars.avatar_model import make_avatar
 from ...queries.context.query_context import SceneData

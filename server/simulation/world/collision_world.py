@@ -27,8 +27,8 @@ from ...queries.context.query_context import SceneData, with_stop
 from ...queries.resident_distance import near
 from ...queries.resident_motion import Probe, Swept
 from ...queries.within import within
-from ...runtime.stop_flag import NEVER, Stop
-from ...served.avatar_limits import EVERYBODY
+from ...runtime.stop_flag import NO_STOP, StopFlag
+from ...scene_interface import EVERYBODY
 from .frame import Hit, Pose, Vec
 from .least_answer import comes_first, earlier, nearer
 from .vectors import lowest_of, unit
@@ -55,7 +55,7 @@ class _Held(threading.local):
 
     depth = 0
     visits = 0
-    stop: Stop = NEVER
+    stop: StopFlag = NO_STOP
     unknown = False
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class World:
         held.depth += 1
         return held.seen
 
-    def begin(self, stop: Stop) -> None:
+    def begin(self, stop: StopFlag) -> None:
         """Begin a frame of this thread's. stop: ends early what it asks from the next hold on."""
         self._held.stop, self._held.unknown = stop, False
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ....schemas.errors import BadTransformError, UnknownAvatarError
 from ....schemas.scene.scene_file import Spawn
-from ....schemas.wire.moves import FRAME_SECONDS, Wish
+from ....schemas.wire.motion_messages import FRAME_SECONDS, Wish
 from .vectors import product, rotation, straightened
 
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid

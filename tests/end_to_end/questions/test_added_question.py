@@ -13,13 +13,13 @@ from count_within_engine import count_within
 from count_within_question import COUNT_WITHIN, CountWithinAnswers
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.questions import QUESTIONS
 from solidcloud.server.cli.main import run
 from solidcloud.server.queries.engines import ENGINES
-from solidcloud.server.remote import request_batches
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_client import request_batches
 from split_scans import STEP, Built, exact_pose, several
 
 REACH = 0.3
@@ -135,7 +135,7 @@ def test_it_is_asked_by_the_command(
 
 
 def test_without_its_declaration_it_is_no_operation(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert keys.question_key("hall", "c", "count_within")
+    assert key_expressions.query_key("hall", "c", "count_within")
     monkeypatch.delitem(QUESTIONS, "count_within")
     with pytest.raises(BadRequestError, match="operation 'count_within': expected one of info, "):
-        keys.question_key("hall", "c", "count_within")
+        key_expressions.query_key("hall", "c", "count_within")

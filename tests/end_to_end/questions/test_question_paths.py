@@ -5,7 +5,7 @@ import pytest
 import zenoh
 from corner import POSES, same
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.columns import join, without_part
 from solidcloud.schemas.wire.messages import (
@@ -16,8 +16,8 @@ from solidcloud.schemas.wire.messages import (
     encode,
 )
 from solidcloud.schemas.wire.questions import QUESTIONS
-from solidcloud.server.network.zenoh_settings import session_config
 from solidcloud.server.queries import path as path_module
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_plain_zenoh_gets_the_parts_of_a_path(scene, endpoint, op, parameters, e
     monkeypatch.setattr(path_module, "FIRST_PART", 3)
     monkeypatch.setattr(path_module, "LARGEST_PART", 9)
     expected = list(scene.path("al", POSES, op, **parameters))
-    key = keys.question_key("hall", "plain", "path")
+    key = key_expressions.query_key("hall", "plain", "path")
     payload = encode(PathRequest("al", POSES, op, **parameters), encoding)
     with zenoh.open(session_config(connect=endpoint)) as session:
         every = {"consolidation": zenoh.ConsolidationMode.NONE, "encoding": encoding}

@@ -21,7 +21,7 @@ from corner import (
     same,
 )
 from solidcloud.schemas.errors import TooLargeError
-from solidcloud.schemas.wire import keys
+from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.columns import join, without_part
 from solidcloud.schemas.wire.messages import (
     JSON,
@@ -32,9 +32,9 @@ from solidcloud.schemas.wire.messages import (
 )
 from solidcloud.server import kernels
 from solidcloud.server.client import Client
-from solidcloud.server.network.zenoh_settings import session_config
 from solidcloud.server.queries import path as path_module
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
@@ -50,7 +50,7 @@ def test_client_answers_as_the_scene_does(scene, client, question):
 @pytest.mark.parametrize("question", QUESTIONS)
 def test_plain_zenoh_is_answered_as_the_scene_does(scene, endpoint, question, encoding):
     ask, request, kind, k = QUESTIONS[question]
-    key = keys.question_key("hall", "plain", question.partition("-")[0])
+    key = key_expressions.query_key("hall", "plain", question.partition("-")[0])
     with zenoh.open(session_config(connect=endpoint)) as session:
         (reply,) = session.get(key, payload=encode(request, encoding), encoding=encoding)
     assert reply.ok is not None, reply.err.payload.to_bytes()
@@ -60,7 +60,7 @@ def test_plain_zenoh_is_answered_as_the_scene_does(scene, endpoint, question, en
 
 @pytest.mark.parametrize("question", QUESTIONS)
 def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkeypatch):
-    from solidcloud.server.remote import request_batches as questions_module
+    from solidcloud.server.zenoh_client import request_batches as questions_module
 
     monkeypatch.setattr(questions_module, "BATCH_POSES", 7)
     monkeypatch.setattr(questions_module, "SLOW_BATCH", 7)
@@ -70,7 +70,7 @@ def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkey
 
 def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monkeypatch):
     """Clusters are not bounded by `limit`: here there are many of them, and messages are small."""
-    from solidcloud.server.service import service as app_module
+    from solidcloud.server.zenoh_server import service as app_module
 
     parameters = {"limit": 0, "margin": 0.5, "cluster_distance": 0.0}
     expected = scene.contacts("al", POSES, **parameters)

@@ -25,7 +25,7 @@ from solidcloud.schemas.wire.answers import (
 from solidcloud.schemas.wire.columns import check_answers, unknown
 from solidcloud.schemas.wire.encoding import decode_answer, encode
 from solidcloud.schemas.wire.messages import CollideRequest, WithinRequest
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,18 @@ import pytest
 import wire_sections
 from solidcloud.schemas.wire.answers import Part, WithinAnswers
 from solidcloud.schemas.wire.path_request import PathOperation, PathRequest
-from solidcloud.schemas.wire.questions import QUESTIONS, Column, Merge, Question, path_questions, question_of
+from solidcloud.schemas.wire.questions import (
+    QUESTIONS,
+    ColumnRules,
+    Merge,
+    Question,
+    path_questions,
+    question_of,
+)
 from solidcloud.schemas.wire.requests import QuestionRequest, WithinRequest
 from solidcloud.server.cli.commands.query_command import query
 from solidcloud.server.queries.engines import ENGINES
-from solidcloud.server.served.asks import Asks
+from solidcloud.server.scene_interface import QueryMethods
 
 WIRE = (files("solidcloud.schemas") / "WIRE.md").read_text(encoding="utf-8")
 
@@ -40,7 +47,7 @@ def test_a_field_that_wire_md_lacks_is_found():
 def test_a_question_has_a_method_an_engine_and_options(question):
     assert question.name in ENGINES
     assert question_of(question.answers) is question
-    method = list(inspect.signature(getattr(Asks, question.name)).parameters)[1:-1]
+    method = list(inspect.signature(getattr(QueryMethods, question.name)).parameters)[1:-1]
     assert [name.replace("name", "avatar") for name in method] == list(question.arguments)
     options = inspect.signature(query).parameters
     assert {*question.parameters, *QuestionRequest.__struct_fields__} <= set(options)
@@ -56,7 +63,7 @@ def test_paths_are_of_the_questions_with_parts():
 
 def test_defaults_of_parameters_are_those_of_the_methods():
     for question in QUESTIONS.values():
-        parameters = inspect.signature(getattr(Asks, question.name)).parameters
+        parameters = inspect.signature(getattr(QueryMethods, question.name)).parameters
         for name in question.parameters:
             default = parameters[name].default
             assert (default is inspect.Parameter.empty) == (name in question.required)
@@ -69,7 +76,7 @@ def test_a_declaration_has_a_rule_for_each_column():
     assert Question("within", WithinRequest, WithinAnswers, "points", rules).columns == rules
     for wrong in (
         {name: rule for name, rule in rules.items() if name != "distance"},
-        rules | {"hit": Column(Merge.FIRST)},
+        rules | {"hit": ColumnRules(Merge.FIRST)},
     ):
         with pytest.raises(TypeError, match="expected a rule for each array field"):
             Question("within", WithinRequest, WithinAnswers, "points", wrong)

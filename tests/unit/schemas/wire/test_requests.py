@@ -19,7 +19,7 @@ from solidcloud.schemas.wire.messages import (
     decode_request,
     encode,
 )
-from solidcloud.schemas.wire.requests import MAX_OBJECTS, ObjectItem, make_objects
+from solidcloud.schemas.wire.requests import MAX_OBJECTS, ObjectEntry, make_objects
 
 POSES = np.tile(np.eye(4), (3, 1, 1))
 VECTORS = np.arange(9.0).reshape(3, 3)
@@ -30,7 +30,7 @@ REQUESTS = [
     SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES + 1, margin=0.5),
     RaycastRequest(VECTORS, VECTORS + 1, 2.0),
     WithinRequest(VECTORS, 2.0),
-    ObjectsRequest([ObjectItem("al"), ObjectItem("bo", 2, 2**32 - 2), ObjectItem("al", 0, 0)], POSES, 0.5),
+    ObjectsRequest([ObjectEntry("al"), ObjectEntry("bo", 2, 2**32 - 2), ObjectEntry("al", 0, 0)], POSES, 0.5),
     PathRequest("al", POSES, "contacts", limit=5, margin=0.25, tolerance=0.5),
 ]
 names = pytest.mark.parametrize("request_", REQUESTS, ids=lambda request: type(request).__name__)
@@ -118,7 +118,7 @@ def test_a_sweep_defaults_to_a_micrometre():
     [
         (SweepRequest, {"avatar": "al", "pose_from": POSES, "pose_to": POSES[:2]}),
         (RaycastRequest, {"origins": VECTORS, "directions": VECTORS[:2], "reach": 1.0}),
-        (ObjectsRequest, {"objects": [ObjectItem("al")], "poses": POSES}),
+        (ObjectsRequest, {"objects": [ObjectEntry("al")], "poses": POSES}),
     ],
 )
 def test_as_many_of_each_are_expected(kind, values):
@@ -135,7 +135,7 @@ def test_objects_as_they_are_given():
     items, poses = make_objects(
         [("al", POSES[0]), ("bo", POSES[1] * 2, np.uint32(4)), ("al", POSES[2].tolist(), 1, 6)]
     )
-    assert items == [ObjectItem("al"), ObjectItem("bo", 4), ObjectItem("al", 1, 6)]
+    assert items == [ObjectEntry("al"), ObjectEntry("bo", 4), ObjectEntry("al", 1, 6)]
     assert np.array_equal(poses, [POSES[0], POSES[1] * 2, POSES[2]])
     assert make_objects([])[1].shape == (0, 4, 4)
 
@@ -158,7 +158,7 @@ def test_what_is_no_object_is_refused(entry, said):
 
 
 def test_too_many_objects_are_too_large():
-    many = [ObjectItem("al")] * (MAX_OBJECTS + 1)
+    many = [ObjectEntry("al")] * (MAX_OBJECTS + 1)
     with pytest.raises(TooLargeError, match="2049 objects"):
         ObjectsRequest(many, np.zeros((MAX_OBJECTS + 1, 4, 4)))
     with pytest.raises(TooLargeError, match="2049 objects"):

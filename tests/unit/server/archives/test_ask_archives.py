@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from solidcloud.server.archives import ask_archives
-from solidcloud.server.runtime.stop_flag import NEVER, Stop
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 pytestmark = pytest.mark.interpreted
 
@@ -35,7 +35,7 @@ def asked_along(stop, **parameters):
 
 @pytest.mark.parametrize("parameters", [{}, {"budget_visits": 100}])
 def test_all_archives_share_the_time_of_a_part(flags, parameters):
-    ask = asked_along(Stop(part_seconds=30.0), **parameters)
+    ask = asked_along(StopFlag(part_seconds=30.0), **parameters)
     ask(0, 4)
     ask(4, 8)
     first, second = flags[0], flags[-1]
@@ -45,5 +45,5 @@ def test_all_archives_share_the_time_of_a_part(flags, parameters):
 
 
 def test_without_a_limit_each_archive_keeps_its_own_flag(flags):
-    asked_along(NEVER)(0, 4)
+    asked_along(NO_STOP)(0, 4)
     assert flags == [None] * 3

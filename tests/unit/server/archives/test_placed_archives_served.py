@@ -11,11 +11,11 @@ import pytest
 from msgspec import structs
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, FormatError, UnknownAvatarError
-from solidcloud.schemas.wire.keys import public_id
+from solidcloud.schemas.wire.key_expressions import public_id
 from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of, moved, under
 from solidcloud.server.scene import Scene
-from solidcloud.server.service.server_config import ServerConfig
-from solidcloud.server.service.service import Service
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.service import Service
 from split_scans import BODY, COUNT, OPTIONS, RADIUS, STEP, Built, exact_pose, near, several
 
 

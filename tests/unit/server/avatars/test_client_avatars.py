@@ -9,8 +9,7 @@ from solidcloud.schemas.wire.seals import avatar_digest
 from solidcloud.server.avatars import client_avatars as avatars_module
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.avatars.client_avatars import Avatars, bytes_of
-from solidcloud.server.served.answering_avatars import noted
-from solidcloud.server.served.avatar_limits import EVERYBODY, AvatarLimits
+from solidcloud.server.scene_interface import EVERYBODY, AvatarLimits, recording_avatars
 
 LIMITS = AvatarLimits(bytes=100_000, bytes_by_client=60_000, avatars=10, avatars_by_client=4, clients=3)
 BODY = np.random.default_rng(5).uniform(-1, 1, (500, 3))  # some 29 kB
@@ -140,7 +139,7 @@ def test_the_avatars_that_answer_are_noted_as_they_are_handed_out():
     al = avatars.add("al", BODY, None, "a")
     avatars.add("own", BODY, 0.01, EVERYBODY)
     found = []
-    with noted(found):
+    with recording_avatars(found):
         assert avatars.get("al", "a") is al
         avatars.drop_client("a")
         other = avatars.add("al", BODY[:9], 0.5, "a")

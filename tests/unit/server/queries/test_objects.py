@@ -16,7 +16,7 @@ from solidcloud.server.queries.context.query_context import SceneData, make_scen
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.residency.voxel_store import Store
-from solidcloud.server.runtime.stop_flag import Stop
+from solidcloud.server.runtime.stop_flag import StopFlag
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 BALL = make_avatar([[0.0, 0, 0]], 0.5)
@@ -52,7 +52,7 @@ def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
     assert objects(data, [BALL, BALL], at(0, 1.5), [1, 1], [1, 1]).pairs_tested == 0
 
 
-class Counting(Stop):
+class Counting(StopFlag):
     """A stop that counts how often it is looked at."""
 
     looks = 0

@@ -22,19 +22,19 @@ from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.objects import find_pairs
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.runtime.stop_flag import NEVER, Stop, StoppedError
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from stopped_queries import CLEAR, CONTACT, UNKNOWN, Asked
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 WHY = "the test says so"
 
 
-def effort_of(stop: Stop) -> QueryBudget:
+def effort_of(stop: StopFlag) -> QueryBudget:
     return EXACT._replace(stop=stop)
 
 
-def stopped_already(reason: str) -> Stop:
-    stop = Stop()
+def stopped_already(reason: str) -> StopFlag:
+    stop = StopFlag()
     stop.set(reason)
     return stop
 
@@ -81,7 +81,7 @@ def test_a_stopped_motion_inside_is_not_said_to_leave(asked: Asked) -> None:
     data, ball, pose = asked.data, make_avatar([[0.0, 0, 0]], 0.001), np.eye(4)[None]
     middle = (data.broad.scene_low + data.broad.scene_high) // 2
     pose[0, :3, 3] = data.arrays.origin + data.arrays.step * middle
-    for stop in (NEVER, stopped_already(WHY)):
+    for stop in (NO_STOP, stopped_already(WHY)):
         found = sweep(with_stop(data, stop), ball, pose, pose, budget=effort_of(stop))
         assert found.outside.tolist() == [False]
     assert found.lower.tolist() == [0.0] and found.verdict.tolist() == [UNKNOWN]
@@ -98,11 +98,11 @@ def test_noise_of_scans_is_not_exact_where_it_was_stopped(asked: Asked) -> None:
 def test_a_flag_is_of_one_request_alone(asked: Asked) -> None:
     stop = stopped_already(WHY)
     with pytest.raises(RuntimeError, match="all requests"):
-        NEVER.set(WHY)
-    assert with_stop(asked.data, NEVER) is asked.data
+        NO_STOP.set(WHY)
+    assert with_stop(asked.data, NO_STOP) is asked.data
     stopped = with_stop(asked.data, stop)
-    assert stopped.arrays.stop is stop.flag and asked.data.arrays.stop is NEVER.flag
-    assert with_stop(stopped, NEVER).arrays.stop is NEVER.flag
+    assert stopped.arrays.stop is stop.flag and asked.data.arrays.stop is NO_STOP.flag
+    assert with_stop(stopped, NO_STOP).arrays.stop is NO_STOP.flag
     stop.set("another reason")
     assert stop.reason == WHY
 
@@ -116,7 +116,7 @@ def test_whichever_look_finds_the_flag_set_nothing_is_wrong(
     ask = stopped_queries.QUESTIONS[question]
     truth, looks = ask(asked, EXACT), 0
     assert (truth.verdict != UNKNOWN).all()
-    stop, at = Stop(), 0
+    stop, at = StopFlag(), 0
 
     def look(flag: Any) -> Any:
         nonlocal looks
@@ -133,7 +133,7 @@ def test_whichever_look_finds_the_flag_set_nothing_is_wrong(
     ended = False
     while not ended:
         at = at + 1 if at < 12 else int(at * 1.3)
-        stop, looks = Stop(), 0
+        stop, looks = StopFlag(), 0
         found = ask(asked, effort_of(stop))
         ended = looks < at
         assert found.stopped == ("" if ended else WHY)
@@ -189,7 +189,7 @@ def crowded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Asked]:
 def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int], Asked], question: str) -> None:
     ask = stopped_queries.QUESTIONS[question]
     truth = ask(crowded(FEW), EXACT)
-    asked, stop, when = crowded(LONG[question]), Stop(), []
+    asked, stop, when = crowded(LONG[question]), StopFlag(), []
 
     def end() -> None:
         when.append(time.perf_counter())
@@ -256,7 +256,7 @@ def test_a_stop_ends_a_wait_for_loads(asked: Asked, monkeypatch: pytest.MonkeyPa
     loader.start()
     try:
         assert begun.wait(60.0)
-        stop = Stop()
+        stop = StopFlag()
         threading.Timer(0.1, stop.set, [WHY]).start()
         with residency.hold(rows, stop=stop) as held:
             assert held.late == (0,)
@@ -271,5 +271,6 @@ def test_a_clear_pose_is_said_to_be_clear_before_the_stop(asked: Asked) -> None:
     far = np.tile(np.eye(4), (2, 1, 1))
     far[:, 0, 3] = 500.0
     assert (
-        stopped_queries.QUESTIONS["collide"](asked._replace(poses=far), effort_of(Stop())).verdict == CLEAR
+        stopped_queries.QUESTIONS["collide"](asked._replace(poses=far), effort_of(StopFlag())).verdict
+        == CLEAR
     ).all()

@@ -24,7 +24,7 @@ from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, s
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.surface_normals import Normals, warm
 from solidcloud.server.residency.voxel_store import Store
-from solidcloud.server.runtime.stop_flag import Stop, StoppedError
+from solidcloud.server.runtime.stop_flag import StopFlag, StoppedError
 
 pytestmark = pytest.mark.interpreted
 
@@ -251,7 +251,7 @@ def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_p
     case = build(tmp_path, "plane")
     with serving(case.archive) as opened:
         places = [place for place, *_ in judged(opened, case.points)]
-        stop = Stop()
+        stop = StopFlag()
         stop.set("the client is gone")
         normals = Normals(opened.store, with_stop(opened.data, stop))
         with pytest.raises(StoppedError):
@@ -265,7 +265,7 @@ def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_p
 def test_nobody_imports_it_but_who_asks() -> None:
     """A scene that calls for no normals has none of their code in memory."""
     code = (
-        "import sys; import solidcloud.server.scene, solidcloud.server.service.service; "
+        "import sys; import solidcloud.server.scene, solidcloud.server.zenoh_server.service; "
         "print([name for name in sys.modules if name.startswith('solidcloud') and 'normals' in name])"
     )
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

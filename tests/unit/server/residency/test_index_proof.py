@@ -17,7 +17,7 @@ from solidcloud.server.queries.context import front_to_back as rounds
 from solidcloud.server.queries.context.query_budget import make_budget
 from solidcloud.server.residency.index_proof import Bounds
 from solidcloud.server.residency.voxel_store import Store
-from solidcloud.server.runtime.stop_flag import Stop
+from solidcloud.server.runtime.stop_flag import StopFlag
 
 pytestmark = pytest.mark.interpreted
 
@@ -83,7 +83,7 @@ def test_rows_to_prove_of_many_poses_take_little_memory_and_look_at_the_stop(
     finally:
         tracemalloc.stop()
     assert peak < 16 << 20
-    stop = Stop()
+    stop = StopFlag()
     stop.set("the client is gone")
     assert bounds.rows_to_prove(reach, bounds.unproved, stop) == []
 

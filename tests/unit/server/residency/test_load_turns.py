@@ -4,7 +4,7 @@ import threading
 import time
 
 from solidcloud.server.residency.load_turns import MAX_TURN_SECONDS, LoadTurns
-from solidcloud.server.runtime.stop_flag import NEVER, Stop
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 NO_DEADLINE = float("inf")
 
@@ -25,10 +25,10 @@ def start(run) -> threading.Thread:
 def test_one_request_at_a_time_first_come_first_served(monkeypatch) -> None:
     monkeypatch.setattr("solidcloud.server.residency.load_turns.MAX_TURN_SECONDS", 60.0)
     turns, order, holding = LoadTurns(), [], []
-    first = turns.take(NO_DEADLINE, NEVER)
+    first = turns.take(NO_DEADLINE, NO_STOP)
 
     def request(number: int) -> None:
-        turn = turns.take(NO_DEADLINE, NEVER)
+        turn = turns.take(NO_DEADLINE, NO_STOP)
         holding.append(number)
         assert holding == [number], "two requests have a turn"
         order.append(number)
@@ -49,8 +49,8 @@ def test_one_request_at_a_time_first_come_first_served(monkeypatch) -> None:
 
 def test_a_turn_that_takes_too_long_keeps_nobody_waiting() -> None:
     turns = LoadTurns()
-    first = turns.take(NO_DEADLINE, NEVER)
-    second = turns.take(NO_DEADLINE, NEVER)  # waits for MAX_TURN_SECONDS, not for `first`
+    first = turns.take(NO_DEADLINE, NO_STOP)
+    second = turns.take(NO_DEADLINE, NO_STOP)  # waits for MAX_TURN_SECONDS, not for `first`
     assert second is not None and second is turns._current
     turns.give_back(first)
     assert turns._current is second, "the end of an overlong turn ended another request's"
@@ -61,9 +61,9 @@ def test_a_turn_that_takes_too_long_keeps_nobody_waiting() -> None:
 
 def test_a_stop_and_a_deadline_end_the_wait_and_leave_the_queue(monkeypatch) -> None:
     monkeypatch.setattr("solidcloud.server.residency.load_turns.MAX_TURN_SECONDS", 60.0)
-    turns, stop, said = LoadTurns(), Stop(), []
-    first = turns.take(NO_DEADLINE, NEVER)
-    assert turns.take(time.perf_counter() + MAX_TURN_SECONDS, NEVER) is None
+    turns, stop, said = LoadTurns(), StopFlag(), []
+    first = turns.take(NO_DEADLINE, NO_STOP)
+    assert turns.take(time.perf_counter() + MAX_TURN_SECONDS, NO_STOP) is None
     waiting = start(lambda: said.append(turns.take(NO_DEADLINE, stop)))
     assert until(lambda: len(turns._queue) == 1)
     stop.set("the client is gone")
@@ -78,9 +78,9 @@ def test_many_threads_lose_no_turn() -> None:
 
     def request(number: int) -> None:
         for _ in range(50):
-            stop = Stop()
+            stop = StopFlag()
             deadline = time.perf_counter() + (0.0005 if number % 3 == 0 else 60.0)
-            turn = turns.take(deadline, stop if number % 2 else NEVER)
+            turn = turns.take(deadline, stop if number % 2 else NO_STOP)
             turns.give_back(turn)
         done.append(number)
 

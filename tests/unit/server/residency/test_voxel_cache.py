@@ -19,7 +19,7 @@ from solidcloud.server.residency.eviction import POLICIES
 from solidcloud.server.residency.held import Held
 from solidcloud.server.residency.load_turns import LOADS_WITHOUT_TURN
 from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
@@ -305,7 +305,7 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     told: list[None] = []
     residency.owed = lambda: told.append(None)
     # Reserved by one whose deadline comes before the load begins.
-    residency._reserve([1], float("inf"), False, NEVER)
+    residency._reserve([1], float("inf"), False, NO_STOP)
     residency._pin([1])  # another waits for it
     residency._leave([1])
     residency._owed[1] = None
@@ -341,7 +341,7 @@ def test_who_misses_few_voxels_needs_no_turn(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("solidcloud.server.residency.load_turns.MAX_TURN_SECONDS", 60.0)
     store = FakeStore([1] * 20)
     residency = Residency(store, 20 * BLOCK)
-    turn = residency._turns.take(math.inf, NEVER)
+    turn = residency._turns.take(math.inf, NO_STOP)
     assert take(residency, list(range(LOADS_WITHOUT_TURN))) == Held(0, LOADS_WITHOUT_TURN, ())
     assert take(residency, list(range(LOADS_WITHOUT_TURN))) == Held(LOADS_WITHOUT_TURN, 0, ())
     with ThreadPoolExecutor(1) as pool:

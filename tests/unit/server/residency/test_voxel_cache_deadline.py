@@ -12,7 +12,7 @@ from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
 from solidcloud.server.residency.held import Held
 from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, Stop
+from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, StopFlag
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
@@ -112,7 +112,7 @@ def test_a_stopped_request_is_owed_nothing() -> None:
     residency = Residency(FakeStore([1] * 4), 4 * BLOCK)
     told: list[str] = []
     residency.owed = lambda: told.append("owed")
-    stop = Stop()
+    stop = StopFlag()
     stop.set("the client is gone")
     with residency.hold([0, 1], stop=stop) as held:
         assert held.late == (0, 1)
@@ -130,7 +130,7 @@ def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch:
     monkeypatch.setattr(
         residency, "_allocate_all", lambda rows, scan: tries.append(rows) or allocate(rows, scan)
     )
-    stop = Stop()
+    stop = StopFlag()
     with ThreadPoolExecutor(1) as pool:
         with residency.hold([0, 1]):
             waiter = pool.submit(lambda: residency.acquire([2], stop=stop))

@@ -7,7 +7,7 @@ import weakref
 import pytest
 from solidcloud.server.runtime import deadlines as deadlines_module
 from solidcloud.server.runtime.deadlines import Deadlines
-from solidcloud.server.runtime.stop_flag import Stop
+from solidcloud.server.runtime.stop_flag import StopFlag
 
 pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0
@@ -26,47 +26,47 @@ def test_each_flag_is_set_at_its_time_whatever_the_order():
     deadlines, now = Deadlines(), time.perf_counter()
     order = []
 
-    class Noted(Stop):
+    class Noted(StopFlag):
         def set(self, reason):
             order.append(reason)
             super().set(reason)
 
     stops = [Noted() for _ in range(3)]
-    never = Stop()
+    never = StopFlag()
     deadlines.add(never, now + FAR, "never")
     for stop, when in zip(stops, (0.3, 0.1, 0.2), strict=True):
         deadlines.add(stop, now + when, str(when))
     assert [is_set(stop) for stop in stops] == ["0.3", "0.1", "0.2"]
     assert order == ["0.1", "0.2", "0.3"] and not never
-    past = Stop()
+    past = StopFlag()
     deadlines.add(past, now, "past")
     assert is_set(past) == "past"
 
 
 def test_flags_that_nobody_has_any_more_are_dropped():
     deadlines, now = Deadlines(), time.perf_counter()
-    kept = Stop()
+    kept = StopFlag()
     deadlines.add(kept, now + FAR, "kept")
-    dropped = Stop()
+    dropped = StopFlag()
     gone = weakref.ref(dropped)
     deadlines.add(dropped, now + 0.01, "dropped")
     del dropped
     gc.collect()
     assert gone() is None
-    after = Stop()
+    after = StopFlag()
     deadlines.add(after, now + 0.02, "after")
     assert is_set(after) == "after" and not kept
 
 
 def test_entries_of_requests_that_ended_do_not_pile_up():
     deadlines, now = Deadlines(), time.perf_counter()
-    kept = [Stop() for _ in range(10)]
+    kept = [StopFlag() for _ in range(10)]
     for stop in kept:
         deadlines.add(stop, now + FAR, "kept")
-    ended = Stop()
+    ended = StopFlag()
     ended.set("answered")
     for _ in range(10_000):
-        deadlines.add(Stop(), now + FAR, "gone")
+        deadlines.add(StopFlag(), now + FAR, "gone")
         deadlines.add(ended, now + FAR, "set")
     assert len(deadlines._heap) <= 2 * deadlines_module._LEAST_ENTRIES
     left = [entry[2]() for entry in deadlines._heap]
@@ -83,7 +83,7 @@ def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monk
         return start(*what)
 
     monkeypatch.setattr(deadlines_module, "start_thread", starting)
-    first, second = Stop(), Stop()
+    first, second = StopFlag(), StopFlag()
     with pytest.raises(RuntimeError, match="can't start"):
         deadlines.add(first, time.perf_counter(), "first")
     deadlines.add(second, time.perf_counter(), "second")
@@ -95,5 +95,5 @@ def test_it_is_started_once():
     deadlines.start()
     thread = deadlines._thread
     deadlines.start()
-    deadlines.add(Stop(), time.perf_counter(), "as such")
+    deadlines.add(StopFlag(), time.perf_counter(), "as such")
     assert deadlines._thread is thread and thread.is_alive()

@@ -13,7 +13,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.queries import path
 from solidcloud.server.queries.context.query_budget import EXACT
-from solidcloud.server.runtime.stop_flag import NEVER, Stop
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -88,7 +88,7 @@ MANY = {
 @pytest.mark.interpreted
 @pytest.mark.parametrize("op", OPS)
 def test_stopped_before_it_begins_all_is_unknown_and_says_why(scene: Scene, op: str) -> None:
-    stop = Stop()
+    stop = StopFlag()
     stop.set(WHY)
     answers = ask(scene, op, 3, stop=stop)
     assert answers.stopped == WHY
@@ -102,7 +102,7 @@ def test_stopped_before_it_begins_all_is_unknown_and_says_why(scene: Scene, op: 
 @pytest.mark.parametrize("op", OPS)
 def test_a_flag_that_is_never_set_changes_nothing(scene: Scene, op: str) -> None:
     count = 3
-    with_flag, without = ask(scene, op, count, stop=Stop()), ask(scene, op, count)
+    with_flag, without = ask(scene, op, count, stop=StopFlag()), ask(scene, op, count)
     assert with_flag.stopped == without.stopped == ""
     for name in ("verdict", "node_visits", "point_tests", "outside"):
         assert np.array_equal(getattr(with_flag, name), getattr(without, name)), name
@@ -111,7 +111,7 @@ def test_a_flag_that_is_never_set_changes_nothing(scene: Scene, op: str) -> None
 @pytest.mark.parametrize("op", OPS)
 def test_stopped_at_work_it_ends_soon_and_says_nothing_wrong(scene: Scene, op: str) -> None:
     ask(scene, op, 2)  # compiled
-    stop = Stop()
+    stop = StopFlag()
     timer = threading.Timer(0.2, stop.set, [WHY])
     timer.start()
     begin = time.monotonic()
@@ -132,7 +132,7 @@ def test_stopped_at_work_it_ends_soon_and_says_nothing_wrong(scene: Scene, op: s
 @pytest.mark.interpreted
 @pytest.mark.parametrize("op", ["collide", "distance", "contacts", "sweep"])
 def test_a_path_that_is_stopped_is_unknown_to_its_end(scene: Scene, op: str) -> None:
-    stop = Stop()
+    stop = StopFlag()
     given: dict[str, Any] = {"reach": 1.0} if op == "distance" else {}
     poses = poses_above(200)
     parts = []
@@ -147,7 +147,7 @@ def test_a_path_that_is_stopped_is_unknown_to_its_end(scene: Scene, op: str) -> 
 
 @pytest.mark.interpreted
 def test_bounds_of_a_stopped_answer_hold(scene: Scene) -> None:
-    stop = Stop()
+    stop = StopFlag()
     stop.set(WHY)
     exact = ask(scene, "distance", 2)
     for options in ({}, {"budget_visits": 10}, {"budget_ms": 1e6}):
@@ -164,13 +164,13 @@ def test_contacts_found_before_the_stop_stay(scene: Scene) -> None:
     poses = np.concatenate([poses_above(1, RADIUS), poses_above(3)])
     truth = scene.collide("corner", poses, radius_model=f"fixed:{RADIUS}").verdict
     assert truth.tolist() == [CONTACT, CLEAR, CLEAR, CLEAR]
-    answers = scene.collide("corner", poses, radius_model=f"fixed:{RADIUS}", stop=Stop()).verdict
+    answers = scene.collide("corner", poses, radius_model=f"fixed:{RADIUS}", stop=StopFlag()).verdict
     assert answers.tolist() == truth.tolist()
 
 
 @pytest.mark.interpreted
 def test_a_stopped_frame_leaves_the_avatar_where_it_was(scene: Scene) -> None:
-    stop = Stop()
+    stop = StopFlag()
     stop.set(WHY)
     begin, end = poses_above(2, 1.0)
     end[0, 3] += 0.2
@@ -189,14 +189,14 @@ def test_a_part_of_a_path_that_takes_too_long_ends_alone(
     truth = [part.verdict for part in scene.path("corner", poses, "collide")]
     late: list[str] = []
 
-    def at_once(stop: Stop, when: float, reason: str) -> None:
+    def at_once(stop: StopFlag, when: float, reason: str) -> None:
         assert when <= time.perf_counter() + 30.0
         late.append(reason)
         if len(late) == 1:
             stop.set(reason)
 
     monkeypatch.setattr(path, "stop_at", at_once)
-    stop = Stop(part_seconds=30.0)
+    stop = StopFlag(part_seconds=30.0)
     parts = list(scene.path("corner", poses, "collide", threads=threads, stop=stop))
     assert [part.stopped for part in parts].count(late[0]) == 1 and "30 s" in late[0]
     for part in parts:
@@ -210,18 +210,18 @@ def test_a_part_of_a_path_that_takes_too_long_ends_alone(
 
 @pytest.mark.interpreted
 def test_a_flag_sets_those_of_its_parts() -> None:
-    stop = Stop()
+    stop = StopFlag()
     parts = [stop.part(), stop.part()]
     parts[0].set("of one part")
     assert not stop and not parts[1]
     stop.set(WHY)
     assert [part.reason for part in [*parts, stop.part()]] == ["of one part", WHY, WHY]
-    assert not NEVER.part()
+    assert not NO_STOP.part()
 
 
 @pytest.mark.interpreted
 def test_the_first_reason_is_kept() -> None:
-    stop = Stop()
+    stop = StopFlag()
     assert not stop
     stop.set("first")
     stop.set("second")
@@ -229,25 +229,25 @@ def test_the_first_reason_is_kept() -> None:
 
 
 def test_nobody_sets_the_flag_of_requests_that_are_not_watched(scene: Scene) -> None:
-    assert not NEVER and EXACT.stop is NEVER
+    assert not NO_STOP and EXACT.stop is NO_STOP
     ask(scene, "collide", 2)
-    assert not NEVER
+    assert not NO_STOP
 
 
 def test_loads_are_not_waited_for_once_a_request_is_stopped(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that does not answer: the request ends, what was not read is unknown."""
-    stops: list[Stop] = []
+    stops: list[StopFlag] = []
     hold = scene.residency.hold
 
-    def watched(_: Any, *what: Any, stop: Stop, **options: Any) -> Any:
+    def watched(_: Any, *what: Any, stop: StopFlag, **options: Any) -> Any:
         stops.append(stop)
         return hold(*what, stop=stop, **options)
 
     monkeypatch.setattr(type(scene.residency), "hold", watched)
     for op in ("collide", "distance", "contacts", "sweep", "within"):
         stops.clear()
-        stop = Stop()
+        stop = StopFlag()
         ask(scene, op, 2, stop=stop)
         assert stops and all(each is stop for each in stops), op

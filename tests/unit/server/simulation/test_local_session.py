@@ -10,9 +10,9 @@ from solidcloud.schemas.errors import (
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.wire.keys import User
-from solidcloud.schemas.wire.moves import Wish
-from solidcloud.server.served.served_scene import Turn
+from solidcloud.schemas.wire.key_expressions import User
+from solidcloud.schemas.wire.motion_messages import Wish
+from solidcloud.server.scene_interface import FrameCommand
 
 pytestmark = pytest.mark.interpreted
 
@@ -53,7 +53,7 @@ def test_users_of_a_server_and_of_this_process_walk_one_scene(scene):
     scene.add_avatar("al", POINTS, 0.125, client="a")
     with scene.session("al") as session:
         session.wish(pose_at(0.5))
-        scene.simulation.step([Turn(AL, Wish(seq=1, time=0.0, pose=pose_at(0.5)))])
+        scene.simulation.step([FrameCommand(AL, Wish(seq=1, time=0.0, pose=pose_at(0.5)))])
         assert scene.simulation.users == [User("", "al"), AL]
         session.wish(pose_at(0.25))
         assert session.latest().state.frame == 3

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.keys import User
-from solidcloud.schemas.wire.moves import Moved, Wish
-from solidcloud.server.served.served_scene import Turn
+from solidcloud.schemas.wire.key_expressions import User
+from solidcloud.schemas.wire.motion_messages import Moved, Wish
+from solidcloud.server.scene_interface import FrameCommand
 from solidcloud.server.simulation.replay import replay
 from solidcloud.server.simulation.replay_log import Begin, Entered, Frame, FrameLog, Points, Record, read_log
 
@@ -57,7 +57,7 @@ def log(tmp_path):
                 pose = np.eye(4)[None].copy()
                 pose[0, :3, 3] = rng.normal(size=3)
                 pose[0, 3, 3] = 1.0 + (rng.random() < 0.05)  # some that are none
-                turns.append(Turn(users[user], Wish(seq=number, time=0.02 * number, pose=pose)))
+                turns.append(FrameCommand(users[user], Wish(seq=number, time=0.02 * number, pose=pose)))
             simulation._pipeline.skips = bool(rng.random() < 0.3)
             simulation.step(turns, now=0.02 * number + 40.0 * (number > 30))
             if number == 20:
@@ -151,7 +151,7 @@ def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
         for number in range(4):
             simulation._pipeline.reloads = int(number == 3)
             wish = Wish(seq=number, time=float(number), pose=np.eye(4)[None])
-            simulation.step([Turn(AL, wish)])
+            simulation.step([FrameCommand(AL, wish)])
             if number == 1:
                 simulation.scene.reload()
     assert replay(simulated(), read_log(path)) == (3, 3, 0, None, 4)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError
-from solidcloud.schemas.wire.keys import User
-from solidcloud.schemas.wire.moves import Wish
-from solidcloud.server.served.served_scene import Turn
+from solidcloud.schemas.wire.key_expressions import User
+from solidcloud.schemas.wire.motion_messages import Wish
+from solidcloud.server.scene_interface import FrameCommand
 from solidcloud.server.simulation.replay_log import (
     MAGIC,
     Begin,
@@ -42,9 +42,9 @@ def write(path):
         simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     with FrameLog(path, BEGIN) as log:
         simulation.record(log)
-        simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.25))])
+        simulation.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.25))])
         simulation.end(BO)
-        simulation.step([Turn(AL, wish(2, -9.0)), Turn(NOBODY, wish(1, 0.0))])
+        simulation.step([FrameCommand(AL, wish(2, -9.0)), FrameCommand(NOBODY, wish(1, 0.0))])
         simulation.scene.reload()
         simulation.drop_client("a")
         simulation.record(None)
@@ -71,7 +71,7 @@ def test_another_radius_is_another_avatar(tmp_path):
     simulation.scene.add_avatar("bo", POINTS, 0.25, client="b")
     with FrameLog(tmp_path / "log", BEGIN) as log:
         simulation.record(log)
-        simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))])
+        simulation.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))])
     points = [record for record in read_log(tmp_path / "log") if isinstance(record, Points)]
     assert [record.radius for record in points] == [0.125, 0.25] and points[0].digest != points[1].digest
 
@@ -127,7 +127,7 @@ def test_a_log_that_can_grow_no_more_stops_nobody(tmp_path, caplog):
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     log = FrameLog(tmp_path / "log", BEGIN)
     simulation.record(log)
-    simulation.step([Turn(AL, wish(1, 0.5))])
+    simulation.step([FrameCommand(AL, wish(1, 0.5))])
 
     class Full:
         def write(self, data):
@@ -139,7 +139,7 @@ def test_a_log_that_can_grow_no_more_stops_nobody(tmp_path, caplog):
     log._file.close()
     log._file = Full()
     for seq in (2, 3):
-        ((_, state, _),) = simulation.step([Turn(AL, wish(seq, 0.5))])
+        ((_, state, _),) = simulation.step([FrameCommand(AL, wish(seq, 0.5))])
         assert state.seq == seq
     assert caplog.text.count("No space left on device") == 1
     assert len(list(read_log(tmp_path / "log"))) == 4

@@ -15,15 +15,14 @@ from solidcloud.schemas.errors import (
 )
 from solidcloud.schemas.scene.effect_options import Ground, Stop
 from solidcloud.schemas.scene.scene_file import SceneFile, Spawn, scene_of
-from solidcloud.schemas.wire.keys import User, public_id
-from solidcloud.schemas.wire.moves import FRAME_SECONDS, Moved, State, Wish
+from solidcloud.schemas.wire.key_expressions import User, public_id
+from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Moved, State, Wish
 from solidcloud.server.client import Client
-from solidcloud.server.remote.client_session import ClientSession
 from solidcloud.server.scene import Scene
-from solidcloud.server.served.avatar_limits import EVERYBODY
-from solidcloud.server.served.served_scene import SceneLike, Turn
+from solidcloud.server.scene_interface import EVERYBODY, FrameCommand, ServedScene
 from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.simulation import SILENT_SECONDS, Simulation
+from solidcloud.server.zenoh_client.client_session import ClientSession
 
 pytestmark = pytest.mark.interpreted
 
@@ -51,21 +50,23 @@ def floor():
 
 
 def test_a_frame_goes_on_from_where_the_last_one_ended(floor):
-    ((_, first, _),) = floor.step([Turn(AL, wish(1, 0.5))])
+    ((_, first, _),) = floor.step([FrameCommand(AL, wish(1, 0.5))])
     assert isinstance(first, State) and np.array_equal(first.pose, pose_at(0.5))
-    ((user, second, _),) = floor.step([Turn(AL, wish(2, velocity=(2.0, 0.0, -1.0), time=1.0625), late=7)])
+    ((user, second, _),) = floor.step(
+        [FrameCommand(AL, wish(2, velocity=(2.0, 0.0, -1.0), time=1.0625), late=7)]
+    )
     assert user == AL and np.array_equal(second.pose, pose_at(0.4375, 0.125))
     assert (second.seq, second.time, second.frame, second.late) == (2, 1.0625, 2, 7)
-    ((_, third, _),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, -1e3), time=1.125))])
+    ((_, third, _),) = floor.step([FrameCommand(AL, wish(3, velocity=(0.0, 0.0, -1e3), time=1.125))])
     assert third.pose[0, 2, 3] == np.nextafter(-0.375, 1.0), "stopped by the floor"
-    ((_, fourth, _),) = floor.step([Turn(AL, wish(4, velocity=(1.0, 0.0, 0.0), time=1.25))])
+    ((_, fourth, _),) = floor.step([FrameCommand(AL, wish(4, velocity=(1.0, 0.0, 0.0), time=1.25))])
     assert fourth.pose[0, 2, 3] == third.pose[0, 2, 3], "from where it was stopped"
 
 
 def test_users_begin_at_the_spawn():
     simulation = floor_simulation(spawn=Spawn(position=(3.0, 4.0, 5.0)))
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
-    ((_, state, _),) = simulation.step([Turn(AL, wish(1, velocity=(3.0, 0.0, 0.0)))])
+    ((_, state, _),) = simulation.step([FrameCommand(AL, wish(1, velocity=(3.0, 0.0, 0.0)))])
     assert np.array_equal(state.pose[0, :3, 3], [3.0 + 3.0 * FRAME_SECONDS, 4.0, 5.0])
 
 
@@ -73,29 +74,34 @@ def test_everybody_who_wished_has_one_frame_in_the_order_given(floor):
     order = []
     run = floor._pipeline.run
     floor._pipeline.run = lambda body, *rest, **more: [order.append(body.name), run(body, *rest, **more)][1]
-    outcomes = floor.step([Turn(BO, wish(1, 0.25)), Turn(AL, wish(1, 0.5))])
+    outcomes = floor.step([FrameCommand(BO, wish(1, 0.25)), FrameCommand(AL, wish(1, 0.5))])
     assert [outcome.user for outcome in outcomes] == [BO, AL] and order == [
         f"{public_id('b')}/bo",
         f"{public_id('a')}/al",
     ]
     assert {outcome.state.frame for outcome in outcomes} == {1}
-    assert floor.step([]) == [] and floor.step([Turn(AL, wish(2, 0.5))])[0].state.frame == 3
+    assert floor.step([]) == [] and floor.step([FrameCommand(AL, wish(2, 0.5))])[0].state.frame == 3
 
 
 def test_a_refused_wish_is_its_users_alone_and_changes_nothing(floor):
     floor.scene.add_avatar("crash", POINTS, 0.125, client="a")
-    floor.step([Turn(AL, wish(1, 0.5))])
+    floor.step([FrameCommand(AL, wish(1, 0.5))])
     crash, nobody = User("a", "crash"), User("a", "nobody")
     sheared = wish(2, 0.25)
     sheared.pose[0, 0, 1] = 0.5
     outcomes = floor.step(
-        [Turn(AL, sheared), Turn(crash, wish(1, 0.5)), Turn(nobody, wish(1, 0.5)), Turn(BO, wish(1, 0.25))]
+        [
+            FrameCommand(AL, sheared),
+            FrameCommand(crash, wish(1, 0.5)),
+            FrameCommand(nobody, wish(1, 0.5)),
+            FrameCommand(BO, wish(1, 0.25)),
+        ]
     )
     kinds = [type(outcome.state) for outcome in outcomes]
     assert kinds == [BadTransformError, InternalError, UnknownAvatarError, State]
     assert "secret" not in str(outcomes[1].state)
     assert floor.users == [AL, BO], "who was refused at first is not there"
-    ((_, state, _),) = floor.step([Turn(AL, wish(3, velocity=(0.0, 0.0, 1.0), time=1.0625))])
+    ((_, state, _),) = floor.step([FrameCommand(AL, wish(3, velocity=(0.0, 0.0, 1.0), time=1.0625))])
     assert np.array_equal(state.pose, pose_at(0.5625)), "its clock and its pose are as before"
 
 
@@ -103,38 +109,40 @@ def test_there_is_room_for_so_many_users_and_who_leaves_makes_room():
     simulation = floor_simulation(users=1)
     for user in (AL, BO):
         simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
-    outcomes = simulation.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))])
+    outcomes = simulation.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))])
     assert isinstance(outcomes[0].state, State) and isinstance(outcomes[1].state, BusyError)
     simulation.end(AL)
     simulation.end(AL)
-    assert isinstance(simulation.step([Turn(BO, wish(1, 0.5))])[0].state, State)
+    assert isinstance(simulation.step([FrameCommand(BO, wish(1, 0.5))])[0].state, State)
     simulation.end_client("a")
     assert simulation.users == [BO]
     simulation.drop_client("b")
     assert simulation.users == [] and simulation.scene.gone == ["b"]
-    assert isinstance(simulation.step([Turn(BO, wish(2, 0.5))])[0].state, UnknownAvatarError)
+    assert isinstance(simulation.step([FrameCommand(BO, wish(2, 0.5))])[0].state, UnknownAvatarError)
 
 
 def test_who_wishes_nothing_for_long_has_left(floor):
-    floor.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))], now=100.0)
-    floor.step([Turn(BO, wish(2, 0.5))], now=100.0 + SILENT_SECONDS)
+    floor.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))], now=100.0)
+    floor.step([FrameCommand(BO, wish(2, 0.5))], now=100.0 + SILENT_SECONDS)
     assert floor.users == [AL, BO]
-    floor.step([Turn(BO, wish(3, 0.5))], now=100.5 + SILENT_SECONDS)
+    floor.step([FrameCommand(BO, wish(3, 0.5))], now=100.5 + SILENT_SECONDS)
     assert floor.users == [BO]
     floor.step([], now=100.0 + 2 * SILENT_SECONDS)
     assert floor.users == [BO], "half a second short of it"
 
 
 def test_effects_are_skipped_as_a_recorded_frame_says(floor):
-    outcomes = floor.step([Turn(AL, wish(1, 0.5)), Turn(BO, wish(1, 0.5))], skips=[["proximity"], []])
+    outcomes = floor.step(
+        [FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))], skips=[["proximity"], []]
+    )
     assert [outcome.state.skipped for outcome in outcomes] == [["proximity"], []]
 
 
 def test_a_move_is_remembered_by_nobody(floor):
-    floor.step([Turn(AL, wish(1, 0.5))])
+    floor.step([FrameCommand(AL, wish(1, 0.5))])
     moved = floor.move("al", pose_at(0.0), pose_at(-1.0), 0.25, client="a")
     assert type(moved) is Moved and moved.pose[0, 2, 3] == np.nextafter(-0.375, 1.0)
-    ((_, state, _),) = floor.step([Turn(AL, wish(2, velocity=(0.0, 0.0, 0.0)))])
+    ((_, state, _),) = floor.step([FrameCommand(AL, wish(2, velocity=(0.0, 0.0, 0.0)))])
     assert np.array_equal(state.pose, pose_at(0.5)) and state.frame == 2
     poses = pose_at(0.0)
     assert floor.move("al", poses, poses, client="a").pose is not poses
@@ -154,7 +162,7 @@ def test_a_move_that_is_none_is_refused(floor):
 
 def test_wishes_for_objects_where_there_are_none_are_refused(floor):
     objects = {"door": np.eye(4).tolist()}
-    ((_, error, _),) = floor.step([Turn(AL, wish(1, 0.5, objects=objects))])
+    ((_, error, _),) = floor.step([FrameCommand(AL, wish(1, 0.5, objects=objects))])
     assert isinstance(error, BadRequestError) and "objects" in str(error)
 
 
@@ -172,11 +180,11 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
     simulation = Simulation(stand_in.scene, file, stand_in._pipeline, bodies=bodies)
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
     objects = {"door": np.eye(4).tolist()}
-    simulation.step([Turn(AL, wish(1, 0.5, objects=objects))])
+    simulation.step([FrameCommand(AL, wish(1, 0.5, objects=objects))])
     assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
     assert bodies.told == objects and not bodies.put_back
     simulation._pipeline.run = None
-    ((_, error, _),) = simulation.step([Turn(AL, wish(2, 0.5, objects=objects))])
+    ((_, error, _),) = simulation.step([FrameCommand(AL, wish(2, 0.5, objects=objects))])
     assert isinstance(error, InternalError) and bodies.put_back == 1
     simulation.end(AL)
     assert not bodies
@@ -188,7 +196,7 @@ def test_the_scenes_own_avatars_are_everybodys():
     file = SceneFile(format=1, archives=scene_of("floor").archives, effects=[Ground(), Stop()])
     simulation = Simulation(stand_in.scene, file, stand_in._pipeline)
     guides = [User("a", "guide"), User("b", "guide")]
-    outcomes = simulation.step([Turn(user, wish(1, 0.5)) for user in guides])
+    outcomes = simulation.step([FrameCommand(user, wish(1, 0.5)) for user in guides])
     assert all(isinstance(outcome.state, State) for outcome in outcomes)
     assert simulation.scene.add_avatar("guide", POINTS, 0.125, client="c") == own
     with pytest.raises(BadRequestError):
@@ -216,7 +224,7 @@ def test_frames_come_one_at_a_time(floor):
     floor._pipeline.run = run
     threads = [
         threading.Thread(
-            target=lambda user=user: [floor.step([Turn(user, wish(seq, 0.5))]) for seq in range(20)]
+            target=lambda user=user: [floor.step([FrameCommand(user, wish(seq, 0.5))]) for seq in range(20)]
         )
         for user in (AL, BO)
     ]
@@ -234,7 +242,7 @@ _OF_THE_SERVER = ("limit_avatars", "drop_unused_avatars")
 def test_it_has_all_that_a_scene_has():
     wanted = {
         name
-        for name, found in inspect.getmembers(SceneLike)
+        for name, found in inspect.getmembers(ServedScene)
         if not name.startswith("_") and (callable(found) or isinstance(found, property))
     }
     assert {"move", "ask", "simulation", "reload", "path"} <= wanted

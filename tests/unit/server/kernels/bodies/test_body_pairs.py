@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.bodies import body_pairs as kernel
 from solidcloud.server.kernels.core.voxel_layout import LANES
-from solidcloud.server.runtime.stop_flag import NEVER, Stop
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 pytestmark = pytest.mark.interpreted
 interpreted_only = pytest.mark.skipif(
@@ -44,7 +44,7 @@ def test_pairs_of_boxes_are_those_of_all_pairs(seed: int) -> None:
     order = np.argsort(low[:, 0], kind="stable")
     for room in (len(meet) + 1, len(meet), 1, 0):
         pairs = np.full((room, 2), -1, np.int32)
-        found = kernel.sweep_and_prune(order, low, high, groups, masks, NEVER.flag, pairs)
+        found = kernel.sweep_and_prune(order, low, high, groups, masks, NO_STOP.flag, pairs)
         assert found == (len(meet), stopped)
         written = [row for row in pairs.tolist() if row != [-1, -1]]
         assert len(written) == min(room, len(meet)) and all(row in meet for row in written)
@@ -118,7 +118,7 @@ class Asked:
         a, b, pair = (self.b, self.a, [1, 0]) if turned else (self.a, self.b, [0, 1])
         kernel.touch_pairs(
             a.arrays, b.arrays, self.poses, self.scales, units, np.array([pair]), reach - int(units.sum()),
-            ORIGIN, visits, NEVER.flag, verdict, counters,
+            ORIGIN, visits, NO_STOP.flag, verdict, counters,
         )  # fmt: skip
         return int(verdict[0]), int(counters[0]) - 100, int(counters[1]) - 200
 
@@ -257,7 +257,7 @@ def test_pairs_after_the_stop_are_unknown_and_not_examined() -> None:
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, 0, 3] = 10.0 * np.arange(n)
     pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)])
-    stop = Stop()
+    stop = StopFlag()
     for expected in (kernel.CLEAR, kernel.UNKNOWN):
         verdict, counters = np.full(len(pairs), 99, np.uint8), np.zeros(2, np.int64)
         kernel.touch_pairs(

@@ -14,7 +14,7 @@ from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.bodies import body_sweep as kernel
 from solidcloud.server.kernels.bodies import moving_bodies as placed
 from solidcloud.server.kernels.bodies import near_bodies
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -64,7 +64,7 @@ def ask(
     row, fraction = kernel.sweep_bodies(
         a.arrays, box_of(a), units_of(a), *ends, b.arrays, poses, units_of(b), np.arange(len(poses)), ORIGIN,
         int(np.rint(margin * naive.UNITS)), TOLERANCE, until, witness, named, scratch or scratch_of(a, b),
-        NEVER.flag,
+        NO_STOP.flag,
     )  # fmt: skip
     if row >= 0:
         point = b.points[b.rows[named[0], named[1]]]

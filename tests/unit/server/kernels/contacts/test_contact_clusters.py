@@ -26,7 +26,7 @@ from solidcloud.server.kernels.contacts.contact_clusters import (
     make_cells,
     sort_rows,
 )
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
 
@@ -53,7 +53,7 @@ def test_the_deepest_are_kept_whatever_the_order(rng: np.random.Generator, limit
         heap, kept = np.empty((limit, RECORD), np.int64), 0
         for record in rng.permutation(records):
             kept = keep_deepest(heap, kept, record[None])
-        sort_rows(heap, kept, NEVER.flag)
+        sort_rows(heap, kept, NO_STOP.flag)
         assert [place_of(record) for record in heap[:kept].tolist()] == expected
 
 
@@ -67,7 +67,7 @@ def test_rows_are_sorted_by_all_columns_that_order(rng: np.random.Generator, cou
     rows[:, TAG] = np.arange(count)
     expected = sorted(map(place_of, rows.tolist()))
     before = {tuple(row) for row in rows.tolist()}
-    sort_rows(rows, count, NEVER.flag)
+    sort_rows(rows, count, NO_STOP.flag)
     assert [place_of(row) for row in rows.tolist()] == expected
     assert {tuple(row) for row in rows.tolist()} == before
 
@@ -81,19 +81,19 @@ def test_a_cell_is_found_again_through_growth_and_after_emptying(rng: np.random.
             rng.integers(-(1 << 50), 1 << 50, (9, 3)),
         ]
     )
-    cells = make_cells(32, NEVER.flag)
+    cells = make_cells(32, NO_STOP.flag)
     for _ in range(2):
         rows: dict[tuple[int, ...], int] = {}
         for place in map(tuple, places.tolist()):
             if len(rows) == len(cells.table):
-                cells = grow_cells(cells, len(rows), NEVER.flag)
+                cells = grow_cells(cells, len(rows), NO_STOP.flag)
             row = enter_cell(cells, len(rows), *place)
             assert row == rows.setdefault(place, len(rows))
         for place, row in rows.items():
             assert cells.slots[find_slot(cells, *place)] == row
             assert tuple(cells.table[row, PLACE:].tolist()) == place
         assert len(cells.slots) == 2 * len(cells.table) < 4 * max(32, len(rows))
-        empty_cells(cells, len(rows), NEVER.flag)
+        empty_cells(cells, len(rows), NO_STOP.flag)
         assert (cells.slots == -1).all()
 
 
@@ -101,8 +101,9 @@ def test_a_cell_is_found_again_through_growth_and_after_emptying(rng: np.random.
 def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: int) -> None:
     """One pair a cell; three poses in turn, so that nothing of one is left for the next."""
     memory = Memory(
-        make_cells(64, NEVER.flag), np.empty((10, RECORD), np.int64), np.array([0, 0, 0, 0, -1]), np.zeros(3, np.int64),
-        np.empty((1, 2), np.int64), np.empty((0, RECORD), np.int64), np.empty((0, CLUSTER), np.int64),
+        make_cells(64, NO_STOP.flag), np.empty((10, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
+        np.zeros(3, np.int64), np.empty((1, 2), np.int64), np.empty((0, RECORD), np.int64),
+        np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip
     for _ in range(3):
         places = np.unique(rng.integers(-spread, spread, (40, 3)), axis=0)
@@ -120,7 +121,7 @@ def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: in
             memory.cells.table[row, PAIRS : PAIRS + 7] = [1, *pair.point, *pair.point]
             memory.sizes[KEPT] = keep_deepest(memory.heap, memory.sizes[KEPT], record)
         runs = np.empty(4, np.int64)
-        memory, listed = list_pose(memory, runs, NEVER.flag)
+        memory, listed = list_pose(memory, runs, NO_STOP.flag)
         assert listed
         clusters, of_pair = clusters_of(sorted(pairs), 1)
         own = memory.clusters[runs[2] : runs[2] + runs[3]]

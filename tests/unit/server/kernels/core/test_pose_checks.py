@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core import pose_transform as placing
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
 
@@ -22,7 +22,7 @@ class Lattice(NamedTuple):
     stop: NDArray[np.int64]
 
 
-LATTICE = Lattice(2.0**-13, 65_536, NEVER.flag)
+LATTICE = Lattice(2.0**-13, 65_536, NO_STOP.flag)
 
 
 def check(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core.voxel_tree import FAN, Lists, list_voxels, make_voxel_tree
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
 
@@ -56,7 +56,7 @@ def listed(tree: tuple, at: NDArray, direction: NDArray, along: bool, reach: flo
             round(reach * UNITS),
             round(radius * UNITS),
             UNITS,
-            NEVER.flag,
+            NO_STOP.flag,
             lists,
         )
         assert needed == lists.starts[k]
@@ -117,7 +117,7 @@ def test_boxes_far_away_are_grown_by_what_rounding_takes(along: bool, sign: floa
         units = np.rint(at * 4).astype(np.int64)
         lists = Lists(np.zeros(2, np.int64), np.full(4, -1), np.zeros(4), np.zeros(1))
         reach = 40 if along else 0
-        assert list_voxels(tree, units, direction, along, reach, 0, 4.0, NEVER.flag, lists) == found
+        assert list_voxels(tree, units, direction, along, reach, 0, 4.0, NO_STOP.flag, lists) == found
 
 
 def test_equal_distances_are_sorted_by_row() -> None:

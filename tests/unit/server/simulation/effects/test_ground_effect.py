@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.effect_options import Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.simulation.world.frame import Body
 
 FRAMES = 60 if not INTERPRETED else 30

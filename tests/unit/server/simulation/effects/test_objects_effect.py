@@ -14,7 +14,7 @@ from solidcloud.schemas.scene.scene_file import ObjectItem
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import EXACT
-from solidcloud.server.runtime.stop_flag import Stop as Ending
+from solidcloud.server.runtime.stop_flag import StopFlag as Ending
 from solidcloud.server.runtime.stop_flag import StoppedError
 from solidcloud.server.simulation.effects.bodies import Bodies
 from solidcloud.server.simulation.world.frame import Body

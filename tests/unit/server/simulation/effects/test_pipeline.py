@@ -12,7 +12,7 @@ from effect_rooms import at, play
 from solidcloud.schemas.errors import BadTransformError
 from solidcloud.schemas.scene.effect_options import Ground, Proximity, Slide, Step, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import Limits
-from solidcloud.schemas.wire.moves import Moved
+from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Frame, Runner

@@ -11,7 +11,7 @@ from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
 from solidcloud.schemas.scene.effect_options import Proximity
 from solidcloud.schemas.scene.scene_file import parse_scene
-from solidcloud.schemas.wire.moves import ProximityReport
+from solidcloud.schemas.wire.motion_messages import ProximityReport
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.scene import Scene

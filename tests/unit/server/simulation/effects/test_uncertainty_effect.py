@@ -19,9 +19,9 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_options import Uncertainty
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.moves import UncertaintyReport
+from solidcloud.schemas.wire.motion_messages import UncertaintyReport
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects import uncertainty_effect as module
 from solidcloud.server.simulation.effects.uncertainty_effect import check, make, scan_names
@@ -170,7 +170,7 @@ def test_a_frame_whose_distance_is_not_exact_is_unknown(
     ):
         world = world_of(scene, other)
         runner, body = make(Uncertainty(sigma=0.005), world), body_of(MODEL)
-        world._world.begin(NEVER)
+        world._world.begin(NO_STOP)
         found = report(runner, world, body, at(0.06))
         assert found.unknown and world._world.unknown
 

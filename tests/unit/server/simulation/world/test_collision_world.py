@@ -18,7 +18,7 @@ from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.resident_motion import Probe, Swept
-from solidcloud.server.runtime.stop_flag import NEVER
+from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects import contacts_effect
 from solidcloud.server.simulation.world.collision_world import World
@@ -163,7 +163,7 @@ def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_loo
     monkeypatch.setattr(Probe, "sweep", lambda *_: found)
     with Scene.open(case.archive) as scene:
         for world in (world_of((scene, None)), world_of((scene, None), (scene, THERE))):
-            world.begin(NEVER)
+            world.begin(NO_STOP)
             world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
             assert world.unknown == unknown
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.scene.scene_file import Spawn
-from solidcloud.schemas.wire.moves import FRAME_SECONDS, MoveRequest, Wish
+from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, MoveRequest, Wish
 from solidcloud.server.simulation.world.motion_commands import (
     LONGEST_FRAME,
     check_rigid,

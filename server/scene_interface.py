@@ -1,0 +1,264 @@
+"""Interface of a scene: the query methods of `Scene` and `Client`, and what a server requires of a scene.
+
+`QueryMethods` are the methods that both implement. `ServedScene` is the scene that a server serves;
+the types it exchanges with the server follow. No zenoh and no numba here.
+"""
+
+import threading
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from enum import Enum
+from typing import Any, NamedTuple, Protocol, TypeVar, Unpack
+
+from ..schemas.errors import SolidcloudError
+from ..schemas.wire.answers import (
+    CollideAnswers,
+    ContactsAnswers,
+    Cost,
+    DistanceAnswers,
+    ObjectsAnswers,
+    Part,
+    RaycastAnswers,
+    SweepAnswers,
+    WithinAnswers,
+)
+from ..schemas.wire.key_expressions import User
+from ..schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
+from ..schemas.wire.motion_messages import Moved, State, Wish
+from ..schemas.wire.questions import (
+    COLLIDE,
+    CONTACTS,
+    DISTANCE,
+    OBJECTS,
+    RAYCAST,
+    SWEEP,
+    WITHIN,
+    Question,
+)
+from ..schemas.wire.requests import QuestionOptions
+from .runtime.stop_flag import StopFlag
+
+_A = TypeVar("_A", bound=Cost)
+
+# Owner of the avatars that every client may use in requests; no key can name it.
+EVERYBODY = "*"
+# Owner of the avatars added in the serving process, not by a client.
+THIS_PROCESS = ""
+
+
+class QueryOptions(QuestionOptions, total=False):
+    """Options of the query methods: those of every query, and two that only a `Scene` takes.
+
+    client: owner of the avatar.  stop: flag that ends the work early.
+    """
+
+    client: str
+    stop: StopFlag
+
+
+class QueryMethods:
+    """The queries that have one answer each. `Scene` and `Client` implement `ask`.
+
+    name: of an avatar.  poses: (k, 4, 4) float64, avatar to world.  margin: distance below which two
+    spheres count as in contact [m].  reach: farthest distance worth reporting [m].
+    options: tolerance [m], budget_ms, budget_visits and radius_model, as in WIRE.md.
+    """
+
+    def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A:
+        """Ask a question.
+
+        arguments: the fields of its request, in their order; options may follow by name.
+        """
+        raise NotImplementedError
+
+    def collide(
+        self, name: str, poses: Any, margin: float = 0.0, **options: Unpack[QueryOptions]
+    ) -> CollideAnswers:
+        """Test for k poses if an avatar touches the scene."""
+        return self.ask(COLLIDE, name, poses, margin, **options)
+
+    def distance(
+        self, name: str, poses: Any, reach: float, **options: Unpack[QueryOptions]
+    ) -> DistanceAnswers:
+        """Measure for k poses the distance from an avatar to the scene, up to `reach`."""
+        return self.ask(DISTANCE, name, poses, reach, **options)
+
+    def contacts(
+        self,
+        name: str,
+        poses: Any,
+        limit: int = 100,
+        margin: float = 0.0,
+        cluster_distance: float | None = None,
+        **options: Unpack[QueryOptions],
+    ) -> ContactsAnswers:
+        """List for k poses the pairs of points in contact: the deepest `limit` of each, all clusters."""
+        return self.ask(CONTACTS, name, poses, limit, margin, cluster_distance, **options)
+
+    def sweep(
+        self,
+        name: str,
+        pose_from: Any,
+        pose_to: Any,
+        margin: float = 0.0,
+        **options: Unpack[QueryOptions],
+    ) -> SweepAnswers:
+        """Find for k motions between two poses the first contact of an avatar with the scene."""
+        return self.ask(SWEEP, name, pose_from, pose_to, margin, **options)
+
+    def raycast(
+        self, origins: Any, directions: Any, reach: float, **options: Unpack[QueryOptions]
+    ) -> RaycastAnswers:
+        """Find for k rays, (k, 3) and (k, 3), the first scan point whose sphere they hit within `reach`."""
+        return self.ask(RAYCAST, origins, directions, reach, **options)
+
+    def within(self, points: Any, reach: float, **options: Unpack[QueryOptions]) -> WithinAnswers:
+        """Find for k points (k, 3) the nearest scan point, up to `reach`."""
+        return self.ask(WITHIN, points, reach, **options)
+
+    def objects(
+        self,
+        objects: Sequence[Sequence[Any]],
+        margin: float = 0.0,
+        **options: Unpack[QueryOptions],
+    ) -> ObjectsAnswers:
+        """Test several avatars (name, pose, group = 1, mask = all) against the scene and each other."""
+        return self.ask(OBJECTS, objects, margin, **options)
+
+
+class AvatarLimits(NamedTuple):
+    """Limits on avatars, for all clients together and for each one.
+
+    bytes: of their arrays.  avatars: their number.  clients: number of clients with avatars.
+    """
+
+    bytes: int
+    bytes_by_client: int
+    avatars: int
+    avatars_by_client: int
+    clients: int
+
+
+class LimitReached(Enum):
+    """Limit of a server that a request exceeds."""
+
+    REQUESTS = "requests in flight, of all clients"
+    OWN_REQUESTS = "requests in flight, of one client"
+    PATHS = "paths"
+    STATES = "queries for states"
+
+
+class EncodedReply(NamedTuple):
+    """Encoded reply: its bytes, their encoding, and whether it is an answer or an error.
+
+    about: the joined digests of the client's own avatars that answered; the seal names them.
+    """
+
+    payload: bytes
+    encoding: str
+    ok: bool
+    about: bytes = b""
+
+
+class FrameCommand(NamedTuple):
+    """Motion command of one user in one frame.
+
+    late: number of its motion commands dropped so far because a newer one had arrived.
+    """
+
+    user: User
+    wish: Wish
+    late: int = 0
+
+
+class FrameResult(NamedTuple):
+    """Result of a motion command in a frame.
+
+    state: the user's new state, or an error.  about: as in `EncodedReply`.
+    """
+
+    user: User
+    state: State | SolidcloudError
+    about: bytes = b""
+
+
+class LatestState(NamedTuple):
+    """The last state of a session's avatar, and the time since it arrived [s]."""
+
+    state: State
+    age: float
+
+
+class ServedSimulation(Protocol):
+    """Simulation of the frames of users that move in a scene; thread-safe."""
+
+    @property
+    def most_users(self) -> int: ...
+    @property
+    def users(self) -> list[User]: ...
+    def step(
+        self,
+        turns: Sequence[FrameCommand],
+        now: float | None = None,
+        *,
+        stops: Sequence[StopFlag] | None = None,
+    ) -> list[FrameResult]: ...
+    def end(self, user: User) -> None: ...
+    def end_client(self, client: str) -> None: ...
+    def warm(self) -> None: ...
+
+
+class ServedScene(Protocol):
+    """Scene that answers a server's requests; thread-safe. Refuses one with a SolidcloudError.
+
+    `ask`, `path` and `move` take the parameters of those of `Scene`. Each calls `record_avatar` in
+    the calling thread for every avatar that answers, before it returns.
+    simulation: of its users' frames; None if it has none.
+    """
+
+    name: str
+
+    @property
+    def simulation(self) -> ServedSimulation | None: ...
+    def info(self) -> SceneInfo: ...
+    def add_avatar(
+        self, name: str, points: Any, radius: float | None = None, *, client: str = ""
+    ) -> AvatarInfo: ...
+    def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A: ...
+    def path(self, *what: Any, **parameters: Any) -> Iterator[Part]: ...
+    def move(self, *what: Any, **parameters: Any) -> Moved: ...
+    def limit_avatars(self, limits: AvatarLimits) -> None: ...
+    def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None: ...
+    def drop_client(self, client: str) -> None: ...
+    def reload(self) -> ReloadAnswer: ...
+    def stats(self, keys: bool = False) -> StatsAnswer: ...
+    def warm(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class _Recorded(threading.local):
+    digests: list[bytes] | None = None
+
+
+_RECORDED = _Recorded()
+
+
+@contextmanager
+def recording_avatars(digests: list[bytes]) -> Iterator[None]:
+    """Have `record_avatar` append to `digests` in this thread, for a `with`.
+
+    The seal of a reply names the avatars that answered (WIRE.md, "Seals"), so a client can tell
+    whether they were its own. They are recorded when they are looked up, because an avatar may be
+    dropped and another added under its name while the answer is computed.
+    """
+    before, _RECORDED.digests = _RECORDED.digests, digests
+    try:
+        yield
+    finally:
+        _RECORDED.digests = before
+
+
+def record_avatar(digest: bytes) -> None:
+    """Record the digest of an avatar that was looked up; ignore the empty one of a scene's own."""
+    if digest and _RECORDED.digests is not None:
+        _RECORDED.digests.append(digest)

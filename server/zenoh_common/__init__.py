@@ -1,0 +1,5 @@
+"""What both ends of zenoh share: endpoints, session settings, key files and sealed replies.
+
+May import server/scene_interface.py, schemas.
+Begin with zenoh_settings.py.
+"""

@@ -1,0 +1,236 @@
+"""Sealed replies to zenoh queries: sending and reading them."""
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from ...schemas.errors import UnknownAvatarError
+from ...schemas.wire.encoding import JSON, MSGPACK
+from ...schemas.wire.seals import NONCE_BYTES, Sealer, hash_of, is_about
+from ..scene_interface import EncodedReply
+from .key_files import KeyFile, find_key, read_given_key
+
+log = logging.getLogger(__name__)
+
+_ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
+
+
+def sealer_of(query: zenoh.Query, key: bytes, key_expression: str, request: bytes) -> Sealer | None:
+    """Return the sealer of the replies to a query; None if the query has no nonce.
+
+    key: the server's.  request: the query's payload.
+    """
+    attachment = query.attachment
+    if attachment is None or len(nonce := attachment.to_bytes()) != NONCE_BYTES:
+        return None
+    return Sealer(key, nonce, key_expression, hash_of(request))
+
+
+def send_reply(
+    query: zenoh.Query, key: Any, answer: EncodedReply, sealer: Sealer | None = None, number: int = 0
+) -> bool:
+    """Send one answer; log and return False if the client or its link no longer exists.
+
+    number: of the replies to this query, increasing.
+    """
+    payload, encoding, ok, about = answer
+    seal = None if sealer is None else sealer.seal(number, ok, encoding, payload, about)
+    try:
+        if ok:
+            query.reply(key, payload, encoding=_ENCODINGS[encoding], attachment=seal)
+        elif seal is None:
+            query.reply_err(payload, encoding=_ENCODINGS[encoding])
+        else:
+            # zenoh's error replies have no attachment.
+            query.reply_err(payload, encoding=f"{encoding};{seal.hex()}")
+    except zenoh.ZError as error:
+        log.warning("reply to %s: %s", query.key_expr, error)
+        return False
+    return True
+
+
+class OtherAvatarError(UnknownAvatarError):
+    """Reply about another avatar than the client added: another program uses the client's id.
+
+    key_expression: of the query, with the id.
+    """
+
+    def __init__(self, key_expression: str) -> None:
+        super().__init__("the server answered about another avatar of this name than the one that was added")
+        self.key_expression = key_expression
+
+
+def _no_avatars() -> bytes:
+    """Return the joined digests of no avatars."""
+    return b""
+
+
+class TrustAnchor:
+    """Trust anchor of one client: the key by which it recognizes its server's replies.
+
+    The key is given, or found in the user's key files. Once there is a key, this object ignores
+    every reply without the right seal. The key is replaced only from the file, where a restarted
+    server leaves a new one. Without a key, all replies are accepted, with one warning. Thread-safe:
+    assignments are atomic.
+    """
+
+    def __init__(self, endpoint: str, key_file: Path | str | None = None) -> None:
+        """Read or find the key.
+
+        key_file: holds the key; BadRequestError if it does not. None: search the user's key files.
+        """
+        self._endpoint = endpoint
+        self._given = None if key_file is None else Path(key_file)
+        self._known: KeyFile | None = None
+        self._said: set[str] = set()
+        self._unusable: set[Any] = set()  # key files
+        if self._given is None:
+            self._known = find_key(endpoint, None, self._unusable)
+        else:
+            self._known = KeyFile(read_given_key(self._given), (0, 0, 0))
+
+    @property
+    def key(self) -> bytes | None:
+        """Return the key; None if there is none yet."""
+        return None if self._known is None else self._known.key
+
+    def look_again(self) -> bytes | None:
+        """Return the key after rereading its file, in which a new server may have left another."""
+        if self._given is None:
+            self._known = find_key(self._endpoint, self._known, self._unusable) or self._known
+        return self.key
+
+    def unsealed(self) -> None:
+        """Warn once that unauthenticated replies are accepted."""
+        if "unsealed" not in self._said:
+            self._said.add("unsealed")
+            log.warning(
+                "no key of the server at %s: its replies are accepted unchecked; give its --key-file to tell it from "
+                "another program at that endpoint",
+                self._endpoint,
+            )
+
+    def refused(self, key_expression: str) -> None:
+        """Warn once that a reply is ignored."""
+        if "refused" not in self._said:
+            self._said.add("refused")
+            log.warning(
+                "ignored a reply to %s at %s: it is not sealed with the server's key: another program may be there, "
+                "or the server was started with another --key-file",
+                key_expression.rpartition("/")[2],
+                self._endpoint,
+            )
+
+
+class SealedQuery:
+    """Query of a client, and reader of its replies."""
+
+    __slots__ = (
+        "_about",
+        "_anchor",
+        "_hash",
+        "_key",
+        "_key_expression",
+        "_last",
+        "_request",
+        "_sealer",
+        "nonce",
+    )
+
+    def __init__(
+        self,
+        anchor: TrustAnchor,
+        key_expression: str,
+        request: bytes = b"",
+        about: Callable[[], bytes | None] = _no_avatars,
+    ) -> None:
+        """Make a nonce, which the caller sends as the query's attachment.
+
+        about: returns the joined digests of the avatars that this client added and that the query
+        names; None if the client does not know one of them. With a key, a reply about other avatars
+        is rejected.
+        """
+        self._anchor, self._key_expression, self._request = anchor, key_expression, request
+        self._about = about
+        self.nonce = os.urandom(NONCE_BYTES)
+        self._hash: bytes | None = None  # of the request
+        self._key: bytes | None = None  # of `_sealer`
+        self._sealer: Sealer | None = None
+        self._last = -1  # number of the last reply
+
+    def sent(self) -> None:
+        """Hash the request after it was sent: the server hashes a large one at the same time."""
+        self._hash = hash_of(self._request)
+
+    def read(self, reply: zenoh.Reply) -> tuple[bool, bytes] | None:
+        """Return (whether a reply is an answer, its bytes); None if the server did not send it.
+
+        A reply that is no answer is an error. The server replies only under the exact key of the
+        query, never under a wider one. Raise OtherAvatarError for the server's reply about other
+        avatars; an error may also be about none.
+        """
+        sample: Any = reply.ok
+        if sample is None:
+            error: Any = reply.err
+            encoding, _, said = str(error.encoding).partition(";")
+            payload: bytes = error.payload.to_bytes()
+            if encoding != MSGPACK:
+                log.debug(
+                    "no answer to %s: %s", self._key_expression, payload[:200]
+                )  # zenoh's own, such as "Timeout"
+                return None
+            seal = _unhexed(said)
+        else:
+            encoding, payload = str(sample.encoding), sample.payload.to_bytes()
+            under = str(sample.key_expr)
+            if under != self._key_expression or sample.kind != zenoh.SampleKind.PUT or encoding != MSGPACK:
+                log.debug("ignored a reply to %s under %s, %s", self._key_expression, under, encoding)
+                return None
+            attachment = sample.attachment
+            seal = b"" if attachment is None else attachment.to_bytes()
+        ok = sample is not None
+        if not self._has_key_and_seal(seal, ok, encoding, payload):
+            if self._anchor.key is not None:
+                self._anchor.refused(self._key_expression)
+                return None
+            self._anchor.unsealed()
+        elif not self._is_about_ours(seal, ok):
+            raise OtherAvatarError(self._key_expression)
+        return ok, payload
+
+    def _has_key_and_seal(self, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
+        """Return whether a key exists and the reply has its seal; reread the key if not."""
+        key = self._anchor.key
+        if key is not None and self._is_sealed(key, seal, ok, encoding, payload):
+            return True
+        fresh = self._anchor.look_again()
+        return fresh is not None and fresh != key and self._is_sealed(fresh, seal, ok, encoding, payload)
+
+    def _is_about_ours(self, seal: bytes, ok: bool) -> bool:
+        """Return whether a sealed reply is about the client's avatars; errors may be about none."""
+        about = self._about()
+        return (about is not None and is_about(seal, about)) or (not ok and is_about(seal, b""))
+
+    def _is_sealed(self, key: bytes, seal: bytes, ok: bool, encoding: str, payload: bytes) -> bool:
+        """Return whether a reply has a valid seal and does not repeat an earlier reply."""
+        if self._sealer is None or key is not self._key:
+            if self._hash is None:
+                self.sent()
+            self._key, self._sealer = key, Sealer(key, self.nonce, self._key_expression, self._hash or b"")
+        number = self._sealer.number_of(seal, ok, encoding, payload)
+        if number <= self._last:
+            return False
+        self._last = number
+        return True
+
+
+def _unhexed(text: str) -> bytes:
+    """Return the bytes of hex digits; b"" if the text is not hexadecimal."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        return b""

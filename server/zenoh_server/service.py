@@ -1,0 +1,378 @@
+"""Assembly of a server: build its parts, warm them up, start them and stop them.
+
+`Service` connects the bytes of the wire with the scenes; the command runs `serve`.
+"""
+
+import logging
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from typing import Any, NamedTuple
+
+from ...schemas.errors import (
+    BadRequestError,
+    ErrorCode,
+    SolidcloudError,
+    TooLargeError,
+    UnknownAvatarError,
+    UnknownSceneError,
+)
+from ...schemas.wire import key_expressions
+from ...schemas.wire.messages import (
+    MAX_MESSAGE_BYTES,
+    MSGPACK,
+    WIRE_VERSION,
+    AddAvatarRequest,
+    ErrorReply,
+    MoveRequest,
+    PathRequest,
+    ReloadAnswer,
+    ScenesAnswer,
+    StatsRequest,
+    decode_request,
+    encode,
+    wire_encoding,
+)
+from ...schemas.wire.questions import QUESTIONS, Question
+from ...schemas.wire.requests import QuestionRequest
+from ..runtime.deadlines import start_deadlines
+from ..runtime.process_heap import give_back_large_blocks
+from ..runtime.stop_flag import NO_STOP, StopFlag
+from ..runtime.threads import start_thread
+from ..scene_interface import EncodedReply, LimitReached, ServedScene, recording_avatars
+from .command_mailboxes import FrameLoop
+from .server_config import ServerConfig
+from .transport import Transport
+
+log = logging.getLogger(__name__)
+
+
+class _Operation(NamedTuple):
+    """How an operation with a payload is answered.
+
+    request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, ""
+    for none. ask: a scene, the request, the client and the stop flag to an answer, or to the parts
+    of one.
+    """
+
+    request: type
+    counted: str
+    ask: Callable[[ServedScene, Any, str, StopFlag], Any]
+
+
+# Operations with a payload that are not questions.
+_OTHERS = {
+    "add_avatar": _Operation(
+        AddAvatarRequest, "", lambda s, r, c, stop: s.add_avatar(r.name, r.points, r.radius, client=c)
+    ),
+    "move": _Operation(
+        MoveRequest,
+        "",
+        lambda s, r, c, stop: s.move(r.avatar, r.pose_from, r.pose_to, r.seconds, client=c, stop=stop),
+    ),
+    "path": _Operation(
+        PathRequest,
+        "poses",
+        lambda s, r, c, stop: s.path(r.avatar, r.poses, r.op, client=c, stop=stop, **r.parameters()),
+    ),
+}
+
+
+@cache
+def _operation(name: str) -> _Operation | None:
+    """Return how an operation is answered; None for one without a payload."""
+    question = QUESTIONS.get(name)
+    if question is None:
+        return _OTHERS.get(name)
+    own: Question[Any] = question
+
+    def ask(scene: ServedScene, request: QuestionRequest, client: str, stop: StopFlag) -> Any:
+        client_too = {"client": client} if own.about_avatars else {}
+        return scene.ask(own, *request.arguments(), stop=stop, **client_too, **request.options())
+
+    return _Operation(own.request, own.counted, ask)
+
+
+class Service:
+    """Answers requests on the wire from scenes. Thread-safe; never raises: errors are answers."""
+
+    def __init__(self, scenes: Sequence[ServedScene], config: ServerConfig) -> None:
+        names = [key_expressions.check_name(scene.name, "scene") for scene in scenes]
+        if len(set(names)) != len(names):
+            raise BadRequestError(f"scenes {', '.join(names)}: each needs a name of its own")
+        self._scenes = {scene.name: scene for scene in scenes}
+        self._config = config
+        self._frames: dict[str, FrameLoop] = {}
+        self.left_at_work = False  # after serving: whether a request did not end in time
+        for scene in scenes:
+            scene.limit_avatars(config.avatar_limits)
+
+    def scenes(self, encoding: str | None) -> EncodedReply:
+        """Return the answer that lists the served scenes."""
+        formats = {scene.info().format_version for scene in self._scenes.values()}
+        answer = ScenesAnswer(sorted(self._scenes), WIRE_VERSION, max(formats, default=0))
+        try:
+            stated = wire_encoding(encoding)
+            return EncodedReply(encode(answer, stated), stated, True)
+        except SolidcloudError as error:
+            return self._error(encoding, error.code, str(error))
+
+    def answer(
+        self, key: str, payload: bytes, encoding: str | None, stop: StopFlag | None = None
+    ) -> EncodedReply | Iterator[EncodedReply]:
+        """Return the answer to a request under this key; an iterator if it comes in parts.
+
+        stop: ends the work early once it is set; what was not computed by then is unknown.
+        """
+        avatars: list[bytes] = []
+        try:
+            stated = wire_encoding(encoding)
+            with recording_avatars(avatars):
+                found = self._ask(key, payload, stated, NO_STOP if stop is None else stop)
+            about = b"".join(avatars)
+            if isinstance(found, Iterator):
+                return self._parts(key, found, stated, about)
+            return self._encoded(found, stated, about)
+        except Exception as error:
+            return self._failed(key, encoding, error, b"".join(avatars))
+
+    def _parts(self, key: str, parts: Iterator[Any], encoding: str, about: bytes) -> Iterator[EncodedReply]:
+        """Yield parts as answers; an error is the last one."""
+        try:
+            for part in parts:
+                yield self._encoded(part, encoding, about)
+        except Exception as error:
+            yield self._failed(key, encoding, error, about)
+
+    def _encoded(self, message: Any, encoding: str, about: bytes) -> EncodedReply:
+        """Encode a message as an answer. TooLargeError: its receiver would drop it unread."""
+        payload = encode(message, encoding)
+        # The margin is far more than zenoh's own part of a message takes.
+        if len(payload) > MAX_MESSAGE_BYTES - (1 << 16):
+            raise TooLargeError(
+                f"the answer takes {len(payload)} bytes, a message holds {MAX_MESSAGE_BYTES}: ask for less at a time"
+            )
+        return EncodedReply(payload, encoding, True, about)
+
+    def _failed(self, key: str, encoding: str | None, error: Exception, about: bytes) -> EncodedReply:
+        """Return an error as an answer; log one that is no SolidcloudError and send its type only.
+
+        about: of the avatars that were looked up; if one is unknown, the answer is about none.
+        """
+        if isinstance(error, SolidcloudError):
+            answer = self._error(encoding, error.code, str(error))
+            return answer if isinstance(error, UnknownAvatarError) else answer._replace(about=about)
+        log.error("a request failed with an internal error: %s", key, exc_info=error)
+        answer = self._error(
+            encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
+        )
+        return answer._replace(about=about)
+
+    def busy(self, encoding: str | None, full: LimitReached) -> EncodedReply:
+        """Return the answer to a request that exceeds a limit. full: the limit reached."""
+        as_one = "(all clients without a liveliness token count as one)"
+        config = self._config
+        message = {
+            LimitReached.REQUESTS: f"up to {config.max_in_flight} requests are in flight here: ask again later",
+            LimitReached.OWN_REQUESTS: (
+                f"{config.max_in_flight_by_client} requests of this client are in flight, the most that this server "
+                f"takes {as_one}: wait for answers"
+            ),
+            LimitReached.PATHS: (
+                f"this server answers up to {config.max_paths} paths at a time, {max(1, config.max_paths // 2)} of one "
+                f"client {as_one}: ask again when one has ended"
+            ),
+            LimitReached.STATES: "as many queries for states are open as this scene has room for: ask again later",
+        }[full]
+        return self._error(encoding, ErrorCode.BUSY, message)
+
+    def client_gone(self, scene: str, client: str) -> None:
+        """Remove the avatars of a disconnected client, and end its bodies."""
+        if (frames := self._frames.get(scene)) is not None:
+            frames.client_gone(client)
+        self._scenes[scene].drop_client(client)
+
+    def drop_unused(self, scene: str, alive: Collection[str]) -> None:
+        """Drop avatars unused for long, except those of clients in `alive`."""
+        self._scenes[scene].drop_unused_avatars(alive, self._config.avatar_seconds)
+
+    def frames(
+        self,
+        scene: str,
+        publish: Callable[[key_expressions.User, EncodedReply], None],
+        turn: Callable[[str], str] = str,
+    ) -> FrameLoop | None:
+        """Return the sessions of a scene, which send states with `publish`; None if it has none.
+
+        turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
+        """
+        if (simulation := self._scenes[scene].simulation) is None:
+            return None
+        frames = FrameLoop(simulation, publish, self._config.max_request_seconds, turn)
+        return self._frames.setdefault(scene, frames)
+
+    def warm(self) -> None:
+        """Warm every scene, so that the first client does not wait for compilation."""
+        start_deadlines()
+        for scene in self._scenes.values():
+            log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
+            scene.warm()
+            if scene.simulation is not None:
+                scene.simulation.warm()
+
+    def _ask(self, key: str, payload: bytes, encoding: str, stop: StopFlag) -> Any:
+        """Send one request to the scene that its key names."""
+        route = key_expressions.parse_query_key(key)
+        scene = self._scenes.get(route.scene)
+        if scene is None:
+            served = ", ".join(sorted(self._scenes))
+            raise UnknownSceneError(f"scene {route.scene!r} is not served here; served: {served}")
+        operation = _operation(route.operation)
+        if operation is None:
+            if route.operation == "stats":
+                asked = decode_request(StatsRequest, payload, encoding) if payload else StatsRequest()
+                return scene.stats(asked.keys)
+            if payload:
+                raise BadRequestError(
+                    f"{route.operation} with a payload of {len(payload)} bytes: expected none"
+                )
+            # `reload` answers in one part: parts are sent by a separate thread, so no worker waits.
+            return self._reload(scene) if route.operation == "reload" else scene.info()
+        request: Any = decode_request(operation.request, payload, encoding)
+        self._check_size(operation, request)
+        return operation.ask(scene, request, route.client, stop)
+
+    def _reload(self, scene: ServedScene) -> Iterator[ReloadAnswer]:
+        """Reload one scene when the answer is requested; log and raise errors."""
+        try:
+            answer = scene.reload()
+        except Exception as error:
+            log.error("%s cannot be reloaded and is served as before: %s", scene.name, error)
+            raise
+        log.info(
+            "reloaded %s in %.1f s: generation %d, was %d; %d points",
+            scene.name, answer.seconds, answer.generation_after, answer.generation_before, answer.points,
+        )  # fmt: skip
+        yield answer
+
+    def reload(self) -> None:
+        """Reload every scene in turn; log errors, and serve the scene concerned as before."""
+        for scene in self._scenes.values():
+            with suppress(Exception):
+                next(self._reload(scene))
+
+    def _check_size(self, operation: _Operation, request: Any) -> None:
+        """Raise TooLargeError for a request that exceeds this server's limits."""
+        if operation.counted:
+            count, most = len(getattr(request, operation.counted)), self._config.max_poses
+            if count > most:
+                raise TooLargeError(f"{count} {operation.counted} in a request: at most {most}: split them")
+        elif operation.request is AddAvatarRequest and len(request.points) > self._config.max_avatar_points:
+            most = self._config.max_avatar_points
+            raise TooLargeError(f"avatar of {len(request.points)} points: at most {most}: thin it out first")
+
+    def _error(self, encoding: str | None, code: ErrorCode, message: str) -> EncodedReply:
+        """Return an error as an answer, in the stated encoding if that is valid."""
+        try:
+            stated = wire_encoding(encoding)
+        except BadRequestError:
+            stated = MSGPACK
+        return EncodedReply(encode(ErrorReply(code, message), stated), stated, False)
+
+
+@contextmanager
+def serving(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[Service]:
+    """Serve scenes inside a `with`; the caller closes them afterwards.
+
+    Everything is warm and reachable once entered. SolidcloudError: a scene or endpoint is unusable.
+    """
+    service = Service(scenes, config)
+    service.warm()
+    transport = Transport([scene.name for scene in scenes], service, config)
+    try:
+        with transport:
+            yield service
+    finally:
+        service.left_at_work = transport.left_at_work
+
+
+def serve(
+    scenes: Sequence[ServedScene], config: ServerConfig, ready: Callable[[], object] = lambda: None
+) -> bool:
+    """Serve scenes until SIGTERM or SIGINT, then answer accepted requests. Main thread only.
+
+    Return whether all requests have ended; if not, closing their scene waits for them.
+    ready: called once all is warm and reachable.  SIGHUP: reload all scenes, see `Scene.reload`.
+    """
+    give_back_large_blocks()
+    # By default, a pure Python thread may hold the interpreter's lock for 5 ms while a reply waits.
+    sys.setswitchinterval(0.0005)
+    if config.insecure:
+        log.warning("--insecure: every client that reaches %s may send requests", config.listen)
+    with (
+        _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
+        _metrics(scenes, config),
+        serving(scenes, config) as service,
+        _reloader(service) as wanted,
+    ):
+        ready()
+        print(f"serving {', '.join(scene.name for scene in scenes)} at {config.listen}", flush=True)
+        while signals.recv(1)[0] == signal.SIGHUP:
+            wanted.set()
+    return not service.left_at_work
+
+
+@contextmanager
+def _metrics(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[None]:
+    """Serve the metrics of scenes if configured; from the start, so that errors show early."""
+    if not config.metrics_port:
+        yield
+        return
+    from ..observability.prometheus_metrics import metrics_served  # its library is an extra
+
+    with metrics_served(scenes, config.metrics_host, config.metrics_port) as where:
+        log.info("metrics at %s", where)
+        yield
+
+
+@contextmanager
+def _reloader(service: Service) -> Iterator[threading.Event]:
+    """Run a thread that reloads all scenes when the event is set; a stop does not wait for it."""
+    wanted, ended = threading.Event(), threading.Event()
+
+    def run() -> None:
+        while wanted.wait() and not ended.is_set():
+            wanted.clear()
+            service.reload()
+
+    # A reload that is running at the end is abandoned when its scene closes (`Scene.close` waits).
+    start_thread("reload", run)
+    try:
+        yield wanted
+    finally:
+        ended.set()
+        wanted.set()
+
+
+@contextmanager
+def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
+    """Replace the signals' handlers and yield a socket that becomes readable when a signal arrives.
+
+    An event set by a handler would not do: the system may deliver the signal to one of zenoh's
+    threads, and a main thread that waits for a lock is not woken then to run the handler.
+    """
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+        descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        try:
+            yield reader
+        finally:
+            signal.set_wakeup_fd(descriptor)
+            for number, handler in before.items():
+                signal.signal(number, handler)

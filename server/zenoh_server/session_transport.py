@@ -1,0 +1,170 @@
+"""Server side of sessions over zenoh: clients publish motion commands and query for states.
+
+A motion command is a `Wish` on the wire; one long query a user receives all its states. zenoh
+passes motion commands and queries to bounded channels. One thread moves motion commands into
+mailboxes, one opens streams of states, and another simulates frames and sends their states
+(command_mailboxes.py).
+"""
+
+import logging
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import zenoh
+
+from ...schemas.errors import BadRequestError
+from ...schemas.wire import key_expressions
+from ...schemas.wire.seals import Sealer
+from ..scene_interface import EncodedReply, LimitReached
+from ..zenoh_common.channels import take_at_hand
+from ..zenoh_common.sealed_replies import send_reply
+from .command_mailboxes import FrameLoop
+from .liveliness_tokens import Tokens
+from .state_streams import StateStreams
+from .waiting_commands import WaitingCommands
+
+log = logging.getLogger(__name__)
+
+# Motion commands that the channel holds until the thread takes them: one each of a thousand users.
+_CHANNEL = 1024
+# Open queries for states, for each user that a scene has room for.
+_STREAMS_A_USER = 2
+
+
+class Sessions(Protocol):
+    """Service that simulates the frames of scenes."""
+
+    def frames(
+        self,
+        scene: str,
+        publish: Callable[[key_expressions.User, EncodedReply], None],
+        turn: Callable[[str], str],
+    ) -> FrameLoop | None: ...
+    def busy(self, encoding: str | None, full: LimitReached) -> EncodedReply: ...
+
+
+class SceneSessions:
+    """Sessions of one scene.
+
+    declared: zenoh objects to undeclare at the end, which also ends the threads.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        scene: str,
+        service: Sessions,
+        start: Callable[..., None],
+        sealer: Callable[[zenoh.Query, str, bytes], Sealer | None],
+        tokens: Tokens,
+    ) -> None:
+        """Declare the sessions and start their threads, if the scene simulates.
+
+        start: starts a named thread that runs a function with arguments.  sealer: as in `Wire`.
+        tokens: those of the scene's clients.
+        """
+        self.declared: list[Any] = []
+        self._service, self._sealer, self._tokens = service, sealer, tokens
+        self._frames = frames = service.frames(scene, self._send, tokens.turn)
+        self._streams = StateStreams(
+            0 if frames is None else _STREAMS_A_USER * frames.most_users, tokens.turn
+        )
+        if frames is None:
+            return
+        queryable = session.declare_queryable(
+            key_expressions.all_states_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        wishes = session.declare_subscriber(
+            key_expressions.all_commands_key(scene), zenoh.handlers.FifoChannel(_CHANNEL)
+        )
+        self.declared += [queryable, wishes]
+        start(f"{scene}-states", self._open_streams, queryable.handler)
+        start(f"{scene}-wishes", self._take_wishes, wishes.handler, frames)
+        start(f"{scene}-frames", self._run_frames, frames)
+
+    def give_up(self) -> None:
+        """Stop the running frame, and those of the waiting motion commands."""
+        if self._frames is not None:
+            self._frames.give_up()
+
+    def client_gone(self, client: str) -> None:
+        """End the queries of a disconnected client."""
+        self._streams.end_client(client)
+
+    def _send(self, user: key_expressions.User, answer: EncodedReply) -> None:
+        self._streams.send(user, answer)
+
+    def _run_frames(self, frames: FrameLoop) -> None:
+        """Simulate until motion commands end, then end the streams. Runs in a thread."""
+        try:
+            frames.run()
+        finally:
+            self._streams.close()
+
+    def _open_streams(self, queries: Any) -> None:
+        """Take the queries for states. Runs in a thread."""
+        for query in queries:
+            try:
+                self._open_stream(query)
+            except Exception:  # affects this query only
+                log.exception("a query for states failed")
+
+    def _open_stream(self, query: zenoh.Query) -> None:
+        """Open a stream or answer `busy`; end a query for several users without a reply."""
+        try:
+            key = str(query.key_expr)
+            user = key_expressions.parse_state_key(key)
+        except BadRequestError as error:
+            log.debug("a query for the states of no user: %s", error)
+            query.drop()
+            return
+        payload = query.payload
+        sealer = self._sealer(query, key, b"" if payload is None else payload.to_bytes())
+        if not self._streams.open(user, query, sealer):
+            with query:
+                encoding = None if query.encoding is None else str(query.encoding)
+                send_reply(query, query.key_expr, self._service.busy(encoding, LimitReached.STATES), sealer)
+
+    def _take_wishes(self, samples: Any, frames: FrameLoop) -> None:
+        """Take motion commands until they end, then end the frames. Runs in a thread.
+
+        Waiting samples are sorted by turns before one is decoded: decoding a large one takes
+        milliseconds.
+        """
+        waiting = WaitingCommands(self._tokens.turn)
+        try:
+            for sample in samples:
+                self._sort(sample, waiting, frames)
+                while (following := waiting.take()) is not None:
+                    self._take_wish(*following, frames)
+                    for _ in range(_CHANNEL):
+                        if (more := take_at_hand(samples)) is None:
+                            break
+                        self._sort(more, waiting, frames)
+        finally:
+            frames.close()
+
+    def _sort(self, sample: zenoh.Sample, waiting: WaitingCommands, frames: FrameLoop) -> None:
+        """Queue a motion command for its client's turn; refuse one that is too large, undecoded."""
+        try:
+            user = key_expressions.parse_command_key(str(sample.key_expr))
+        except BadRequestError as error:
+            log.debug("a motion command of no user: %s", error)
+            return
+        try:
+            size = len(sample.payload)
+            if sample.kind == zenoh.SampleKind.DELETE or frames.fits(user, size, str(sample.encoding)):
+                waiting.put(user, sample, size)
+        except Exception:  # affects this motion command only
+            log.exception("a motion command failed")
+
+    def _take_wish(self, user: key_expressions.User, sample: zenoh.Sample, frames: FrameLoop) -> None:
+        """Accept one motion command, or have a user leave."""
+        try:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                frames.leave(user)
+                self._streams.forget(user)
+            elif frames.wish(user, sample.payload.to_bytes(), str(sample.encoding)):
+                self._streams.send_again(user)
+        except Exception:  # affects this motion command only
+            log.exception("a motion command failed")

@@ -1,0 +1,259 @@
+"""The threads of a lane, without zenoh: queries come from a queue, the service and the wire are fakes."""
+
+import os
+import queue
+import sys
+import threading
+import time
+from contextlib import contextmanager, suppress
+
+import pytest
+from solidcloud.server.runtime.threads import start_thread
+from solidcloud.server.runtime.watchdog import lower_priority
+from solidcloud.server.scene_interface import EncodedReply, LimitReached
+from solidcloud.server.zenoh_server import request_lanes as lanes_module
+from solidcloud.server.zenoh_server.fair_queues import Offer, Ticket
+from solidcloud.server.zenoh_server.jobs import Wire
+from solidcloud.server.zenoh_server.liveliness_tokens import Tokens
+from solidcloud.server.zenoh_server.request_lanes import Lane
+from solidcloud.server.zenoh_server.server_config import ServerConfig
+
+DEADLINE = 20.0
+ANSWER = EncodedReply(b"", "msgpack", True)
+
+
+def eventually(condition):
+    deadline = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < deadline, "never came true"
+        time.sleep(0.002)
+
+
+class Query:
+    """A query of a client. replies: what was said, in order.  ended: whether no more will come."""
+
+    def __init__(self, client, operation="collide"):
+        self.key_expr, self.payload = f"solidcloud/1/scene/hall/{client}/{operation}", None
+        self.client, self.operation = client, operation
+        self.replies, self.ended = [], threading.Event()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.ended.set()
+
+
+class Fake:
+    """A service that answers with what `answers` makes of a query. busy: what there was no room for, in order."""
+
+    def __init__(self, answers):
+        self.answers, self.full, self.unused = answers, [], []
+
+    def answer(self, key, payload, encoding, stop):
+        _, _, _, _, client, operation = key.split("/")
+        return self.answers(client, operation, stop)
+
+    def busy(self, encoding, full):
+        self.full.append(full)
+        return ANSWER
+
+    def client_gone(self, scene, client):
+        pass
+
+    def drop_unused(self, scene, alive):
+        self.unused.append(alive)
+
+
+def reply(query, key, answer, sealer, number):
+    query.replies.append(answer)
+    return True
+
+
+class Hall:
+    """A lane that takes what is put into `queries`; None, once for each taker, ends them."""
+
+    def __init__(self, answers, start=start_thread, **config):
+        self.queries, self.threads, self.service = queue.SimpleQueue(), [], Fake(answers)
+        self.tokens = Tokens(64)
+
+        def started(name, run, *arguments):
+            self.threads.append(start(name, run, *arguments))
+
+        self.lane = Lane(
+            self.service,
+            "hall",
+            ServerConfig(**config),
+            iter(self.queries.get, None),
+            self.at_hand,
+            started,
+            Wire(lambda query: None, lambda *_: None, reply),
+            self.tokens,
+        )
+
+    def at_hand(self):
+        with suppress(queue.Empty):
+            query = self.queries.get_nowait()
+            if query is not None:
+                return query
+            self.queries.put(None)
+        return None
+
+    def ask(self, client, operation="collide"):
+        self.queries.put(query := Query(client, operation))
+        return query
+
+    @contextmanager
+    def running(self):
+        self.lane.start()
+        try:
+            yield self
+        finally:
+            for _ in range(64):
+                self.queries.put(None)
+            eventually(lambda: not self.lane.in_flight and not any(t.is_alive() for t in self.threads))
+            self.lane.close()
+
+
+def test_a_newcomer_does_not_wait_for_all_that_came_before_it(monkeypatch):
+    """One client has many queries in the channel, none of them slow; another has one behind them."""
+    monkeypatch.setattr(lanes_module, "_EMPTY_SECONDS", 0.0)
+    order = []
+
+    def answers(client, operation, stop):
+        order.append(client)
+        return ANSWER
+
+    hall = Hall(answers, workers=1)
+    for client in ("many", "new"):
+        hall.tokens.here(client)
+    asked = [hall.ask("many") for _ in range(40)]
+    asked.append(hall.ask("new"))
+    with hall.running():
+        assert all(query.ended.wait(DEADLINE) for query in asked)
+    assert order.index("new") == 2 and len(order) == 41
+    assert not hall.service.full
+
+
+def test_a_query_that_cannot_be_read_stops_nobody(monkeypatch, caplog):
+    monkeypatch.setattr(lanes_module, "_EMPTY_SECONDS", 0.0)
+    hall = Hall(lambda *_: ANSWER, workers=1)
+    asked = [hall.ask("a")]
+    hall.queries.put(object())
+    asked += [hall.ask("a"), hall.ask("b")]
+    with hall.running():
+        assert all(query.ended.wait(DEADLINE) for query in asked)
+    assert "a query of scene hall" in caplog.text
+
+
+def paths(gate):
+    """Answers in two parts, the second once the gate is open."""
+
+    def answers(client, operation, stop):
+        def parts():
+            yield ANSWER
+            while not (stop or gate.wait(0.01)):
+                pass
+            yield ANSWER
+
+        return parts()
+
+    return answers
+
+
+def test_all_clients_without_a_token_have_half_of_the_paths_together():
+    gate = threading.Event()
+    hall = Hall(paths(gate), max_paths=4)
+    hall.tokens.here("known")
+    with hall.running():
+        try:
+            invented = [hall.ask(f"invented-{number}", "path") for number in range(2)]
+            eventually(lambda: all(query.replies for query in invented))
+            refused = hall.ask("invented-3", "path")
+            assert refused.ended.wait(DEADLINE)
+            assert hall.service.full == [LimitReached.PATHS]
+            known = hall.ask("known", "path")
+            eventually(lambda: known.replies)
+            assert not known.ended.is_set() and len(hall.service.full) == 1
+        finally:
+            gate.set()
+        assert all(query.ended.wait(DEADLINE) for query in [*invented, known])
+    assert [len(query.replies) for query in [*invented, known]] == [2, 2, 2]
+
+
+def test_a_path_of_a_client_without_a_token_ends_after_a_while():
+    """It may be gone, which nothing tells."""
+    gate = threading.Event()
+    hall = Hall(paths(gate), avatar_seconds=0.2)
+    hall.tokens.here("known")
+    with hall.running():
+        known, stranger = hall.ask("known", "path"), hall.ask("stranger", "path")
+        assert stranger.ended.wait(DEADLINE)
+        assert not known.ended.is_set()
+        gate.set()
+        assert known.ended.wait(DEADLINE)
+
+
+def test_a_request_that_is_made_slow_while_it_is_put_back_leaves_no_worker_behind():
+    """The watchdog finds a slow place for a request at the moment at which its thread puts it back."""
+    hall = Hall(lambda *_: ANSWER)
+    lane = hall.lane
+    ticket = Ticket("a", lanes_module.Request(Query("a"), lane._wire), 0)
+    assert lane._queues.offer(ticket) is Offer.RUN
+    put_back = lane._queues.put_back
+
+    def late(ticket):
+        assert lane._queues.slow(ticket) == []
+        return put_back(ticket)
+
+    lane._queues.put_back = late
+
+    def again(request, job):
+        job.again = True
+
+    lane._answer = again
+    left, started = lane._carry_out(ticket, True)
+    assert left, "its place as a worker was given to another thread"
+    [ticket] = started
+    assert lane._queues.finished(ticket) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads")
+def test_what_a_slow_request_starts_has_the_usual_priority():
+    """A path that is slow to check is checked at a low priority; its parts are sent at the usual one."""
+    usual, found = os.getpriority(os.PRIO_PROCESS, 0), []
+
+    def priority():
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    def answers(client, operation, stop):
+        lower_priority(threading.get_native_id())
+        found.append(priority())
+
+        def parts():
+            found.append(priority())
+            yield ANSWER
+
+        return parts()
+
+    hall = Hall(answers)
+    with hall.running():
+        assert hall.ask("a", "path").ended.wait(DEADLINE)
+    assert found == [min(19, usual + 10), usual]
+
+
+def test_a_thread_that_cannot_be_started_is_started_later():
+    failures = [RuntimeError("can't start new thread")] * 3
+
+    def start(name, run, *arguments):
+        if name.endswith("-parts") and failures:
+            raise failures.pop()
+        return start_thread(name, run, *arguments)
+
+    gate = threading.Event()
+    gate.set()
+    hall = Hall(paths(gate), start)
+    with hall.running():
+        path = hall.ask("a", "path")
+        assert path.ended.wait(DEADLINE)
+    assert len(path.replies) == 2 and not failures

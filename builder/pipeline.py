@@ -61,8 +61,7 @@ from .run.memory_shares import jobs_that_fit, readers_that_fit
 from .run.progress import Progress, Silent
 from .run.stages import Stages
 from .sources.coincident_scans import coincident_sources, coincident_text
-from .sources.scan_list import Input
-from .sources.scan_list import inputs as scans_of
+from .sources.scan_files import InputFile, open_input_files
 from .spool.spool import Spool, spool_dtype
 from .voxel.dense_voxel import DENSE_POINTS
 
@@ -132,7 +131,7 @@ def build_archive(
     target = Path(target)
     stages = Stages(progress or Silent())
     with made_parents(target), locked(target), _machine_errors(target):
-        inputs = open_inputs(paths, config)
+        inputs = open_input_files(paths, config.spacing)
         what = described(inputs, config)
         recover(target)
         if not config.overwrite and not config.fresh and _is_whole(target, inputs, config, stages):
@@ -151,7 +150,7 @@ def build_archive(
 
 
 def _build(
-    inputs: Sequence[Input],
+    inputs: Sequence[InputFile],
     what: Mapping[str, Any],
     place: Workplace,
     target: Path,
@@ -224,7 +223,7 @@ def _check_voxels(spool: Spool, config: BuildConfig) -> None:
 
 
 def _check_unchanged(
-    inputs: Sequence[Input], what: Mapping[str, Any], place: Workplace, config: BuildConfig
+    inputs: Sequence[InputFile], what: Mapping[str, Any], place: Workplace, config: BuildConfig
 ) -> None:
     """Raise ScanError and start over if a file changed since before it was read.
 
@@ -268,15 +267,7 @@ def _read_back(folder: Path, points: int, spool: Spool, executor: Executor, stag
         )
 
 
-def open_inputs(paths: Sequence[Path], config: BuildConfig) -> list[Input]:
-    """Open the files that the paths stand for: files, folders or scan lists.
-
-    This reads their headers.
-    """
-    return scans_of(paths, config.spacing)
-
-
-def _about(item: Input) -> int:
+def _about(item: InputFile) -> int:
     """Estimate the number of points in a file."""
     declared = [scan.declared_count for scan in item.scans]
     if None not in declared:
@@ -284,7 +275,7 @@ def _about(item: Input) -> int:
     return item.path.stat().st_size // BYTES_A_POINT
 
 
-def _is_whole(target: Path, inputs: Sequence[Input], config: BuildConfig, stages: Stages) -> bool:
+def _is_whole(target: Path, inputs: Sequence[InputFile], config: BuildConfig, stages: Stages) -> bool:
     """Return whether the archive is already complete."""
     if not target.is_dir():
         return False

@@ -113,7 +113,7 @@ DOORS = {
     "pye57": ("builder/sources/formats/e57.py", "builder/synthetic/write.py"),
     "plyfile": ("builder/sources/formats/ply.py",),
     "tomli_w": ("builder/sources/scan_list.py",),
-    "trimesh": ("builder/sources/formats/surface.py", "builder/synthetic/"),
+    "trimesh": ("builder/sources/surface_samples.py", "builder/synthetic/"),
     "embreex": ("builder/synthetic/scanner.py",),
     "prometheus_client": ("server/observability/prometheus_metrics.py",),
     "distributed": ("builder/run/dask_cluster.py",),
@@ -131,7 +131,6 @@ MOST_LINES = 400
 LONG = {
     "schemas/archive/index.py": 410,
     "builder/plan/build_plan.py": 417,
-    "builder/sources/scan_list.py": 409,
     "builder/spool/spool.py": 427,
     "builder/voxel/dense_voxel.py": 438,
     "server/client.py": 522,

@@ -19,7 +19,7 @@ from ..passes.survey import Survey, hash_file, joined, ranges, survey_range, uno
 from ..pipeline import ARCHIVE_BYTES_A_POINT
 from ..sources.coincident_scans import coincide
 from ..sources.common.scan import Scan
-from ..sources.scan_list import Input
+from ..sources.scan_files import InputFile
 from ..spool.spool import Spool
 from ..spool.spool_pass import SpoolUnit, run_points, spool_range
 from .transaction import Change, scan_name
@@ -43,7 +43,7 @@ class Wanted(NamedTuple):
     strict: bool = False
 
 
-def survey_added(change: Change, inputs: Sequence[Input], wanted: Wanted) -> list[Survey]:
+def survey_added(change: Change, inputs: Sequence[InputFile], wanted: Wanted) -> list[Survey]:
     """Return the surveys of the scans of `inputs` to add, all of them usable.
 
     Scans that the archive already contains are reported before any points are read.

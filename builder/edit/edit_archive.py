@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ...schemas.errors import BadRequestError, ScanError
-from ..pipeline import open_inputs
 from ..resume.build_identity import changed_inputs, described
 from ..run.progress import Progress
+from ..sources.scan_files import open_input_files
 from ..spool.spool import Spool
 from .added_scans import Wanted, box_of, no_longer_unknown, source_of, spool_added, survey_added
 from .rebuild_voxels import ChangeSummary, Difference, rebuild
@@ -49,7 +49,7 @@ def add_scans(
             "--new and --again together: expected one of them: skip scans already in the archive, or add them twice?"
         )
     with changing(Path(target), jobs, memory_bytes, progress) as change:
-        inputs = open_inputs(paths, change.config)
+        inputs = open_input_files(paths, change.config.spacing)
         what = described(inputs, change.config)
 
         def check_unchanged() -> None:

@@ -21,7 +21,7 @@ from ..resume.journal import Work, resumed
 from ..run.executor import Executor
 from ..run.memory_shares import memory_share
 from ..run.stages import Stages
-from ..sources.scan_list import Input
+from ..sources.scan_files import InputFile
 from ..spool.spool import KEYS_SUFFIX, RUN_SUFFIX, Spool, spool_dtype
 from ..spool.spool_pass import (
     RunsHold,
@@ -55,7 +55,7 @@ MAX_SCANS = 1 << 16
 
 
 def survey_scans(
-    inputs: Sequence[Input],
+    inputs: Sequence[InputFile],
     about: int,
     place: Workplace,
     executor: Executor,
@@ -110,7 +110,7 @@ def _points_of(unit: Path | RangeUnit) -> int:
 
 
 def _check_surveys(
-    good: list[Survey], faulty: list[Survey], inputs: Sequence[Input], config: BuildConfig
+    good: list[Survey], faulty: list[Survey], inputs: Sequence[InputFile], config: BuildConfig
 ) -> None:
     """Refuse scans that cannot be built with these options."""
     if faulty and not config.skip_bad:

@@ -19,7 +19,7 @@ from ...schemas.errors import ScanError
 from ..config import DEFAULT_STEP, BuildConfig
 from ..passes.survey import shared_step
 from ..sources.common.scan import Scan
-from ..sources.scan_list import Input, inputs
+from ..sources.scan_files import InputFile, open_input_files
 from .build_plan import Plan, Rates, Scene, estimate, load_rates
 from .packed_sample import BrokenScanError, Packed, packed_sample
 
@@ -135,7 +135,7 @@ def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
 
 
 def seen_scene(
-    inputs: Sequence[Input], config: BuildConfig, rates: Rates | None = None, *, quick: bool = False
+    inputs: Sequence[InputFile], config: BuildConfig, rates: Rates | None = None, *, quick: bool = False
 ) -> Scene:
     """Sample opened scans to describe a build of them; pack some blocks of points.
 
@@ -302,5 +302,5 @@ def planned(
     Raise ScanError and BadRequestError as a build would, as far as a sample can detect the error.
     """
     rates = rates or load_rates()
-    scene = seen_scene(inputs(paths, config.spacing), config, rates, quick=quick)
+    scene = seen_scene(open_input_files(paths, config.spacing), config, rates, quick=quick)
     return estimate(scene, config, rates, target)

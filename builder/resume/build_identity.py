@@ -13,7 +13,7 @@ from ...schemas.errors import BadRequestError, FormatError
 from ..config import BuildConfig
 from ..run.software_versions import software_versions
 from ..sources.common.scan import NOT_FINITE, Scan, sha256_of
-from ..sources.scan_list import Input
+from ..sources.scan_files import InputFile
 
 # Most differences that a message names.
 NAMED = 5
@@ -25,7 +25,7 @@ _PLACED = {"pose": "pose", "crs": "coordinate system", "units": "unit", "up": "d
 _OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
 
 
-def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
+def described(inputs: Sequence[InputFile], config: BuildConfig) -> dict[str, Any]:
     """Return the software, options and inputs of a build, as a JSON value.
 
     Memory and jobs are not included.
@@ -39,7 +39,7 @@ def described(inputs: Sequence[Input], config: BuildConfig) -> dict[str, Any]:
     }
 
 
-def _entries(item: Input) -> list[dict[str, Any]]:
+def _entries(item: InputFile) -> list[dict[str, Any]]:
     """Return the entries of a file: its size and time, and for each of its scans the placement."""
     try:
         status = item.path.stat()
@@ -80,7 +80,7 @@ def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> 
     )
 
 
-def changed_inputs(inputs: Sequence[Input], config: BuildConfig, what: Mapping[str, Any]) -> str:
+def changed_inputs(inputs: Sequence[InputFile], config: BuildConfig, what: Mapping[str, Any]) -> str:
     """Return a text listing the inputs that changed since `what` was described, or ""."""
     return _listed(_input_differences(what["inputs"], described(inputs, config)["inputs"]))
 
@@ -132,7 +132,10 @@ def _listed(items: list[str]) -> str:
 
 
 def is_whole(
-    target: Path, inputs: Sequence[Input], config: BuildConfig, tick: Callable[[int], None] = lambda _: None
+    target: Path,
+    inputs: Sequence[InputFile],
+    config: BuildConfig,
+    tick: Callable[[int], None] = lambda _: None,
 ) -> bool:
     """Return whether `target` already is the archive of these scans, by their SHA-256, and options.
 

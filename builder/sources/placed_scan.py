@@ -30,7 +30,7 @@ TURNS: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
 _IDENTITY = np.eye(4)
 
 
-def placed(
+def place_scan(
     scan: Scan,
     *,
     pose: NDArray[np.float64] | None = None,

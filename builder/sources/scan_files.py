@@ -1,68 +1,47 @@
-"""Registry of scan formats by file suffix, and functions that find and open scan files."""
+"""Opening of scans: files, folders and scan lists, as a build or `solidcloud inspect` names them.
 
+format_table.py lists the formats, scan_list.py reads a list. Opening a file reads its headers. Points
+are read only from the text of PTX and PTS files, where the second scan can be found only by reading
+past the first, and from small scans without declared bounds (coincident_scans.py).
+"""
+
+import importlib
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import BadRequestError
+from ...schemas.errors import BadRequestError, ScanError
 from ...schemas.process.interrupts import check
-from .common.scan import Scan, library_errors, scan_error
-from .formats.e57 import e57_bounds, open_e57
-from .formats.glb import open_glb
-from .formats.las import las_bounds, open_las
-from .formats.mesh import open_obj, open_stl
-from .formats.pcd import open_pcd
-from .formats.ply import open_ply
-from .formats.pts import open_pts
-from .formats.ptx import open_ptx
-from .formats.surface import SurfaceSamples
-from .formats.text import open_text
+from ..run.progress import Progress, Silent
+from ..run.transient_errors import raise_transient
+from .coincident_scans import coincident_scan
+from .common.scan import Scan, library_errors, scan_error, sha256_of
+from .format_table import FORMATS, UNSUPPORTED
+from .placed_scan import METRES, place_scan
+from .scan_list import LIST_SUFFIX, ScanEntry, read_scan_list
+from .surface_samples import SurfaceSamples
 
-# Reader by suffix, in lower case. A COPC file ends in ".copc.laz" and is a LAZ file.
-READERS: dict[str, Callable[[Path], list[Scan]]] = {
-    ".las": open_las,
-    ".laz": open_las,
-    ".e57": open_e57,
-    ".ply": open_ply,
-    ".pcd": open_pcd,
-    ".xyz": open_text,
-    ".pts": open_pts,
-    ".ptx": open_ptx,
-    ".txt": open_text,
-    ".csv": open_text,
-    ".obj": open_obj,
-    ".stl": open_stl,
-    ".glb": open_glb,
-}
-# Suffixes collected from a folder. A text file of any other kind may hold notes, which would stop a
-# build; it is read only when named.
-IN_FOLDERS = frozenset(READERS) - {".txt", ".csv"}
-# Suffixes of scan formats without a reader. In a folder they are reported as errors, like broken
-# scans, and not skipped silently.
-UNREAD = frozenset(
-    [
-        ".fls",
-        ".fws",
-        ".gltf",
-        ".lsproj",
-        ".pod",
-        ".ptb",
-        ".ptg",
-        ".ptz",
-        ".rcp",
-        ".rcs",
-        ".rdbx",
-        ".rxp",
-        ".x3a",
-        ".zfs",
-        ".zlas",
-    ]
-)
-MESHES = frozenset({".obj", ".stl", ".ply", ".glb"})
+_FORMATS = {row.suffix: row for row in FORMATS}
+_IN_FOLDERS = frozenset(row.suffix for row in FORMATS if row.in_folders)
+
+
+class InputFile(NamedTuple):
+    """File of a build: its scans, opened and placed, or the fault that prevents it.
+
+    region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None:
+    not known.
+    """
+
+    path: Path
+    scans: list[Scan]
+    fault: str = ""
+    region: NDArray[np.float64] | None = None
 
 
 def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
@@ -81,22 +60,32 @@ def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
     _check_exists(path)
     if not path.is_file():
         raise scan_error(
-            path, "a folder or a device", "a file", "name its files, or pass it through scan_files()"
+            path, "a folder or a device", "a file", "name its files, or pass it through find_scan_files()"
         )
     suffix = path.suffix.lower()
-    if suffix not in READERS:
+    form = _FORMATS.get(suffix)
+    if form is None:
         raise scan_error(
-            path, f"the suffix {suffix!r}", f"one of {' '.join(READERS)}", "convert the scan to one of these"
+            path, f"the suffix {suffix!r}", f"one of {' '.join(_FORMATS)}", "convert the scan to one of these"
         )
     with library_errors(path):
         if path.stat().st_size == 0:
             raise scan_error(path, "an empty file", "a scan", "fetch the file again, or leave it out")
-        scans = READERS[suffix](path)
+        scans: list[Scan] = _reader(form.reader)(path)
         # The vertex reader has checked the header by now; trimesh never sees a broken one.
-        return [SurfaceSamples(scans[0], spacing)] if spacing is not None and suffix in MESHES else scans
+        return [SurfaceSamples(scans[0], spacing)] if spacing is not None and form.is_mesh else scans
 
 
-def scan_files(paths: Iterable[Path]) -> list[Path]:
+def _reader(name: str) -> Callable[[Path], Any]:
+    """Return a function of `formats/` by its module and name, as format_table.py gives them."""
+    module, function = name.split(".")
+    found: Callable[[Path], Any] = getattr(
+        importlib.import_module(f".formats.{module}", __package__), function
+    )
+    return found
+
+
+def find_scan_files(paths: Iterable[Path]) -> list[Path]:
     """Expand paths to scan files: files stay as they are, folders are searched at any depth.
 
     A folder's files are sorted by path; the order does not depend on the file system. They include
@@ -114,13 +103,13 @@ def scan_files(paths: Iterable[Path]) -> list[Path]:
             Path(folder, name)
             for folder, _, names in os.walk(path)
             for name in names
-            if Path(name).suffix.lower() in IN_FOLDERS | UNREAD
+            if Path(name).suffix.lower() in _IN_FOLDERS | UNSUPPORTED
         )
         if not below:
             raise scan_error(
                 path,
                 "a folder without scans",
-                f"files ending in {' '.join(sorted(IN_FOLDERS))}",
+                f"files ending in {' '.join(sorted(_IN_FOLDERS))}",
                 "check the folder's name, or name its files",
             )
         files += below
@@ -130,13 +119,15 @@ def scan_files(paths: Iterable[Path]) -> list[Path]:
 def header_bounds(path: Path) -> NDArray[np.float64] | None:
     """Return the bounds that the header of an unreadable scan file declares.
 
-    Returns (2, 3) world frame [m], low and high corner, or None where they are unknown; only LAS,
-    LAZ and E57 declare bounds. Never raises, and reads no more than the header, whatever it claims.
+    Returns (2, 3) world frame [m], low and high corner, or None where they are unknown. Never
+    raises, and reads no more than the header, whatever it claims.
     """
-    readers = {".las": las_bounds, ".laz": las_bounds, ".e57": e57_bounds}
+    form = _FORMATS.get(Path(path).suffix.lower())
+    if form is None or not form.bounds:
+        return None
     try:
-        reader = readers.get(Path(path).suffix.lower())
-        return reader(Path(path)) if reader else None
+        bounds: NDArray[np.float64] | None = _reader(form.bounds)(Path(path))
+        return bounds
     except Exception:
         check()
         # Best effort on a file known to be broken; open_scans() or blocks() has already raised its
@@ -149,3 +140,125 @@ def _check_exists(path: Path) -> None:
         exists = path.exists()
     if not exists:
         raise scan_error(path, "no such file or folder", "a scan", "check the path for a misspelling")
+
+
+def inspect_scans(
+    paths: Iterable[Path], *, with_sha256: bool = False, progress: Progress | None = None
+) -> list[ScanEntry]:
+    """List the scans of files and folders by their headers, in the order of `find_scan_files`.
+
+    A file that cannot be read, or that holds no scan (possible in E57), becomes an entry with a
+    fault. Raise ScanError for a path that does not exist and a folder without scans,
+    BadRequestError for a file that is named twice.
+    """
+    files = find_scan_files(paths)
+    _check_once((path, 0) for path in files)
+    progress = progress or Silent()
+    progress.start("inspect", len(files), "files")
+    entries: list[ScanEntry] = []
+    for path in files:
+        entries += _inspect_file(path, with_sha256)
+        progress.advance(1)
+    progress.finish()
+    return entries
+
+
+def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
+    """List the scans of one file."""
+    digest = ""
+    try:
+        digest = sha256_of(path) if with_sha256 else ""
+        scans = open_scans(path)
+    except ScanError as error:
+        return [ScanEntry(path, bounds=header_bounds(path), sha256=digest, fault=str(error))]
+    if not scans:
+        return [ScanEntry(path, sha256=digest, fault=f"{path}: holds no scan, expected at least one")]
+    return [
+        ScanEntry(
+            path,
+            scan.index,
+            scan.format,
+            scan.declared_count,
+            scan.bounds,
+            None if np.array_equal(scan.pose, np.eye(4)) else scan.pose,
+            scan.units,
+            scan.up,
+            1.0,
+            scan.crs,
+            digest,
+            fault=scan.fault,
+            warning=coincident_scan(scan),
+        )
+        for scan in scans
+    ]
+
+
+def open_input_files(paths: Sequence[Path], spacing: float | None = None) -> list[InputFile]:
+    """Open what a build reads: files, folders and lists of scans (.toml).
+
+    Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
+    opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
+    that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
+    that is named twice, OSError if a file cannot be opened for a transient reason (transient_errors.py).
+    """
+    found: list[InputFile] = []
+    for path in map(Path, paths):
+        if path.suffix.lower() != LIST_SUFFIX or path.is_dir():
+            found += [_open_input(file, None, spacing) for file in find_scan_files([path])]
+            continue
+        used = [entry for entry in read_scan_list(path) if entry.use]
+        if not used:
+            raise BadRequestError(f"{path}: no scan to use, expected at least one: set use = true")
+        files: dict[Path, list[ScanEntry]] = {}
+        for entry in used:
+            files.setdefault(entry.path, []).append(entry)
+        found += [_open_input(file, entries, spacing) for file, entries in files.items()]
+    _check_once((item.path, index) for item in found for index in [scan.index for scan in item.scans] or [0])
+    return found
+
+
+def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
+    """Raise BadRequestError for a scan (file, index) that occurs twice, even by different paths."""
+    seen: dict[tuple[str, int], Path] = {}
+    for path, index in scans:
+        key = os.path.realpath(path), index
+        if key in seen:
+            raise BadRequestError(
+                f"{path}: scan {index} is named twice, as that of {seen[key]} too, expected each once: leave one out"
+            )
+        seen[key] = path
+
+
+def _open_input(path: Path, entries: list[ScanEntry] | None, spacing: float | None) -> InputFile:
+    """Open one file with its listed scans; None: all of them, unchanged."""
+
+    @cache
+    def scans_spaced(factor: float) -> list[Scan]:
+        # A mesh is sampled in its own units.
+        return open_scans(path, spacing=None if spacing is None else spacing / factor)
+
+    try:
+        if entries is None:
+            return InputFile(path, [place_scan(scan) for scan in scans_spaced(1.0)])
+        scans = []
+        for entry in entries:
+            listed = scans_spaced(METRES[entry.units] * entry.scale)
+            if entry.index >= len(listed):
+                raise ScanError(
+                    f"{path}: holds {len(listed)} scans, expected one of index {entry.index}: correct the list"
+                )
+            scan = place_scan(
+                listed[entry.index], pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
+            )
+            scan.crs = entry.crs or scan.crs
+            scans.append(scan)
+        return InputFile(path, scans)
+    except ScanError as error:
+        raise_transient(error, path)
+        region = header_bounds(path)
+        moved = entries is not None and any(
+            (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None
+            for entry in entries
+        )
+        # The header's bounds do not apply after a list has moved the scan.
+        return InputFile(path, [], str(error), None if moved else region)

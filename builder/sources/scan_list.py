@@ -1,9 +1,6 @@
-"""List of the scans that a build reads: made from headers, written as TOML, and read back.
+"""Lists of scans, as TOML: written from entries, and read back after edits by hand. Opens no scan.
 
-`inspect` makes entries of files and folders. `write_scan_list` and `read_scan_list` write and read
-a file of them. `inputs` opens what a build reads: files and folders as they are, or a list with its
-edits. Points are read only from the text of PTX and PTS files, where the second scan can be found
-only by reading past the first, and from small scans without declared bounds (coincident_scans.py).
+scan_files.py makes the entries and opens the scans that a list names.
 """
 
 import math
@@ -11,9 +8,8 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,22 +17,17 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from ...schemas.errors import BadRequestError, ScanError
+from ...schemas.errors import BadRequestError
 from ...schemas.process.new_file import sync_folder
-from ..run.progress import Progress, Silent
-from ..run.transient_errors import raise_transient
-from .coincident_scans import coincident_scan
-from .common.scan import Scan, sha256_of
-from .placed_scan import METRES, TURNS, placed
-from .scan_files import header_bounds, open_scans, scan_files
+from .placed_scan import METRES, TURNS
 
-SUFFIX = ".toml"
-VERSION = 1
+LIST_SUFFIX = ".toml"
+_VERSION = 1
 
 # Code points that represent bytes of a file name that is not UTF-8.
 _BROKEN_NAME = re.compile("[\ud800-\udfff]")
 
-HEAD = """\
+_HEAD = """\
 # Scans for `solidcloud build`, as their headers describe them. Edit by hand:
 #   use    false leaves a scan out: the archive has no information about its region.
 #   units  unit of length in the file: {units}.
@@ -78,70 +69,6 @@ class ScanEntry:
     warning: str = ""
 
 
-class Input(NamedTuple):
-    """File of a build: its scans, opened and placed, or the fault that prevents it.
-
-    region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None:
-    not known.
-    """
-
-    path: Path
-    scans: list[Scan]
-    fault: str = ""
-    region: NDArray[np.float64] | None = None
-
-
-def inspect(
-    paths: Iterable[Path], *, with_sha256: bool = False, progress: Progress | None = None
-) -> list[ScanEntry]:
-    """List the scans of files and folders by their headers, in the order of `scan_files`.
-
-    A file that cannot be read, or that holds no scan (possible in E57), becomes an entry with a
-    fault. Raise ScanError for a path that does not exist and a folder without scans,
-    BadRequestError for a file that is named twice.
-    """
-    files = scan_files(paths)
-    _check_once((path, 0) for path in files)
-    progress = progress or Silent()
-    progress.start("inspect", len(files), "files")
-    entries: list[ScanEntry] = []
-    for path in files:
-        entries += _inspect_file(path, with_sha256)
-        progress.advance(1)
-    progress.finish()
-    return entries
-
-
-def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
-    """List the scans of one file."""
-    digest = ""
-    try:
-        digest = sha256_of(path) if with_sha256 else ""
-        scans = open_scans(path)
-    except ScanError as error:
-        return [ScanEntry(path, bounds=header_bounds(path), sha256=digest, fault=str(error))]
-    if not scans:
-        return [ScanEntry(path, sha256=digest, fault=f"{path}: holds no scan, expected at least one")]
-    return [
-        ScanEntry(
-            path,
-            scan.index,
-            scan.format,
-            scan.declared_count,
-            scan.bounds,
-            None if np.array_equal(scan.pose, np.eye(4)) else scan.pose,
-            scan.units,
-            scan.up,
-            1.0,
-            scan.crs,
-            digest,
-            fault=scan.fault,
-            warning=coincident_scan(scan),
-        )
-        for scan in scans
-    ]
-
-
 def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
     """Write a list of scans as TOML, with paths relative to it.
 
@@ -151,8 +78,8 @@ def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
     """
     folder = Path(path).parent
     tables = [_table(entry, folder) for entry in entries]
-    head = HEAD.format(units=", ".join(METRES))
-    text = head + "\n" + tomli_w.dumps({"version": VERSION, "scan": tables})
+    head = _HEAD.format(units=", ".join(METRES))
+    text = head + "\n" + tomli_w.dumps({"version": _VERSION, "scan": tables})
     for entry in entries:
         if _BROKEN_NAME.search(str(entry.path)):
             raise BadRequestError(
@@ -221,9 +148,9 @@ def read_scan_list(path: Path) -> list[ScanEntry]:
             f"{path}: {found}, expected a list of scans: correct it, or write it with `solidcloud inspect`"
         ) from error
     unknown = sorted(set(document) - {"version", "scan"})
-    if unknown or document.get("version", VERSION) != VERSION or not isinstance(document.get("scan"), list):
-        found = f"unknown {unknown[0]}" if unknown else f"version {_shown(document.get('version'))}"
-        raise BadRequestError(f"{path}: {found}, expected version = {VERSION} and a [[scan]] for each scan")
+    if unknown or document.get("version", _VERSION) != _VERSION or not isinstance(document.get("scan"), list):
+        found = f"unknown {unknown[0]}" if unknown else f"version {_short_text(document.get('version'))}"
+        raise BadRequestError(f"{path}: {found}, expected version = {_VERSION} and a [[scan]] for each scan")
     entries = [_entry(path, number, table) for number, table in enumerate(document["scan"], 1)]
     seen: dict[tuple[str, int], int] = {}
     for number, entry in enumerate(entries, 1):
@@ -249,7 +176,7 @@ def _long_number(text: str) -> str:
     return f"a number of {len(found[0])} digits (at line {line})"
 
 
-def _shown(value: Any) -> str:
+def _short_text(value: Any) -> str:
     """Return the beginning of a value as text for a message."""
     try:
         return str(value)[:80]
@@ -317,7 +244,7 @@ def _entry(path: Path, number: int, table: Any) -> ScanEntry:
             )
         if not _FIELDS[field].good(value):
             raise BadRequestError(
-                f"{where}: {field} is {_shown(value)!r}, expected {_FIELDS[field].expected}: correct it"
+                f"{where}: {field} is {_short_text(value)!r}, expected {_FIELDS[field].expected}: correct it"
             )
     if ("low" in table) != ("high" in table):
         raise BadRequestError(f"{where}: low or high alone, expected both or none: remove it")
@@ -336,74 +263,3 @@ def _entry(path: Path, number: int, table: Any) -> ScanEntry:
         table.get("use", True),
         table.get("fault", ""),
     )
-
-
-def inputs(paths: Sequence[Path], spacing: float | None = None) -> list[Input]:
-    """Open what a build reads: files, folders and lists of scans (.toml).
-
-    Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
-    opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
-    that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
-    that is named twice, OSError if a file cannot be opened for a transient reason (transient_errors.py).
-    """
-    found: list[Input] = []
-    for path in map(Path, paths):
-        if path.suffix.lower() != SUFFIX or path.is_dir():
-            found += [_opened(file, None, spacing) for file in scan_files([path])]
-            continue
-        used = [entry for entry in read_scan_list(path) if entry.use]
-        if not used:
-            raise BadRequestError(f"{path}: no scan to use, expected at least one: set use = true")
-        files: dict[Path, list[ScanEntry]] = {}
-        for entry in used:
-            files.setdefault(entry.path, []).append(entry)
-        found += [_opened(file, entries, spacing) for file, entries in files.items()]
-    _check_once((item.path, index) for item in found for index in [s.index for s in item.scans] or [0])
-    return found
-
-
-def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
-    """Raise BadRequestError for a scan (file, index) that occurs twice, even by different paths."""
-    seen: dict[tuple[str, int], Path] = {}
-    for path, index in scans:
-        key = os.path.realpath(path), index
-        if key in seen:
-            raise BadRequestError(
-                f"{path}: scan {index} is named twice, as that of {seen[key]} too, expected each once: leave one out"
-            )
-        seen[key] = path
-
-
-def _opened(path: Path, entries: list[ScanEntry] | None, spacing: float | None) -> Input:
-    """Open one file with its listed scans; None: all of them, unchanged."""
-
-    @cache
-    def scans_spaced(factor: float) -> list[Scan]:
-        # A mesh is sampled in its own units.
-        return open_scans(path, spacing=None if spacing is None else spacing / factor)
-
-    try:
-        if entries is None:
-            return Input(path, [placed(scan) for scan in scans_spaced(1.0)])
-        scans = []
-        for entry in entries:
-            listed = scans_spaced(METRES[entry.units] * entry.scale)
-            if entry.index >= len(listed):
-                raise ScanError(
-                    f"{path}: holds {len(listed)} scans, expected one of index {entry.index}: correct the list"
-                )
-            scan = placed(
-                listed[entry.index], pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
-            )
-            scan.crs = entry.crs or scan.crs
-            scans.append(scan)
-        return Input(path, scans)
-    except ScanError as error:
-        raise_transient(error, path)
-        region = header_bounds(path)
-        moved = entries is not None and any(
-            (entry.units, entry.up, entry.scale) != ("m", "z", 1.0) or entry.pose is not None
-            for entry in entries
-        )
-        # The header's bounds do not apply after a list has moved the scan.
-        return Input(path, [], str(error), None if moved else region)

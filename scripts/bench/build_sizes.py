@@ -7,7 +7,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.sources.scan_files import open_scans, scan_files
+from solidcloud.builder.sources.scan_files import find_scan_files, open_scans
 from solidcloud.schemas.archive.archive import Archive
 
 # Real scans to build, in the folder that SOLIDCLOUD_SCANS names.
@@ -36,7 +36,7 @@ def quantised(scans: Path, archive: Path) -> NDArray[np.int64]:
         lattice, expected = opened.header.lattice, opened.header.points
     blocks = [
         lattice.to_lattice(block.xyz[np.isfinite(block.xyz).all(axis=1)])
-        for path in scan_files([scans])
+        for path in find_scan_files([scans])
         for scan in open_scans(path)
         for block in scan.blocks()
     ]

@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.sources.scan_files import open_scans, scan_files
+from solidcloud.builder.sources.scan_files import find_scan_files, open_scans
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 
 def source_points(path: Path) -> NDArray[np.float64]:
     """All points of a scan or a folder of them, world [m], as the readers give them."""
-    scans = [scan for file in scan_files([path]) for scan in open_scans(file)]
+    scans = [scan for file in find_scan_files([path]) for scan in open_scans(file)]
     points = np.concatenate([block.xyz for scan in scans for block in scan.blocks()])
     return points[np.isfinite(points).all(axis=1)]
 

@@ -1,4 +1,4 @@
-"""LAS, LAZ and COPC readers; lazrs decompresses the latter two.
+"""LAS, LAZ and COPC reader; lazrs decompresses the latter two.
 
 COPC is LAZ with an index, which is not needed to read every point. The header is read here: laspy
 2.7, given a file of 14 kB that claims 10^9 variable length records, creates an object for each of
@@ -27,7 +27,6 @@ from ..common.scan import (
     reader_library,
     scan_error,
 )
-from .las_crs import las_crs
 from .laz_chunks import VLR_HEADER_BYTES, ChunksFrom, check_chunks
 
 # Size of the public header of LAS 1.0 to 1.2; later versions append fields [LAS 1.4 R15, table 3].
@@ -38,6 +37,26 @@ RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 # Maximum bytes before the points. Real files have kilobytes there (a coordinate system, names of
 # extra bytes); waveform tables, the largest known content, stay below 16 KiB.
 LONGEST_PREAMBLE = 16 << 20
+
+# Coordinate reference system: user and numbers of the variable length records that name it.
+PROJECTION = b"LASF_Projection"
+WKT, GEO_KEYS, GEO_TEXTS = 2112, 34735, 34737
+# Maximum bytes of a text, several times longer than any real one; a longer one is truncated.
+LONGEST_CRS = 1 << 16
+
+# GeoTIFF keys that identify the system [OGC 19-008r4, 7]; other keys refine it.
+KEY_NAMES = {
+    1024: "model",
+    1026: "citation",
+    2048: "geodetic EPSG",
+    2049: "geodetic citation",
+    3072: "projected EPSG",
+    3073: "projected citation",
+    3076: "linear units EPSG",
+    4096: "vertical EPSG",
+    4097: "vertical citation",
+    4099: "vertical units EPSG",
+}
 
 
 class Header(NamedTuple):
@@ -160,7 +179,7 @@ def open_las(path: Path) -> list[Scan]:
             )
         scan = LasScan(path, header, laszip)
         start = header.offset_to_points
-        scan.crs = las_crs(file, header.header_size, header.vlr_count, start, header.evlrs)
+        scan.crs = _crs_text(file, header.header_size, header.vlr_count, start, header.evlrs)
         return [scan]
 
 
@@ -256,3 +275,56 @@ def _check_header(header: Header, path: Path, size: int) -> None:
         refuse(
             f"{header.points} points declared", f"at most the {held} that the file of {size} bytes can hold"
         )
+
+
+def _crs_text(file: BinaryIO, header_size: int, vlr_count: int, start: int, evlrs: tuple[int, int]) -> str:
+    """Return the coordinate reference system that a LAS file names, as text: WKT or GeoTIFF keys.
+
+    start: offset of the points, where the records before them end.
+    evlrs: (offset, number) of the records after the points.
+    Never raises: returns "" where the file names none or its records are broken.
+    """
+    try:
+        found = _projection_records(file, header_size, vlr_count, start, "<2x16sHH32x")
+        if WKT not in found:
+            at, count = evlrs
+            found = {**_projection_records(file, at, count, 1 << 62, "<2x16sHQ32x"), **found}
+        if found.get(WKT, b"").strip(b"\0 "):
+            return found[WKT].split(b"\0")[0].decode("utf-8", "replace").strip()
+        return _geo_text(found[GEO_KEYS], found.get(GEO_TEXTS, b"")) if GEO_KEYS in found else ""
+    except (OSError, ValueError, struct.error, OverflowError):
+        return ""
+
+
+def _projection_records(file: BinaryIO, at: int, count: int, end: int, form: str) -> dict[int, bytes]:
+    """Return the projection records among `count` from offset `at`, up to LONGEST_CRS bytes of each."""
+    head = struct.Struct(form)
+    found: dict[int, bytes] = {}
+    file.seek(at)
+    for _ in range(count):
+        raw = file.read(head.size)
+        if len(raw) < head.size or file.tell() > end:
+            break
+        user, number, length = head.unpack(raw)
+        behind = file.tell() + length
+        if user.rstrip(b"\0") == PROJECTION and number not in found:
+            found[number] = file.read(min(length, LONGEST_CRS, end - file.tell()))
+        file.seek(behind)
+    return found
+
+
+def _geo_text(keys: bytes, texts: bytes) -> str:
+    """Format the identifying keys: "projected EPSG 26915; citation NAD83 / UTM zone 15N"."""
+    words = struct.unpack(f"<{len(keys) // 2}H", keys[: len(keys) // 2 * 2])
+    parts = []
+    for k in range(1, 1 + min(words[3] if len(words) > 3 else 0, len(words) // 4 - 1)):
+        key, place, count, value = words[4 * k : 4 * k + 4]
+        if key not in KEY_NAMES:
+            continue
+        if place == GEO_TEXTS:
+            text = texts[value : value + count].decode("ascii", "replace").strip("|\0 ")
+        else:
+            text = str(value) if place == 0 else ""
+        if text:
+            parts.append(f"{KEY_NAMES[key]} {text}")
+    return "; ".join(parts)

@@ -1,6 +1,6 @@
 """OBJ and STL readers: the vertices of meshes as points, in file order, duplicates included.
 
-The vertices are read here, in blocks. trimesh, which surface.py uses for sampling, holds the whole
+The vertices are read here, in blocks. trimesh, which surface_samples.py uses for sampling, holds the whole
 mesh; its OBJ loader omits vertices that no face uses and splits vertices that have two texture
 coordinates.
 """

@@ -29,7 +29,7 @@ from ..common.scan import (
     scan_error,
 )
 from ..common.text_rows import is_number, number_rows
-from .lzf import LzfStream
+from .pcd_lzf import LzfStream
 
 # Maximum bytes of a header. A real one has a few hundred bytes; a file without a DATA line in this
 # range is not a PCD file.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ....builder.sources.format_table import FORMATS
 from .command_options import AsJson, parse_bytes, print_json
 from .interruptible import interruptible
 
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 Scans = Annotated[
     list[Path],
     typer.Argument(
-        help="Scans, folders of scans, or a scans.toml. Formats: LAS LAZ E57 PLY PTX PTS XYZ PCD OBJ STL GLB."
+        help="Scans, folders of scans, or a scans.toml. Formats: "
+        f"{' '.join(row.name for row in FORMATS if row.in_folders)}."
     ),
 ]
 
@@ -181,12 +183,14 @@ def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_jso
     """Print the estimated cost of a build."""
     from ....builder.plan.build_plan import estimate, load_rates
     from ....builder.plan.scan_sample import seen_scene
-    from ....builder.sources.scan_list import inputs
+    from ....builder.sources.scan_files import open_input_files
     from ..output.console import print_facts
     from .plan_command import plan_facts
 
     with interruptible():
-        found = estimate(seen_scene(inputs(scans, config.spacing), config), config, load_rates(), output)
+        found = estimate(
+            seen_scene(open_input_files(scans, config.spacing), config), config, load_rates(), output
+        )
     if as_json:
         print_json(found.as_json())
     else:

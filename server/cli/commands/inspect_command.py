@@ -31,7 +31,7 @@ def inspect(
 
     The description comes from the headers of the scans. Exit code 3: a scan is broken.
     """
-    from ....builder.sources.scan_list import inspect as inspect_scans
+    from ....builder.sources.scan_files import inspect_scans
     from ....builder.sources.scan_list import write_scan_list
     from ....schemas.errors import BadRequestError
     from ....schemas.process.os_errors import writing

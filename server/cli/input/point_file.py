@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.sources.placed_scan import placed
-from ....builder.sources.scan_files import open_scans, scan_files
+from ....builder.sources.placed_scan import place_scan
+from ....builder.sources.scan_files import find_scan_files, open_scans
 from ....schemas.errors import ScanError, TooLargeError
 from ....schemas.wire.messages import MAX_AVATAR_POINTS
 
@@ -41,9 +41,9 @@ def read_thinned(paths: Sequence[Path], points: int, at_most: int) -> NDArray[np
     step = max(1, -(-points // at_most))
     blocks = [
         block.xyz[::step]
-        for path in scan_files(paths)
+        for path in find_scan_files(paths)
         for scan in open_scans(path)
-        for block in placed(scan).blocks()
+        for block in place_scan(scan).blocks()
     ]
     thinned = np.concatenate([np.empty((0, 3)), *blocks])
     return thinned[np.isfinite(thinned).all(axis=1)]

@@ -16,7 +16,7 @@ from solidcloud.builder.plan import scan_sample as sample
 from solidcloud.builder.plan.build_plan import Rates, Stage, dump_rates, estimate, imagined, load_rates
 from solidcloud.builder.plan.build_rates import POINTS, measured, room
 from solidcloud.builder.plan.scan_sample import planned, seen_scene, unseen
-from solidcloud.builder.sources.scan_list import Input, inputs
+from solidcloud.builder.sources.scan_files import InputFile, open_input_files
 from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
 from synthetic_scans import write_xyz
@@ -179,7 +179,7 @@ def test_keys_not_seen_are_guessed_from_those_seen_once_and_twice(rng: np.random
 
 
 def looked(path: Path, config: BuildConfig = ONE) -> sample.Scene:
-    return seen_scene(inputs([path]), config)
+    return seen_scene(open_input_files([path]), config)
 
 
 def test_a_small_scan_is_seen_as_it_is(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_a_broken_scan_stops_a_plan_as_it_stops_a_build(tmp_path: Path) -> None:
         looked(tmp_path)
     assert looked(tmp_path, replace(ONE, skip_bad=True)).points == 1000
     with pytest.raises(ScanError, match="no scan holds a point"):
-        seen_scene([Input(tmp_path / "x", [])], ONE)
+        seen_scene([InputFile(tmp_path / "x", [])], ONE)
 
 
 @pytest.mark.parametrize("name", ["b.xyz", "b.laz"])

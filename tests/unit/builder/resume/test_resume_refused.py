@@ -16,7 +16,8 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.build_directory import building_folder
 from solidcloud.builder.resume.build_identity import check_same, described
 from solidcloud.builder.run.software_versions import software_versions
-from solidcloud.builder.sources.scan_list import Input, inputs, inspect, write_scan_list
+from solidcloud.builder.sources.scan_files import InputFile, inspect_scans, open_input_files
+from solidcloud.builder.sources.scan_list import write_scan_list
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.cli.main import run
 from synthetic_scans import make_scan, write_las, write_xyz
@@ -109,7 +110,7 @@ def test_many_differences_are_counted() -> None:
 
 
 def test_a_pose_and_a_file_that_cannot_be_opened_are_part_of_what_is_built(scans: list[Path]) -> None:
-    opened = inputs(scans)
+    opened = open_input_files(scans)
     what = described(opened, BuildConfig())
     opened[0].scans[0].pose = np.diag([-1.0, -1, 1, 1])
     with pytest.raises(BadRequestError, match=r"a\.las has another pose"):
@@ -117,7 +118,7 @@ def test_a_pose_and_a_file_that_cannot_be_opened_are_part_of_what_is_built(scans
     opened[0].scans[0].pose, opened[0].scans[0].crs, opened[0].scans[0].up = np.eye(4), "EPSG:25832", "y"
     with pytest.raises(BadRequestError, match=r"a\.las has another coordinate system and direction up"):
         check_same(Path("hall"), what, described(opened, BuildConfig()))
-    gone = [Input(scans[0].with_name("gone.las"), [], "no such file"), opened[1]]
+    gone = [InputFile(scans[0].with_name("gone.las"), [], "no such file"), opened[1]]
     (entry, _) = described(gone, BuildConfig())["inputs"][::-1]
     assert (Path(entry["path"]).name, entry["bytes"], entry["pose"]) == ("gone.las", -1, "")
 
@@ -152,7 +153,7 @@ def test_an_archive_of_anything_else_is_in_the_way(scans: list[Path], tmp_path: 
 def test_an_archive_of_scans_that_stand_elsewhere_is_in_the_way(
     elsewhere: dict[str, str], scans: list[Path], tmp_path: Path
 ) -> None:
-    entries = inspect([scans[1]])
+    entries = inspect_scans([scans[1]])
     write_scan_list(tmp_path / "scans.toml", entries)
     build(tmp_path / "hall", [tmp_path / "scans.toml"])
     assert build(tmp_path / "hall", [tmp_path / "scans.toml"]).already

@@ -15,7 +15,7 @@ import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.resume.build_directory import building_folder
 from solidcloud.builder.sources.common.scan import Scan, library_errors
-from solidcloud.builder.sources.scan_list import inputs
+from solidcloud.builder.sources.scan_files import open_input_files
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from synthetic_scans import write_las
 
@@ -250,7 +250,7 @@ def test_a_machine_that_fails_for_a_moment_leaves_no_scan_out(
         yield
 
     with monkeypatch.context() as patch:
-        patch.setattr(type(inputs(scans)[1].scans[0]), "_read", fails)
+        patch.setattr(type(open_input_files(scans)[1].scans[0]), "_read", fails)
         with pytest.raises(SolidcloudError, match=said):
             build(tmp_path / "hall", scans, skip_bad=True)
     summary = build(tmp_path / "hall", scans, skip_bad=True)

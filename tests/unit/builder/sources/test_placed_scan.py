@@ -8,7 +8,7 @@ import pytest
 import synthetic_scans
 from scan_formats import ptx_scan, write_e57
 from solidcloud.builder.sources.common.scan import Scan
-from solidcloud.builder.sources.placed_scan import METRES, TURNS, placed
+from solidcloud.builder.sources.placed_scan import METRES, TURNS, place_scan
 from solidcloud.builder.sources.scan_files import open_scans
 
 TURN = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
@@ -27,9 +27,9 @@ def las(tmp_path: Path) -> Scan:
 
 @pytest.mark.parametrize("up", TURNS)
 def test_the_axis_that_is_up_becomes_z_by_a_turn(up: str, las: Scan) -> None:
-    before, after = read(las), read(placed(las, up=up))
+    before, after = read(las), read(place_scan(las, up=up))
     assert np.array_equal(after[:, 2], before[:, "xyz".index(up)])
-    turn = placed(las, up=up).pose[:3, :3]
+    turn = place_scan(las, up=up).pose[:3, :3]
     assert np.linalg.det(turn) == 1 and np.array_equal(before @ turn.T, after)
 
 
@@ -37,30 +37,30 @@ def test_the_axis_that_is_up_becomes_z_by_a_turn(up: str, las: Scan) -> None:
 def test_a_turned_scan_stays_on_its_lattice_and_one_that_is_scaled_or_posed_does_not(
     up: str, las: Scan
 ) -> None:
-    turned = placed(las, up=up)
+    turned = place_scan(las, up=up)
     assert turned.lattice is not None
     steps = (read(turned) - turned.lattice.offset) / turned.lattice.scale
     assert np.abs(steps - np.rint(steps)).max() < 1e-6
-    assert placed(las, up=up, units="ft").lattice is None
-    assert placed(las, up=up, pose=TURN).lattice is None
+    assert place_scan(las, up=up, units="ft").lattice is None
+    assert place_scan(las, up=up, pose=TURN).lattice is None
 
 
 def test_what_changes_no_number_is_the_scan_itself(las: Scan) -> None:
-    assert placed(las) is las
-    assert placed(las, pose=np.eye(4), units="m", up="z", scale=1.0) is las
-    thousandth = placed(las, units="mm", scale=1000.0)
+    assert place_scan(las) is las
+    assert place_scan(las, pose=np.eye(4), units="m", up="z", scale=1.0) is las
+    thousandth = place_scan(las, units="mm", scale=1000.0)
     assert thousandth.units == "mm" and thousandth.lattice == las.lattice
     assert np.array_equal(read(thousandth), read(las)) and las.units == "m"
 
 
 @pytest.mark.parametrize("units", METRES)
 def test_lengths_are_multiplied_once(units: str, las: Scan) -> None:
-    assert np.array_equal(read(placed(las, units=units)), read(las) * METRES[units])
-    assert np.array_equal(read(placed(las, units=units, scale=3.0)), read(las) * (METRES[units] * 3.0))
+    assert np.array_equal(read(place_scan(las, units=units)), read(las) * METRES[units])
+    assert np.array_equal(read(place_scan(las, units=units, scale=3.0)), read(las) * (METRES[units] * 3.0))
 
 
 def test_units_then_axes_then_the_pose(las: Scan) -> None:
-    moved = placed(las, units="cm", up="y", pose=TURN)
+    moved = place_scan(las, units="cm", up="y", pose=TURN)
     x, y, z = (read(las) * 0.01).T
     assert np.abs(read(moved) - np.column_stack([10 + z, 20 + x, 30 + y])).max() < 1e-12
     homogeneous = np.column_stack([read(las), np.ones(500)]) @ moved.pose.T
@@ -69,7 +69,7 @@ def test_units_then_axes_then_the_pose(las: Scan) -> None:
 
 
 def test_blocks_ranges_and_processes_change_no_bit(las: Scan) -> None:
-    moved = placed(las, units="us-ft", up="x", pose=TURN)
+    moved = place_scan(las, units="us-ft", up="x", pose=TURN)
     whole = read(moved)
     assert np.array_equal(read(moved, 7), whole)
     assert moved.seekable
@@ -81,7 +81,7 @@ def test_blocks_ranges_and_processes_change_no_bit(las: Scan) -> None:
 @pytest.mark.parametrize("up", TURNS)
 def test_bounds_hold_all_points(up: str, las: Scan) -> None:
     for options in ({}, {"units": "ft"}, {"pose": TURN}, {"units": "in", "pose": TURN, "scale": 7.0}):
-        moved = placed(las, up=up, **options)
+        moved = place_scan(las, up=up, **options)
         xyz = read(moved)
         assert moved.bounds is not None
         assert (moved.bounds[0] <= xyz).all() and (xyz <= moved.bounds[1]).all()
@@ -96,13 +96,13 @@ def test_a_given_pose_takes_the_place_of_a_scans_own(tmp_path: Path) -> None:
     (scan,) = open_scans(path)
     own = read(scan)
     xyz = np.delete(xyz, 3, axis=0)
-    assert placed(scan, pose=TURN) is scan  # as the list of scans has it, unless it was edited
-    bare = placed(scan, pose=np.eye(4))
+    assert place_scan(scan, pose=TURN) is scan  # as the list of scans has it, unless it was edited
+    bare = place_scan(scan, pose=np.eye(4))
     assert np.array_equal(read(bare), xyz) and bare.dropped == {"no return": 1}
     other = TURN.copy()
     other[:3, 3] = [1, 2, 3]
-    assert np.abs(read(placed(scan, pose=other)) - (own - [9, 18, 27])).max() < 1e-12
-    assert np.array_equal(read(placed(scan, units="mm")), own * 0.001)  # its own, in its own units
+    assert np.abs(read(place_scan(scan, pose=other)) - (own - [9, 18, 27])).max() < 1e-12
+    assert np.array_equal(read(place_scan(scan, units="mm")), own * 0.001)  # its own, in its own units
     assert np.array_equal(read(scan), own)  # the scan itself is as it was
 
 
@@ -111,5 +111,5 @@ def test_bounds_that_a_scans_own_pose_made_are_not_believed_at_another(tmp_path:
     scan = {"columns": columns, "translation": [5.0, 0, 0], "bounds": [[0, 0, 0], [2, 2, 2]]}
     (scan,) = open_scans(write_e57(tmp_path / "a.e57", [scan]))
     assert scan.bounds is not None
-    assert placed(scan, pose=np.eye(4)).bounds is None
-    assert placed(scan, units="cm").bounds is not None
+    assert place_scan(scan, pose=np.eye(4)).bounds is None
+    assert place_scan(scan, units="cm").bounds is not None

@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 import pye57
 import pytest
-from solidcloud.builder.sources.scan_files import open_scans, scan_files
+from solidcloud.builder.sources.scan_files import find_scan_files, open_scans
 from solidcloud.schemas.errors import ScanError
 
 FOLDER = os.environ.get("SOLIDCLOUD_SCANS")
@@ -68,7 +68,7 @@ def test_real_scans_have_the_counts_and_bounds_that_are_known(
 
 
 def test_the_dome_in_six_files_keeps_its_map_coordinates(folder: Path) -> None:
-    files = scan_files([folder / "cupola_las"])
+    files = find_scan_files([folder / "cupola_las"])
     assert [path.name for path in files] == ["r.las", "r0.las", "r1.las", "r2.las", "r3.las", "r4.las"]
     xyz = np.concatenate([read_all(path) for path in files])
     assert len(xyz) == 107_935

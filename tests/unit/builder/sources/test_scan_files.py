@@ -25,7 +25,8 @@ from scan_formats import (
     write_pts,
 )
 from solidcloud.builder.sources.common.scan import Scan, sha256_of
-from solidcloud.builder.sources.scan_files import READERS, header_bounds, open_scans, scan_files
+from solidcloud.builder.sources.format_table import FORMATS
+from solidcloud.builder.sources.scan_files import find_scan_files, header_bounds, open_scans
 from solidcloud.schemas.errors import BadRequestError, ScanError
 
 COUNT = 1000  # no multiple of the small block, 7
@@ -262,7 +263,7 @@ def test_memory_is_that_of_a_block_and_not_of_the_file(
     """Of 30,000 points, 0.7 MB as float64, in blocks of 500; text in pieces of 16 kB."""
     for module in ("common.text_rows", "common.counted_rows"):
         monkeypatch.setattr(f"solidcloud.builder.sources.{module}.CHUNK_BYTES", 1 << 14)
-    monkeypatch.setattr("solidcloud.builder.sources.formats.lzf.PIECE_BYTES", 1 << 12)
+    monkeypatch.setattr("solidcloud.builder.sources.formats.pcd_lzf.PIECE_BYTES", 1 << 12)
     rng = np.random.default_rng(3)
     count = 30_016  # three points a triangle and one; whole columns of 8
     many = Truth(rng.uniform(-50, 50, (count, 3)), rng.integers(0, 99, count).astype(np.float32))
@@ -284,7 +285,7 @@ def test_a_scan_can_be_sent_to_another_process(written: Path) -> None:
     assert np.array_equal(read(sent)[0], read(scan)[0])
 
 
-@pytest.mark.parametrize("suffix", sorted(READERS))
+@pytest.mark.parametrize("suffix", [row.suffix for row in FORMATS])
 def test_an_empty_file_is_an_error(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
     path.touch()
@@ -292,7 +293,7 @@ def test_an_empty_file_is_an_error(suffix: str, tmp_path: Path) -> None:
         open_scans(path)
 
 
-@pytest.mark.parametrize("suffix", sorted(READERS))
+@pytest.mark.parametrize("suffix", [row.suffix for row in FORMATS])
 def test_garbage_is_an_error_and_bounds_of_it_are_unknown(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(np.random.default_rng(7).bytes(20_000))
@@ -306,7 +307,7 @@ def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ScanError, match="no such file or folder, expected a scan: check the path"):
         open_scans(tmp_path / "gone.las")
     with pytest.raises(ScanError, match="no such file"):
-        scan_files([tmp_path / "gone"])
+        find_scan_files([tmp_path / "gone"])
     with pytest.raises(ScanError, match="gone"):
         sha256_of(tmp_path / "gone.las")
 
@@ -336,12 +337,12 @@ def test_a_folder_gives_its_scans_sorted_and_files_stay_as_given(tmp_path: Path)
         (tmp_path / name).touch()
     odd = tmp_path / "a" / "readme.md"
     below = [tmp_path / name for name in ("a/deep/er/x.e57", "b/a.LAS", "b/z.laz", "c.FLS", "c.ply")]
-    assert scan_files([odd, tmp_path]) == [odd, *below]
+    assert find_scan_files([odd, tmp_path]) == [odd, *below]
     with pytest.raises(ScanError, match=r"the suffix '\.fls', expected one of"):
         open_scans(tmp_path / "c.FLS")
     (tmp_path / "none").mkdir()
     with pytest.raises(ScanError, match="a folder without scans"):
-        scan_files([tmp_path / "none"])
+        find_scan_files([tmp_path / "none"])
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, float("nan"), float("inf")])

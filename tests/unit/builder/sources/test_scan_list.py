@@ -11,9 +11,10 @@ import pytest
 import synthetic_scans
 import tomli_w
 from scan_formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
-from solidcloud.builder.sources import scan_list
+from solidcloud.builder.sources import scan_files
 from solidcloud.builder.sources.common.scan import library_errors, sha256_of
-from solidcloud.builder.sources.scan_list import ScanEntry, inputs, inspect, read_scan_list, write_scan_list
+from solidcloud.builder.sources.scan_files import inspect_scans, open_input_files
+from solidcloud.builder.sources.scan_list import ScanEntry, read_scan_list, write_scan_list
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 from solidcloud.server.cli.main import run
@@ -38,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def points(inputs_: list[scan_list.Input]) -> np.ndarray:
+def points(inputs_: list[scan_files.InputFile]) -> np.ndarray:
     blocks = [block.xyz for item in inputs_ for scan in item.scans for block in scan.blocks()]
     return np.concatenate([np.empty((0, 3)), *blocks])
 
@@ -55,7 +56,7 @@ def edit(path: Path, change: dict[str, Any], number: int = 0) -> None:
 
 
 def test_headers_say_what_scans_there_are(folder: Path) -> None:
-    las, first, second, broken, text = inspect([folder])
+    las, first, second, broken, text = inspect_scans([folder])
     assert (las.path, las.format, las.count, las.fault) == (folder / "a.las", "las", 50, "")
     assert las.bounds is not None and las.pose is None
     assert (first.index, first.format, first.count) == (0, "ptx", 20) and np.array_equal(first.pose, POSE)
@@ -65,7 +66,7 @@ def test_headers_say_what_scans_there_are(folder: Path) -> None:
 
 
 def test_hashes_are_of_the_files_where_asked(folder: Path) -> None:
-    for entry in inspect([folder], with_sha256=True):
+    for entry in inspect_scans([folder], with_sha256=True):
         assert entry.sha256 == sha256_of(entry.path)
 
 
@@ -80,7 +81,7 @@ def same(a: ScanEntry, b: ScanEntry) -> bool:
 
 @pytest.mark.parametrize("place", ["scans.toml", "deep/scans.toml", "../scans.toml"])
 def test_a_list_is_read_back_as_it_was_written(place: str, folder: Path) -> None:
-    entries = inspect([folder], with_sha256=True)
+    entries = inspect_scans([folder], with_sha256=True)
     odd = ScanEntry(
         folder / "a.las", 9, "las", 0, np.array([[0.1, 2, 3], [4, 5, 1e300]]), POSE, "us-ft", "y", 0.3, 'X["ü"]\n"',
         "ab", False, "why",
@@ -91,22 +92,22 @@ def test_a_list_is_read_back_as_it_was_written(place: str, folder: Path) -> None
 
 
 def test_paths_in_a_list_move_with_it(folder: Path, tmp_path: Path) -> None:
-    write_scan_list(folder / "scans.toml", inspect([folder / "a.las"]))
+    write_scan_list(folder / "scans.toml", inspect_scans([folder / "a.las"]))
     assert 'path = "a.las"' in (folder / "scans.toml").read_text()
     folder.rename(tmp_path / "elsewhere")
-    (item,) = inputs([tmp_path / "elsewhere" / "scans.toml"])
+    (item,) = open_input_files([tmp_path / "elsewhere" / "scans.toml"])
     assert item.path == tmp_path / "elsewhere" / "a.las" and len(points([item])) == 50
 
 
 def test_what_is_edited_is_what_is_built(folder: Path) -> None:
     path = folder / "scans.toml"
-    write_scan_list(path, inspect([folder / "a.las", folder / "b.ptx"]))
-    before = points(inputs([path]))
-    assert np.array_equal(before, points(inputs([folder / "a.las", folder / "b.ptx"])))
+    write_scan_list(path, inspect_scans([folder / "a.las", folder / "b.ptx"]))
+    before = points(open_input_files([path]))
+    assert np.array_equal(before, points(open_input_files([folder / "a.las", folder / "b.ptx"])))
     edit(path, {"units": "mm", "up": "y", "crs": "EPSG:2056"}, 0)
     edit(path, {"pose": np.eye(4).tolist()}, 1)
     edit(path, {"use": False}, 2)
-    las, ptx = inputs([path])
+    las, ptx = open_input_files([path])
     x, y, z = before[:50].T
     assert np.array_equal(points([las]), np.column_stack([x, -z, y]) * 0.001)
     assert (las.scans[0].crs, las.scans[0].units, las.scans[0].up) == ("EPSG:2056", "mm", "y")
@@ -122,17 +123,17 @@ def test_what_is_edited_is_what_is_built(folder: Path) -> None:
 
 def test_only_the_scans_that_are_listed_are_built(folder: Path) -> None:
     path = folder / "scans.toml"
-    write_scan_list(path, [e for e in inspect([folder / "b.ptx"]) if e.index == 1])
-    (item,) = inputs([path])
+    write_scan_list(path, [e for e in inspect_scans([folder / "b.ptx"]) if e.index == 1])
+    (item,) = open_input_files([path])
     assert [scan.index for scan in item.scans] == [1] and len(points([item])) == 7
 
 
 def test_faults_are_kept_for_all_of_them_to_be_named(folder: Path) -> None:
     (folder / "e.las").write_bytes(b"LASF")
-    write_scan_list(folder / "scans.toml", inspect([folder]))
+    write_scan_list(folder / "scans.toml", inspect_scans([folder]))
     edit(folder / "scans.toml", {"index": 5}, 2)
     for paths, bad in (([folder], 2), ([folder / "scans.toml"], 3)):
-        found = inputs(paths)
+        found = open_input_files(paths)
         faults = {item.path.name: item.fault for item in found if item.fault}
         assert len(faults) == bad and "checksum" in faults["c.e57"] and "b'LASF'" in faults["e.las"]
     assert "holds 2 scans, expected one of index 5" in faults["b.ptx"]
@@ -141,13 +142,13 @@ def test_faults_are_kept_for_all_of_them_to_be_named(folder: Path) -> None:
 
 def test_a_header_says_where_a_broken_scan_was_unless_the_list_puts_it_elsewhere(folder: Path) -> None:
     las = folder / "a.las"
-    bounds = inspect([las])[0].bounds
+    bounds = inspect_scans([las])[0].bounds
     las.write_bytes(las.read_bytes()[:600])
-    write_scan_list(folder / "scans.toml", inspect([las]))
-    assert np.array_equal(inputs([folder / "scans.toml"])[0].region, bounds)
-    assert np.array_equal(inputs([las])[0].region, bounds)
+    write_scan_list(folder / "scans.toml", inspect_scans([las]))
+    assert np.array_equal(open_input_files([folder / "scans.toml"])[0].region, bounds)
+    assert np.array_equal(open_input_files([las])[0].region, bounds)
     edit(folder / "scans.toml", {"units": "ft"})
-    assert inputs([folder / "scans.toml"])[0].region is None
+    assert open_input_files([folder / "scans.toml"])[0].region is None
 
 
 def test_a_scan_that_is_named_twice_is_refused(folder: Path, tmp_path: Path) -> None:
@@ -156,14 +157,14 @@ def test_a_scan_that_is_named_twice_is_refused(folder: Path, tmp_path: Path) -> 
     link.symlink_to(las)
     for twice in ([folder, las], [las, folder / "deep" / ".." / "a.las"], [las, link], [folder / "deep"] * 2):
         with pytest.raises(BadRequestError, match=r"scan 0 is named twice, as that of .*: leave one out"):
-            inputs(twice)
+            open_input_files(twice)
         with pytest.raises(BadRequestError, match="is named twice"):
-            inspect(twice)
+            inspect_scans(twice)
     path = tmp_path / "scans.toml"
     write_scan_list(path, [ScanEntry(folder / "b.ptx", index) for index in (0, 1)])
-    assert [len(item.scans) for item in inputs([path, las])] == [2, 1]
+    assert [len(item.scans) for item in open_input_files([path, las])] == [2, 1]
     with pytest.raises(BadRequestError, match=r"b\.ptx: scan 0 is named twice"):
-        inputs([path, folder / "b.ptx"])
+        open_input_files([path, folder / "b.ptx"])
 
 
 def test_a_list_that_cannot_be_written_leaves_the_one_there_was(
@@ -171,12 +172,12 @@ def test_a_list_that_cannot_be_written_leaves_the_one_there_was(
 ) -> None:
     path = tmp_path / "lists" / "scans.toml"
     path.parent.mkdir()
-    write_scan_list(path, inspect([folder]))
+    write_scan_list(path, inspect_scans([folder]))
     before = path.read_bytes()
     odd = folder / os.fsdecode(b"odd\xff.xyz")
     odd.write_text("1 2 3\n")
     with pytest.raises(BadRequestError, match=r"odd\\udcff\.xyz'.* not UTF-8"):
-        write_scan_list(path, inspect([folder]))
+        write_scan_list(path, inspect_scans([folder]))
     assert [p.read_bytes() for p in path.parent.iterdir()] == [before]
 
     def full(*_: object) -> None:
@@ -231,18 +232,18 @@ def test_a_file_that_cannot_be_opened_just_now_is_not_left_out(
         with library_errors(path):
             raise error
 
-    monkeypatch.setattr(scan_list, "open_scans", fails)
+    monkeypatch.setattr(scan_files, "open_scans", fails)
     with pytest.raises((OSError, SolidcloudError), match=r"Input/output error|out of memory") as caught:
-        inputs([folder / "a.las"])
+        open_input_files([folder / "a.las"])
     assert not isinstance(caught.value, ScanError)
 
 
 def test_a_missing_file_of_a_list_is_a_fault_and_of_the_command_an_error(folder: Path) -> None:
-    write_scan_list(folder / "scans.toml", inspect([folder]))
+    write_scan_list(folder / "scans.toml", inspect_scans([folder]))
     (folder / "a.las").unlink()
-    assert "no such file" in inputs([folder / "scans.toml"])[0].fault
+    assert "no such file" in open_input_files([folder / "scans.toml"])[0].fault
     with pytest.raises(ScanError, match="no such file"):
-        inputs([folder / "a.las"])
+        open_input_files([folder / "a.las"])
 
 
 @pytest.mark.parametrize(
@@ -280,7 +281,7 @@ def test_a_wrong_edit_is_refused_by_file_scan_and_field(
     field: str, value: object, message: str, folder: Path
 ) -> None:
     path = folder / "scans.toml"
-    write_scan_list(path, inspect([folder / "a.las"]))
+    write_scan_list(path, inspect_scans([folder / "a.las"]))
     edit(path, {field: value})
     with pytest.raises(BadRequestError, match=message) as caught:
         read_scan_list(path)
@@ -309,16 +310,16 @@ def test_a_file_that_is_no_list_is_refused(text: str, message: str, tmp_path: Pa
     path = tmp_path / "scans.toml"
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(BadRequestError, match=message):
-        inputs([path])
+        open_input_files([path])
 
 
 def test_a_mesh_is_sampled_in_metres_whatever_its_units(tmp_path: Path) -> None:
     square = np.array([[0.0, 0, 1], [2000, 0, 1], [2000, 2000, 1], [0, 2000, 1]])
     corners = np.array([0, 1, 2, 0, 2, 3], "<u2")
     write_glb(tmp_path / "a.glb", glb_document(4, 6), glb_vertices(square) + corners.tobytes())
-    write_scan_list(tmp_path / "scans.toml", inspect([tmp_path / "a.glb"]))
+    write_scan_list(tmp_path / "scans.toml", inspect_scans([tmp_path / "a.glb"]))
     edit(tmp_path / "scans.toml", {"units": "mm"})
-    xyz = points(inputs([tmp_path / "scans.toml"], 0.1))
+    xyz = points(open_input_files([tmp_path / "scans.toml"], 0.1))
     assert abs(len(xyz) - 400) <= 1
     # glTF has y up: the square in its xy plane stands upright, and its front looks to -y.
     assert (xyz[:, 1] == -0.001).all() and xyz[:, 2].max() <= 2 and xyz[:, 2].max() > 1.9
@@ -366,11 +367,11 @@ def test_the_crs_of_a_las_and_an_e57_is_in_the_list(folder: Path) -> None:
         struct.pack_into("<II", data, 96, start + len(vlr), count + 1)
         data[header_size:header_size] = vlr
         (folder / f"{name}.las").write_bytes(data)
-        (entry,) = inspect([folder / f"{name}.las"])
+        (entry,) = inspect_scans([folder / f"{name}.las"])
         assert (entry.crs, entry.count, entry.fault) == (expected, 50, "")
     columns = {f"cartesian{axis}": np.arange(3.0) for axis in "XYZ"}
     write_e57(folder / "p.e57", [{"columns": columns}], crs=wkt)
-    assert inspect([folder / "p.e57"])[0].crs == wkt
+    assert inspect_scans([folder / "p.e57"])[0].crs == wkt
 
 
 def test_a_build_names_every_broken_file_on_a_line_of_its_own(

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from broken_scans import with_checksums
 from scan_formats import cartesian, write_e57
-from solidcloud.builder.sources.scan_files import header_bounds, open_scans
-from solidcloud.builder.sources.scan_list import inspect
+from solidcloud.builder.sources.scan_files import header_bounds, inspect_scans, open_scans
 from solidcloud.schemas.errors import ScanError
 
 
@@ -162,7 +161,7 @@ def test_a_scan_whose_pose_is_none_does_not_keep_others_from_being_read(tmp_path
     assert broken.index == 1 and "scan 1 with a rotation quaternion of length 1.41" in broken.fault
     with pytest.raises(ScanError, match="quaternion of length"):
         list(broken.blocks())
-    assert [entry.fault for entry in inspect([path])] == ["", broken.fault, ""]
+    assert [entry.fault for entry in inspect_scans([path])] == ["", broken.fault, ""]
     write_e57(path, [{"columns": cartesian(good), **bad}] * 2)
     with pytest.raises(ScanError, match="scan 0 with a rotation quaternion"):
         open_scans(path)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scan_formats import lzf, write_pcd
-from solidcloud.builder.sources.formats.lzf import LzfStream
+from solidcloud.builder.sources.formats.pcd_lzf import LzfStream
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.errors import ScanError
 
@@ -102,7 +102,7 @@ def test_compressed_sizes_that_lie_are_refused(tmp_path: Path) -> None:
 def test_lzf_is_decoded_in_pieces_and_side_by_side(
     piece: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("solidcloud.builder.sources.formats.lzf.PIECE_BYTES", piece)
+    monkeypatch.setattr("solidcloud.builder.sources.formats.pcd_lzf.PIECE_BYTES", piece)
     rng = np.random.default_rng(1)
     # Runs, repeats from far back and noise: references of both lengths, that overlap themselves, and literals.
     parts = [bytes([7]) * 700, rng.bytes(3000), bytes(range(256)) * 30, rng.bytes(5000)]

@@ -10,8 +10,7 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.sources.common.text_rows import LONGEST_LINE, number_rows
-from solidcloud.builder.sources.scan_files import open_scans
-from solidcloud.builder.sources.scan_list import inspect
+from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
 from solidcloud.schemas.errors import ScanError
 
 
@@ -126,7 +125,7 @@ def test_a_row_that_makes_the_declared_points_too_many_to_hold_is_a_fault_of_the
         read_all(path)
     good = tmp_path / "b.xyz"
     good.write_text("1 2 3\n4 5 6\n")
-    inspected = {entry.path: entry.fault for entry in inspect([path, good])}
+    inspected = {entry.path: entry.fault for entry in inspect_scans([path, good])}
     assert inspected[good] == ""
     config = BuildConfig(jobs=1, skip_bad=True, resolution=0.001)
     summary = build_archive([path, good], tmp_path / "hall", config)

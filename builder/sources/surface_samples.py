@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.scan import NOT_FINITE, Block, Scan, reader_library, scan_error
-from .glb import GlbScan
+from .common.scan import NOT_FINITE, Block, Scan, reader_library, scan_error
+from .formats.glb import GlbScan
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
 # sequence of this kind whose points keep farthest apart (Roberts 2018, "The unreasonable

@@ -17,7 +17,7 @@ from ..passes.radius_classes import ALL_CODES
 from ..passes.resumable_passes import MAX_SCANS
 from ..passes.survey import Survey, hash_file, joined, ranges, survey_range, unopened
 from ..pipeline import ARCHIVE_BYTES_A_POINT
-from ..sources.coincident_scans import coincide
+from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
 from ..sources.scan_files import InputFile
 from ..spool.spool import Spool
@@ -138,7 +138,7 @@ def source_of(survey: Survey) -> Source:
     assert scan is not None
     return Source(
         str(survey.path), scan.index, scan.format, survey.sha256, survey.count, scan.pose, survey.dropped,
-        crs=scan.crs, units=scan.units, up=scan.up, one_place=coincide(survey.low, survey.high, survey.count),
+        crs=scan.crs, units=scan.units, up=scan.up, one_place=is_one_position(survey.low, survey.high, survey.count),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from ...schemas.archive.index import Header, Source
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel_grid import Lattice, voxel_coordinates
 from ..config import BuildConfig
-from ..sources.coincident_scans import coincide
+from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
 from ..spool.spool_pass import Spooled
 from .build_shards import Shard
@@ -96,7 +96,7 @@ def _good_source(survey: Survey, filtered: dict[str, int]) -> Source:
     skipped = {**survey.dropped, **filtered}
     return Source(
         str(survey.path), scan.index, scan.format, survey.sha256, kept, scan.pose, skipped,
-        crs=scan.crs, units=scan.units, up=scan.up, one_place=coincide(survey.low, survey.high, survey.count),
+        crs=scan.crs, units=scan.units, up=scan.up, one_place=is_one_position(survey.low, survey.high, survey.count),
     )  # fmt: skip
 
 

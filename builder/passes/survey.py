@@ -18,8 +18,7 @@ from ...schemas.errors import ScanError
 from ..config import DEFAULT_STEP, BuildConfig
 from ..kernels.points.spool_rows import usable_bounds
 from ..run.transient_errors import raise_transient
-from ..sources.common.scan import NOT_FINITE, Scan, sha256_of
-from ..sources.common.scan import Lattice as SourceLattice
+from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
 
 # A header's bounds are trusted if no point lies farther outside than this [m]: they are rounded,
 # but not by more.

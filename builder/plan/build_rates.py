@@ -58,11 +58,13 @@ def _writers() -> dict[str, tuple[str, Callable[[Path, NDArray[np.float64]], Non
     """Return the file suffix and the writer function of each format."""
 
     def made(path: Path, xyz: NDArray[np.float64]) -> None:
-        from ..synthetic.scanner import Place, Scan
+        from ..synthetic.scanner import ScannerPose, SimulatedScan
         from ..synthetic.write import open_target
 
         with open_target(path) as file:
-            file.write(1, Scan(Place((0.0, 0.0, 0.0), 0.0), 0.0, xyz, np.zeros(len(xyz), np.uint16)))
+            file.write(
+                1, SimulatedScan(ScannerPose((0.0, 0.0, 0.0), 0.0), 0.0, xyz, np.zeros(len(xyz), np.uint16))
+            )
 
     def ply(path: Path, xyz: NDArray[np.float64]) -> None:
         properties = "".join(f"property double {name}\n" for name in "xyz")

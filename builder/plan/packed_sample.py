@@ -19,7 +19,7 @@ from ...schemas.errors import ScanError
 from ...schemas.process.interrupts import check
 from ..config import BuildConfig
 from ..kernels.points.occupied_cubes import FREE, insert_all, take_cubes
-from ..sources.common.scan import Block, Scan
+from ..sources.common.scan import Scan, ScanBlock
 from ..spool.spool_pass import usable
 from ..voxel.voxel_octree import VoxelPoints, build_voxel
 from .build_plan import Rates
@@ -154,7 +154,7 @@ class _Reader:
                     held = len(parts[0].slot)
         return _joined(parts)
 
-    def taken(self, number: int, block: Block, chosen: NDArray[np.int64]) -> _Gathered:
+    def taken(self, number: int, block: ScanBlock, chosen: NDArray[np.int64]) -> _Gathered:
         """Return the points of a block that are in chosen cubes."""
         lattice, size = self.lattice, len(block.xyz)
         self.read += size
@@ -181,7 +181,7 @@ class _Reader:
         )
 
 
-def _usable_blocks(scan: Scan, start: int, stop: int | None) -> Iterator[Block]:
+def _usable_blocks(scan: Scan, start: int, stop: int | None) -> Iterator[ScanBlock]:
     """Yield the usable points of a piece of a scan; if it cannot seek, from its beginning.
 
     Raise BrokenScanError if the scan cannot be read.
@@ -233,7 +233,9 @@ def packed_sample(
     lacking = 1.0
     if share < 1 and some is not None:
         expected = (
-            len(_Reader(scans, lattice).taken(0, Block(some, None), cubes.chosen).slot) / len(some) * total
+            len(_Reader(scans, lattice).taken(0, ScanBlock(some, None), cubes.chosen).slot)
+            / len(some)
+            * total
         )
         lacking = max(1.0, expected / max(1, len(found.slot)))
     found = cubes.cropped(found, BLOCK_POINTS)

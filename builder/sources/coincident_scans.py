@@ -16,7 +16,7 @@ from .common.scan import Scan
 
 # A scan with at most this many points whose header declares no bounds is read to check it: some
 # milliseconds.
-MOST_READ = 1 << 16
+MAX_READ = 1 << 16
 
 
 def coincident_text(path: Path | str, index: int, count: int) -> str:
@@ -27,7 +27,7 @@ def coincident_text(path: Path | str, index: int, count: int) -> str:
     )
 
 
-def coincide(low: NDArray[np.float64], high: NDArray[np.float64], count: int | None) -> bool:
+def is_one_position(low: NDArray[np.float64], high: NDArray[np.float64], count: int | None) -> bool:
     """Return whether several points with the bounds low, high (3,) are at one position.
 
     A single point is no fault.
@@ -49,9 +49,9 @@ def coincident_scan(scan: Scan) -> str:
     if scan.fault or count is None:
         return ""
     bounds = scan.bounds
-    if bounds is None and 1 < count <= MOST_READ:
+    if bounds is None and 1 < count <= MAX_READ:
         bounds = _read_bounds(scan)
-    found = bounds is not None and coincide(bounds[0], bounds[1], count)
+    found = bounds is not None and is_one_position(bounds[0], bounds[1], count)
     return coincident_text(scan.path, scan.index, count) if found else ""
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.scan import BOUNDS_MARGIN, Block, Lattice, Scan, apply_pose, checked_bounds
+from .common.scan import BOUNDS_MARGIN, Scan, ScanBlock, SourceLattice, apply_pose, checked_bounds
 
 # Length units [m]. "us-ft": the US survey foot, which older state plane coordinates use.
 METRES = {
@@ -92,13 +92,13 @@ class PlacedScan(Scan):
         )
         self.units, self.up, self.crs, self.seekable = units, up, inner.crs, inner.seekable
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         return self._read_range(block_points, 0, None)
 
-    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
+    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
         for block in self._inner.blocks(block_points, start, stop):
             self.dropped = self._inner.dropped
-            yield Block(apply_pose(self._given, self._turned(block.xyz)), block.intensity)
+            yield ScanBlock(apply_pose(self._given, self._turned(block.xyz)), block.intensity)
         self.dropped = self._inner.dropped
 
     def _turned(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,14 +109,14 @@ class PlacedScan(Scan):
                 np.multiply(xyz[:, source], sign * self._factor, out=turned[:, axis])
         return turned
 
-    def _lattice(self) -> Lattice | None:
+    def _lattice(self) -> SourceLattice | None:
         """Return the source's lattice with its axes exchanged; None where points are moved off it."""
         inner = self._inner.lattice
         if inner is None or self._factor != 1 or not np.array_equal(self._given, _IDENTITY):
             return None
         (i, j, k), (a, b, c) = self._axes, self._signs
         scale, offset = inner.scale, inner.offset
-        return Lattice((scale[i], scale[j], scale[k]), (a * offset[i], b * offset[j], c * offset[k]))
+        return SourceLattice((scale[i], scale[j], scale[k]), (a * offset[i], b * offset[j], c * offset[k]))
 
     def _bounds(self, bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return a box (2, 3) that encloses every point of the box `bounds` (2, 3) once placed."""

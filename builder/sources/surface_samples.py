@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.scan import NOT_FINITE, Block, Scan, reader_library, scan_error
+from .common.scan import NOT_FINITE, Scan, ScanBlock, reader_library, scan_error
 from .formats.glb import GlbScan
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
@@ -42,7 +42,7 @@ class SurfaceSamples(Scan):
         self._vertices = vertices
         self._spacing = spacing
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         """Yield the samples.
 
         Sample k lies in the triangle at which the cumulative area reaches k + 1/2 samples, at the
@@ -77,7 +77,7 @@ class SurfaceSamples(Scan):
             face = np.minimum(face, len(total) - 1)
             u, v = _unit_triangle((0.5 + STEP_U * k) % 1.0, (0.5 + STEP_V * k) % 1.0)
             a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
-            yield Block(a + u[:, None] * (b - a) + v[:, None] * (c - a), None)
+            yield ScanBlock(a + u[:, None] * (b - a) + v[:, None] * (c - a), None)
 
     def _triangles(self) -> NDArray[np.float64]:
         """Return the corners of all triangles, (n, 3, 3). Raises ScanError."""

@@ -27,7 +27,7 @@ from ..kernels.points.spool_rows import (
     scatter,
     usable_bounds,
 )
-from ..sources.common.scan import Block, Scan
+from ..sources.common.scan import Scan, ScanBlock
 from .spool import RUN_SUFFIX, RunSums, new_run, run_sizes, write_directory
 
 # Bytes per point in a spooling worker: voxel number, code, and a copy of the code in sorted order.
@@ -156,12 +156,12 @@ def spool_range(unit: SpoolUnit) -> Spooled:
     return Spooled(runs, kept, content, places, held.moved_max)
 
 
-def usable(block: Block) -> Block:
+def usable(block: ScanBlock) -> ScanBlock:
     """Return the points of a block that are finite and in range (NUMERICS.md N7, case 16)."""
     if usable_bounds(block.xyz, MAX_COORDINATE, np.empty(3), np.empty(3)) == len(block.xyz):
         return block
     good = (np.abs(block.xyz) <= MAX_COORDINATE).all(axis=1)  # false for NaN
-    return Block(block.xyz[good], None if block.intensity is None else block.intensity[good])
+    return ScanBlock(block.xyz[good], None if block.intensity is None else block.intensity[good])
 
 
 class _Held:
@@ -197,7 +197,7 @@ class _Held:
         self.keys[: len(keys)], self.known = keys, known
         rehash(self.keys, int(known[0]), self.table, self.number_of)
 
-    def take(self, block: Block, begin: int) -> int:
+    def take(self, block: ScanBlock, begin: int) -> int:
         """Take points of a block from point `begin` on; return how many were taken."""
         end = min(len(block.xyz), begin + self.capacity - self.size)
         to = slice(self.size, self.size + end - begin)
@@ -271,7 +271,7 @@ class _Held:
             yield rows[: end - begin]
 
 
-def intensity_bits(block: Block, begin: int, end: int) -> NDArray[np.uint32]:
+def intensity_bits(block: ScanBlock, begin: int, end: int) -> NDArray[np.uint32]:
     """Return the bits of the intensities of points [begin, end), 0 if the source has none.
 
     Each value has one bit pattern (no -0.0, one NaN), or the bytes would depend on the order of

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadDataError
 from .facade import build_facade
-from .scanner import GRAZING, HIGHEST, LOWEST, Place, RayScene
+from .scanner import GRAZING, HIGHEST, LOWEST, RayScene, ScannerPose
 from .truth import FacadeTruth, SceneTruth, StationTruth, WallTruth
 
 # Ratio of the largest to the smallest spacing: 24 to 96 mm on the façade of the paper's size.
@@ -70,7 +70,7 @@ def wall_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> Wall
         order = drawn[(around > 0).all(axis=1)][:places]
     if len(order) < places:
         raise BadDataError(
-            f"the stations of the made façade see {len(order)} places on its walls: expected {places}: request fewer"
+            f"the stations of the façade see {len(order)} places on its walls: expected {places}: request fewer"
         )
     return WallPlaces(points[order] + np.asarray(facade.origin), normals[order], spacing[order])
 
@@ -122,7 +122,7 @@ def _density(
     reach = np.linalg.norm(way, axis=-1)
     elevation = np.arcsin(way[..., 2] / reach)
     azimuth = np.arctan2(way[..., 1], way[..., 0]) - station.yaw
-    returns = rays.cast(Place((x, y, z), station.yaw), azimuth, elevation)
+    returns = rays.cast(ScannerPose((x, y, z), station.yaw), azimuth, elevation)
     cosine = np.abs(np.take_along_axis(way, axes[..., None], axis=2)[..., 0]) / reach
     seen = (np.abs(returns.range - reach) < NEAR) & (cosine > GRAZING)
     seen &= (elevation > LOWEST) & (elevation < HIGHEST)

@@ -39,14 +39,14 @@ GRAZING = 0.12
 FULL_REFLECTION_RANGE, NEAR = 10.0, 2.5
 
 
-class Place(NamedTuple):
+class ScannerPose(NamedTuple):
     """Pose of a scanner: its optical centre [m] and its rotation about z [rad]."""
 
     position: tuple[float, float, float]
     yaw: float
 
 
-class Scan(NamedTuple):
+class SimulatedScan(NamedTuple):
     """Points of one station, in the mesh's frame.
 
     place, step: the scanner's pose, and the angle between neighbouring rays [rad].
@@ -54,7 +54,7 @@ class Scan(NamedTuple):
     intensity: (n,) uint16.
     """
 
-    place: Place
+    place: ScannerPose
     step: float
     xyz: NDArray[np.float64]
     intensity: NDArray[np.uint16]
@@ -83,12 +83,14 @@ class RayScene:
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise SolidcloudError(
-                f"cannot cast rays: {error}: generated scenes need embreex: pip install 'solidcloud[made]'"
+                f"cannot cast rays: {error}: generated scenes need embreex: pip install 'solidcloud[scan]'"
             ) from error
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
 
-    def cast(self, place: Place, azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> Returns:
+    def cast(
+        self, place: ScannerPose, azimuth: NDArray[np.float64], elevation: NDArray[np.float64]
+    ) -> Returns:
         """Return the first hits of rays at azimuth (c, e) and elevation (c, e) [rad].
 
         The azimuth is relative to the yaw.
@@ -104,7 +106,7 @@ class RayScene:
         return Returns(reach.reshape(azimuth.shape), directions, normals.reshape(directions.shape))
 
 
-def plan(scene: RayScene, places: Sequence[Place], points: int) -> tuple[float, list[int]]:
+def plan_stations(scene: RayScene, places: Sequence[ScannerPose], points: int) -> tuple[float, list[int]]:
     """Return the angular step [rad] for about 3 % more than `points`, and the quota of each station.
 
     A trial at one degree counts each station's hits; hits grow with 1/step². Every station has the
@@ -120,7 +122,9 @@ def plan(scene: RayScene, places: Sequence[Place], points: int) -> tuple[float, 
     return step, quotas.tolist()
 
 
-def scan(scene: RayScene, place: Place, step: float, quota: int, key: Sequence[int]) -> Scan:
+def simulate_scan(
+    scene: RayScene, place: ScannerPose, step: float, quota: int, key: Sequence[int]
+) -> SimulatedScan:
     """Return exactly `quota` points from one station: one scan, thinned evenly by a seeded choice.
 
     A scan with too few points (the plan is based on a trial) is repeated with a step 3 % finer.
@@ -135,10 +139,10 @@ def scan(scene: RayScene, place: Place, step: float, quota: int, key: Sequence[i
     rng = np.random.default_rng([*key, 0x7415])
     kept = np.sort(rng.choice(len(xyz), quota, replace=False))
     intensity = np.concatenate([block[1] for block in blocks])
-    return Scan(place, step, xyz[kept], intensity[kept])
+    return SimulatedScan(place, step, xyz[kept], intensity[kept])
 
 
-def _trial_hits(scene: RayScene, place: Place) -> int:
+def _trial_hits(scene: RayScene, place: ScannerPose) -> int:
     """Count the hits of a grid of one degree whose cosine of incidence is above half of GRAZING."""
     azimuth, elevation = _grid(TRIAL_STEP, 0, int(2 * np.pi / TRIAL_STEP))
     returns = scene.cast(place, azimuth, elevation)
@@ -154,7 +158,7 @@ def _grid(step: float, first: int, last: int) -> tuple[NDArray[np.float64], NDAr
 
 
 def _blocks(
-    scene: RayScene, place: Place, step: float, key: Sequence[int]
+    scene: RayScene, place: ScannerPose, step: float, key: Sequence[int]
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint16]]]:
     """Yield blocks of returned points (xyz, intensity) of one whole turn, a few columns at a time."""
     columns = int(2 * np.pi / step)
@@ -176,7 +180,7 @@ def _blocks(
 
 
 def _points(
-    place: Place, returns: Returns, rng: np.random.Generator
+    place: ScannerPose, returns: Returns, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.uint16]]:
     """Return the points of a block of returns.
 

@@ -9,7 +9,16 @@ import numpy as np
 
 from ...schemas.errors import BadRequestError
 from .facade import SILL, build_facade
-from .scanner import LATTICE, NOISE, TRIPOD, Place, RayScene, Scan, plan, scan
+from .scanner import (
+    LATTICE,
+    NOISE,
+    TRIPOD,
+    RayScene,
+    ScannerPose,
+    SimulatedScan,
+    plan_stations,
+    simulate_scan,
+)
 from .town import Lot, town_lots
 from .truth import FacadeTruth, SceneTruth, StationTruth, write_truth
 from .write import check_target, open_target
@@ -17,7 +26,7 @@ from .write import check_target, open_target
 FEWEST, MOST = 1_000, 1_000_000_000
 # Maximum points of a station, which is held in memory while it is scanned (about 100 bytes a
 # point). More points need more stations.
-MOST_PER_STATION = 1_000_000
+MAX_PER_STATION = 1_000_000
 # x, y and ground height of the five stations of [Fig12]'s scene: four outside, from far to near,
 # one in the nave.
 STATIONS = ((0.8, -13.0, 0.0), (-6.0, -8.6, 0.0), (5.6, -7.4, 0.0), (0.5, -3.4, 0.0), (0.4, 5.2, SILL))
@@ -25,7 +34,7 @@ STATIONS = ((0.8, -13.0, 0.0), (-6.0, -8.6, 0.0), (5.6, -7.4, 0.0), (0.5, -3.4, 
 Progress = Callable[[int, int], None]
 
 
-class MadeScene(NamedTuple):
+class GeneratedScene(NamedTuple):
     """Result of a generation.
 
     paths: the scan files, in the order of their stations.
@@ -42,7 +51,7 @@ class _Job(NamedTuple):
     """One façade to scan: the lot to cast rays at, the scanner's poses, and the number of points."""
 
     lot: Lot
-    places: tuple[Place, ...]
+    places: tuple[ScannerPose, ...]
     points: int
 
 
@@ -53,7 +62,7 @@ def make_facade(
     seed: int = 2012,
     door: float = 1.60,
     progress: Progress | None = None,
-) -> MadeScene:
+) -> GeneratedScene:
     """Generate the façade and scan it into exactly `points` points.
 
     Five stations scan it, more above 5 million points. The step between rays is chosen for slightly
@@ -67,12 +76,14 @@ def make_facade(
     out = Path(out)
     _check(out, points)
     facade = build_facade(seed, door)
-    count = max(len(STATIONS), -(-points // MOST_PER_STATION))
+    count = max(len(STATIONS), -(-points // MAX_PER_STATION))
     job = _Job(Lot(facade.truth, lambda: facade.mesh), _places(count, seed), points)
     return _make(out, points, seed, [job], progress)
 
 
-def make_town(out: Path, *, points: int, seed: int = 2012, progress: Progress | None = None) -> MadeScene:
+def make_town(
+    out: Path, *, points: int, seed: int = 2012, progress: Progress | None = None
+) -> GeneratedScene:
     """Generate a town of façades, each as dense as the paper's, and scan each from five stations.
 
     `points` determines the number of façades. Rays also hit the neighbouring façades. `out`, the
@@ -93,7 +104,7 @@ def _check(out: Path, points: int) -> None:
         raise BadRequestError(f"{points} points: expected {FEWEST} to {MOST}: choose a count in this range")
 
 
-def _places(count: int, seed: int) -> tuple[Place, ...]:
+def _places(count: int, seed: int) -> tuple[ScannerPose, ...]:
     """Return `count` scanner poses: the first five stations, then seeded ones.
 
     Of the latter, two stand on the forecourt for each one in the nave.
@@ -109,10 +120,14 @@ def _places(count: int, seed: int) -> tuple[Place, ...]:
         )
         spots.append((round(x, 3), round(y, 3), SILL if inside else 0.0))
     yaws = np.round(rng.uniform(-np.pi, np.pi, count), 6).tolist()
-    return tuple(Place((x, y, z + TRIPOD), yaw) for (x, y, z), yaw in zip(spots[:count], yaws, strict=True))
+    return tuple(
+        ScannerPose((x, y, z + TRIPOD), yaw) for (x, y, z), yaw in zip(spots[:count], yaws, strict=True)
+    )
 
 
-def _make(out: Path, points: int, seed: int, jobs: Iterable[_Job], progress: Progress | None) -> MadeScene:
+def _make(
+    out: Path, points: int, seed: int, jobs: Iterable[_Job], progress: Progress | None
+) -> GeneratedScene:
     """Scan each job, station by station, and write the files.
 
     Memory is bounded by one station and its mesh.
@@ -127,14 +142,14 @@ def _make(out: Path, points: int, seed: int, jobs: Iterable[_Job], progress: Pro
             for number, job in enumerate(jobs):
                 mesh, truth = job.lot.surroundings(), job.lot.truth
                 scene = RayScene(mesh)
-                step, quotas = plan(scene, job.places, job.points)
+                step, quotas = plan_stations(scene, job.places, job.points)
                 facades.append(truth)
                 for k, (place, quota) in enumerate(zip(job.places, quotas, strict=True)):
-                    made = _moved(scan(scene, place, step, quota, (seed, number, k)), truth.origin)
+                    scan = _moved(simulate_scan(scene, place, step, quota, (seed, number, k)), truth.origin)
                     stations.append(
-                        StationTruth(len(stations) + 1, made.place.position, place.yaw, made.step, quota)
+                        StationTruth(len(stations) + 1, scan.place.position, place.yaw, scan.step, quota)
                     )
-                    writer.write(len(stations), made)
+                    writer.write(len(stations), scan)
                     done += quota
                     if progress is not None:
                         progress(done, points)
@@ -143,11 +158,11 @@ def _make(out: Path, points: int, seed: int, jobs: Iterable[_Job], progress: Pro
     finally:
         truth_temporary.unlink(missing_ok=True)
     paths = tuple(sorted(out.iterdir())) if out.is_dir() else (out,)
-    return MadeScene(paths, truth_path, done)
+    return GeneratedScene(paths, truth_path, done)
 
 
-def _moved(made: Scan, origin: tuple[float, float, float]) -> Scan:
+def _moved(scan: SimulatedScan, origin: tuple[float, float, float]) -> SimulatedScan:
     """Return the scan moved from a façade's frame into the world, on the lattice again."""
-    x, y, z = np.add(made.place.position, origin).tolist()
-    xyz = np.rint((made.xyz + np.asarray(origin)) / LATTICE) * LATTICE
-    return made._replace(place=made.place._replace(position=(x, y, z)), xyz=xyz)
+    x, y, z = np.add(scan.place.position, origin).tolist()
+    xyz = np.rint((scan.xyz + np.asarray(origin)) / LATTICE) * LATTICE
+    return scan._replace(place=scan.place._replace(position=(x, y, z)), xyz=xyz)

@@ -142,7 +142,9 @@ def read_truth(path: Path) -> SceneTruth:
         return msgspec.json.decode(path.read_bytes(), type=SceneTruth)
     except OSError as error:
         raise ScanError(
-            f"{path}: cannot be read ({error.strerror}): give the .truth.json of a made scene"
+            f"{path}: cannot be read ({error.strerror}): give the .truth.json of a generated scene"
         ) from error
     except msgspec.MsgspecError as error:
-        raise ScanError(f"{path}: not the truth of a made scene ({error}): make the scene again") from error
+        raise ScanError(
+            f"{path}: not the truth of a generated scene ({error}): make the scene again"
+        ) from error

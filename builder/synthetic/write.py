@@ -16,7 +16,7 @@ import numpy as np
 import pye57
 
 from ...schemas.errors import BadRequestError
-from .scanner import LATTICE, Scan
+from .scanner import LATTICE, SimulatedScan
 
 SUFFIXES = (".laz", ".las", ".e57")
 # A fixed date, the year of [Fig12]: the same seed gives the same file.
@@ -37,7 +37,7 @@ class LasFile:
             path.open("wb"), mode="w", header=header, do_compress=compressed, closefd=True
         )
 
-    def write(self, number: int, scan: Scan) -> None:
+    def write(self, number: int, scan: SimulatedScan) -> None:
         """Append one station."""
         header = self._writer.header
         record = laspy.ScaleAwarePointRecord.zeros(len(scan.xyz), header=header)
@@ -60,7 +60,7 @@ class LasFolder:
         path.mkdir()
         self._path = path
 
-    def write(self, number: int, scan: Scan) -> None:
+    def write(self, number: int, scan: SimulatedScan) -> None:
         """Write one station as its own file."""
         file = LasFile(self._path / station_name(number), compressed=True)
         try:
@@ -81,7 +81,7 @@ class E57File:
     def __init__(self, path: Path) -> None:
         self._file = pye57.E57(str(path), mode="w")
 
-    def write(self, number: int, scan: Scan) -> None:
+    def write(self, number: int, scan: SimulatedScan) -> None:
         """Append one station; world = rotation about z by the yaw, then the scanner's position."""
         c, s = np.cos(scan.place.yaw), np.sin(scan.place.yaw)
         x, y, z = (scan.xyz - np.asarray(scan.place.position)).T

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check
-from .scan import NO_RETURN, Block, Scan, apply_pose, scan_error
+from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
 from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, split_row
 
 # Bytes of the shortest row of three numbers, "0 0 0" and a line end. A declared count is checked
@@ -20,7 +20,7 @@ from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_row
 LEAST_ROW_BYTES = 6
 # Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
 # (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
-MOST_SCANS = 1 << 16
+MAX_SCANS = 1 << 16
 
 
 class CountedRows(Scan):
@@ -49,7 +49,7 @@ class CountedRows(Scan):
         self._start, self._line, self._columns = start, line, columns
         self._zeros_are_no_return = zeros_are_no_return
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         count = self.declared_count or 0
         if not count:
             return
@@ -67,7 +67,7 @@ class CountedRows(Scan):
         if seen < count:
             raise _too_few(self.path, self.index, seen, count)
 
-    def _block(self, rows: NDArray[np.float64]) -> Block:
+    def _block(self, rows: NDArray[np.float64]) -> ScanBlock:
         if self._zeros_are_no_return:
             hit = (rows[:, :3] != 0).any(axis=1)
             lost = len(rows) - int(np.count_nonzero(hit))
@@ -75,7 +75,7 @@ class CountedRows(Scan):
                 self.dropped[NO_RETURN] = self.dropped.get(NO_RETURN, 0) + lost
                 rows = rows[hit]
         xyz = apply_pose(self.pose, np.ascontiguousarray(rows[:, :3]))
-        return Block(xyz, rows[:, 3].astype(np.float32) if self._columns in (4, 7) else None)
+        return ScanBlock(xyz, rows[:, 3].astype(np.float32) if self._columns in (4, 7) else None)
 
 
 def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> int:

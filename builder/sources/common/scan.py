@@ -56,14 +56,14 @@ INTENSITY_NAMES = ("intensity", "scalar_intensity")
 _IDENTITY = np.eye(4)
 
 
-class Lattice(NamedTuple):
+class SourceLattice(NamedTuple):
     """Grid on which a source stores its coordinates, world frame: x = offset + k * scale [m]."""
 
     scale: tuple[float, float, float]
     offset: tuple[float, float, float]
 
 
-class Block(NamedTuple):
+class ScanBlock(NamedTuple):
     """Some points of a scan.
 
     xyz: (n, 3) float64, world frame [m], with the scan's pose applied; may hold non-finite values.
@@ -110,7 +110,7 @@ class Scan(ABC):
         index: int = 0,
         declared_count: int | None = None,
         pose: NDArray[np.float64] | None = None,
-        lattice: Lattice | None = None,
+        lattice: SourceLattice | None = None,
         bounds: NDArray[np.float64] | None = None,
     ) -> None:
         self.path = path
@@ -124,7 +124,7 @@ class Scan(ABC):
 
     def blocks(
         self, block_points: int = BLOCK_POINTS, start: int = 0, stop: int | None = None
-    ) -> Iterator[Block]:
+    ) -> Iterator[ScanBlock]:
         """Read the points in file order, at most `block_points` at a time.
 
         start, stop: range of declared points to read, dropped points counted too. Only a seekable
@@ -141,14 +141,14 @@ class Scan(ABC):
                 check()
                 yield block
 
-    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
+    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
         """Return the blocks of a range. Only the whole range is allowed; SeekableScan overrides this."""
         if (start, stop) != (0, None):
             raise ValueError(f"points {start} to {stop} of a scan that cannot seek, expected 0 to None")
         return self._read(block_points)
 
     @abstractmethod
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         """Yield all blocks. blocks() converts any exception."""
 
 
@@ -157,10 +157,10 @@ class SeekableScan(Scan):
 
     seekable = True
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         return self._read_range(block_points, 0, None)
 
-    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[Block]:
+    def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
         count = self.declared_count or 0
         stop = count if stop is None else stop
         if not 0 <= start <= stop <= count:
@@ -168,7 +168,7 @@ class SeekableScan(Scan):
         return self._read_between(block_points, start, stop) if start < stop else iter(())
 
     @abstractmethod
-    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         """Yield the blocks of points [start, stop), start < stop. blocks() converts any exception."""
 
 
@@ -179,7 +179,7 @@ class BrokenScan(Scan):
         super().__init__(path, format, index=index)
         self.fault = fault
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         raise ScanError(self.fault)
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ....schemas.errors import ScanError
 from ..common.scan import (
     BOUNDS_MARGIN,
-    Block,
     BrokenScan,
     Scan,
+    ScanBlock,
     apply_pose,
     checked_bounds,
     library_errors,
@@ -26,7 +26,7 @@ from ..common.scan import (
     reader_library,
     scan_error,
 )
-from .e57_xml import check_e57, look_through, xml_of
+from .e57_xml import check_e57, check_xml, xml_of
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 INVALID_STATE = "invalid state"
@@ -35,7 +35,7 @@ SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 LONGEST_CRS = 1 << 16  # several times longer than any real text; a longer one is truncated
 
 
-class Fields(NamedTuple):
+class _Fields(NamedTuple):
     """Names of the record fields to read."""
 
     coordinates: tuple[str, ...]
@@ -53,12 +53,12 @@ class E57Scan(Scan):
         count: int,
         pose: NDArray[np.float64],
         bounds: NDArray[np.float64] | None,
-        fields: Fields,
+        fields: _Fields,
     ) -> None:
         super().__init__(path, "e57", index=index, declared_count=count, pose=pose, bounds=bounds)
         self._fields = fields
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         if not self.declared_count:
             return
         libe57 = _libe57(self.path)
@@ -90,7 +90,7 @@ class E57Scan(Scan):
                 "fetch the file again, it is damaged",
             )
 
-    def _block(self, columns: dict[str, NDArray[Any]]) -> Block:
+    def _block(self, columns: dict[str, NDArray[Any]]) -> ScanBlock:
         """Build a block: drop and count invalid records, convert spherical coordinates, apply the pose."""
         fields = self._fields
         valid: Any = slice(None)
@@ -105,7 +105,7 @@ class E57Scan(Scan):
         if fields.coordinates == SPHERICAL:
             xyz = _cartesian(xyz)
         # Copy the intensity: the reader fills the same array again.
-        return Block(
+        return ScanBlock(
             apply_pose(self.pose, xyz), columns[fields.intensity][valid].copy() if fields.intensity else None
         )
 
@@ -180,7 +180,7 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
             "check the program that wrote this file",
         )
     invalid_state = "cartesianInvalidState" if coordinates == CARTESIAN else "sphericalInvalidState"
-    fields = Fields(
+    fields = _Fields(
         coordinates,
         invalid_state if invalid_state in names else None,
         "intensity" if "intensity" in names else None,
@@ -255,7 +255,7 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
     """
     with path.open("rb") as file:
         xml = xml_of(file)
-    look_through(xml)
+    check_xml(xml)
     root = ElementTree.fromstring(xml)
     tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""
     boxes: list[NDArray[np.float64]] = []

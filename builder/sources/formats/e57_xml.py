@@ -17,11 +17,11 @@ from ..common.scan import scan_error
 LONGEST_XML = 16 << 20
 PAGE_BYTES = 1024  # the last four bytes are the page's checksum [ASTM E2807, 7]
 # A scan has about 60 elements, nested at most nine deep; extensions add some.
-MOST_ELEMENTS = 1 << 18
+MAX_ELEMENTS = 1 << 18
 DEEPEST = 64
 
 
-class TooMuchError(ValueError):
+class XmlLimitError(ValueError):
     """Content of the XML that no scan needs."""
 
 
@@ -46,8 +46,8 @@ def check_e57(path: Path) -> None:
             )
         xml = xml_of(file)
     try:
-        look_through(xml)
-    except TooMuchError as error:
+        check_xml(xml)
+    except XmlLimitError as error:
         raise _damaged(path, str(error), "the description of some scans") from None
     except expat.ExpatError:
         # The XML up to the error is within the limits. libE57Format checks the checksums first and
@@ -55,8 +55,8 @@ def check_e57(path: Path) -> None:
         pass
 
 
-def look_through(xml: bytes) -> None:
-    """Raise TooMuchError for excessive depth, too many elements, or a document type.
+def check_xml(xml: bytes) -> None:
+    """Raise XmlLimitError for excessive depth, too many elements, or a document type.
 
     A document type may define entities, which can expand to any depth and number of elements.
     """
@@ -65,15 +65,15 @@ def look_through(xml: bytes) -> None:
     def begin(name: str, attributes: dict[str, str]) -> None:
         nonlocal depth, count
         depth, count = depth + 1, count + 1
-        if depth > DEEPEST or count > MOST_ELEMENTS:
-            raise TooMuchError(f"XML of over {MOST_ELEMENTS} elements, or nested over {DEEPEST} deep")
+        if depth > DEEPEST or count > MAX_ELEMENTS:
+            raise XmlLimitError(f"XML of over {MAX_ELEMENTS} elements, or nested over {DEEPEST} deep")
 
     def end(name: str) -> None:
         nonlocal depth
         depth -= 1
 
     def declares(*what: object) -> None:
-        raise TooMuchError("XML with a document type")
+        raise XmlLimitError("XML with a document type")
 
     parser = expat.ParserCreate()
     parser.StartElementHandler = begin

@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check
-from ..common.scan import BLOCK_BYTES, Block, Scan, apply_pose, library_errors, quaternion_pose, scan_error
+from ..common.scan import (
+    BLOCK_BYTES,
+    Scan,
+    ScanBlock,
+    apply_pose,
+    library_errors,
+    quaternion_pose,
+    scan_error,
+)
 
 # Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
 # takes thirty times that.
@@ -24,10 +32,10 @@ LONGEST_JSON = 8 << 20
 # Maximum nodes, and maximum primitives at nodes. Nodes may share a mesh, and a shared part takes no
 # JSON. This limit is three times the number of parts that the JSON has room for as separate meshes.
 # Resolving a part takes 15 us and half a kilobyte.
-MOST_PARTS = 1 << 16
+MAX_PARTS = 1 << 16
 # Maximum triangles to sample. The corners of a triangle take 72 bytes, and sampling holds the whole
 # mesh: 1.2 GB for this many.
-MOST_TRIANGLES = 1 << 24
+MAX_TRIANGLES = 1 << 24
 
 # Extensions that do not affect the positions of vertices. Other required extensions may:
 # instancing, compression.
@@ -38,7 +46,7 @@ INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
-class Column(NamedTuple):
+class _Accessor(NamedTuple):
     """Accessor: `rows` rows of `width` values, `stride` bytes apart, from byte `start` of the file.
 
     type: numpy type of a value.
@@ -57,22 +65,22 @@ class _Primitive(NamedTuple):
     indices: vertex numbers of the corners; None: vertices in order.
     """
 
-    vertices: Column
+    vertices: _Accessor
     mode: int
-    indices: Column | None
+    indices: _Accessor | None
 
 
-class Part(NamedTuple):
+class _Part(NamedTuple):
     """Primitive of a mesh at a node.
 
     pose: (4, 4), mesh frame -> scene.
     indices: vertex numbers of the corners; None: vertices in order.
     """
 
-    vertices: Column
+    vertices: _Accessor
     pose: NDArray[np.float64]
     mode: int
-    indices: Column | None
+    indices: _Accessor | None
 
 
 class GlbScan(Scan):
@@ -80,30 +88,30 @@ class GlbScan(Scan):
 
     up = "y"
 
-    def __init__(self, path: Path, parts: list[Part]) -> None:
+    def __init__(self, path: Path, parts: list[_Part]) -> None:
         # Parts of a mesh usually share vertices and differ in material and triangles.
         at_nodes = {(part.vertices, part.pose.tobytes()): part for part in parts}
         self._shown = list(at_nodes.values())
         self._parts = parts
         super().__init__(path, "glb", declared_count=sum(part.vertices.rows for part in self._shown))
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         with self.path.open("rb") as file:
             for part in self._shown:
                 for rows in _rows(file, self.path, part.vertices, block_points):
-                    yield Block(apply_pose(part.pose, rows.astype(np.float64)), None)
+                    yield ScanBlock(apply_pose(part.pose, rows.astype(np.float64)), None)
 
     def triangles(self) -> NDArray[np.float64]:
         """Return the corners of all triangles, (n, 3, 3).
 
-        Raises ScanError for more than MOST_TRIANGLES.
+        Raises ScanError for more than MAX_TRIANGLES.
         """
         total = sum(part.indices.rows if part.indices else part.vertices.rows for part in self._parts)
-        if total > 3 * MOST_TRIANGLES:
+        if total > 3 * MAX_TRIANGLES:
             raise scan_error(
                 self.path,
                 f"about {total // 3} triangles",
-                f"at most {MOST_TRIANGLES} to sample",
+                f"at most {MAX_TRIANGLES} to sample",
                 "split the mesh, or build it without --spacing",
             )
         found = [np.empty((0, 3, 3))]
@@ -120,7 +128,7 @@ class GlbScan(Scan):
         return np.concatenate(found)
 
 
-def _corners(file: BufferedReader, path: Path, part: Part) -> NDArray[np.int64]:
+def _corners(file: BufferedReader, path: Path, part: _Part) -> NDArray[np.int64]:
     """Return the vertex numbers of a part's triangles, (n, 3)."""
     if part.mode not in (TRIANGLES, STRIP, FAN):
         return np.empty((0, 3), np.int64)
@@ -136,20 +144,20 @@ def _corners(file: BufferedReader, path: Path, part: Part) -> NDArray[np.int64]:
     return np.stack([first, order[1:-1], order[2:]], axis=1)
 
 
-def _rows(file: BufferedReader, path: Path, column: Column, block_rows: int) -> Iterator[NDArray[Any]]:
+def _rows(file: BufferedReader, path: Path, accessor: _Accessor, block_rows: int) -> Iterator[NDArray[Any]]:
     """Yield the rows of an accessor, (n, width) of its type, in blocks of bounded memory."""
-    item = np.dtype(column.type).itemsize
-    step = max(1, min(block_rows, BLOCK_BYTES // column.stride))
-    for begin in range(0, column.rows, step):
-        count = min(step, column.rows - begin)
+    item = np.dtype(accessor.type).itemsize
+    step = max(1, min(block_rows, BLOCK_BYTES // accessor.stride))
+    for begin in range(0, accessor.rows, step):
+        count = min(step, accessor.rows - begin)
         # The last row, and the file with it, may end before the row's full stride.
-        wanted = (count - 1) * column.stride + column.width * item
-        file.seek(column.start + begin * column.stride)
+        wanted = (count - 1) * accessor.stride + accessor.width * item
+        file.seek(accessor.start + begin * accessor.stride)
         check()
         data = file.read(wanted)
         if len(data) < wanted:
             raise _damaged(path, "a file that ends within its vertices", "all its vertices")
-        yield np.ndarray((count, column.width), column.type, data, strides=(column.stride, item))
+        yield np.ndarray((count, accessor.width), accessor.type, data, strides=(accessor.stride, item))
 
 
 def open_glb(path: Path) -> list[Scan]:
@@ -193,10 +201,10 @@ class _Document:
         """Hold the parsed JSON. start, size: of the binary chunk [bytes]."""
         self.path, self.document, self.start, self.size = path, document, start, size
 
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[_Part]:
         """Return every primitive at each node of the scene, in one depth-first walk of the node tree.
 
-        Raises ScanError for more than MOST_PARTS nodes or primitives at nodes.
+        Raises ScanError for more than MAX_PARTS nodes or primitives at nodes.
         """
         required = [str(name) for name in self.document.get("extensionsRequired", [])]
         if others := [name for name in required if not name.startswith(HARMLESS)]:
@@ -213,7 +221,7 @@ class _Document:
         else:
             children = {child for node in nodes for child in node.get("children", [])}
             roots = [k for k in range(len(nodes)) if k not in children]
-        found: list[Part] = []
+        found: list[_Part] = []
         meshes: dict[int, list[_Primitive]] = {}
         parts = 0
         waiting = [(root, np.eye(4)) for root in roots]
@@ -231,17 +239,17 @@ class _Document:
                 self._check_parts(parts, "primitives at nodes")
                 if node["mesh"] not in meshes:
                     meshes[node["mesh"]] = self._mesh(node["mesh"])
-                found += [Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
+                found += [_Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
             waiting += [(child, pose) for child in reversed(node.get("children", []))]
         return found
 
     def _check_parts(self, parts: int, what: str) -> None:
-        if parts > MOST_PARTS:
+        if parts > MAX_PARTS:
             raise scan_error(
-                self.path, f"over {MOST_PARTS} {what}", "at most that many", "join meshes, or split the scene"
+                self.path, f"over {MAX_PARTS} {what}", "at most that many", "join meshes, or split the scene"
             )
 
-    def _mesh(self, number: int) -> list["_Primitive"]:
+    def _mesh(self, number: int) -> list[_Primitive]:
         """Return the primitives of a mesh that have positions."""
         primitives = [self._primitive(primitive) for primitive in self._at("meshes", number)["primitives"]]
         return [primitive for primitive in primitives if primitive is not None]
@@ -265,7 +273,7 @@ class _Document:
             )
         return pose
 
-    def _primitive(self, primitive: dict[str, Any]) -> "_Primitive | None":
+    def _primitive(self, primitive: dict[str, Any]) -> _Primitive | None:
         """Return a primitive's accessors, or None where it has no positions."""
         if primitive.get("extensions", {}).get("KHR_draco_mesh_compression") is not None:
             raise _damaged(
@@ -273,13 +281,13 @@ class _Document:
             )
         if "POSITION" not in primitive["attributes"]:
             return None
-        vertices = self._column(primitive["attributes"]["POSITION"], "VEC3", {FLOAT: "<f4"})
+        vertices = self._accessor(primitive["attributes"]["POSITION"], "VEC3", {FLOAT: "<f4"})
         indices = None
         if "indices" in primitive:
-            indices = self._column(primitive["indices"], "SCALAR", INDEX_TYPES)
+            indices = self._accessor(primitive["indices"], "SCALAR", INDEX_TYPES)
         return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices)
 
-    def _column(self, number: int, shape: str, types: dict[int, str]) -> Column:
+    def _accessor(self, number: int, shape: str, types: dict[int, str]) -> _Accessor:
         """Return an accessor, checked against its buffer view, and the view against the binary chunk."""
         accessor = self._at("accessors", number)
         if accessor["type"] != shape or accessor["componentType"] not in types or "sparse" in accessor:
@@ -310,7 +318,7 @@ class _Document:
                 f"accessor {number}: {count} rows of {row} bytes, {stride} apart, from byte {offset} of {length}",
                 f"an accessor within its buffer view, and the view within the binary part of {self.size} bytes",
             )
-        return Column(self.start + begin + offset, stride, count, type_, width)
+        return _Accessor(self.start + begin + offset, stride, count, type_, width)
 
     def _at(self, name: str, number: Any) -> dict[str, Any]:
         """Return one entry of a list of the document. Raises ScanError for an invalid index."""

@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import kept_back
 from ..common.scan import (
     BLOCK_BYTES,
-    Block,
-    Lattice,
     Scan,
+    ScanBlock,
     SeekableScan,
+    SourceLattice,
     checked_bounds,
     library_errors,
     read_records,
     reader_library,
     scan_error,
 )
-from .laz_chunks import VLR_HEADER_BYTES, ChunksFrom, check_chunks
+from .laz_chunks import VLR_HEADER_BYTES, LazTail, check_chunks
 
 # Size of the public header of LAS 1.0 to 1.2; later versions append fields [LAS 1.4 R15, table 3].
 HEADER_BYTES = 227
@@ -59,7 +59,7 @@ KEY_NAMES = {
 }
 
 
-class Header(NamedTuple):
+class _Header(NamedTuple):
     """Fields of a LAS header that locate the points and describe their encoding."""
 
     header_size: int
@@ -69,7 +69,7 @@ class Header(NamedTuple):
     compressed: bool
     record_bytes: int
     points: int
-    lattice: Lattice
+    lattice: SourceLattice
     bounds: NDArray[np.float64] | None
     evlrs: tuple[int, int]  # offset of the first record after the points, and the number of such records
 
@@ -77,7 +77,7 @@ class Header(NamedTuple):
 class LasScan(SeekableScan):
     """One LAS or LAZ file."""
 
-    def __init__(self, path: Path, header: Header, laszip: bytes) -> None:
+    def __init__(self, path: Path, header: _Header, laszip: bytes) -> None:
         """Create the scan.
 
         laszip: the LASzip record that lazrs needs, for a compressed file with points.
@@ -100,7 +100,7 @@ class LasScan(SeekableScan):
             }
         )
 
-    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         with self.path.open("rb") as file:
             file.seek(self._start)
             if self.format == "laz":
@@ -123,7 +123,7 @@ class LasScan(SeekableScan):
             | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
         )
         with kept_back():
-            source: Any = ChunksFrom(lazrs, file, self._start, self._laszip, start) if start else file
+            source: Any = LazTail(lazrs, file, self._start, self._laszip, start) if start else file
             # Decompress serially: the builder already runs one process per core.
             decompressor = lazrs.LasZipDecompressor(source, self._laszip, wanted)
         step = max(1, min(block_points, BLOCK_BYTES // self._record.itemsize))
@@ -142,7 +142,7 @@ class LasScan(SeekableScan):
                 decompressor.decompress_many(raw[: count * self._record.itemsize])
             yield buffer[:count]
 
-    def _block(self, record: NDArray[np.void]) -> Block:
+    def _block(self, record: NDArray[np.void]) -> ScanBlock:
         """Build a block from point records.
 
         Coordinates are raw * scale + offset, in that order, as laspy and others compute them.
@@ -158,7 +158,7 @@ class LasScan(SeekableScan):
                 column = xyz[:, axis]
                 np.multiply(record[name], lattice.scale[axis], out=column)
                 column += lattice.offset[axis]
-        return Block(xyz, record["intensity"].astype(np.float32))
+        return ScanBlock(xyz, record["intensity"].astype(np.float32))
 
 
 def open_las(path: Path) -> list[Scan]:
@@ -195,7 +195,7 @@ def las_bounds(path: Path) -> NDArray[np.float64] | None:
     return header.bounds
 
 
-def _read_header(file: BinaryIO, path: Path) -> Header:
+def _read_header(file: BinaryIO, path: Path) -> _Header:
     """Read the fields of the public header block; check only what reading them requires."""
     start = file.read(375)
     if start[:4] != b"LASF" or len(start) < HEADER_BYTES:
@@ -221,7 +221,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
     if minor >= 4:
         (count,) = struct.unpack_from("<Q", start, 247)
     # LASzip marks a compressed file in bit 7 of the format; older versions set bit 6 as well.
-    return Header(
+    return _Header(
         header_size,
         offset_to_points,
         vlr_count,
@@ -229,7 +229,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
         bool(point_format & 0xC0),
         record_bytes,
         count,
-        Lattice(scale, offset),
+        SourceLattice(scale, offset),
         _bounds_of(start) if count else None,
         struct.unpack_from("<QI", start, 235) if minor >= 4 else (0, 0),
     )
@@ -241,7 +241,7 @@ def _bounds_of(start: bytes) -> NDArray[np.float64] | None:
     return checked_bounds(bounds)
 
 
-def _check_header(header: Header, path: Path, size: int) -> None:
+def _check_header(header: _Header, path: Path, size: int) -> None:
     """Check all header values against the file's size and against each other. Raises ScanError."""
 
     def refuse(found: str, expected: str) -> None:

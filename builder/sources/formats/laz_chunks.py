@@ -88,7 +88,7 @@ def check_chunks(
     return laszip
 
 
-class ChunksFrom(io.RawIOBase):
+class LazTail(io.RawIOBase):
     """Points of a LAZ file from one of its chunks on, presented to lazrs as a file that begins there.
 
     lazrs 0.8 cannot seek correctly where chunks differ in size (COPC): its `seek` takes the point's

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..common.scan import Block, Scan, SeekableScan, library_errors, read_records, scan_error
+from ..common.scan import Scan, ScanBlock, SeekableScan, library_errors, read_records, scan_error
 from ..common.text_rows import keyword_rows
 
 # A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
@@ -27,11 +27,11 @@ class VertexLines(Scan):
         super().__init__(path, "mesh")
         self._keyword = keyword
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         with self.path.open("rb") as file:
             for rows in keyword_rows(file, self.path, self._keyword):
                 for start in range(0, len(rows), block_points):
-                    yield Block(rows[start : start + block_points], None)
+                    yield ScanBlock(rows[start : start + block_points], None)
 
 
 class BinaryStl(SeekableScan):
@@ -40,7 +40,7 @@ class BinaryStl(SeekableScan):
     def __init__(self, path: Path, triangles: int) -> None:
         super().__init__(path, "mesh", declared_count=3 * triangles)
 
-    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         first, past = start // 3, -(-stop // 3)
         with self.path.open("rb") as file:
             file.seek(STL_HEADER_BYTES + first * STL_TRIANGLE.itemsize)
@@ -53,7 +53,7 @@ class BinaryStl(SeekableScan):
                 corners = corners[max(0, start - at) : len(corners) - max(0, end - stop)]
                 at = end
                 for k in range(0, len(corners), block_points):
-                    yield Block(corners[k : k + block_points], None)
+                    yield ScanBlock(corners[k : k + block_points], None)
 
 
 def open_obj(path: Path) -> list[Scan]:

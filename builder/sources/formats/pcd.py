@@ -19,8 +19,8 @@ from ..common.scan import (
     BLOCK_BYTES,
     INTENSITY_NAMES,
     NO_RETURN,
-    Block,
     Scan,
+    ScanBlock,
     SeekableScan,
     apply_pose,
     library_errors,
@@ -38,10 +38,10 @@ KINDS = ("ascii", "binary", "binary_compressed")
 TYPES = {("F", 4): "<f4", ("F", 8): "<f8", **{(t, n): f"<{t.lower()}{n}" for t in "IU" for n in (1, 2, 4, 8)}}
 # Maximum decompressed bytes per compressed byte: a reference of three bytes stands for at most 264
 # [LZF].
-MOST_EXPANSION = 88
+MAX_EXPANSION = 88
 
 
-class Field(NamedTuple):
+class _Field(NamedTuple):
     """One field to read.
 
     offset: bytes from the start of the record.
@@ -53,10 +53,10 @@ class Field(NamedTuple):
     type: str
 
 
-class Header(NamedTuple):
+class _Header(NamedTuple):
     """Header of a PCD file. fields: x, y, z, and the intensity where there is one."""
 
-    fields: tuple[Field, ...]
+    fields: tuple[_Field, ...]
     record_bytes: int
     columns: int
     points: int
@@ -66,7 +66,7 @@ class Header(NamedTuple):
     lines: int  # number of header lines
 
 
-def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
+def _block(scan: Scan, columns: list[NDArray[Any]]) -> ScanBlock:
     """Build a block from the columns x, y, z and optionally intensity, (n,) each; drops NaN points."""
     xyz = np.stack(columns[:3], axis=1, dtype=np.float64, casting="unsafe")
     intensity = columns[3].astype(np.float32) if len(columns) > 3 else None
@@ -75,17 +75,17 @@ def _block(scan: Scan, columns: list[NDArray[Any]]) -> Block:
     if lost:
         scan.dropped[NO_RETURN] = scan.dropped.get(NO_RETURN, 0) + lost
         xyz, intensity = xyz[hit], None if intensity is None else intensity[hit]
-    return Block(apply_pose(scan.pose, xyz), intensity)
+    return ScanBlock(apply_pose(scan.pose, xyz), intensity)
 
 
 class BinaryPcd(SeekableScan):
     """Points of a binary PCD file, stored record by record."""
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
         self._header = header
 
-    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         header = self._header
         names = "xyzi"[: len(header.fields)]
         record = np.dtype(
@@ -105,12 +105,12 @@ class BinaryPcd(SeekableScan):
 class CompressedPcd(Scan):
     """Points of a compressed PCD file: one stream with the columns one after the other."""
 
-    def __init__(self, path: Path, header: Header, past: int) -> None:
+    def __init__(self, path: Path, header: _Header, past: int) -> None:
         """Create the scan; past is the offset of the first byte after the compressed data."""
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
         self._header, self._past = header, past
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header = self._header
         with self.path.open("rb") as file:
             # Decode once to find where the last column begins, then decode all columns side by
@@ -138,11 +138,11 @@ class CompressedPcd(Scan):
 class AsciiPcd(Scan):
     """Points of an ASCII PCD file."""
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
         self._header = header
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header, seen = self._header, 0
         if not header.points:
             return
@@ -173,13 +173,13 @@ def open_pcd(path: Path) -> list[Scan]:
         return [(AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header)]
 
 
-def _compressed_end(file: BufferedReader, path: Path, header: Header, left: int) -> int:
+def _compressed_end(file: BufferedReader, path: Path, header: _Header, left: int) -> int:
     """Return the offset of the first byte after the compressed data; checks both of its sizes."""
     file.seek(header.start)
     packed, unpacked = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if 8 + packed > left:
         raise _truncated(path, f"{left} bytes of data", f"{8 + packed}")
-    if unpacked != header.points * header.record_bytes or unpacked > packed * MOST_EXPANSION:
+    if unpacked != header.points * header.record_bytes or unpacked > packed * MAX_EXPANSION:
         raise _truncated(
             path,
             f"{unpacked} bytes in {packed} compressed",
@@ -192,7 +192,7 @@ def _truncated(path: Path, found: str, expected: str) -> Exception:
     return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
 
 
-def _read_header(file: BufferedReader, path: Path) -> Header:
+def _read_header(file: BufferedReader, path: Path) -> _Header:
     """Read and check the header. Raises ScanError."""
     entries: dict[str, list[str]] = {}
     lines = 0
@@ -247,6 +247,6 @@ def _read_header(file: BufferedReader, path: Path) -> Header:
     for name in wanted[:4]:
         k = names.index(name)
         offset = sum(size * count for size, count in zip(sizes[:k], counts[:k], strict=True))
-        fields.append(Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]]))
+        fields.append(_Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]]))
     pose = quaternion_pose(path, 0, place[3:], place[:3])
-    return Header(tuple(fields), record_bytes, sum(counts), width * height, pose, kind, file.tell(), lines)
+    return _Header(tuple(fields), record_bytes, sum(counts), width * height, pose, kind, file.tell(), lines)

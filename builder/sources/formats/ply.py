@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ..common.scan import (
     INTENSITY_NAMES,
-    Block,
     Scan,
+    ScanBlock,
     SeekableScan,
     library_errors,
     read_records,
@@ -28,7 +28,7 @@ from ..common.text_rows import LONGEST_LINE, number_rows
 LONGEST_HEADER = 1 << 20
 
 
-class Header(NamedTuple):
+class _Header(NamedTuple):
     """Description of a PLY file's vertices, from its header."""
 
     record: np.dtype[np.void]  # layout of one vertex in a binary file
@@ -43,11 +43,11 @@ class Header(NamedTuple):
 class BinaryPly(SeekableScan):
     """Vertices of one binary PLY file."""
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)
         self._header = header
 
-    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[Block]:
+    def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         header = self._header
         with self.path.open("rb") as file:
             file.seek(header.start + header.skip + start * header.record.itemsize)
@@ -66,11 +66,11 @@ def _skip_lines(file: BinaryIO, lines: int) -> None:
 class AsciiPly(Scan):
     """Vertices of one PLY file in text."""
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)
         self._header = header
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header = self._header
         if not header.points:
             return
@@ -97,12 +97,12 @@ class AsciiPly(Scan):
             raise _truncated(self.path, seen, header.points)
 
 
-def _block(record: NDArray[np.void], intensity: str | None) -> Block:
+def _block(record: NDArray[np.void], intensity: str | None) -> ScanBlock:
     """Convert vertex records to a block."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("xyz"):
         xyz[:, axis] = record[name]
-    return Block(xyz, record[intensity].astype(np.float32) if intensity else None)
+    return ScanBlock(xyz, record[intensity].astype(np.float32) if intensity else None)
 
 
 def open_ply(path: Path) -> list[Scan]:
@@ -126,7 +126,7 @@ def _truncated(path: Path, found: int, declared: int) -> Exception:
     )
 
 
-def _read_header(file: BinaryIO, path: Path) -> Header:
+def _read_header(file: BinaryIO, path: Path) -> _Header:
     """Read and check the header; leaves the file position at the start of the body."""
     lines: list[str] = []
     counts: list[int] = []
@@ -178,4 +178,4 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
             "check the program that wrote this file",
         )
     intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
-    return Header(record, count, start, skip, len(lines), ply.text, intensity)
+    return _Header(record, count, start, skip, len(lines), ply.text, intensity)

@@ -6,7 +6,7 @@ other text scan.
 
 from pathlib import Path
 
-from ..common.counted_rows import MOST_SCANS, CountedRows, next_line, skip_rows
+from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
 from ..common.scan import Scan, library_errors, scan_error
 from .text import open_text
 
@@ -29,8 +29,8 @@ def open_pts(path: Path) -> list[Scan]:
                     "the end of the file, or the number of points that follow",
                     "correct the count before them",
                 )
-            if len(scans) == MOST_SCANS:
-                raise scan_error(path, f"over {MOST_SCANS} blocks of points", "fewer", "split the file")
+            if len(scans) == MAX_SCANS:
+                raise scan_error(path, f"over {MAX_SCANS} blocks of points", "fewer", "split the file")
             count, start, line = int(text), file.tell(), line + 1
             columns = skip_rows(file, path, len(scans), count, line)
             scans.append(CountedRows(path, "pts", len(scans), count, start=start, line=line, columns=columns))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.counted_rows import MOST_SCANS, CountedRows, next_line, skip_rows
+from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
 from ..common.scan import FARTHEST, Scan, library_errors, scan_error
 from ..common.text_rows import LONGEST_LINE, is_number
 
@@ -29,8 +29,8 @@ def open_ptx(path: Path) -> list[Scan]:
     with library_errors(path), path.open("rb") as file:
         text, line = next_line(file, 1)
         while text:
-            if len(scans) == MOST_SCANS:
-                raise scan_error(path, f"over {MOST_SCANS} scans", "fewer", "split the file")
+            if len(scans) == MAX_SCANS:
+                raise scan_error(path, f"over {MAX_SCANS} scans", "fewer", "split the file")
             columns = _size(path, line, text)
             rows = _size(path, line + 1, file.readline(LONGEST_LINE).decode("latin-1").strip())
             pose = _pose(file, path, line + 2)

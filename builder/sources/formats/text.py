@@ -20,14 +20,14 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from ..common.scan import INTENSITY_NAMES, Block, Scan, library_errors, scan_error
+from ..common.scan import INTENSITY_NAMES, Scan, ScanBlock, library_errors, scan_error
 from ..common.text_rows import LONGEST_LINE, is_number, number_rows, split_row
 
 # Maximum lines before the first row of numbers; a file with a longer preamble is not a point list.
 LONGEST_PREAMBLE = 1000
 
 
-class Layout(NamedTuple):
+class _Layout(NamedTuple):
     """Positions of the numbers in a text scan."""
 
     start: int  # byte offset of the first row
@@ -42,12 +42,12 @@ class Layout(NamedTuple):
 class TextScan(Scan):
     """Points of one text file."""
 
-    def __init__(self, path: Path, layout: Layout | None) -> None:
+    def __init__(self, path: Path, layout: _Layout | None) -> None:
         """Create the scan; layout is None for a file without rows."""
         super().__init__(path, "text", declared_count=layout.points if layout else 0)
         self._layout = layout
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         if self._layout is None:
             return
         layout = self._layout
@@ -63,7 +63,7 @@ class TextScan(Scan):
                     intensity = None
                     if layout.intensity is not None:
                         intensity = part[:, layout.intensity].astype(np.float32)
-                    yield Block(np.ascontiguousarray(part[:, layout.xyz]), intensity)
+                    yield ScanBlock(np.ascontiguousarray(part[:, layout.xyz]), intensity)
         if layout.points is not None and seen != layout.points:
             raise scan_error(
                 self.path,
@@ -81,7 +81,7 @@ def open_text(path: Path) -> list[Scan]:
         return [TextScan(path, _find_layout(file, path))]
 
 
-def _find_layout(file: BinaryIO, path: Path) -> Layout | None:
+def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
     """Read the file up to the first row of numbers; None where there is no such row."""
     names: tuple[int, str] | None = None  # the header row: its line number and text
     comment = ""  # the last comment, which may name the columns
@@ -105,7 +105,7 @@ def _find_layout(file: BinaryIO, path: Path) -> Layout | None:
             count = int(fields[0])
         elif any(map(is_number, fields)):
             return _layout_of(
-                path, fields, delimiter, Layout(start, line, 0, None, (0, 1, 2), None, count), names, comment
+                path, fields, delimiter, _Layout(start, line, 0, None, (0, 1, 2), None, count), names, comment
             )
         elif names is None:
             names = (line, text)
@@ -123,10 +123,10 @@ def _layout_of(
     path: Path,
     fields: list[str],
     delimiter: str | None,
-    found: Layout,
+    found: _Layout,
     names: tuple[int, str] | None,
     comment: str,
-) -> Layout:
+) -> _Layout:
     """Complete the layout from the first row of numbers and the header. Raises ScanError."""
     if len(fields) < 3 or not all(map(is_number, fields)):
         raise scan_error(

@@ -18,8 +18,7 @@ from solidcloud.builder.passes.survey import (
     survey_range,
     survey_scan,
 )
-from solidcloud.builder.sources.common.scan import Block, Scan
-from solidcloud.builder.sources.common.scan import Lattice as SourceLattice
+from solidcloud.builder.sources.common.scan import Scan, ScanBlock, SourceLattice
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
@@ -33,12 +32,12 @@ class Listed(Scan):
         super().__init__(path, "text")
         self.xyz, self.size, self.fails_after = xyz, size, fails_after
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         for start in range(0, len(self.xyz), self.size):
             if self.fails_after is not None and start >= self.fails_after:
                 raise ScanError(f"{self.path}: broke off")
             xyz = self.xyz[start : start + self.size]
-            yield Block(xyz, np.arange(start, start + len(xyz), dtype=np.float32))
+            yield ScanBlock(xyz, np.arange(start, start + len(xyz), dtype=np.float32))
 
 
 def listed(folder: Path, xyz: np.ndarray, size: int = 50, fails_after: int | None = None) -> Listed:
@@ -116,7 +115,7 @@ def test_a_scan_that_cannot_seek_is_one_unit(tmp_path: Path) -> None:
 
 def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path: Path) -> None:
     class Dropping(Listed):
-        def _read(self, block_points: int) -> Iterator[Block]:
+        def _read(self, block_points: int) -> Iterator[ScanBlock]:
             self.dropped = {"not finite": 2, "invalid": 5}
             yield from super()._read(block_points)
 
@@ -135,7 +134,7 @@ def test_that_memory_ran_out_is_no_fault_of_the_scan(
     where: str, error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Starved(Listed):
-        def _read(self, block_points: int) -> Iterator[Block]:
+        def _read(self, block_points: int) -> Iterator[ScanBlock]:
             yield from super()._read(block_points)
             raise error
 

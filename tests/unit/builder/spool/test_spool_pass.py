@@ -9,7 +9,7 @@ import pytest
 import solidcloud.builder.spool.spool_pass as partition
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.content_hash import SEEDS, content_sum
-from solidcloud.builder.sources.common.scan import Block, Scan
+from solidcloud.builder.sources.common.scan import Scan, ScanBlock
 from solidcloud.builder.spool.spool import Spool, places_sum, row_codes, spool_dtype, write_run
 from solidcloud.builder.spool.spool_pass import (
     RunsHold,
@@ -36,10 +36,10 @@ class Listed(Scan):
         self.xyz, self.size = xyz, size
         self.intensity = np.arange(len(xyz), dtype=np.float32) if intensity is None else intensity
 
-    def _read(self, block_points: int) -> Iterator[Block]:
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
         for start in range(0, len(self.xyz), self.size):
             part = slice(start, start + self.size)
-            yield Block(self.xyz[part], self.intensity[part])
+            yield ScanBlock(self.xyz[part], self.intensity[part])
 
 
 def spooled(
@@ -152,11 +152,11 @@ def test_a_point_too_far_for_its_voxel_is_refused(tmp_path: Path) -> None:
 def test_only_usable_points_are_spooled(tmp_path: Path) -> None:
     xyz = make_scan("noise", 1, 60) + 1
     xyz[5, 1], xyz[6, 0], xyz[50, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
-    kept = usable(Block(xyz, np.arange(60, dtype=np.float32)))
+    kept = usable(ScanBlock(xyz, np.arange(60, dtype=np.float32)))
     assert kept.intensity is not None
     assert kept.intensity.tolist() == [i for i in range(60) if i not in (5, 6, 50)]
     assert np.array_equal(kept.xyz, np.delete(xyz, [5, 6, 50], axis=0))
-    assert usable(Block(xyz, None)).intensity is None
+    assert usable(ScanBlock(xyz, None)).intensity is None
     result, _ = spooled(tmp_path / "s", Listed(xyz, 9), 57, make_lattice((0, 0, 0), 0.001, 0.5))
     assert result.count == 57
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.builder.synthetic.facade import NAVE_X, SILL, build_facade
-from solidcloud.builder.synthetic.scanner import Place, RayScene
+from solidcloud.builder.synthetic.scanner import RayScene, ScannerPose
 from solidcloud.schemas.errors import BadRequestError
 
 
@@ -11,7 +11,7 @@ def ranges(
     scene: RayScene, position: tuple[float, float, float], azimuth: list[float], elevation: list[float]
 ):
     """Ranges [m] from a position along azimuths and elevations [rad]."""
-    return scene.cast(Place(position, 0.0), np.array([azimuth]), np.array([elevation])).range[0]
+    return scene.cast(ScannerPose(position, 0.0), np.array([azimuth]), np.array([elevation])).range[0]
 
 
 @pytest.mark.parametrize("width", [0.50, 1.20, 1.60, 2.40])

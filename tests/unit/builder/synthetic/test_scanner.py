@@ -5,11 +5,19 @@ from functools import cache
 import numpy as np
 import pytest
 from solidcloud.builder.synthetic.facade import build_facade
-from solidcloud.builder.synthetic.scanner import LATTICE, NOISE, Place, RayScene, Scan, plan, scan
+from solidcloud.builder.synthetic.scanner import (
+    LATTICE,
+    NOISE,
+    RayScene,
+    ScannerPose,
+    SimulatedScan,
+    plan_stations,
+    simulate_scan,
+)
 from solidcloud.builder.synthetic.shapes import Parts
 
-FORECOURT = Place((0.8, -13.0, 1.7), 0.3)
-NEAR = Place((0.5, -3.4, 1.7), -1.0)
+FORECOURT = ScannerPose((0.8, -13.0, 1.7), 0.3)
+NEAR = ScannerPose((0.5, -3.4, 1.7), -1.0)
 
 
 @cache
@@ -18,14 +26,14 @@ def world() -> RayScene:
 
 
 @cache
-def scanned(place: Place = FORECOURT, quota: int = 60_000) -> Scan:
-    step, quotas = plan(world(), [place], quota)
-    return scan(world(), place, step, quotas[0], (2012, 1))
+def scanned(place: ScannerPose = FORECOURT, quota: int = 60_000) -> SimulatedScan:
+    step, quotas = plan_stations(world(), [place], quota)
+    return simulate_scan(world(), place, step, quotas[0], (2012, 1))
 
 
 def test_plan_owes_exactly_the_count() -> None:
     for points in (1_000, 20_011, 587_923):
-        step, quotas = plan(world(), [FORECOURT, NEAR], points)
+        step, quotas = plan_stations(world(), [FORECOURT, NEAR], points)
         assert sum(quotas) == points
         assert step > 0
         # The nearer one has the façade all before it and so the more hits.
@@ -42,15 +50,17 @@ def test_scan_has_exactly_its_quota_on_the_lattice(quota: int) -> None:
 
 
 def test_a_quota_beyond_the_plan_is_met_with_a_finer_step() -> None:
-    step, quotas = plan(world(), [FORECOURT], 5_000)
-    made = scan(world(), FORECOURT, step, 2 * quotas[0], (1,))
+    step, quotas = plan_stations(world(), [FORECOURT], 5_000)
+    made = simulate_scan(world(), FORECOURT, step, 2 * quotas[0], (1,))
     assert len(made.xyz) == 10_000
     assert made.step < step
 
 
 def test_same_key_same_points_and_another_key_others() -> None:
-    step, quotas = plan(world(), [FORECOURT], 5_000)
-    one, two, other = (scan(world(), FORECOURT, step, quotas[0], key) for key in ((1, 2), (1, 2), (1, 3)))
+    step, quotas = plan_stations(world(), [FORECOURT], 5_000)
+    one, two, other = (
+        simulate_scan(world(), FORECOURT, step, quotas[0], key) for key in ((1, 2), (1, 2), (1, 3))
+    )
     assert np.array_equal(one.xyz, two.xyz)
     assert not np.array_equal(one.xyz, other.xyz)
 
@@ -100,8 +110,8 @@ def test_some_returns_are_mixed_between_two_depths(edges: str) -> None:
     for low in np.arange(-3.0, 6.0, 0.71):
         x, z = (low, low + 0.37), (-20.0, 20.0)
         parts.box(x if edges == "upright" else z, (4.0, 4.1), z if edges == "upright" else x)
-    place = Place((0.0, 0.0, 1.7), 0.0)
-    made = scan(RayScene(parts.mesh()), place, np.deg2rad(0.25), 100_000, (6,))
+    place = ScannerPose((0.0, 0.0, 1.7), 0.0)
+    made = simulate_scan(RayScene(parts.mesh()), place, np.deg2rad(0.25), 100_000, (6,))
     y = made.xyz[:, 1]
     # The panels end at 4.1; what hangs between them and the wall is mixed.
     air = (y > 4.12) & (y < 4.48)
@@ -114,8 +124,8 @@ def test_a_slanting_floor_and_a_corner_are_no_step_in_depth() -> None:
     parts = Parts()
     parts.box((-30.0, 30.0), (-30.0, 30.0), (-0.2, 0.0))
     parts.box((-30.0, 30.0), (20.0, 20.5), (-0.2, 9.0))
-    place = Place((0.0, 0.0, 1.7), 0.0)
-    xyz = scan(RayScene(parts.mesh()), place, np.deg2rad(0.25), 100_000, (6,)).xyz
+    place = ScannerPose((0.0, 0.0, 1.7), 0.0)
+    xyz = simulate_scan(RayScene(parts.mesh()), place, np.deg2rad(0.25), 100_000, (6,)).xyz
     off = np.minimum(np.abs(xyz[:, 2]), np.abs(xyz[:, 1] - 20.0))
     # The wall's top edge is mixed with nothing: beyond it is the sky.
     assert off.max() < 6 * NOISE
@@ -123,13 +133,13 @@ def test_a_slanting_floor_and_a_corner_are_no_step_in_depth() -> None:
 
 def test_returns_at_grazing_incidence_are_lost() -> None:
     """Along the far forecourt more rays reach the ground than come back."""
-    step, _ = plan(world(), [FORECOURT], 60_000)
+    step, _ = plan_stations(world(), [FORECOURT], 60_000)
     elevation = np.full((1, 4_000), -np.arcsin(0.05))
     azimuth = np.linspace(0, 2 * np.pi, 4_000)[None, :]
-    low = Place((0.0, -11.0, 0.2), 0.0)
+    low = ScannerPose((0.0, -11.0, 0.2), 0.0)
     returns = world().cast(low, azimuth, elevation)
     assert (np.isfinite(returns.range) & (returns.cosine < 0.06)).sum() > 2_000
-    made = scan(world(), low, step, 20_000, (4,))
+    made = simulate_scan(world(), low, step, 20_000, (4,))
     ray = made.xyz - low.position
     sine = -ray[:, 2] / np.linalg.norm(ray, axis=1)
     ground = np.abs(made.xyz[:, 2]) < 0.01

@@ -8,18 +8,20 @@ import pye57
 import pytest
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.scanner import LATTICE, NOISE
-from solidcloud.builder.synthetic.scenes import MadeScene, make_facade, make_town
+from solidcloud.builder.synthetic.scenes import GeneratedScene, make_facade, make_town
 from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
 from solidcloud.schemas.errors import BadRequestError, ScanError
 
 
-def points_of(scene: MadeScene) -> NDArray[np.float64]:
+def points_of(scene: GeneratedScene) -> NDArray[np.float64]:
     """All points of LAZ or LAS files, in the order of the files."""
     return np.concatenate([np.asarray(laspy.read(path).xyz) for path in scene.paths])
 
 
 @pytest.fixture(scope="module")
-def facade(tmp_path_factory: pytest.TempPathFactory) -> tuple[MadeScene, NDArray[np.float64], SceneTruth]:
+def facade(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[GeneratedScene, NDArray[np.float64], SceneTruth]:
     """The façade in 150,000 points, as one LAZ file."""
     scene = make_facade(tmp_path_factory.mktemp("facade") / "hall.laz", points=150_000)
     return scene, points_of(scene), read_truth(scene.truth)

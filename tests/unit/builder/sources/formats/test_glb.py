@@ -129,7 +129,7 @@ def test_parts_of_shared_meshes_are_bounded(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(ScanError, match="over 65536 primitives"):
         open_scans(write_square(tmp_path / "b.glb", scene(1, 70_000)))
     assert not parsed
-    monkeypatch.setattr(glb, "MOST_PARTS", 6)
+    monkeypatch.setattr(glb, "MAX_PARTS", 6)
     with pytest.raises(ScanError, match="over 6 nodes"):
         open_scans(write_square(tmp_path / "c.glb", scene(1, 1, meshless=6)))
     assert open_scans(write_square(tmp_path / "d.glb", scene(3, 2, meshless=3)))[0].declared_count == 4

@@ -7,7 +7,7 @@ import laspy
 import numpy as np
 import pytest
 from broken_scans import SEEDS
-from solidcloud.builder.sources.common.scan import Lattice
+from solidcloud.builder.sources.common.scan import SourceLattice
 from solidcloud.builder.sources.scan_files import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
 
@@ -40,7 +40,7 @@ def test_las_coordinates_are_raw_times_scale_plus_offset_to_the_bit(las: Path) -
 
 def test_las_gives_its_lattice_and_bounds(las: Path) -> None:
     (scan,) = open_scans(las)
-    assert scan.lattice == Lattice((0.01, 0.02, 0.005), (2322968.4731, 4770131.8677, 290.1455))
+    assert scan.lattice == SourceLattice((0.01, 0.02, 0.005), (2322968.4731, 4770131.8677, 290.1455))
     xyz = read_all(las)
     assert np.allclose(scan.bounds, [xyz.min(axis=0), xyz.max(axis=0)], rtol=0, atol=1e-6)
     assert np.array_equal(header_bounds(las), scan.bounds)

@@ -181,7 +181,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         SERVER + "kernels/motion/test_moving_avatar.py",
         *work("sweep", "sweep bounded"),
     ),
-    "server/kernels/nearest/nearest_by_scan.py": (SERVER + "queries/test_distance_by_scan.py",),
+    "server/kernels/nearest/nearest_by_scan.py": (SERVER + "queries/test_distance_per_scan.py",),
     "server/kernels/nearest/nearest_search.py": work("distance", "distance deep"),
     "server/kernels/nearest/nearest_resident.py": (
         SERVER + "queries/test_resident_distance.py",
@@ -204,7 +204,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("bounded deep", "collide bounded", "distance bounded"),
         *tangent("bounded"),
     ),
-    "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_motion.py",),
+    "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/motion/sweep_interval.py": work("sweep", "sweep bounded"),
     "server/kernels/core/voxel_tree.py": (SERVER + "kernels/core/test_voxel_tree.py",),

@@ -10,7 +10,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.voxels_in_reach import Reach
-from ..kernels.overlap.overlap import CLEAR, CONTACT, UNKNOWN, answer_resident, overlap_poses
+from ..kernels.overlap.overlap import CLEAR, CONTACT, UNKNOWN, overlap_poses
 from ..residency.coarse_bounds import settle
 from .context.anytime_search import collide_bounded
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
@@ -21,49 +21,8 @@ from .context.query_context import (
     in_unknown,
     kernel_poses,
     pieces,
-    refuse,
     to_units,
 )
-
-# Avatars of at most this many points are tested under the residency's lock in a request of one
-# pose: 20 µs for the 3,617 points of the walk. Larger ones could block other requests, and gain
-# little.
-QUICK_POINTS = 1 << 13
-
-
-def _answer_at_once(
-    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int, begin: float
-) -> CollideAnswers | None:
-    """Answer one pose in one kernel call; return None if a voxel in reach is not resident.
-
-    The voxels are nearly always resident. scripts/bench_walk measures the overhead of a call of one
-    pose.
-    """
-    residency = data.residency
-    rows, outside = np.empty(64, np.int64), np.zeros(1, bool)
-    verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
-    with residency.still():
-        fault, pose, found, needed = answer_resident(
-            poses,
-            avatar.arrays,
-            avatar.radius,
-            other_units,
-            data.arrays,
-            data.broad,
-            rows,
-            outside,
-            verdict,
-            counts,
-        )
-        if needed > 0:
-            residency.use(rows[:needed].tolist())
-    refuse(fault, pose, found)
-    if needed < 0:
-        return None
-    return CollideAnswers(
-        verdict, outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
-        hits=needed, resident=residency.resident, resident_bytes=residency.resident_bytes,
-    )  # fmt: skip
 
 
 def collide(
@@ -86,11 +45,6 @@ def collide(
     margin_units = to_units(margin, "margin")
     other_units = data.radius_units + margin_units
     k = len(array)
-    unseen = data.nothing_clear or len(data.unknown) > 0
-    if k == 1 and len(avatar.points) <= QUICK_POINTS and not unseen and budget.tolerance == 0:
-        answers = _answer_at_once(data, avatar, array, other_units, begin)
-        if answers is not None:
-            return answers
     residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
 
     def settled(reach: Reach) -> Reach:
@@ -111,7 +65,8 @@ def collide(
             seen = as_held(data, held)
             overlap_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
         spent.add(held)
-    if (data.nothing_clear or unseen) and len(avatar.points):  # a load may have proved the index wrong
+    # A load may have proved the index wrong by now.
+    if (data.nothing_clear or len(data.unknown)) and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     return CollideAnswers(

@@ -51,7 +51,7 @@ from .context.query_context import (
     pieces,
     to_units,
 )
-from .distance import signed_from_square
+from .context.signed_distance import signed_from_square
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
 # columns temporarily takes some three times as much. The wire's largest message holds an eighth.

@@ -15,10 +15,15 @@ from ..kernels.nearest.nearest_pair import Nearest
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.anytime_search import distance_bounded
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
-from .context.query_context import SceneData, as_held, find_proved_reach, kernel_poses, pieces, to_units
-from .context.signed_distance import distance_columns, signed_from_square, unknown_gaps
-
-__all__ = ["distance", "signed_from_square"]
+from .context.query_context import (
+    SceneData,
+    as_held,
+    find_proved_reach,
+    kernel_poses,
+    pieces,
+    to_units,
+)
+from .context.signed_distance import distance_columns, unknown_gaps
 
 
 def distance(

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 from ...schemas.wire.answers import SweepAnswers
 from ...schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
 from ..avatars.avatar_model import AvatarModel
-from .collide import collide
 from .contacts import contacts
 from .context.query_budget import QueryBudget
 from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
 from .raycast import raycast
+from .resident_fast_path import collide_fast
 from .sweep import sweep
 from .within import within
 
@@ -37,7 +37,7 @@ def _sweep(
 
 
 ENGINES: dict[str, Callable[..., Any]] = {
-    COLLIDE.name: collide,
+    COLLIDE.name: collide_fast,
     DISTANCE.name: distance,
     CONTACTS.name: contacts,
     SWEEP.name: _sweep,

@@ -18,9 +18,9 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.pose_transform import MAX_REACH_UNITS, check_poses
 from ..runtime.stop_flag import NO_STOP
-from .collide import collide
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
+from .resident_fast_path import collide_fast
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
@@ -94,7 +94,7 @@ def objects(
         if budget.spent:
             verdict[rows] = UNKNOWN
             continue
-        found = collide(data, model, placing.poses[rows], margin, budget._replace(tolerance=0.0))
+        found = collide_fast(data, model, placing.poses[rows], margin, budget._replace(tolerance=0.0))
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)

@@ -56,7 +56,7 @@ ALONE: dict[str, list[str]] = {
 HELPERS = {
     "server.simulation.effects.separation_cache": {"proximity", "contacts", "uncertainty"},
     "server.simulation.world.contact_probability": {"uncertainty"},
-    "server.queries.distance_by_scan": {"uncertainty"},
+    "server.queries.distance_per_scan": {"uncertainty"},
     "server.kernels.nearest.nearest_by_scan": {"uncertainty"},
     "server.archives.masked_archive": {"through"},
     "server.simulation.effects.bodies": {"objects", "crowd"},
@@ -170,7 +170,7 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
     assert {"server.scene", "server.queries.collide"} <= ours
     # What a frame is made of, and their order, are types; nothing that would simulate one.
     assert not {name for name in ours if name.startswith("server.simulation.effects")}
-    assert not {"server.simulation.world.collision_world", "server.queries.resident_motion", *HELPERS} & ours
+    assert not {"server.simulation.world.collision_world", *HELPERS} & ours
     for part in ("server.report", "server.zenoh_server", "server.zenoh_common", "server.zenoh_client",
                  "server.client", "server.cli", "builder.synthetic", "builder.sources",
                  "builder.pipeline"):  # fmt: skip

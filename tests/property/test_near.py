@@ -20,7 +20,7 @@ from solidcloud.schemas.wire.answers import DistanceAnswers
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.resident_distance import QUICK_REACH, near
+from solidcloud.server.queries.resident_fast_path import MAX_FAST_REACH, distance_fast
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
@@ -55,7 +55,7 @@ def both_ways(
     distance(data, avatar, poses, reach)
     for pose in poses:
         expected = distance(data, avatar, pose[None], reach)
-        assert_same(near(data, avatar, pose, reach), expected)
+        assert_same(distance_fast(data, avatar, pose, reach), expected)
         counted.nothing += bool(np.isinf(expected.signed_distance[0]))
         counted.touching += bool(expected.signed_distance[0] <= 0)
 
@@ -69,7 +69,7 @@ def both_ways(
     far=st.sampled_from([0.0, 5e5, 6.4e6]),
     scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
     step=st.sampled_from([archive_cases.BINARY_STEP, 1e-4, 1e-2]),
-    reach=st.sampled_from([0.0, 1e-3, 0.1, 0.5, QUICK_REACH, 3.0]),
+    reach=st.sampled_from([0.0, 1e-3, 0.1, 0.5, MAX_FAST_REACH, 3.0]),
     tree=TREES,
 )
 def test_one_pose_has_the_bits_of_distance(
@@ -107,7 +107,7 @@ def test_what_is_refused_is_refused_in_the_same_words(tmp_path: Path) -> None:
         for pose, reach in ((shear, 0.1), (mirror, 0.1), (gone, 0.1), (np.eye(4), -1.0), (np.eye(4), np.nan),
                             (np.eye(4), 1e3), (np.eye(3), 0.1), (np.diag([1.0, 1, 1, 2]), 0.1)):  # fmt: skip
             said = []
-            for ask in (lambda p, r: near(scene._data, avatar, p, r),
+            for ask in (lambda p, r: distance_fast(scene._data, avatar, p, r),
                         lambda p, r: distance(scene._data, avatar, p[None], r)):  # fmt: skip
                 with pytest.raises(SolidcloudError) as refused:
                     ask(pose, reach)

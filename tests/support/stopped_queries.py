@@ -8,15 +8,14 @@ from numpy.typing import NDArray
 from solidcloud.schemas.wire import questions
 from solidcloud.schemas.wire.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
-from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, ask_until_stopped
 from solidcloud.server.queries.context.query_context import SceneData, with_stop
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.distance_by_scan import gaps_by_scan
+from solidcloud.server.queries.distance_per_scan import separation_per_scan
 from solidcloud.server.queries.objects import objects
 from solidcloud.server.queries.raycast import raycast
-from solidcloud.server.queries.resident_distance import near
+from solidcloud.server.queries.resident_fast_path import collide_fast, distance_fast
 from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within
 
@@ -35,10 +34,10 @@ class Asked(NamedTuple):
     reach: float = 0.5
 
 
-def _ask(question: Any, k: int, a: Asked, budget: QueryBudget, *what: Any) -> Any:
-    data = with_stop(a.data, budget.stop)
+def _ask(engine: Any, k: int, a: Asked, budget: QueryBudget, *what: Any) -> Any:
+    data, question = with_stop(a.data, budget.stop), engine.__name__.removesuffix("_fast")
     return ask_until_stopped(
-        questions.QUESTIONS[question.__name__], k, budget, lambda: question(data, *what, budget=budget)
+        questions.QUESTIONS[question], k, budget, lambda: engine(data, *what, budget=budget)
     )
 
 
@@ -49,7 +48,7 @@ def _objects(a: Asked, budget: QueryBudget) -> ObjectsAnswers:
 
 
 def _collide(a: Asked, budget: QueryBudget, **more: Any) -> Any:
-    return _ask(collide, len(a.poses), a, budget._replace(**more), a.avatar, a.poses, a.margin)
+    return _ask(collide_fast, len(a.poses), a, budget._replace(**more), a.avatar, a.poses, a.margin)
 
 
 def _distance(a: Asked, budget: QueryBudget, **more: Any) -> Any:
@@ -59,7 +58,7 @@ def _distance(a: Asked, budget: QueryBudget, **more: Any) -> Any:
 def _near(a: Asked, budget: QueryBudget) -> Any:
     data = with_stop(a.data, budget.stop)
     return ask_until_stopped(
-        questions.DISTANCE, 1, budget, lambda: near(data, a.avatar, a.poses[0], a.reach, budget)
+        questions.DISTANCE, 1, budget, lambda: distance_fast(data, a.avatar, a.poses[0], a.reach, budget)
     )
 
 
@@ -84,8 +83,8 @@ QUESTIONS: dict[str, Callable[[Asked, QueryBudget], Any]] = {
 
 
 def gaps(a: Asked, budget: QueryBudget) -> Any:
-    """`gaps_by_scan` of the first pose."""
-    return gaps_by_scan(with_stop(a.data, budget.stop), a.avatar, a.poses[0], a.reach, 2, budget)
+    """`separation_per_scan` of the first pose."""
+    return separation_per_scan(with_stop(a.data, budget.stop), a.avatar, a.poses[0], a.reach, 2, budget)
 
 
 def assert_not_wrong(found: Any, truth: Any) -> None:

@@ -1,4 +1,4 @@
-"""Resident path of `distance`: one pose in one kernel call (`resident_distance.py`).
+"""Resident path of `distance`: one pose in one kernel call (`resident_fast_path.py`).
 
 It applies where all voxels in the pose's reach are resident. The kernel also converts the nearest
 pair to metres, with the formulas of `signed_distance.py` in the same order of operations; the bits are

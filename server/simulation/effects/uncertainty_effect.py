@@ -20,8 +20,8 @@ from ....schemas.wire.motion_messages import UncertaintyReport
 from ...archives.rigid_transform import under
 from ...avatars.avatar_model import make_avatar
 from ...queries.context.query_context import SceneData
-from ...queries.distance_by_scan import ANY_SCAN, gaps_by_scan
-from ...queries.resident_distance import near
+from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
+from ...queries.resident_fast_path import distance_fast
 from ..world.contact_probability import FARTHEST, each_alone, together
 from ..world.frame import Frame
 from .separation_cache import nearest, surely_farther
@@ -130,7 +130,7 @@ def _warm(data: SceneData) -> None:
     """
     nowhere = np.eye(4)
     nowhere[:3, 3] = MAX_COORDINATE / 2
-    gaps_by_scan(data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
+    separation_per_scan(data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)
 
 
 class UncertaintyRunner:
@@ -191,10 +191,10 @@ class UncertaintyRunner:
         inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin + UNIT
         pose = frame.pose if inverse is None else under(inverse, frame.pose[None])[0]
         if scans.one is None:
-            found = gaps_by_scan(each.data, avatar, pose, margin, len(scans.names), frame.budget)
+            found = separation_per_scan(each.data, avatar, pose, margin, len(scans.names), frame.budget)
             frame.world.count(found.node_visits, not found.exact)
-            return found.gaps, found.exact
-        answers = near(each.data, avatar, pose, margin, frame.budget)
+            return found.separations, found.exact
+        answers = distance_fast(each.data, avatar, pose, margin, frame.budget)
         frame.world.count(int(answers.node_visits[0]), not answers.exact[0])
         gap = float(answers.signed_distance[0])
         return {scans.one: gap} if gap <= margin else {}, bool(answers.exact[0])

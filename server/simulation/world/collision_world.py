@@ -24,8 +24,7 @@ from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import SceneData, with_stop
-from ...queries.resident_distance import near
-from ...queries.resident_motion import Probe, Swept
+from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from ...scene_interface import EVERYBODY
@@ -60,7 +59,7 @@ class _Held(threading.local):
 
     def __init__(self) -> None:
         self.seen: list[Seen] = []
-        self.probes: OrderedDict[int, Probe] = OrderedDict()
+        self.probes: OrderedDict[int, ResidentQueries] = OrderedDict()
         self.points = 0
 
 
@@ -150,14 +149,14 @@ class World:
             for each in seen:
                 each.opened.saw(user, avatar, _into(each, pose)[None], around)
 
-    def _probe(self, avatar: AvatarModel) -> Probe:
+    def _probe(self, avatar: AvatarModel) -> ResidentQueries:
         """This thread's probe of an avatar."""
         probes, key = self._held.probes, id(avatar.points)
         probe = probes.get(key)
         if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
             if probe is not None:
                 self._held.points -= len(probes.pop(key).avatar.points)
-            probe = probes[key] = Probe(avatar)
+            probe = probes[key] = ResidentQueries(avatar)
             self._held.points += len(avatar.points)
             while len(probes) > 1 and (len(probes) > _PROBES or self._held.points > _PROBED_POINTS):
                 _, oldest = probes.popitem(last=False)
@@ -184,7 +183,7 @@ class World:
         pose_to: Pose,
         tolerance: float = 1e-6,
         budget: QueryBudget = EXACT,
-    ) -> Swept:
+    ) -> SweepResult:
         """Return when the avatar first touches any archive on its way between two poses.
 
         See server/queries/sweep.py. Of several archives: `lower` is the least, and `upper` and
@@ -196,7 +195,7 @@ class World:
             self.count(swept.visits, swept.unknown)
             return swept
         with self as seen:
-            found: Swept | None = None
+            found: SweepResult | None = None
             for number, each in enumerate(seen):
                 swept = probe.sweep(
                     each.data, _into(each, pose_from), _into(each, pose_to), tolerance, budget
@@ -279,7 +278,7 @@ class World:
         found: DistanceAnswers | None = None
         with self as seen:
             for each in seen:
-                answers = near(each.data, avatar, _into(each, pose), reach, budget)
+                answers = distance_fast(each.data, avatar, _into(each, pose), reach, budget)
                 self._count_of(answers)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
@@ -361,7 +360,7 @@ def _out(seen: Seen, place: NDArray[np.float64]) -> Vec:
     return place if pose is None else moved(pose, place[None])[0]
 
 
-def _carried(swept: Swept, seen: Seen, number: int) -> Swept:
+def _carried(swept: SweepResult, seen: Seen, number: int) -> SweepResult:
     """What an archive says of a motion, in the world."""
     if swept.avatar is None or swept.cloud is None:
         return swept._replace(archive=number)

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from ....schemas.wire.answers import DistanceAnswers, Verdict
-from ...queries.resident_motion import Swept
+from ...queries.resident_fast_path import SweepResult
 from .frame import Vec
 
 
@@ -30,7 +30,7 @@ def comes_first(
     return False
 
 
-def earlier(one: Swept, other: Swept) -> Swept:
+def earlier(one: SweepResult, other: SweepResult) -> SweepResult:
     """Return what two archives together say of a motion."""
     other_first = comes_first(other.upper, (other.cloud, other.avatar), one.upper, (one.cloud, one.avatar))
     first = other if other_first else one

@@ -19,8 +19,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.queries.context.query_context import make_scene_data
-from solidcloud.server.queries.resident_distance import near
-from solidcloud.server.queries.resident_motion import Probe
+from solidcloud.server.queries.resident_fast_path import ResidentQueries, distance_fast
 from solidcloud.server.residency.voxel_cache import Residency
 from solidcloud.server.residency.voxel_store import Store
 from solidcloud.server.scene import Scene
@@ -93,7 +92,7 @@ def poses_at(places: np.ndarray) -> np.ndarray:
 
 def probed(scene: Scene, at: np.ndarray, question: str) -> Any:
     """What a frame of a simulation asks about one avatar, pose by pose."""
-    probe, data = Probe(scene.avatar("ball", "")), scene._data
+    probe, data = ResidentQueries(scene.avatar("ball", "")), scene._data
     verdicts = []
     for pose in poses_at(at):
         if question == "collide":
@@ -103,7 +102,7 @@ def probed(scene: Scene, at: np.ndarray, question: str) -> Any:
             before[:3, 3] += 0.3
             verdicts.append(probe.sweep(data, before, pose, 1e-6, EXACT).verdict)
         else:
-            verdicts.append(near(data, scene.avatar("ball", ""), pose, 0.05).verdict[0])
+            verdicts.append(distance_fast(data, scene.avatar("ball", ""), pose, 0.05).verdict[0])
     return SimpleNamespace(verdict=np.array(verdicts))
 
 

@@ -160,8 +160,12 @@ def test_a_frame_whose_distance_is_not_exact_is_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No voxel is missing; the search of one of two archives ended before the nearest point was known."""
-    near = module.near
-    monkeypatch.setattr(module, "near", lambda *asked: structs.replace(near(*asked), exact=np.zeros(1, bool)))
+    ask = module.distance_fast
+    monkeypatch.setattr(
+        module,
+        "distance_fast",
+        lambda *asked: structs.replace(ask(*asked), exact=np.zeros(1, bool)),
+    )
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
     with (

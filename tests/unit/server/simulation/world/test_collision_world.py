@@ -17,7 +17,7 @@ from solidcloud.schemas.scene.effect_options import Contacts
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.resident_motion import Probe, Swept
+from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects import contacts_effect
@@ -159,8 +159,8 @@ def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_loo
 ) -> None:
     """A graze just before the contact: all was looked at."""
     case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    found = Swept(Verdict.CONTACT, 0.2, 0.6, exact=False, unknown=unknown)
-    monkeypatch.setattr(Probe, "sweep", lambda *_: found)
+    found = SweepResult(Verdict.CONTACT, 0.2, 0.6, exact=False, unknown=unknown)
+    monkeypatch.setattr(ResidentQueries, "sweep", lambda *_: found)
     with Scene.open(case.archive) as scene:
         for world in (world_of((scene, None)), world_of((scene, None), (scene, THERE))):
             world.begin(NO_STOP)

@@ -19,32 +19,32 @@ from .context.query_context import (
     to_units,
 )
 
-# Number of points whose scan is not stored, or whose number belongs to no scan.
+# Key of points whose scan is not stored, or whose number belongs to no scan.
 ANY_SCAN = -1
 
 
-class ScanGaps(NamedTuple):
+class ScanSeparations(NamedTuple):
     """Separation of each scan from an avatar.
 
-    gaps: least signed separation [m] of each scan within the margin, by its row in
+    separations: least signed one [m] of each scan within the margin, by its row in
     `SceneInfo.sources`.
     exact: whether everything in reach was examined.  node_visits, point_tests: cost.
     """
 
-    gaps: dict[int, float]
+    separations: dict[int, float]
     exact: bool
     node_visits: int = 0
     point_tests: int = 0
 
 
-def gaps_by_scan(
+def separation_per_scan(
     data: SceneData,
     avatar: AvatarModel,
     pose: ArrayLike,
     margin: float,
     scans: int,
     budget: QueryBudget = EXACT,
-) -> ScanGaps:
+) -> ScanSeparations:
     """Compute the least signed separation of every scan from the avatar under a pose (4, 4).
 
     Scans farther than `margin` [m] are omitted.
@@ -59,11 +59,10 @@ def gaps_by_scan(
     poses = kernel_poses(np.asarray(pose)[None])
     margin_units = to_units(margin, "margin")
     units = data.radius_units + margin_units
-    reach = find_proved_reach(
-        data, avatar, poses, units, budget, CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    )
+    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    reach = find_proved_reach(data, avatar, poses, units, budget, spent)
     if not len(avatar.points):
-        return ScanGaps({}, True)
+        return ScanSeparations({}, True)
     nearer = Nearer(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
     counts, exact = np.zeros(3, np.int64), True
     for _, rows, part in pieces(reach, data.residency, budget.share, budget.stop):
@@ -79,5 +78,5 @@ def gaps_by_scan(
             )
     exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
     found = np.flatnonzero(nearer.gaps < np.inf).tolist()
-    gaps = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}
-    return ScanGaps(gaps, bool(exact), int(counts[1]), int(counts[2]))
+    separations = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}
+    return ScanSeparations(separations, bool(exact), int(counts[1]), int(counts[2]))

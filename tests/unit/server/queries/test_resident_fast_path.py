@@ -15,11 +15,11 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
 from solidcloud.server.kernels.motion import sweep_resident as kernel
-from solidcloud.server.queries import resident_motion as module
+from solidcloud.server.queries import resident_fast_path as module
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData
-from solidcloud.server.queries.resident_motion import Probe, Swept
+from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
 from solidcloud.server.queries.sweep import sweep
 
 Poses = NDArray[np.float64]
@@ -27,7 +27,9 @@ COUNT = 12
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 
-def same(probe: Probe, data: SceneData, first: Poses, last: Poses, tolerance: float = 1e-6) -> list[Swept]:
+def same(
+    probe: ResidentQueries, data: SceneData, first: Poses, last: Poses, tolerance: float = 1e-6
+) -> list[SweepResult]:
     """What a probe says of motions (k, 4, 4), asserted to be what `sweep` says."""
     answers = sweep(data, probe.avatar, first, last, tolerance=tolerance)
     found = []
@@ -58,7 +60,7 @@ def test_motions_and_poses_are_answered_to_the_last_bit(
     first, last = judged_sweeps.motions(rng, points, avatar.points, COUNT, 0.3, 0.2, 0.5)
     last[::3, :3, :3] = first[::3, :3, :3]
     last[1] = first[1]
-    probe = Probe(avatar)
+    probe = ResidentQueries(avatar)
     with judged_sweeps.opened(case) as fresh:  # loads
         loaded = [probe.sweep(fresh, one, other, 1e-6, EXACT) for one, other in zip(first, last, strict=True)]
     with judged_sweeps.opened(case) as data:
@@ -79,13 +81,13 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
         first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 4, 0.3, 0.2, 0.5)
         assert all(
             each.verdict == Verdict.CLEAR
-            for each in same(Probe(make_avatar(np.zeros((0, 3)))), data, first, last)
+            for each in same(ResidentQueries(make_avatar(np.zeros((0, 3)))), data, first, last)
         )
         long = last.copy()
         long[:, :3, 3] += [60.0, 0, 0]
         large = first.copy()
         large[:, :3, :3] *= 2.0
-        probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+        probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
         same(probe, data, first, long)
         same(probe, data, large, large)
         spent = QueryBudget(visits=0)
@@ -101,7 +103,7 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
 
 @pytest.mark.interpreted
 def test_the_pose_between_is_the_sweeps(tmp_path: Path, rng: np.random.Generator) -> None:
-    probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
     first, last = judged_sweeps.motions(rng, np.zeros((1, 3)), probe.avatar.points, 8, 0.3, 2.0, 2.0)
     for one, other in zip(first, last, strict=True):
         for fraction in (0.0, 0.3, 1.0):
@@ -119,7 +121,7 @@ def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
     points = synthetic_scans.make_scan("plane", 5, 200)
     case = archive_cases.build(tmp_path, points)
     first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
-    probe, left = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
+    probe, left = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
 
     def counted(*arguments: Any, **options: Any) -> Any:
         left.append(arguments)
@@ -152,7 +154,7 @@ def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
     points = synthetic_scans.make_scan("plane", 5, 200)
     case = archive_cases.build(tmp_path, points)
     first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
-    probe, left = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
+    probe, left = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
 
     def counted(*arguments: Any, **options: Any) -> Any:
         left.append(arguments)
@@ -169,7 +171,7 @@ def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
 
 @pytest.mark.interpreted
 def test_a_pose_between_holds_where_the_origin_comes_off_again(rng: np.random.Generator) -> None:
-    probe = Probe(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
+    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
     said = set()
     for size in (0.1, 1e3, 1e6):
         for _ in range(20):

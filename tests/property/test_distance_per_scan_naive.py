@@ -19,7 +19,7 @@ from point_clouds import KINDS, TREES, cloud
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget
-from solidcloud.server.queries.distance_by_scan import gaps_by_scan
+from solidcloud.server.queries.distance_per_scan import separation_per_scan
 
 SCANS = 4
 
@@ -70,15 +70,17 @@ def test_the_least_gap_of_each_scan_is_that_of_the_definition(
         with closing(case.store):
             for pose in poses:
                 expected = judge(case, avatar, pose, margin)
-                found = gaps_by_scan(case.data, avatar, pose, margin, SCANS)
-                assert found.exact and list(found.gaps) == sorted(expected)
-                for number, gap in found.gaps.items():
+                found = separation_per_scan(case.data, avatar, pose, margin, SCANS)
+                assert found.exact and list(found.separations) == sorted(expected)
+                for number, gap in found.separations.items():
                     assert gap == pytest.approx(expected[number], rel=1e-14, abs=1e-15)
                 for visits in (0, 20, 100):
-                    budget = gaps_by_scan(case.data, avatar, pose, margin, SCANS, QueryBudget(visits=visits))
-                    assert not budget.exact or budget.gaps == found.gaps
-                    for number, gap in budget.gaps.items():
-                        assert gap >= found.gaps[number]
+                    budget = separation_per_scan(
+                        case.data, avatar, pose, margin, SCANS, QueryBudget(visits=visits)
+                    )
+                    assert not budget.exact or budget.separations == found.separations
+                    for number, gap in budget.separations.items():
+                        assert gap >= found.separations[number]
 
 
 def test_a_cache_too_small_for_all_at_once_changes_no_gap(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -89,11 +91,11 @@ def test_a_cache_too_small_for_all_at_once_changes_no_gap(tmp_path: Path, rng: n
         largest = max(case.data.residency.bytes_of([row]) for row in range(len(case.data.broad.keys)))
         small = contact_cases.tight(case, 2 * largest)
         for pose in archive_cases.near_poses(rng, points, avatar.points, 5, 0.1):
-            whole = gaps_by_scan(case.data, avatar, pose, 0.1, 3)
-            assert gaps_by_scan(small.data, avatar, pose, 0.1, 3) == whole
-            assert whole.exact and len(whole.gaps) == 3
+            whole = separation_per_scan(case.data, avatar, pose, 0.1, 3)
+            assert separation_per_scan(small.data, avatar, pose, 0.1, 3) == whole
+            assert whole.exact and len(whole.separations) == 3
             answers = contacts(case.data, avatar, pose[None], 1, 0.1)
-            assert min(whole.gaps.values()) == pytest.approx(answers.signed_distance[0], rel=1e-14)
+            assert min(whole.separations.values()) == pytest.approx(answers.signed_distance[0], rel=1e-14)
             small.data.residency.check()
 
 
@@ -105,6 +107,6 @@ def test_a_wall_that_one_scan_saw_costs_few_tests_of_points(tmp_path: Path, rng:
     pose = archive_cases.pose_of(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.array([0.5, 0.5, 0.04]))
     case = contact_cases.open_case(tmp_path, wall, rng, scan_count=1, voxel=2.0)
     with closing(case.store):
-        found = gaps_by_scan(case.data, avatar, pose, 0.04, 1)
+        found = separation_per_scan(case.data, avatar, pose, 0.04, 1)
         all_pairs = contacts(case.data, avatar, pose[None], 0, 0.04)
     assert found.exact and found.point_tests < all_pairs.point_tests[0] / 3

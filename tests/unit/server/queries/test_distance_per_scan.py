@@ -1,4 +1,4 @@
-"""`gaps_by_scan`: one wall that two scans saw, and what is missing."""
+"""`separation_per_scan`: one wall that two scans saw, and what is missing."""
 
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 from effect_frames import flip_a_byte
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import QueryBudget
-from solidcloud.server.queries.distance_by_scan import ANY_SCAN, ScanGaps, gaps_by_scan
+from solidcloud.server.queries.distance_per_scan import ANY_SCAN, ScanSeparations, separation_per_scan
 
 BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
 POSE = archive_cases.pose_of(np.eye(3), np.array([0.5, 0.0, 0.13]))
@@ -28,42 +28,44 @@ def test_each_scan_has_its_nearest_pair(tmp_path: Path) -> None:
     spheres = (BALL.points + POSE[:3, 3])[:, None] - case.points
     gaps = np.linalg.norm(spheres, axis=2).min(axis=0) - 0.11
     with closing(case.store):
-        found = gaps_by_scan(case.data, BALL, POSE, 0.15, 2)
+        found = separation_per_scan(case.data, BALL, POSE, 0.15, 2)
     assert found.exact and found.point_tests > 0
     for scan in (0, 1):
-        assert found.gaps[scan] == pytest.approx(gaps[case.numbers == scan].min(), abs=1e-7)
-    assert found.gaps[0] != found.gaps[1]
+        assert found.separations[scan] == pytest.approx(gaps[case.numbers == scan].min(), abs=1e-7)
+    assert found.separations[0] != found.separations[1]
 
 
 @pytest.mark.interpreted
 def test_beyond_the_margin_a_scan_is_not_there(tmp_path: Path) -> None:
     case = row(tmp_path)
     with closing(case.store):
-        both = gaps_by_scan(case.data, BALL, POSE, 0.15, 2).gaps
+        both = separation_per_scan(case.data, BALL, POSE, 0.15, 2).separations
         less = float(np.mean(list(both.values())))
         first = min(both, key=both.__getitem__)
-        assert gaps_by_scan(case.data, BALL, POSE, less, 2).gaps == {first: both[first]}
-        assert gaps_by_scan(case.data, BALL, POSE, 0.0, 2).gaps == {}
+        assert separation_per_scan(case.data, BALL, POSE, less, 2).separations == {first: both[first]}
+        assert separation_per_scan(case.data, BALL, POSE, 0.0, 2).separations == {}
 
 
 @pytest.mark.interpreted
 def test_what_is_missing_or_not_looked_at_is_not_exact(tmp_path: Path) -> None:
     case = row(tmp_path)
     with closing(case.store):
-        assert gaps_by_scan(case.data, make_avatar(np.empty((0, 3))), POSE, 0.1, 2) == ScanGaps({}, True)
-        assert not gaps_by_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(visits=1)).exact
-        late = gaps_by_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(deadline=0.0))
-        assert late == ScanGaps({}, False)
+        assert separation_per_scan(case.data, make_avatar(np.empty((0, 3))), POSE, 0.1, 2) == ScanSeparations(
+            {}, True
+        )
+        assert not separation_per_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(visits=1)).exact
+        late = separation_per_scan(case.data, BALL, POSE, 0.1, 2, QueryBudget(deadline=0.0))
+        assert late == ScanSeparations({}, False)
         lost = case.data._replace(unknown_everywhere=True)
-        assert not gaps_by_scan(lost, BALL, POSE, 0.1, 2).exact
+        assert not separation_per_scan(lost, BALL, POSE, 0.1, 2).exact
 
 
 @pytest.mark.interpreted
 def test_a_number_that_no_scan_has_harms_nothing(tmp_path: Path) -> None:
     case = row(tmp_path)
     with closing(case.store):
-        both = gaps_by_scan(case.data, BALL, POSE, 0.15, 2).gaps
-        fewer = gaps_by_scan(case.data, BALL, POSE, 0.15, 1).gaps
+        both = separation_per_scan(case.data, BALL, POSE, 0.15, 2).separations
+        fewer = separation_per_scan(case.data, BALL, POSE, 0.15, 1).separations
     assert fewer == {0: both[0], ANY_SCAN: both[1]}
 
 
@@ -82,8 +84,10 @@ def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp
             placed = avatar.points @ pose[:3, :3].T + pose[:3, 3]
             gaps = np.linalg.norm(placed[:, None] - points, axis=2).min(axis=0) - 0.03
             expected = {s: gaps[case.numbers == s].min() for s in range(3)}
-            found = gaps_by_scan(case.data, avatar, pose, 0.05, 3)
-            assert found.gaps == pytest.approx({s: g for s, g in expected.items() if g <= 0.05}, abs=2e-4)
+            found = separation_per_scan(case.data, avatar, pose, 0.05, 3)
+            assert found.separations == pytest.approx(
+                {s: g for s, g in expected.items() if g <= 0.05}, abs=2e-4
+            )
             visits.append(found.node_visits)
             tests.append(found.point_tests)
     assert visits == [105, 108, 76] and tests == [2432, 2400, 1248]
@@ -105,9 +109,9 @@ def test_of_an_avatar_larger_than_nodes_of_the_scan_all_pairs_count_at_the_same_
             avatar = make_avatar(row, 0.02)
             pose = archive_cases.pose_of(np.eye(3), np.array([0.4, 0.6, 0.15]))
             gaps = np.linalg.norm((row + pose[:3, 3])[:, None] - points, axis=2).min(axis=0) - 0.03
-            found = gaps_by_scan(case.data, avatar, pose, 0.1, 3)
+            found = separation_per_scan(case.data, avatar, pose, 0.1, 3)
             least = {s: gaps[case.numbers == s].min() for s in range(3)}
-            assert found.gaps == pytest.approx({s: g for s, g in least.items() if g <= 0.1}, abs=2e-4)
+            assert found.separations == pytest.approx({s: g for s, g in least.items() if g <= 0.1}, abs=2e-4)
             assert found.exact
             visits.append(found.node_visits)
             tests.append(found.point_tests)
@@ -120,10 +124,10 @@ def test_a_voxel_that_cannot_be_read_is_missing_and_the_rest_is_found(tmp_path: 
     case = contact_cases.open_case(tmp_path, points, np.random.default_rng(3), voxel=0.5)
     flip_a_byte(case.store.archive.folder, (0, 0, 0))
     with closing(case.store):
-        found = gaps_by_scan(case.data, BALL, POSE, 0.15, 2)
-        assert not found.exact and set(found.gaps) == {0, 1}
+        found = separation_per_scan(case.data, BALL, POSE, 0.15, 2)
+        assert not found.exact and set(found.separations) == {0, 1}
         away = archive_cases.pose_of(np.eye(3), np.array([0.9, 0.0, 0.13]))
-        assert gaps_by_scan(case.data, BALL, away, 0.02, 2).exact
+        assert separation_per_scan(case.data, BALL, away, 0.02, 2).exact
 
 
 @pytest.mark.interpreted
@@ -139,9 +143,9 @@ def test_in_voxels_far_along_one_axis_each_scan_is_found_at_the_same_cost(tmp_pa
         spheres = (BALL.points + pose[:3, 3])[:, None] - points
         gaps = np.linalg.norm(spheres, axis=2).min(axis=0) - 0.11
         with closing(case.store):
-            found = gaps_by_scan(case.data, BALL, pose, 0.05, 2)
+            found = separation_per_scan(case.data, BALL, pose, 0.05, 2)
         expected = {scan: gaps[case.numbers == scan].min() for scan in (0, 1)}
-        assert found.gaps == pytest.approx(expected, abs=2e-4)
+        assert found.separations == pytest.approx(expected, abs=2e-4)
         visits.append(found.node_visits)
         tests.append(found.point_tests)
     assert visits == [25, 18, 17] and tests == [256, 384, 416]

@@ -1,0 +1,270 @@
+"""Questions about one pose whose voxels are all resident: one kernel call, without the general machinery.
+
+The answers equal those of the engines bit for bit, cost counters included, except engine_seconds.
+The engine is called instead if
+
+- a voxel in reach has to be loaded, or more than MAX_FAST_VOXELS are in reach,
+- the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds MAX_FAST_REACH,
+- the request has a budget of time or visits, or
+- a scan was left out of the archive, or a load proved its index wrong (not for `sweep`).
+
+The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half of
+the overhead of such a call (scripts/bench_walk). Other requests wait meanwhile, so the limits keep it
+to some tens of microseconds.
+"""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
+from ..avatars.avatar_model import AvatarModel
+from ..kernels.motion import sweep_resident as _swept
+from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
+from ..kernels.nearest import nearest_resident as _nearest
+from ..kernels.nearest.nearest_resident import nearest_resident
+from ..kernels.overlap.overlap import answer_resident
+from ..residency.voxel_cache import Residency
+from .collide import collide
+from .context.query_budget import EXACT, QueryBudget
+from .context.query_context import SceneData, kernel_poses, refuse, to_units
+from .distance import distance
+from .sweep import sweep
+
+Vec = NDArray[np.float64]
+Pose = NDArray[np.float64]
+
+# 20 µs for the 3,617 points of the walk. Larger avatars could block other requests, and gain little.
+MAX_FAST_POINTS = 1 << 13
+# With nothing near, the time grows with the number of voxels in reach [voxels], [m].
+MAX_FAST_VOXELS, MAX_FAST_REACH = 64, 2.0
+# Verdicts by value: constructing one from a number would double the Python time of a query.
+_VERDICTS = tuple(Verdict(value) for value in range(3))
+_CLEAR, _CONTACT = int(Verdict.CLEAR), int(Verdict.CONTACT)
+# Columns of the results of `nearest_resident` and `sweep_resident`.
+_SIGNED, _LOWER = slice(_nearest.SIGNED, _nearest.LOWER), slice(_nearest.LOWER, _nearest.NORMAL)
+_NORMAL, _AVATAR = slice(_nearest.NORMAL, _nearest.AVATAR), slice(_nearest.AVATAR, _nearest.CLOUD)
+_CLOUD = slice(_nearest.CLOUD, None)
+_SWEPT_BOUNDS, _SWEPT_AVATAR = slice(_swept.AVATAR), slice(_swept.AVATAR, _swept.CLOUD)
+_SWEPT_CLOUD = slice(_swept.CLOUD, None)
+# This many consecutive queries of `ResidentQueries` in the same voxels count as one use of them.
+_QUERIES_PER_USE = 16
+
+
+def collide_fast(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
+) -> CollideAnswers:
+    """Answer `collide`, in one kernel call if there is one pose and the fast path applies."""
+    begin = time.perf_counter()
+    array = kernel_poses(poses)
+    if (
+        len(array) != 1
+        or len(avatar.points) > MAX_FAST_POINTS
+        or budget.tolerance
+        or budget.limited
+        or _has_unknown(data)
+    ):
+        return collide(data, avatar, array, margin, budget)
+    residency = data.residency
+    rows, outside = np.empty(MAX_FAST_VOXELS, np.int64), np.zeros(1, bool)
+    verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
+    other_units = data.radius_units + to_units(margin, "margin")
+    with residency.still():
+        fault, pose, found, needed = answer_resident(
+            array,
+            avatar.arrays,
+            avatar.radius,
+            other_units,
+            data.arrays,
+            data.broad,
+            rows,
+            outside,
+            verdict,
+            counts,
+        )
+        if needed > 0:
+            residency.use(rows[:needed].tolist())
+    refuse(fault, pose, found)
+    if needed < 0:
+        return collide(data, avatar, array, margin, budget)
+    return CollideAnswers(
+        verdict, outside, counts[0], counts[1], counts[2], engine_seconds=time.perf_counter() - begin,
+        hits=needed, resident=residency.resident, resident_bytes=residency.resident_bytes,
+    )  # fmt: skip
+
+
+def distance_fast(
+    data: SceneData, avatar: AvatarModel, pose: ArrayLike, reach: float, budget: QueryBudget = EXACT
+) -> DistanceAnswers:
+    """Answer `distance` for one pose (4, 4), in one kernel call if the fast path applies."""
+    begin = time.perf_counter()
+    poses = kernel_poses(np.asarray(pose)[None])
+    if reach > MAX_FAST_REACH or len(avatar.points) > MAX_FAST_POINTS or budget.limited or _has_unknown(data):
+        return distance(data, avatar, poses, reach, budget)
+    reach_units = to_units(reach, "reach")
+    residency = data.residency
+    rows, result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_nearest.COLUMNS)
+    with residency.still():
+        fault, at, found, needed, outside, visits, tests = nearest_resident(
+            poses, avatar.arrays, avatar.radius, data.radius_units, reach_units, float(reach), data.arrays,
+            data.broad, rows, result,
+        )  # fmt: skip
+        if needed > 0:
+            residency.use(rows[:needed].tolist(), scan=budget.scan)
+    refuse(fault, at, found)
+    if needed < 0:
+        return distance(data, avatar, poses, reach, budget)
+    signed, row = result[_SIGNED], result[None]
+    return DistanceAnswers(
+        verdict=np.array([_CONTACT if signed[0] <= 0.0 else _CLEAR], np.uint8), signed_distance=signed,
+        lower=result[_LOWER], upper=signed.copy(), exact=np.ones(1, bool), witness_avatar=row[:, _AVATAR],
+        witness_cloud=row[:, _CLOUD], normal=row[:, _NORMAL], outside=np.array([outside]),
+        voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
+        point_tests=np.array([tests], np.uint32), engine_seconds=time.perf_counter() - begin, hits=needed,
+        resident=residency.resident, resident_bytes=residency.resident_bytes,
+    )  # fmt: skip
+
+
+def _has_unknown(data: SceneData) -> bool:
+    """Return whether a scan was left out anywhere, or a load proved the index wrong."""
+    return data.nothing_clear or len(data.unknown) > 0
+
+
+class SweepResult(NamedTuple):
+    """First contact of an avatar on a motion. Fields as for one motion in `SweepAnswers`.
+
+    avatar, cloud: (3,) the witness's centres, world [m]; None unless the verdict is CONTACT.
+    archive: number of the touched archive in its scene.
+    exact: whether nothing else can be touched before: no point moves farther than the tolerance
+    between `lower` and `upper`.
+    visits: node visits.  missing: voxels that could not be examined.
+    unknown: whether something in reach could not be or was not examined. If it is false, a contact
+    that is not exact may be a graze, with everything examined.
+    """
+
+    verdict: Verdict
+    lower: float
+    upper: float
+    avatar: Vec | None = None
+    cloud: Vec | None = None
+    archive: int = 0
+    exact: bool = True
+    visits: int = 0
+    missing: int = 0
+    unknown: bool = False
+
+
+class ResidentQueries:
+    """Queries of one avatar, frame after frame. Not thread-safe: it reuses its arrays.
+
+    avatar: the avatar's model.
+    """
+
+    __slots__ = (
+        "_again",
+        "_box",
+        "_counts",
+        "_outside",
+        "_poses",
+        "_result",
+        "_rows",
+        "_small",
+        "_used",
+        "_verdict",
+        "avatar",
+    )
+
+    def __init__(self, avatar: AvatarModel) -> None:
+        self.avatar = avatar
+        self._small = 0 < len(avatar.points) <= MAX_FAST_POINTS
+        self._box = box_of(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
+        self._poses = np.empty((1, 4, 4))
+        self._rows, self._result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_swept.COLUMNS)
+        self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
+        self._counts = np.zeros((3, 1), np.uint32)
+        self._used: list[int] = []
+        self._again = 0
+
+    def sweep(
+        self, data: SceneData, pose_from: Pose, pose_to: Pose, tolerance: float, budget: QueryBudget
+    ) -> SweepResult:
+        """Find when the avatar first touches between two poses (4, 4); errors as for `sweep`."""
+        if self._small and not budget.limited:
+            avatar, residency, rows, result = self.avatar, data.residency, self._rows, self._result
+            with residency.still():
+                needed, verdict, visits, _, _ = sweep_resident(
+                    pose_from, pose_to, avatar.arrays, avatar.radius, data.radius_units, self._box, data.arrays,
+                    data.broad, data.unknown, data.nothing_clear, max(tolerance, budget.tolerance), rows, result,
+                )  # fmt: skip
+                if needed > 0:
+                    self._use(residency, rows[:needed].tolist())
+            if needed >= 0:
+                lower, upper, speed = result[_SWEPT_BOUNDS].tolist()
+                if verdict != Verdict.CONTACT:
+                    clear = verdict == _CLEAR
+                    return SweepResult(
+                        _VERDICTS[verdict], lower, upper, None, None, 0, clear, visits, 0, not clear
+                    )
+                own, cloud = result[_SWEPT_AVATAR].copy(), result[_SWEPT_CLOUD].copy()
+                exact = upper == lower or speed * (upper - lower) <= max(tolerance, budget.tolerance)
+                unknown = not exact and _has_unknown(data)
+                return SweepResult(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown)
+        answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, budget=budget)
+        verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
+        touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
+        # A budget may leave places unexamined too.
+        partial = budget.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
+        return SweepResult(
+            verdict,
+            float(answers.lower[0]),
+            float(answers.upper[0]),
+            answers.witness_avatar[0] if touches else None,
+            answers.witness_cloud[0] if touches else None,
+            0,
+            exact,
+            int(answers.node_visits[0]),
+            missing,
+            missing > 0 or verdict == Verdict.UNKNOWN or (not exact and partial),
+        )
+
+    def _use(self, residency: Residency, rows: list[int]) -> None:
+        """Record a use of voxels, once for _QUERIES_PER_USE consecutive queries in the same voxels.
+
+        Recording takes as long as a tenth of a query.
+        """
+        if rows != self._used or not self._again:
+            residency.use(rows)
+            self._used, self._again = rows, _QUERIES_PER_USE
+        self._again -= 1
+
+    def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
+        """Return verdict and node visits of `collide` for a pose (4, 4)."""
+        if self._small and not budget.limited and not _has_unknown(data):
+            avatar, residency, rows = self.avatar, data.residency, self._rows
+            poses, verdict, counts = self._poses, self._verdict, self._counts
+            poses[0] = pose
+            verdict[0] = _CLEAR
+            counts[:] = 0
+            with residency.still():
+                fault, at, found, needed = answer_resident(
+                    poses, avatar.arrays, avatar.radius, data.radius_units, data.arrays, data.broad, rows,
+                    self._outside, verdict, counts,
+                )  # fmt: skip
+                if needed > 0:
+                    self._use(residency, rows[:needed].tolist())
+            refuse(fault, at, found)
+            if needed >= 0:
+                return _VERDICTS[verdict[0]], int(counts[1, 0])
+        answers = collide(data, self.avatar, pose[None], budget=budget)
+        return _VERDICTS[answers.verdict[0]], int(answers.node_visits[0])
+
+    def between(self, origin: Vec, pose_from: Pose, pose_to: Pose, fraction: float) -> tuple[Pose, bool]:
+        """Return the pose at a fraction of a motion, and whether a sweep's proof holds for it.
+
+        origin: (3,) of the dataset, world [m].
+        """
+        pose = np.empty((4, 4))
+        same = pose_between(pose_from, pose_to, fraction, self._box, origin, pose)
+        return pose, bool(same)

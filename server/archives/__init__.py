@@ -2,5 +2,5 @@
 
 May import server.avatars, server.observability, server.queries, server.queries.context,
 server.residency, server.runtime, builder.voxel, schemas.
-Begin with placed_archive.py, then archive_generation.py.
+Begin with placed_archive.py.
 """

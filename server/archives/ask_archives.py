@@ -7,14 +7,14 @@ it left. With one archive at the identity, nothing is transformed or merged.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.wire.answers import ContactsAnswers, Cost
+from ...schemas.wire.answers import ContactsAnswers, Cost, Part
 from ...schemas.wire.columns import join
 from ...schemas.wire.questions import QUESTIONS, Question
 from ..avatars.avatar_model import AvatarModel
@@ -22,9 +22,8 @@ from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stop
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.path import part_stop, path_question
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from .archive_generation import Opened
 from .merge_answers import carried, limited, merged
-from .placed_archive import PlacedArchive
+from .placed_archive import ArchiveGeneration, PlacedArchive
 from .rigid_transform import Pose
 from .scene_info import sources_asked
 
@@ -35,7 +34,7 @@ Rows = slice | None
 Ask = Callable[[SceneData, QueryBudget, Rows], _A]
 # What asks an archive, and whether what is looked at is passed by (`QueryBudget.scan`).
 Prepared = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
-Prepare = Callable[[PlacedArchive, Opened], Prepared]
+Prepare = Callable[[PlacedArchive, ArchiveGeneration], Prepared]
 # Pairs that `contacts` lists where no limit is given.
 LISTED = 100
 
@@ -108,7 +107,7 @@ def in_budget(ask: Ask[_A], data: SceneData, budget: QueryBudget, visits: NDArra
 
 def make_legs(
     archives: Sequence[PlacedArchive],
-    taken: Sequence[Opened],
+    taken: Sequence[ArchiveGeneration],
     radius_model: str | None,
     poses: NDArray[np.float64],
 ) -> list[Leg]:
@@ -170,3 +169,30 @@ def along(
         return together
 
     return ask, asks[0][1]
+
+
+class PathParts(Iterator[Part]):
+    """Parts of a path. Reads the generations that they come from until the last part, or until it is closed."""
+
+    def __init__(self, parts: Generator[Part, None, None], taken: Sequence[ArchiveGeneration]) -> None:
+        """Release `taken`, generations that were taken for these parts, at the end."""
+        self._parts = parts
+        self._taken = list(taken)
+
+    def __next__(self) -> Part:
+        try:
+            return next(self._parts)
+        except BaseException:  # the end, too
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the path."""
+        taken, self._taken = self._taken, []
+        if taken:
+            self._parts.close()
+            for opened in taken:
+                opened.release()
+
+    def __del__(self) -> None:
+        self.close()

@@ -5,22 +5,41 @@ of a scan, on one lattice, answer as the archive of the whole. One at a pose is 
 inverse(pose) @ pose of the avatar, in float64, rounded once: exact for a signed permutation and
 shifts that float64 adds exactly, within some nanometres for others. Witnesses are carried back the
 same way.
+
+A generation is what one opening of the archive's folder found. A reload opens the next one and swaps
+them; requests in progress are answered from the one that they began with. A generation counts its
+readers, and its files and memory are released with the last one.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...schemas.errors import BadRequestError, BusyError
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.archive.voxel_grid import MAX_COORDINATE
+from ...schemas.errors import BadRequestError, BusyError, CorruptError
 from ...schemas.wire.messages import ReloadAnswer, SceneInfo
+from ..avatars.avatar_model import AvatarModel
+from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
+from ..queries.engines import warm_engines
 from ..queries.raycast import make_directions
+from ..residency.arena import ArenaBuffer
+from ..residency.coarse_bounds import Coarse
+from ..residency.eviction import make_policy, prefetches
+from ..residency.index_proof import Bounds
+from ..residency.motion_prediction import Neighbourhood, User
+from ..residency.prefetch import Prefetcher
 from ..residency.voxel_cache import Residency
 from ..residency.voxel_store import OpenStore, Store
-from .archive_generation import Opened
+from ..runtime.threads import start_thread
 from .archive_info import describe
 from .rigid_transform import archive_pose, inverse_of, moved, turned, under
 
@@ -29,6 +48,211 @@ _Floats = NDArray[np.float64]
 # How long a reload waits for the last reader of the generation before the one that is current [s]:
 # with a third one opened meanwhile, three budgets would be in memory.
 RELOAD_WAIT = 10.0
+# A request of more poses passes through the archive: it says nothing about where a user is.
+_MAX_USER_POSES = 8
+# Limits of a user's request, as in kernels/core/pose_transform.py: others will be refused. Margin or
+# reach [m], scale of the avatar.
+_MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
+_NUMBER = (float, int)  # `float | int` would be made anew for each request
+# Voxels within this distance of a user are prefetched, however far its requests reach [m].
+_USER_REACH = 1.0
+# Share of the budget for coarse bounds, 6 KB a voxel.
+_COARSE_SHARE = 1 / 16
+# Radius models whose tables are cached. Clients choose them by name, so there may be any number.
+_MAX_MODELS = 64
+
+
+class ArchiveGeneration:
+    """An archive's store and resident voxels, open until the last reader has released it. Thread-safe.
+
+    data: what every query reads, with the scene's default radius model.
+    radius_model: returns the same with a radius model, by its name; None: the default. It raises
+    BadRequestError for an invalid model, or one that the archive does not store.
+    Only readers may use both.
+    kept: data that other modules store with this generation, by their names.
+    number: of this archive's generations, from 0.  ended: set once the last reader has released it
+    and everything is closed.
+    """
+
+    data: SceneData
+    radius_model: Callable[[str | None], SceneData]
+
+    def __init__(
+        self,
+        store: Store,
+        budget_bytes: int,
+        policy: str = "lru",
+        number: int = 0,
+        took: Callable[[float], None] | None = None,
+        radius_model: str | None = None,
+    ) -> None:
+        """Open a generation with a first reader, the scene, which must `release` it.
+
+        policy: see eviction.py.  took: called with the duration of each load [s].
+        radius_model: the default; None: the archive's single radius. Raises BadRequestError for one
+        that the archive does not store.
+        """
+        self.store, self.number = store, number
+        self.kept: dict[str, Any] = {}
+        self.ended = threading.Event()
+        bounds, lattice = Bounds(store.archive), store.archive.header.lattice
+        around = Neighbourhood(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
+        ahead = prefetches(policy)
+        coarse = _make_coarse(store, budget_bytes) if ahead else None
+        if coarse is not None:
+            budget_bytes -= coarse.bytes
+        residency = Residency(store, budget_bytes, make_policy(policy, budget_bytes, around.nearness))
+        residency.took = took
+        if coarse is not None:
+            arena, remember = residency.buffer.arena, coarse.remember
+            residency.loaded = lambda row, where: remember(row, arena, where)
+        # Without room for all voxels, the room is for those that requests load.
+        fill = _coarse_filling(coarse, store) if coarse is not None and coarse.holds_all else None
+        self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
+        figure = make_scene_data(store.archive, residency, bounds, coarse)
+        data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
+        self.data = data
+
+        @lru_cache(_MAX_MODELS)
+        def with_model(text: str | None) -> SceneData:
+            return data if text is None else with_radius_model(figure, store.archive, text)
+
+        self.radius_model = with_model
+        self._lock = threading.Lock()
+        self._readers = 1
+        self._ending: threading.Thread | None = None
+
+    def take(self) -> bool:
+        """Become a reader until `release`. Return False if the last reader has released it."""
+        with self._lock:
+            if self._readers:
+                self._readers += 1
+                return True
+        return False
+
+    def release(self) -> None:
+        """Stop reading. The last reader closes the files and frees the memory."""
+        with self._lock:
+            self._readers -= 1
+            if self._readers:
+                return
+        if self.prefetcher.running:
+            # Ending waits for its thread. This thread may be collecting garbage, and hold any lock.
+            self._ending = start_thread("end", self._end)
+        else:
+            self._end()
+
+    def join(self) -> None:
+        """Wait until everything is closed if the last reader has left; not during garbage collection."""
+        if self._ending is not None:
+            self._ending.join()
+
+    def _end(self) -> None:
+        """Stop loading and close everything."""
+        self.prefetcher.stop()
+        del self.data, self.radius_model, self.prefetcher, self.kept
+        self.store.close()
+        self.ended.set()
+
+    def __enter__(self) -> Self:
+        """Return this generation, which the caller reads."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release it."""
+        self.release()
+
+    def taken(self) -> Self:
+        """Return this generation with one more reader. Raises BadRequestError if it has ended."""
+        if not self.take():
+            raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
+        return self
+
+    def record_user(self, user: User, avatar: AvatarModel, poses: Any, around: float) -> bool:
+        """Record where a user is: the last of a few poses of its avatar.
+
+        around: margin or reach, in addition to the radii of avatar and scan [m].
+        Return whether the voxels in reach are used in passing: there are many poses, or the user
+        teleported.
+        """
+        # Other arguments will be refused, or have no voxels to prefetch.
+        if not isinstance(poses, np.ndarray) or poses.dtype != np.float64 or poses.shape[1:] != (4, 4):
+            return False
+        if not len(poses) or not len(avatar.points):
+            return False
+        if not isinstance(around, _NUMBER) or not 0 <= around <= _MAX_AROUND:
+            return False
+        if len(poses) > _MAX_USER_POSES:
+            return True
+        (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = poses[-1].tolist()
+        x, y, z = avatar.arrays.center[0].tolist()
+        x, y, z = a * x + b * y + c * z + tx, d * x + e * y + f * z + ty, g * x + h * y + i * z + tz
+        scale = math.sqrt(a * a + d * d + g * g)
+        limit = MAX_COORDINATE
+        if not (
+            _MIN_SCALE <= scale <= 1 / _MIN_SCALE and abs(x) <= limit and abs(y) <= limit and abs(z) <= limit
+        ):
+            return False
+        near = around if around < _USER_REACH else _USER_REACH
+        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
+        return self.prefetcher.saw(user, (x, y, z), reach)
+
+    def warm(self) -> None:
+        """Run every query once, with a load, so that no request waits for compilation."""
+        archive = self.store.archive
+        self.data.bounds.trees()  # before the first load, which tightens them
+        row = int(np.argmin(self.store.sizes))
+        corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
+        x, y, z = place = archive.header.lattice.to_world(corner).tolist()
+        self.prefetcher.warm((x, y, z))
+        warm_engines(self.data, place)
+
+    def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:
+        """Load the voxels that `other` has in memory, the last used ones if not all fit; until `stopped`.
+
+        After a reload, users do not wait for the disk where they are.
+        """
+        residency, keys = self.data.residency, self.store.archive.voxels["key"]
+        wanted = other.store.archive.voxels["key"][other.data.residency.recent()]
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        rows, room = [], residency.buffer.total_bytes
+        for row in at[keys[at] == wanted][::-1].tolist():
+            room -= residency.bytes_of([row])
+            if room < 0:
+                break
+            rows.append(row)
+        for row in reversed(rows):
+            if stopped():
+                return
+            with residency.hold([row]):
+                pass
+
+
+def _make_coarse(store: Store, budget_bytes: int) -> Coarse | None:
+    """Return storage for the coarse bounds of all voxels, or of as many as their share of the budget holds.
+
+    None if the budget has no room for any beside the largest voxel.
+    """
+    voxels, largest = len(store.sizes), int(store.sizes.max(initial=0))
+    most = min(int(budget_bytes * _COARSE_SHARE), budget_bytes - ArenaBuffer.rounded(largest))
+    coarse = Coarse(voxels, most)
+    return coarse if len(coarse.arrays.count) else None
+
+
+def _coarse_filling(coarse: Coarse, store: Store) -> Callable[[], bool]:
+    """Return a function that stores the coarse bounds of one more voxel; False if none is left."""
+    missing = coarse.missing()
+
+    def fill_one() -> bool:
+        row = next(missing, None)
+        if row is None:
+            return False
+        # An unreadable voxel has none; the request that loads it gets the error.
+        with suppress(CorruptError, OSError):
+            coarse.fill(store, row)
+        return True
+
+    return fill_one
 
 
 class PlacedArchive:
@@ -60,7 +284,7 @@ class PlacedArchive:
         self.pose = archive_pose(pose)
         self.inverse = None if self.pose is None else inverse_of(self.pose)
         self._opened = self._open(store, 0)
-        self._before: Opened | None = None  # replaced; some requests may still read it
+        self._before: ArchiveGeneration | None = None  # replaced; some requests may still read it
         self._info = describe(store, name)
         self._closed = False
         self._lock = threading.Lock()
@@ -88,11 +312,13 @@ class PlacedArchive:
             store.close()
             raise
 
-    def _open(self, store: Store, number: int) -> Opened:
+    def _open(self, store: Store, number: int) -> ArchiveGeneration:
         """Return a generation, opened as this archive is served."""
-        return Opened(store, self._budget_bytes, self._policy, number, self._took, self._radius_model)
+        return ArchiveGeneration(
+            store, self._budget_bytes, self._policy, number, self._took, self._radius_model
+        )
 
-    def take(self) -> Opened:
+    def take(self) -> ArchiveGeneration:
         """Return the current generation for a `with`, which releases it. BadRequestError when closed."""
         while True:
             opened = self._opened
@@ -136,7 +362,7 @@ class PlacedArchive:
                 raise
             try:
                 new.warm()
-                new.follow(old, lambda: self._closed)
+                new.load_voxels_of(old, lambda: self._closed)
                 with self._lock:
                     if self._closed:
                         raise BadRequestError(f"{self.name}: closed while it was reloaded: open it again")

@@ -9,8 +9,8 @@ from msgspec import structs
 from ...schemas.wire.messages import SceneInfo, StatsAnswer
 from ...schemas.wire.stats import AvatarStats, Counters
 from ..observability.request_stats import RequestStats, times_of
-from .archive_generation import Opened
 from .archive_info import listed_sources
+from .placed_archive import ArchiveGeneration
 from .rigid_transform import Pose, moved_boxes, under
 
 
@@ -58,7 +58,7 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
     )
 
 
-def sources_asked(opened: Opened) -> int:
+def sources_asked(opened: ArchiveGeneration) -> int:
     """How many sources an archive lists, of the generation that is asked: those of the next archive stand behind."""
     count = opened.kept.get("sources")
     if count is None:
@@ -73,7 +73,12 @@ def _box(box: list[list[float]], pose: Pose | None) -> Any:
 
 
 def make_stats(
-    name: str, each: Sequence[Opened], metrics: RequestStats, avatars: AvatarStats, *, keys: bool = False
+    name: str,
+    each: Sequence[ArchiveGeneration],
+    metrics: RequestStats,
+    avatars: AvatarStats,
+    *,
+    keys: bool = False,
 ) -> StatsAnswer:
     """Return what a scene keeps in memory, all archives together, and what it answered so far.
 
@@ -109,7 +114,7 @@ def make_stats(
     )
 
 
-def _resident_keys(opened: Opened) -> list[int]:
+def _resident_keys(opened: ArchiveGeneration) -> list[int]:
     """Return the keys of an archive's resident voxels."""
     rows = np.flatnonzero(opened.data.residency.where[:, 0] >= 0)
     keys: list[int] = opened.store.archive.voxels["key"][rows].tolist()

@@ -1,20 +1,24 @@
 """The function that answers each question of schemas/wire/questions.py.
 
-Each takes the data of one archive, the avatar if the question is about one, the arguments of the request in their
-order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
+Each takes the data of one archive, the avatar if the question is about one, the arguments of the
+request in their order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ...schemas.wire.answers import SweepAnswers
-from ...schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
-from ..avatars.avatar_model import AvatarModel
+from ...schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, QUESTIONS, RAYCAST, SWEEP, WITHIN
+from ..avatars.avatar_model import AvatarModel, make_avatar
+from ..residency.coarse_bounds import settle
+from .collide import collide
 from .contacts import contacts
-from .context.query_budget import QueryBudget
-from .context.query_context import SceneData
+from .context.query_budget import EXACT, QueryBudget
+from .context.query_context import SceneData, check_request
 from .distance import distance
 from .objects import objects
 from .raycast import raycast
@@ -45,3 +49,33 @@ ENGINES: dict[str, Callable[..., Any]] = {
     WITHIN.name: within,
     OBJECTS.name: objects,
 }
+
+
+def warm_engines(data: SceneData, place: Sequence[float]) -> None:
+    """Run every query of an archive once, so that every kernel is compiled or read from its file.
+
+    place: a scan point, world [m]; its voxel is loaded.
+    """
+    pose = np.eye(4)[None]
+    pose[0, :3, 3] = place
+    points, poses = pose[:, :3, 3].copy(), np.concatenate([pose, pose])
+    avatar = make_avatar([[0.0, 0, 0], [0.1, 0, 0]])
+    groups = np.full(2, 0xFFFFFFFF, np.uint32)
+    samples: dict[str, Any] = {
+        "avatar": avatar, "poses": pose, "pose_from": pose, "pose_to": pose, "points": points, "origins": points,
+        "directions": np.array([[0.0, 0.0, 1.0]]), "reach": 0.01,
+    }  # fmt: skip
+    # Queries with a limit have kernels of their own. These limits are hardly ever reached.
+    limits = QueryBudget(tolerance=1e-3, visits=1 << 20), QueryBudget(deadline=time.perf_counter() + 3600.0)
+    for budget in (EXACT, *limits):
+        collide(data, avatar, poses, 0.0, budget)  # several poses take other kernels than one
+        for question in (one for one in QUESTIONS.values() if not one.whole):
+            arguments = [samples[name] for name in question.arguments if name in question.required]
+            tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
+            ENGINES[question.name](data, *arguments, budget=budget._replace(tolerance=tolerance))
+        objects(data, [avatar, avatar], poses, groups, groups, budget=budget)
+    if data.coarse is not None:
+        # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
+        reach = check_request(data, avatar, pose, data.radius_units)
+        nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+        settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)

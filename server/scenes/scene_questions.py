@@ -13,10 +13,9 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.questions import Question
 from ...schemas.wire.requests import make_objects, make_poses, make_vectors
-from ..archives.archive_generation import HeldParts, Opened
-from ..archives.ask_archives import Prepared, Rows, along, ask_each, make_legs, rows_of
+from ..archives.ask_archives import PathParts, Prepared, Rows, along, ask_each, make_legs, rows_of
 from ..archives.merge_answers import limited
-from ..archives.placed_archive import PlacedArchive
+from ..archives.placed_archive import ArchiveGeneration, PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..avatars.client_avatars import Avatars
 from ..observability.request_stats import RequestStats
@@ -87,7 +86,7 @@ class SceneQuestions(QueryMethods):
         with self._alone.take() as opened:
             data, budget = _terms(opened, **options)
             avatar = self.avatar(name, client)
-            if opened.saw((client, name), avatar, last, _around(question, given)):
+            if opened.record_user((client, name), avatar, last, _around(question, given)):
                 budget = budget._replace(scan=True)
             answers = ask_until_stopped(
                 question, _count(last), budget, lambda: engine(data, avatar, *given[1:], budget=budget)
@@ -107,7 +106,7 @@ class SceneQuestions(QueryMethods):
                 f"{len(arrays[0])} poses to begin at and {len(arrays[-1])} to end at: expected as many"
             )
 
-        def prepare(archive: PlacedArchive, opened: Opened) -> Prepared:
+        def prepare(archive: PlacedArchive, opened: ArchiveGeneration) -> Prepared:
             own = [archive.poses_in(each) for each in arrays]
 
             def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
@@ -116,7 +115,7 @@ class SceneQuestions(QueryMethods):
                 )
                 return answers
 
-            return ask, opened.saw((client, name), avatar, own[-1], _around(question, given))
+            return ask, opened.record_user((client, name), avatar, own[-1], _around(question, given))
 
         answers = ask_each(self.archives, question, len(arrays[0]), prepare, **options)
         self._metrics.answered(client, name, answers)
@@ -141,7 +140,7 @@ class SceneQuestions(QueryMethods):
                 f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected as many"
             )
 
-        def prepare(archive: PlacedArchive, _: Opened) -> Prepared:
+        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> Prepared:
             own = [
                 archive.directions_in(each) if name in question.directions else archive.points_in(each)
                 for each, name in zip(arrays, names, strict=True)
@@ -167,7 +166,7 @@ class SceneQuestions(QueryMethods):
         groups = np.array([item.group for item in items], np.uint32)
         masks = np.array([item.mask for item in items], np.uint32)
 
-        def prepare(archive: PlacedArchive, _: Opened) -> Prepared:
+        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> Prepared:
             # Objects of no group meet nobody but the scene.
             first = archive is self.archives[0]
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
@@ -204,7 +203,7 @@ class SceneQuestions(QueryMethods):
         part is the answer of its question for [first, first + n) of `total`. All poses are checked
         before the first part.
         """
-        taken: list[Opened] = []
+        taken: list[ArchiveGeneration] = []
         try:
             for archive in self.archives:
                 taken.append(archive.take())
@@ -222,7 +221,7 @@ class SceneQuestions(QueryMethods):
 
             most = largest_part(op, parameters)
             ahead = (self.path_threads(client), 2 * threads) if threads > 1 else (None, 1)
-            return HeldParts(path_parts(ask_held, total, most, *ahead), taken)
+            return PathParts(path_parts(ask_held, total, most, *ahead), taken)
         except BaseException:
             for opened in taken:
                 opened.release()
@@ -230,7 +229,7 @@ class SceneQuestions(QueryMethods):
 
 
 def _terms(
-    opened: Opened,
+    opened: ArchiveGeneration,
     tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,

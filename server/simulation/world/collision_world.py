@@ -17,8 +17,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
-from ...archives.archive_generation import Opened
-from ...archives.placed_archive import PlacedArchive
+from ...archives.placed_archive import ArchiveGeneration, PlacedArchive
 from ...archives.rigid_transform import moved, turned, under
 from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts
@@ -44,7 +43,7 @@ SPARSE = 3.0
 class Seen(NamedTuple):
     """An archive as it is held now. data: under the scene's radius model."""
 
-    opened: Opened
+    opened: ArchiveGeneration
     data: SceneData
     placed: PlacedArchive
 
@@ -147,7 +146,7 @@ class World:
         """A user is there: what is around it is loaded before it is asked for. around: beyond the avatar [m]."""
         with self as seen:
             for each in seen:
-                each.opened.saw(user, avatar, _into(each, pose)[None], around)
+                each.opened.record_user(user, avatar, _into(each, pose)[None], around)
 
     def _probe(self, avatar: AvatarModel) -> ResidentQueries:
         """This thread's probe of an avatar."""

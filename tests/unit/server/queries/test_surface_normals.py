@@ -18,8 +18,8 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.schemas.kernels.normal_codes import LINE, NONE, THICK, decode_normal
-from solidcloud.server.archives.archive_generation import Opened
 from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.surface_normals import Normals, warm
@@ -37,9 +37,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @contextmanager
-def serving(archive: Path, budget_bytes: int = 1 << 24) -> Iterator[Opened]:
+def serving(archive: Path, budget_bytes: int = 1 << 24) -> Iterator[ArchiveGeneration]:
     """An archive, open."""
-    opened = Opened(Store(archive), budget_bytes)
+    opened = ArchiveGeneration(Store(archive), budget_bytes)
     try:
         yield opened
     finally:
@@ -49,7 +49,7 @@ def serving(archive: Path, budget_bytes: int = 1 << 24) -> Iterator[Opened]:
 @contextmanager
 def asked(
     archive: Path, budget_bytes: int = 1 << 24, most_bytes: int | None = None
-) -> Iterator[tuple[Opened, Normals]]:
+) -> Iterator[tuple[ArchiveGeneration, Normals]]:
     """An archive, open, and its normals."""
     with serving(archive, budget_bytes) as opened:
         yield opened, Normals(opened.store, opened.data, most_bytes)
@@ -69,7 +69,7 @@ def largest(archive: Path) -> int:
 
 
 def judged(
-    opened: Opened, points: NDArray[np.float64]
+    opened: ArchiveGeneration, points: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.float64], int, naive_normals.Found | None]]:
     """Each source point as it is stored, world [m], its voxel's row, and what numpy finds there."""
     header = opened.store.archive.header
@@ -286,7 +286,7 @@ def test_what_is_stored_is_what_is_found_at_first_use(
         first = [normals.code(place, REACH) for place in places]
         own = opened.store.sizes
         assert normals.estimated == len(places) and len(set(first)) > 20
-    opened = Opened(Store(case.archive, normals=REACH), 2 * int(own.max()))
+    opened = ArchiveGeneration(Store(case.archive, normals=REACH), 2 * int(own.max()))
     try:
         normals = Normals(opened.store, opened.data)
         leaves = opened.store.archive.voxels["leaves"]
@@ -323,7 +323,7 @@ def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path:
         whole = [normals.code(place, REACH) for place in left]
     found = []
     for reach in (None, REACH):
-        opened = Opened(Store(case.archive, without, normals=reach), 1 << 24)
+        opened = ArchiveGeneration(Store(case.archive, without, normals=reach), 1 << 24)
         try:
             assert opened.store.with_normals == (reach is not None)
             normals = Normals(opened.store, opened.data)

@@ -9,7 +9,7 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from solidcloud.server.archives.archive_generation import Opened
+from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.voxels_in_reach import Reach
 from solidcloud.server.queries.collide import collide
@@ -32,9 +32,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def opened(folder: Path) -> Iterator[Opened]:
+def opened(folder: Path) -> Iterator[ArchiveGeneration]:
     """The archive, nothing of it loaded."""
-    opened = Opened(Store(folder), 1 << 24)
+    opened = ArchiveGeneration(Store(folder), 1 << 24)
     yield opened
     opened.release()
 
@@ -50,7 +50,7 @@ def reach_of(bounds: Bounds, poses: int, rng: np.random.Generator) -> Reach:
     )  # fmt: skip
 
 
-def test_rows_to_prove_are_those_the_index_hides(opened: Opened, rng: np.random.Generator) -> None:
+def test_rows_to_prove_are_those_the_index_hides(opened: ArchiveGeneration, rng: np.random.Generator) -> None:
     bounds = opened.data.bounds
     v = len(bounds.proved)
     before = bounds.unproved
@@ -72,7 +72,7 @@ def test_rows_to_prove_are_those_the_index_hides(opened: Opened, rng: np.random.
 
 
 def test_rows_to_prove_of_many_poses_take_little_memory_and_look_at_the_stop(
-    opened: Opened, rng: np.random.Generator
+    opened: ArchiveGeneration, rng: np.random.Generator
 ) -> None:
     bounds = opened.data.bounds
     reach = reach_of(bounds, 400_000 // len(bounds.proved), rng)
@@ -88,7 +88,7 @@ def test_rows_to_prove_of_many_poses_take_little_memory_and_look_at_the_stop(
     assert bounds.rows_to_prove(reach, bounds.unproved, stop) == []
 
 
-def test_a_voxel_proved_meanwhile_is_not_settled(opened: Opened) -> None:
+def test_a_voxel_proved_meanwhile_is_not_settled(opened: ArchiveGeneration) -> None:
     bounds = opened.data.bounds
     rows = np.arange(5)
     assert bounds.unsettled(rows, bounds.unproved).all()
@@ -100,7 +100,7 @@ def test_a_voxel_proved_meanwhile_is_not_settled(opened: Opened) -> None:
 
 
 def test_a_ray_begins_again_where_another_request_proves_a_voxel_meanwhile(
-    opened: Opened, monkeypatch: pytest.MonkeyPatch
+    opened: ArchiveGeneration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The voxel's box may have been read half: by the time its proof is looked at, all are proved."""
     from solidcloud.server.queries.raycast import raycast
@@ -127,7 +127,7 @@ def test_a_ray_begins_again_where_another_request_proves_a_voxel_meanwhile(
 
 
 def test_what_the_index_has_in_reach_is_loaded_first_where_there_is_a_deadline(
-    opened: Opened, monkeypatch: pytest.MonkeyPatch
+    opened: ArchiveGeneration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data, loads = opened.data, list[int]()
     bounds, load = data.bounds, data.residency._store.load
@@ -156,7 +156,9 @@ def test_what_the_index_has_in_reach_is_loaded_first_where_there_is_a_deadline(
     assert loads == [*likely, *doubted]
 
 
-def test_warming_compiles_what_a_proof_takes(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warming_compiles_what_a_proof_takes(
+    opened: ArchiveGeneration, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from solidcloud.server.residency import index_proof as proof
 
     tightened, tighten = list[int](), proof.tighten

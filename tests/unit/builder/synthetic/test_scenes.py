@@ -116,7 +116,7 @@ def test_refusals_say_what_was_expected(tmp_path: Path) -> None:
     (tmp_path / "full" / "something").touch()
     with pytest.raises(BadRequestError, match="new or an empty folder"):
         make_town(tmp_path / "full", points=2_000)
-    with pytest.raises(ScanError, match="not the truth of a made scene"):
+    with pytest.raises(ScanError, match="not the truth of a generated scene"):
         read_truth_of(tmp_path, "{}")
     with pytest.raises(ScanError, match="cannot be read"):
         read_truth(tmp_path / "nowhere.truth.json")

@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import dataclass, field
 
-from ..schemas.archive.index import MAX_NORMAL_REACH, NORMAL_REACH
+from ..schemas.archive.normal_reach import MAX_NORMAL_REACH, NORMAL_REACH
 from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError

@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..schemas.archive.archive import Archive
-from ..schemas.archive.index import Header
-from ..schemas.archive.index_file import write_index
-from ..schemas.archive.shard import SHARD_FOLDER
+from ..schemas.archive.archive_writer import write_index
+from ..schemas.archive.index import SHARD_FOLDER, Header
 from ..schemas.archive.voxel_grid import Lattice
 from ..schemas.archive.vtkhdf import PREVIEW_NAME
 from ..schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError

@@ -93,8 +93,8 @@ COMMANDS = ("server/cli", "server/report")
 DOORS = {
     "h5py": (
         "schemas/process/new_file.py",
-        "schemas/archive/shard.py",
-        "schemas/archive/index_file.py",
+        "schemas/archive/archive_writer.py",
+        "schemas/archive/archive.py",
         "schemas/archive/vtkhdf.py",
     ),
     "zstandard": ("schemas/archive/zstd_frame.py",),
@@ -129,7 +129,6 @@ FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names
 MOST_LINES = 400
 # Longer files, with their lines: a file here may only become shorter, and none may be added.
 LONG = {
-    "schemas/archive/index.py": 410,
     "builder/plan/build_plan.py": 417,
     "builder/spool/spool.py": 427,
     "builder/voxel/dense_voxel.py": 438,

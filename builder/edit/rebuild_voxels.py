@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.index import Header, RadiusNow, Source
-from ...schemas.archive.index_file import write_index
-from ...schemas.archive.shard import SHARD_FOLDER
+from ...schemas.archive.archive_writer import write_index
+from ...schemas.archive.index import SHARD_FOLDER, Header, RadiusNow, Source
 from ...schemas.archive.voxel_grid import voxel_coordinates
 from ...schemas.errors import CorruptError
 from ..config import RADIUS_SAMPLE

@@ -18,9 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.index import Header, Source
-from ...schemas.archive.index_file import INDEX_NAME
-from ...schemas.archive.shard import SHARD_FOLDER
+from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ...schemas.process.new_file import sync_folder

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.archive.archive_writer import write_shard
 from ...schemas.archive.codec import encode_voxel
-from ...schemas.archive.normal_reach import normal_reach
+from ...schemas.archive.index import shard_name
+from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
-from ...schemas.archive.shard import shard_name, write_shard
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.process.interrupts import check
 from ..config import BuildConfig, shard_points
@@ -135,7 +136,7 @@ def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxe
                 voxel_normals,
             )  # most builds have no use for its kernels, and do not load them
 
-            square = normal_reach(unit.config.normal_reach, unit.lattice.step, len(points.local))
+            square = squared_reach(unit.config.normal_reach, unit.lattice.step, len(points.local))
             points = points._replace(normal=voxel_normals(points.local, square))
         voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
         del points

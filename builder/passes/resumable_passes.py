@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ...schemas.archive.index import VOXEL_DTYPE
-from ...schemas.archive.shard import SHARD_FOLDER, file_checksum
+from ...schemas.archive.archive_writer import file_checksum
+from ...schemas.archive.index import SHARD_FOLDER, VOXEL_DTYPE
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.errors import BadRequestError, ScanError
 from ..config import BuildConfig

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import OpenRecord
-from ...schemas.archive.normal_reach import normal_reach
+from ...schemas.archive.index import SHARD_FOLDER
+from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
-from ...schemas.archive.shard import SHARD_FOLDER
 from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.process.interrupts import check
 from ..kernels.neighbours.enclosure import last_loose_node
@@ -243,7 +243,7 @@ def normal_faults(archive: Archive, row: int) -> list[str]:
 
     header = archive.header
     voxel, links = archive.read_voxel(row)
-    square = normal_reach(header.normal_reach, header.lattice.step, len(voxel.points))
+    square = squared_reach(header.normal_reach, header.lattice.step, len(voxel.points))
     found = voxel_normals(voxel_points(voxel, links).astype(np.int32), square)
     wrong = int(np.count_nonzero(found != voxel.normal))
     if not wrong:

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...schemas.archive.index_file import INDEX_NAME
-from ...schemas.archive.shard import SHARD_FOLDER
+from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ...schemas.process.new_file import sync_folder

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.shard import file_checksum
+from ...schemas.archive.archive_writer import file_checksum
 from ...schemas.archive.voxel_grid import Lattice, voxel_coordinates
 from ...schemas.errors import CorruptError
 from ...schemas.process.interrupts import check

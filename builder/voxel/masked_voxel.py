@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import OPTIONAL_COLUMNS, encode_voxel
 from ...schemas.archive.index import Header
-from ...schemas.archive.normal_reach import normal_reach
+from ...schemas.archive.normal_reach import squared_reach
 from ..config import BuildConfig
 from .dense_voxel import BuiltVoxel
 from .point_radius import voxel_points
@@ -41,7 +41,7 @@ def build_rest(header: Header, key: int, points: VoxelPoints, stays: NDArray[np.
     if header.normals:
         from .point_normals import voxel_normals  # most archives have no normals
 
-        square = normal_reach(header.normal_reach, header.lattice.step, len(left.local))
+        square = squared_reach(header.normal_reach, header.lattice.step, len(left.local))
         left = left._replace(normal=voxel_normals(left.local, square))
     voxel = build_voxel(key, left, header.lattice.voxel_steps, _config(header))
     low, high = left.local.min(axis=0).astype(np.int64), left.local.max(axis=0).astype(np.int64)

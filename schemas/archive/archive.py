@@ -1,7 +1,7 @@
-"""Reader of archives: folders with `index.h5` and `shards/`. index_file.py and shard.py write them.
+"""Reader of archives: folders with `index.h5` and `shards/`. archive_writer.py writes them.
 
-FORMAT.md documents the same; change both together. Records are read by offsets, so that neither
-HDF5's lock nor its parser stands between a server and a record.
+FORMAT.md documents the same; change both together. HDF5 reads the index. Records are read by
+offsets, so that neither HDF5's lock nor its parser stands between a server and a record.
 """
 
 import contextlib
@@ -10,7 +10,9 @@ import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import CorruptError, FormatError
 from ..process.interrupts import check
@@ -23,12 +25,22 @@ from .codec import (
     open_tree,
     point_dtype,
 )
-from .index import read_header
-from .index_file import INDEX_NAME, read_columns
-from .index_limits import check_voxels
-from .shard import DATASETS, SHARD_FOLDER, SHARD_NAME
+from .index import (
+    DATASETS,
+    FORMAT_VERSIONS,
+    INDEX_NAME,
+    SHARD_FOLDER,
+    SHARD_NAME,
+    index_digest,
+    read_header,
+)
+from .index_limits import check_columns, check_layout, check_voxels
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
+
+# Limits of the members of the index's root and of a text attribute's bytes: more than any version
+# has.
+_MAX_MEMBERS, _MAX_NAME = 64, 64
 
 
 class Archive:
@@ -46,17 +58,17 @@ class Archive:
         self.folder = Path(folder)
         self._descriptors: list[int] = []
         while True:
-            index = self._index_file()
+            index = self._index_identity()
             try:
                 self._open()
                 return
             except FormatError:
                 # `add` and `remove` replace the index and then delete the shards that it no longer
                 # names. If the index was replaced meanwhile, try again.
-                if self._index_file() == index:
+                if self._index_identity() == index:
                     raise
 
-    def _index_file(self) -> tuple[int, int] | None:
+    def _index_identity(self) -> tuple[int, int] | None:
         """Return the identity and write time of the index file; None if there is none."""
         with contextlib.suppress(OSError):
             found = (self.folder / INDEX_NAME).stat()
@@ -71,7 +83,7 @@ class Archive:
                 f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
             )
         try:
-            archive_id, columns = read_columns(path)
+            archive_id, columns = read_index(path)
             self.header = read_header(archive_id, columns)
             self.voxels = columns["voxels"]
             self._shape_dtype = point_dtype(
@@ -247,3 +259,81 @@ class Archive:
         record = self.open_voxel(row)
         with self.locating(row):
             return record.decode()
+
+
+def _text_attribute(file: h5py.File, name: str) -> str:
+    """Return a text attribute of fixed length, "" if there is none.
+
+    Text of variable length is stored in HDF5's global heap, which has no checksum: with one byte
+    flipped there, HDF5 2.0 hung. This software therefore neither writes nor reads it.
+    """
+    if name not in file.attrs:
+        return ""
+    attribute = file.attrs.get_id(name)
+    if attribute.dtype.kind != "S" or attribute.shape != () or attribute.dtype.itemsize > _MAX_NAME:
+        return ""
+    return bytes(file.attrs[name]).decode("ascii", "replace")
+
+
+def _number_attribute(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray:
+    """Return a numeric attribute, after checking its type and shape. Raises ValueError."""
+    if name not in file.attrs:
+        raise ValueError(f"attribute {name} not found")
+    attribute = file.attrs.get_id(name)
+    if attribute.dtype != np.dtype(dtype) or attribute.shape != shape:
+        raise ValueError(
+            f"attribute {name} {attribute.dtype.str} {attribute.shape}: expected {dtype} {shape}"
+        )
+    return np.asarray(file.attrs[name])
+
+
+def read_index(path: Path) -> tuple[bytes, dict[str, NDArray]]:
+    """Return the archive's id and every dataset of an index, as `check_columns` accepts them.
+
+    No dataset links elsewhere or claims more bytes than the file holds. Raises FormatError or
+    CorruptError naming the file, ValueError for an invalid number, and whatever HDF5 raises for a
+    damaged file.
+    """
+    size = path.stat().st_size
+    columns: dict[str, NDArray] = {}
+    with h5py.File(path, "r") as file:
+        if _text_attribute(file, "format") != "solidcloud":
+            raise FormatError(
+                f"{path}: not a solidcloud index: give the folder that `solidcloud build` wrote"
+            )
+        version = int(_number_attribute(file, "format_version", "<u4", ()))
+        if version not in FORMAT_VERSIONS:
+            known = ", ".join(map(str, FORMAT_VERSIONS))
+            raise FormatError(
+                f"{path}: format version {version}, this software reads {known}: use the one that wrote it"
+            )
+        units = _text_attribute(file, "units")
+        if units != "m":
+            raise FormatError(f"{path}: units {units!r}, expected 'm': rebuild the archive")
+        if len(file) > _MAX_MEMBERS:
+            raise FormatError(f"{path}: {len(file)} datasets, expected at most {_MAX_MEMBERS}: do not use it")
+        for name in file:
+            link = file.get(name, getlink=True)
+            dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
+            if (
+                not isinstance(dataset, h5py.Dataset)
+                or dataset.external
+                or dataset.is_virtual
+                or dataset.chunks
+            ):
+                raise FormatError(
+                    f"{path}: {name} is not a plain dataset: not written by solidcloud, do not use it"
+                )
+            check_layout(name, dataset.dtype, dataset.shape)
+            if dataset.size * dataset.dtype.itemsize > size:
+                raise FormatError(
+                    f"{path}: {name} claims more than the file holds: damaged, restore or rebuild it"
+                )
+            columns[name] = dataset[()]
+        archive_id = _number_attribute(file, "archive_id", "|u1", (16,)).tobytes()
+        if index_digest(archive_id, columns) != _number_attribute(file, "sha256", "|u1", (32,)).tobytes():
+            raise CorruptError(
+                f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
+            )
+    check_columns(version, columns)
+    return archive_id, columns

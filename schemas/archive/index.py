@@ -1,28 +1,33 @@
 """Content of an archive's index: the dataset as a whole, and every voxel. Pure: no HDF5 here.
 
-Only this module names the index's datasets: `index_columns` makes them, `read_header` parses them,
-`index_digest` computes their checksum. FORMAT.md, "index.h5", documents the same.
+`INDEX_COLUMNS` declares the index's datasets. `index_columns` makes them of a `Header`, `read_header`
+parses them, `index_digest` computes their checksum. index_limits.py checks their numbers. FORMAT.md,
+"index.h5", documents the same; change both together.
 """
 
 import hashlib
 import json
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .radius_model import LOCAL_CLASSES, RADIUS_CLASSES, local_radii
+from .radius_model import RADIUS_CLASSES
 from .voxel_grid import Lattice
 
-# Default distance within which points contribute to a point's normal [m]: it covers some forty
-# points of a façade as a scanner sees it, on an area no larger than a hand.
-NORMAL_REACH = 0.08
-# Beyond this, points do not belong to one surface. At steps of 0.1 mm, sums fit 63 bits for any
-# voxel (normal_reach.py) [m].
-MAX_NORMAL_REACH = 1.0
+# Names of an archive's files, and of the datasets of each record in a shard.
+INDEX_NAME = "index.h5"
+SHARD_FOLDER = "shards"
+SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
+DATASETS = ("cells", "nodes", "points")
+# Versions that this software reads. It writes the lowest version that can represent the header.
+FORMAT_VERSIONS = (1, 2, 3, 4)
 
+SHARD_DTYPE = np.dtype([("name", "S24"), ("bytes", "<u8")])
 # One row per voxel, sorted by key.
 # frame_*: place of each dataset's only chunk in its shard, in the order of DATASETS.
 # frame_checksum: the last four bytes of the zstd frame, so that a wrong offset cannot deliver
@@ -41,6 +46,11 @@ VOXEL_DTYPE = np.dtype(
         ("high", "<i4", (3,)),
     ]
 )
+
+
+def shard_name(number: int, generation: int = 0) -> str:
+    """Return the file name of a shard inside SHARD_FOLDER."""
+    return f"{generation}-{number:06d}.h5"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,43 +171,6 @@ class Header:
         return 2 if self.radius_class else 1
 
 
-@dataclass(frozen=True, slots=True)
-class LocalRadius:
-    """Number of points that `local` gives a radius [m]."""
-
-    radius: float
-    points: int
-
-
-@dataclass(frozen=True, slots=True)
-class RadiusDistribution:
-    """Distribution of an archive's radius classes.
-
-    local: the radii that at least one point has, ascending; empty if `local` is not stored.
-    capped: points that had too few neighbours for a local class and have the largest radius.
-    rim: points on the rim of a surface.
-    None: not stored.
-    """
-
-    local: tuple[LocalRadius, ...]
-    capped: int | None
-    rim: int | None
-
-
-def radius_distribution(header: Header) -> RadiusDistribution | None:
-    """Return the distribution of the radius classes; None for an archive without any."""
-    if not header.radius_class:
-        return None
-    by_class = header.radius_counts.reshape(2, LOCAL_CLASSES)  # the second row: points on a rim
-    local = zip(local_radii().tolist(), by_class.sum(axis=0).tolist(), strict=True)
-    with_local = "local" in header.models
-    return RadiusDistribution(
-        tuple(LocalRadius(*held) for held in local if held[1]) if with_local else (),
-        header.radius_capped if with_local else None,
-        int(by_class[1].sum()) if "border" in header.models else None,
-    )
-
-
 def _texts(header: Header) -> bytes:
     """Encode the texts and options of the header as canonical JSON.
 
@@ -224,48 +197,80 @@ def _texts(header: Header) -> bytes:
     return json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
 
 
-def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> dict[str, NDArray]:
-    """Return every dataset of the index by name, for writer, reader and digest alike."""
-    lattice = header.lattice
-    columns = [header.scan_index, header.intensity]
-    classes = {}
+def _point_columns(header: Header) -> list[bool]:
+    """Return which optional columns the points have: `columns` in FORMAT.md."""
+    flags = [header.scan_index, header.intensity]
     if header.radius_class or header.normals:
-        columns += ["local" in header.models, "border" in header.models]
-    if header.radius_class:
-        classes = {
-            "radius_counts": header.radius_counts.astype("<u8"),
-            "radius_capped": np.array([header.radius_capped], "<u8"),
-        }
-    later: dict[str, NDArray] = {}
-    if header.normals:
-        columns += [True]
-        later["normal_reach"] = np.array([header.normal_reach], "<f8")
-    if header.generation:
-        now = header.radius_now or RadiusNow(header.radius, header.radius_error, 0)
-        later["generation"] = np.array([header.generation], "<u4")
-        later["radius_now"] = np.array([now.radius, now.error, now.sample], "<f8")
-    return {
-        "origin": np.array(lattice.origin, "<f8"),
-        "step": np.array([lattice.step], "<f8"),
-        "voxel_steps": np.array([lattice.voxel_steps], "<u4"),
-        "bounds": np.stack([header.low, header.high]).astype("<i8"),
-        "points": np.array([header.points], "<u8"),
-        "radius": np.array([header.radius, header.radius_error], "<f8"),
-        "radius_sample": np.array([header.radius_sample], "<u8"),
-        "moved_max": np.array([header.moved_max], "<f8"),
-        "tree": np.array([header.degree, header.leaf], "<u4"),
-        "columns": np.array(columns, "u1"),
-        **classes,
-        **later,
-        "unknown": header.unknown.reshape(-1, 2, 3).astype("<i8"),
-        "unknown_everywhere": np.array([header.unknown_everywhere], "u1"),
-        "source_pose": np.array([s.pose for s in header.sources], "<f8").reshape(-1, 4, 4),
-        "source_count": np.array([s.count for s in header.sources], "<u8"),
-        "texts": np.frombuffer(_texts(header), "u1"),
-        "shards": np.array(
-            [(name.encode(), size) for name, size in shards], [("name", "S24"), ("bytes", "<u8")]
-        ),
+        flags += ["local" in header.models, "border" in header.models]
+    return [*flags, True] if header.normals else flags
+
+
+def _radius_now(header: Header) -> list[float]:
+    now = header.radius_now or RadiusNow(header.radius, header.radius_error, 0)
+    return [now.radius, now.error, now.sample]
+
+
+class IndexColumn(NamedTuple):
+    """Dataset of the index.
+
+    dtype, shape: as stored; -1 stands for any length.
+    values: its values from the header; None: `index_columns` is given them.
+    requires: property of the header without which an index has no such dataset; "": every index
+    has it.
+    """
+
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    values: Callable[[Header], ArrayLike] | None = None
+    requires: str = ""
+
+
+_F8, _I8, _U8, _U4, _U1 = (np.dtype(name) for name in ("<f8", "<i8", "<u8", "<u4", "|u1"))
+
+# Every dataset that an index may have, in the order in which they are written. To add one, add a
+# row, a field of `Header`, a line in `read_header` and a check in index_limits.py.
+INDEX_COLUMNS = {
+    "origin": IndexColumn(_F8, (3,), lambda header: header.lattice.origin),
+    "step": IndexColumn(_F8, (1,), lambda header: header.lattice.step),
+    "voxel_steps": IndexColumn(_U4, (1,), lambda header: header.lattice.voxel_steps),
+    "bounds": IndexColumn(_I8, (2, 3), lambda header: np.stack([header.low, header.high])),
+    "points": IndexColumn(_U8, (1,), lambda header: header.points),
+    "radius": IndexColumn(_F8, (2,), lambda header: [header.radius, header.radius_error]),
+    "radius_sample": IndexColumn(_U8, (1,), lambda header: header.radius_sample),
+    "moved_max": IndexColumn(_F8, (1,), lambda header: header.moved_max),
+    "tree": IndexColumn(_U4, (2,), lambda header: [header.degree, header.leaf]),
+    "columns": IndexColumn(_U1, (-1,), _point_columns),
+    "radius_counts": IndexColumn(_U8, (RADIUS_CLASSES,), lambda header: header.radius_counts, "radius_class"),
+    "radius_capped": IndexColumn(_U8, (1,), lambda header: header.radius_capped, "radius_class"),
+    "normal_reach": IndexColumn(_F8, (1,), lambda header: header.normal_reach, "normals"),
+    "generation": IndexColumn(_U4, (1,), lambda header: header.generation, "generation"),
+    "radius_now": IndexColumn(_F8, (3,), _radius_now, "generation"),
+    "unknown": IndexColumn(_I8, (-1, 2, 3), lambda header: header.unknown),
+    "unknown_everywhere": IndexColumn(_U1, (1,), lambda header: header.unknown_everywhere),
+    "source_pose": IndexColumn(_F8, (-1, 4, 4), lambda header: [s.pose for s in header.sources]),
+    "source_count": IndexColumn(_U8, (-1,), lambda header: [s.count for s in header.sources]),
+    "texts": IndexColumn(_U1, (-1,), lambda header: np.frombuffer(_texts(header), _U1)),
+    "shards": IndexColumn(SHARD_DTYPE, (-1,)),
+    "voxels": IndexColumn(VOXEL_DTYPE, (-1,)),
+}
+
+
+def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> dict[str, NDArray]:
+    """Return every dataset of an index by name.
+
+    voxels: VOXEL_DTYPE rows sorted by key.
+    shards: name and bytes of each, in the order of their numbers.
+    """
+    columns = {
+        "shards": np.array([(name.encode(), size) for name, size in shards], SHARD_DTYPE),
         "voxels": voxels,
+    }
+    return {
+        name: columns[name]
+        if column.values is None
+        else np.asarray(column.values(header), column.dtype).reshape(column.shape)
+        for name, column in INDEX_COLUMNS.items()
+        if not column.requires or getattr(header, column.requires)
     }
 
 
@@ -276,31 +281,6 @@ def index_digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
         digest.update(f"{name}:{column.dtype.str}:{column.shape}:".encode())
         digest.update(np.ascontiguousarray(column).tobytes())
     return digest.digest()
-
-
-def _check_counts(counts: NDArray, capped: int, points: int) -> None:
-    """Raise ValueError unless every point has exactly one radius class.
-
-    Radii and the reach of a query depend on these counts.
-    """
-    counted = counts.tolist()
-    if counts.shape != (RADIUS_CLASSES,) or min(counted) < 0 or sum(counted) != points or capped > points:
-        raise ValueError(
-            f"radius_counts {counted}, radius_capped {capped}: expected those of {points} points"
-        )
-
-
-def _normal_reach(columns: dict[str, NDArray]) -> float:
-    """Return the estimation distance of the normals, 0 without normals.
-
-    Raises ValueError if it is invalid.
-    """
-    if len(columns["columns"]) < 5:
-        return 0.0
-    reach = float(columns["normal_reach"][0])
-    if not (0 < reach <= MAX_NORMAL_REACH and columns["columns"][4] == 1):
-        raise ValueError(f"normal_reach {reach}: expected above 0, at most {MAX_NORMAL_REACH:g}")
-    return reach
 
 
 _Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -380,7 +360,6 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     counts, capped = np.zeros(RADIUS_CLASSES), 0
     if len(models) > 1:
         counts, capped = columns["radius_counts"], int(columns["radius_capped"][0])
-        _check_counts(counts, capped, int(columns["points"][0]))
     return Header(
         archive_id=archive_id,
         lattice=Lattice((x, y, z), float(columns["step"][0]), int(columns["voxel_steps"][0])),
@@ -406,5 +385,5 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         unknown_everywhere=bool(columns["unknown_everywhere"][0]),
         generation=generation,
         radius_now=now,
-        normal_reach=_normal_reach(columns),
+        normal_reach=float(columns["normal_reach"][0]) if "normal_reach" in columns else 0.0,
     )

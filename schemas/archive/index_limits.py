@@ -14,51 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .codec import CELL_DTYPE, CELL_EXPANSION, NODE_DTYPE, NODE_EXPANSION
-from .index import VOXEL_DTYPE
-from .radius_model import RADIUS_CLASSES
+from .index import INDEX_COLUMNS
+from .normal_reach import MAX_NORMAL_REACH
 from .voxel import MAX_DEGREE, MAX_LEAF, MAX_LEVELS, MIN_DEGREE
 from .voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, voxel_coordinates
 from .zstd_frame import ANY_EXPANSION
 
-SHARD_DTYPE = np.dtype([("name", "S24"), ("bytes", "<u8")])
-# Dtype and shape of every dataset that an index may have; -1 stands for any length.
-_LAYOUT: dict[str, tuple[np.dtype, tuple[int, ...]]] = {
-    "origin": (np.dtype("<f8"), (3,)),
-    "step": (np.dtype("<f8"), (1,)),
-    "voxel_steps": (np.dtype("<u4"), (1,)),
-    "bounds": (np.dtype("<i8"), (2, 3)),
-    "points": (np.dtype("<u8"), (1,)),
-    "radius": (np.dtype("<f8"), (2,)),
-    "radius_sample": (np.dtype("<u8"), (1,)),
-    "moved_max": (np.dtype("<f8"), (1,)),
-    "tree": (np.dtype("<u4"), (2,)),
-    "columns": (np.dtype("|u1"), (-1,)),
-    "radius_counts": (np.dtype("<u8"), (RADIUS_CLASSES,)),
-    "radius_capped": (np.dtype("<u8"), (1,)),
-    "normal_reach": (np.dtype("<f8"), (1,)),
-    "generation": (np.dtype("<u4"), (1,)),
-    "radius_now": (np.dtype("<f8"), (3,)),
-    "unknown": (np.dtype("<i8"), (-1, 2, 3)),
-    "unknown_everywhere": (np.dtype("|u1"), (1,)),
-    "source_pose": (np.dtype("<f8"), (-1, 4, 4)),
-    "source_count": (np.dtype("<u8"), (-1,)),
-    "texts": (np.dtype("|u1"), (-1,)),
-    "shards": (SHARD_DTYPE, (-1,)),
-    "voxels": (VOXEL_DTYPE, (-1,)),
-}
-_CLASSES = ("radius_counts", "radius_capped")
-_LATER = ("generation", "radius_now")
-_OPTIONAL = (*_CLASSES, *_LATER, "normal_reach")
+_OPTIONAL = {name: column.requires for name, column in INDEX_COLUMNS.items() if column.requires}
 
 # Limits of the texts of a dataset and of each source [bytes]. A source's text is a path, a
 # coordinate reference system and a few words. JSON takes about 10 ms per megabyte.
-MOST_TEXT, MOST_TEXT_A_SOURCE = 1 << 20, 1 << 18
+_MAX_TEXT, _MAX_TEXT_A_SOURCE = 1 << 20, 1 << 18
 # Boxes of scans that were left out may lie anywhere; the differences of their corners fit int64.
-_MOST_LATTICE = 1 << 61
+_MAX_LATTICE = 1 << 61
 # Above this, float64 does not represent every integer.
-_MOST_SAMPLE = 1 << 53
+_MAX_SAMPLE = 1 << 53
 # Links are int32 (schemas/archive/voxel.py).
-_MOST_ROWS = (1 << 31) - 1
+_MAX_ROWS = (1 << 31) - 1
 # The shortest zstd frame: magic number, header, one block and checksum.
 _LEAST_FRAME = 13
 
@@ -70,11 +42,11 @@ def _refuse(what: str, found: Any, expected: str) -> None:
 
 def check_layout(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
     """Check the type and shape of one dataset, before it is read."""
-    known = _LAYOUT.get(name)
+    known = INDEX_COLUMNS.get(name)
     if known is None:
-        _refuse("dataset", repr(name), f"one of {', '.join(_LAYOUT)}")
+        _refuse("dataset", repr(name), f"one of {', '.join(INDEX_COLUMNS)}")
     assert known is not None
-    kind, lengths = known
+    kind, lengths = known.dtype, known.shape
     fits = len(shape) == len(lengths) and all(n in (m, -1) for n, m in zip(lengths, shape, strict=True))
     if dtype != kind or not fits:
         _refuse(name, f"{dtype.str} {shape}", f"{kind.str} {lengths}")
@@ -85,11 +57,11 @@ def check_columns(version: int, columns: dict[str, NDArray]) -> None:
 
     columns: datasets that `check_layout` accepts and whose checksum is correct.
     """
-    missing = [name for name in _LAYOUT if name not in columns and name not in _OPTIONAL]
+    missing = [name for name in INDEX_COLUMNS if name not in columns and name not in _OPTIONAL]
     if missing:
         _refuse("datasets", "without " + ", ".join(missing), "all of them")
     _check_lattice(columns)
-    _check_kept(version, columns)
+    _check_point_columns(version, columns)
     _check_radius(columns)
     _check_sources(columns)
 
@@ -126,22 +98,24 @@ def _check_lattice(columns: dict[str, NDArray]) -> None:
     unknown = columns["unknown"]
     if (
         (unknown[:, 0] > unknown[:, 1]).any()
-        or (unknown < -_MOST_LATTICE).any()
-        or (unknown > _MOST_LATTICE).any()
+        or (unknown < -_MAX_LATTICE).any()
+        or (unknown > _MAX_LATTICE).any()
     ):
         _refuse("unknown", "with an inverted or too distant box", "low up to high, within 2^61")
     _numbers(columns, "unknown_everywhere", 0, 1)
 
 
-def _check_kept(version: int, columns: dict[str, NDArray]) -> None:
+def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
     """Check the point columns, the datasets that they require, and the format version that follows."""
     kept = _numbers(columns, "columns", 0, 1)
     classes, normals, later = len(kept) > 2 and any(kept[2:4]), len(kept) == 5, "generation" in columns
     if len(kept) not in (2, 4, 5) or (len(kept) == 4 and not classes) or (normals and not kept[4]):
         _refuse("columns", kept, "2 flags, 4 with radius classes, 5 with normals")
-    here = {name: name in columns for name in _OPTIONAL}
-    if here != {**dict.fromkeys(_CLASSES, classes), **dict.fromkeys(_LATER, later), "normal_reach": normals}:
-        _refuse("datasets", [name for name in here if here[name]], f"those of columns {kept}")
+    held = {"radius_class": classes, "normals": normals, "generation": later}
+    if any((name in columns) != held[requires] for name, requires in _OPTIONAL.items()):
+        _refuse("datasets", [name for name in _OPTIONAL if name in columns], f"those of columns {kept}")
+    if normals and not 0 < (reach := float(columns["normal_reach"][0])) <= MAX_NORMAL_REACH:
+        _refuse("normal_reach", reach, f"above 0, at most {MAX_NORMAL_REACH:g}")
     expected = 4 if normals else 3 if later else 2 if classes else 1
     if version != expected:
         _refuse("format_version", version, f"{expected}, from the datasets")
@@ -159,7 +133,12 @@ def _check_radius(columns: dict[str, NDArray]) -> None:
     (points,) = _numbers(columns, "points", 1, 1 << 62)
     # `radius_sample` is as it was built: in a later generation, sampled points may have been
     # removed.
-    _numbers(columns, "radius_sample", 0, _MOST_SAMPLE if "generation" in columns else points)
+    _numbers(columns, "radius_sample", 0, _MAX_SAMPLE if "generation" in columns else points)
+    if "radius_counts" in columns:
+        # Every point has exactly one radius class. Radii and the reach of a query depend on these counts.
+        counts, capped = columns["radius_counts"].tolist(), int(columns["radius_capped"][0])
+        if sum(counts) != points or capped > points:
+            _refuse(f"radius_counts {counts}, radius_capped", capped, f"those of {points} points")
     if "radius_now" in columns:
         _numbers(columns, "generation", 1, (1 << 32) - 1)
         radius, error, sample = columns["radius_now"].tolist()
@@ -182,7 +161,7 @@ def _check_sources(columns: dict[str, NDArray]) -> None:
         )
     if columns["columns"][0] and len(count) > 1 << 16:
         _refuse("source_count", f"of {len(count)} sources", "at most 65536, as scan_index has 16 bits")
-    most = MOST_TEXT + MOST_TEXT_A_SOURCE * len(count)
+    most = _MAX_TEXT + _MAX_TEXT_A_SOURCE * len(count)
     if len(columns["texts"]) > most:
         _refuse("texts", f"of {len(columns['texts'])} bytes", f"at most {most}")
 
@@ -250,7 +229,7 @@ def _check_rows(columns: dict[str, NDArray], point_bytes: int) -> None:
         | (nodes > leaves * MAX_LEVELS)
         | (points < leaves)
         | (points > leaves * int(columns["tree"][1]))
-        | (np.maximum(points, nodes) > _MOST_ROWS)
+        | (np.maximum(points, nodes) > _MAX_ROWS)
     )
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])

@@ -1,13 +1,19 @@
-"""Surface normals: conversion of the estimation reach. kernels/normal_codes.py defines the normal."""
+"""Reach within which points contribute to a surface normal. kernels/normal_codes.py defines it."""
 
 import math
 from fractions import Fraction
 
 from ..errors import BadRequestError
-from .index import MAX_NORMAL_REACH
+
+# Default distance within which points contribute to a point's normal [m]: it covers some forty
+# points of a façade as a scanner sees it, on an area no larger than a hand.
+NORMAL_REACH = 0.08
+# Beyond this, points do not belong to one surface. At steps of 0.1 mm, sums fit 63 bits for any
+# voxel (`squared_reach`) [m].
+MAX_NORMAL_REACH = 1.0
 
 
-def normal_reach(reach: float, step: float, points: int) -> int:
+def squared_reach(reach: float, step: float, points: int) -> int:
     """Return the greatest squared distance within `reach` [m], in squared steps.
 
     Both lengths count as their decimal texts: 800 steps of 0.1 mm are 8 cm.

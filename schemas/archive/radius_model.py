@@ -9,6 +9,7 @@ classes to radii only at query time, so one archive serves all models.
 
 import re
 from collections.abc import Collection
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -117,3 +118,46 @@ def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDA
             f"radius model {text!r}: radii up to {metres.max():g} m: expected at most {MAX_RADIUS} m"
         )
     return np.rint(metres * UNITS_PER_METRE).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class LocalRadius:
+    """Number of points that `local` gives a radius [m]."""
+
+    radius: float
+    points: int
+
+
+@dataclass(frozen=True, slots=True)
+class RadiusDistribution:
+    """Distribution of an archive's radius classes.
+
+    local: the radii that at least one point has, ascending; empty if `local` is not stored.
+    capped: points that had too few neighbours for a local class and have the largest radius.
+    rim: points on the rim of a surface.
+    None: not stored.
+    """
+
+    local: tuple[LocalRadius, ...]
+    capped: int | None
+    rim: int | None
+
+
+def radius_distribution(
+    models: Collection[str], counts: NDArray[np.int64], capped: int
+) -> RadiusDistribution | None:
+    """Return the distribution of an archive's radius classes; None without any.
+
+    models, counts (32,), capped: see `Header` in index.py, `models`, `radius_counts` and
+    `radius_capped`.
+    """
+    with_local, with_border = "local" in models, "border" in models
+    if not (with_local or with_border):
+        return None
+    by_class = counts.reshape(2, LOCAL_CLASSES)  # the second row: points on a rim
+    local = zip(local_radii().tolist(), by_class.sum(axis=0).tolist(), strict=True)
+    return RadiusDistribution(
+        tuple(LocalRadius(*held) for held in local if held[1]) if with_local else (),
+        capped if with_local else None,
+        int(by_class[1].sum()) if with_border else None,
+    )

@@ -19,7 +19,7 @@ from solidcloud.builder.edit.edit_archive import add_scans
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.scenes import make_facade
-from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.input.point_file import read_thinned
 from solidcloud.server.scene import Scene

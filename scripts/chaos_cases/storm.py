@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from kills.calls import has_strace
-from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.server.client import Client
 

@@ -13,7 +13,7 @@ import laspy
 import numpy as np
 import solidcloud.builder
 from solidcloud.builder.passes.verify import verify_archive
-from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
 

@@ -9,7 +9,7 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...schemas.archive.normal_reach import normal_reach
+from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.errors import CorruptError
 from ...schemas.kernels.normal_codes import NONE, decode_normal
 from ..kernels.core.voxel_layout import LANES
@@ -60,7 +60,7 @@ class Normals:
         self._squares: dict[float, int] = {}
         self._stored = -1
         if store.with_normals:
-            self._stored = normal_reach(
+            self._stored = squared_reach(
                 store.archive.header.normal_reach, data.arrays.step, self._most_points
             )
 
@@ -93,7 +93,7 @@ class Normals:
         """
         square = self._squares.get(reach)
         if square is None:
-            square = normal_reach(reach, self._data.arrays.step, self._most_points)
+            square = squared_reach(reach, self._data.arrays.step, self._most_points)
             self._squares[reach] = square
         step = self._data.arrays.step
         place = np.asarray(cloud, np.float64).tolist()

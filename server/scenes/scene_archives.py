@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from ...schemas.archive.index import NORMAL_REACH
+from ...schemas.archive.normal_reach import NORMAL_REACH
 from ...schemas.archive.radius_model import class_radii
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.messages import JSON, MSGPACK, SceneInfo, decode_answer, encode
 from solidcloud.server.cli.input.pose_file import read_poses

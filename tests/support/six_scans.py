@@ -7,7 +7,7 @@ import numpy as np
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.schemas.archive.archive_writer import write_index
 from synthetic_scans import WITH_POINTS, make_scan, write_xyz
 
 # Of version 3, with dead voxels in its shards.

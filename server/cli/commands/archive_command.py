@@ -11,7 +11,7 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
     """Describe an archive: scans, points, bounds, radius, size."""
     import msgspec
 
-    from ....schemas.archive.index import radius_distribution
+    from ....schemas.archive.radius_model import radius_distribution
     from ...archives.archive_info import describe
     from ...residency.voxel_store import Store
     from ..output.archive_facts import archive_details, detail_facts
@@ -19,7 +19,8 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
 
     store = Store(archive)
     found = describe(store, archive.resolve().name)
-    classes = radius_distribution(store.archive.header)
+    header = store.archive.header
+    classes = radius_distribution(header.models, header.radius_counts, header.radius_capped)
     details = archive_details(store)
     store.close()
     if as_json:

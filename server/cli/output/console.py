@@ -10,7 +10,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
     from ....builder.pipeline import BuildSummary
-    from ....schemas.archive.index import RadiusDistribution
+    from ....schemas.archive.radius_model import RadiusDistribution
     from ....schemas.wire.messages import SceneInfo
 
 

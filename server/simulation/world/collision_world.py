@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.archive.index import MAX_NORMAL_REACH
+from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile

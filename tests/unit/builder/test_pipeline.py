@@ -14,7 +14,7 @@ import solidcloud.builder.spool.spool_pass as partition
 from small_builds import build, content, six_files
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.shard import ZSTD_FILTER
+from solidcloud.schemas.archive.archive_writer import ZSTD_FILTER
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from synthetic_scans import make_scan, write_las, write_ply, write_xyz
 

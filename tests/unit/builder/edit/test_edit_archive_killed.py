@@ -25,8 +25,7 @@ from solidcloud.builder.edit.transaction import delete_orphans
 from solidcloud.builder.passes.preview import write_preview
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.index_file import INDEX_NAME
-from solidcloud.schemas.archive.shard import SHARD_FOLDER
+from solidcloud.schemas.archive.index import INDEX_NAME, SHARD_FOLDER
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
 

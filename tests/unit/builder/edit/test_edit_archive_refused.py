@@ -31,7 +31,7 @@ from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.resume.build_directory import locked
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.shard import SHARD_FOLDER
+from solidcloud.schemas.archive.index import SHARD_FOLDER
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError
 
 

@@ -13,7 +13,7 @@ from solidcloud.builder.edit import rebuild_voxels as rebuild_module
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.edit.transaction import Change
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.shard import SHARD_FOLDER
+from solidcloud.schemas.archive.index import SHARD_FOLDER
 from solidcloud.schemas.errors import CorruptError
 
 ADVICE = "the data read back differ from the data written: check disk and memory.*the archive is what it was"

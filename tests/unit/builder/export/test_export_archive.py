@@ -15,8 +15,8 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.export.export_archive import export_archive, lattice_box
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.archive_writer import write_index
 from solidcloud.schemas.archive.index import Header
-from solidcloud.schemas.archive.index_file import write_index
 from solidcloud.schemas.archive.voxel_grid import Lattice
 from solidcloud.schemas.archive.vtkhdf import read_points
 from solidcloud.schemas.errors import BadRequestError

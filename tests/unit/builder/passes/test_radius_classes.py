@@ -22,8 +22,8 @@ from solidcloud.builder.spool.spool import Spool, write_run
 from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.index import Header, radius_distribution
-from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii
+from solidcloud.schemas.archive.index import Header
+from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii, radius_distribution
 from solidcloud.schemas.errors import BadRequestError
 from synthetic_scans import make_scan, write_xyz
 
@@ -172,7 +172,7 @@ def test_only_what_is_asked_for_is_stored(models: set[str], tmp_path: Path) -> N
     kept = ("local" in models) * (RIM_BIT - 1) + ("border" in models) * RIM_BIT
     assert np.array_equal(classes, full & kept)
     assert set(header.models) == {"mean", *models}
-    found = radius_distribution(header)
+    found = radius_distribution(header.models, header.radius_counts, header.radius_capped)
     assert found is not None
     local = np.bincount(full % 16, minlength=16)
     assert [(r.radius, r.points) for r in found.local] == (
@@ -190,7 +190,9 @@ def test_without_classes_the_format_is_the_first(tmp_path: Path) -> None:
         with Archive(folder) as archive:
             versions.append(archive.header.format_version)
             assert (archive.read_voxel(0)[0].radius_class is None) == (models == {"mean"})
-            assert (radius_distribution(archive.header) is None) == (models == {"mean"})
+            header = archive.header
+            found = radius_distribution(header.models, header.radius_counts, header.radius_capped)
+            assert (found is None) == (models == {"mean"})
     assert versions == [1, 2]
 
 

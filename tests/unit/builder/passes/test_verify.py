@@ -18,11 +18,10 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.spool.spool import places_sum
 from solidcloud.builder.voxel.exact_enclosure import loose_nodes, sample_nodes
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.archive_writer import write_index, write_shard
 from solidcloud.schemas.archive.codec import encode_voxel
-from solidcloud.schemas.archive.index import Header
-from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.schemas.archive.index import Header, shard_name
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
-from solidcloud.schemas.archive.shard import shard_name, write_shard
 from solidcloud.schemas.archive.voxel import VoxelData
 from solidcloud.schemas.errors import BadRequestError, FormatError
 from solidcloud.server.cli.main import run

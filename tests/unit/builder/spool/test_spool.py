@@ -20,7 +20,7 @@ from solidcloud.builder.spool.spool import (
     write_directory,
     write_run,
 )
-from solidcloud.schemas.archive.shard import file_checksum
+from solidcloud.schemas.archive.archive_writer import file_checksum
 from solidcloud.schemas.archive.voxel_grid import make_lattice
 from solidcloud.schemas.errors import CorruptError
 

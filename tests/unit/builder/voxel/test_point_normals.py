@@ -19,7 +19,7 @@ from solidcloud.builder.voxel import point_normals as normals_module
 from solidcloud.builder.voxel.point_normals import voxel_normals
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.normal_reach import normal_reach
+from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.schemas.kernels.normal_codes import NONE, normal_code
 
@@ -143,7 +143,7 @@ def expected(archive: Path) -> dict[tuple[int, ...], int]:
     found: dict[tuple[int, ...], int] = {}
     with Archive(archive) as opened:
         header = opened.header
-        square = normal_reach(header.normal_reach, header.lattice.step, header.points)
+        square = squared_reach(header.normal_reach, header.lattice.step, header.points)
         for row in range(len(opened.voxels)):
             points = voxel_points(*opened.read_voxel(row))
             corner = opened.coordinates[row] * header.lattice.voxel_steps

@@ -13,9 +13,8 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive import index as index_module
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.index import VOXEL_DTYPE
+from solidcloud.schemas.archive.index import VOXEL_DTYPE, shard_name
 from solidcloud.schemas.archive.radius_model import LOCAL_RADII
-from solidcloud.schemas.archive.shard import shard_name
 from synthetic_scans import make_scan, write_xyz
 
 FORMAT = Path(index_module.__file__).parents[1] / "FORMAT.md"

@@ -6,7 +6,7 @@ import naive_normals
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.schemas.archive.normal_reach import normal_reach
+from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.kernels.normal_codes import (
     LINE,
@@ -154,7 +154,7 @@ def test_least_direction_is_numpys() -> None:
 def test_sums_of_the_farthest_points_are_exact() -> None:
     """A wall at the end of 63 bits: no sum of what `normal_reach` lets pass overflows."""
     count = 1 << 19
-    square = normal_reach(1.0, 1e-6, count)
+    square = squared_reach(1.0, 1e-6, count)
     assert square == 10**12 and count * square < 1 << 59
     x, y = 600_000, 800_000
     n = count // 4
@@ -164,14 +164,14 @@ def test_sums_of_the_farthest_points_are_exact() -> None:
 
 
 def test_reach_counts_as_its_decimal_text_and_has_bounds() -> None:
-    assert normal_reach(0.08, 1e-4, 1) == 800**2
-    assert normal_reach(0.08, 0.0003, 1) == 80_000_000 // 1125  # (800 / 3)^2
-    assert normal_reach(1, 0.5, 1) == 4
+    assert squared_reach(0.08, 1e-4, 1) == 800**2
+    assert squared_reach(0.08, 0.0003, 1) == 80_000_000 // 1125  # (800 / 3)^2
+    assert squared_reach(1, 0.5, 1) == 4
     for reach in (0.0, -0.1, math.nan, math.inf, 1.01):
         with pytest.raises(BadRequestError, match="normal reach"):
-            normal_reach(reach, 1e-4, 1)
+            squared_reach(reach, 1e-4, 1)
     with pytest.raises(BadRequestError, match="63 bits: give at most 0"):
-        normal_reach(1.0, 1e-6, 1 << 23)
+        squared_reach(1.0, 1e-6, 1 << 23)
 
 
 def test_codes_are_these_on_any_machine() -> None:

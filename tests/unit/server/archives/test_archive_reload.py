@@ -12,7 +12,7 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from solidcloud.schemas.archive.index_file import INDEX_NAME
+from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BusyError, FormatError, SolidcloudError
 from solidcloud.server.archives import placed_archive
 from solidcloud.server.residency import coarse_bounds

@@ -9,7 +9,7 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.index_file import write_index
+from solidcloud.schemas.archive.archive_writer import write_index
 from solidcloud.server.cli.main import run
 from solidcloud.server.residency.voxel_store import Store
 from synthetic_scans import make_scan, write_xyz

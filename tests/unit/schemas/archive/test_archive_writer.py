@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from six_scans import rewrite_index
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.archive_writer import file_checksum, write_index, write_shard
 from solidcloud.schemas.archive.codec import encode_voxel
-from solidcloud.schemas.archive.index_file import write_index
-from solidcloud.schemas.archive.shard import DATASETS, file_checksum, shard_name, write_shard
+from solidcloud.schemas.archive.index import DATASETS, shard_name
 from solidcloud.schemas.errors import CorruptError, FormatError
 
 

@@ -1,14 +1,12 @@
-"""Writer of shards: HDF5 files with the records of many voxels.
+"""Writer of an archive's HDF5 files: shards with the records of many voxels, and the index.
 
-A shard is verified by offsets before it is given its name. FORMAT.md documents the same; change
-both together. archive.py reads shards by offsets, so that neither HDF5's lock nor its parser stands
-between a server and a record.
+A shard is verified by offsets before it is given its name. The index is written last. FORMAT.md
+documents the same; change both together. archive.py reads these files.
 """
 
 import base64
 import functools
 import os
-import re
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,13 +19,11 @@ from ..errors import CorruptError
 from ..process.interrupts import check
 from ..process.new_file import new_file, publish, temporary_path
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
-from .index import VOXEL_DTYPE
+from .index import DATASETS, INDEX_NAME, VOXEL_DTYPE, Header, index_columns, index_digest
 from .voxel import VoxelData
 from .zstd_frame import Frame
 
-SHARD_FOLDER = "shards"
 ZSTD_FILTER = 32015  # registered with the HDF Group
-DATASETS = ("cells", "nodes", "points")
 # Block size for reading back a shard that was just written [bytes].
 READ_BYTES = 1 << 20
 
@@ -38,13 +34,6 @@ _PROPERTIES = (
     rb"c-rgqaB<`1lHy|K;9!7(|4?wA5yCfsinmX3)${jo31U*1u$&<q8CNg~A!~#IE+z(`5o|mRK#H;AFwA@p2C4zY86rtwCjl*B6"
     rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"
 )
-
-SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
-
-
-def shard_name(number: int, generation: int = 0) -> str:
-    """Return the file name of a shard inside SHARD_FOLDER."""
-    return f"{generation}-{number:06d}.h5"
 
 
 @functools.cache
@@ -149,3 +138,22 @@ def _verify_frames(path: Path, table: NDArray) -> int:
                         f"{path}: voxel {int(row['key']):#x}, {name}: differs from what was written: is the disk full?"
                     )
     return file_checksum(path)
+
+
+def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tuple[str, int]]) -> None:
+    """Write index.h5, the last file of an archive, which completes it.
+
+    voxels: VOXEL_DTYPE rows sorted by key.
+    shards: name and bytes of each, in the order of their numbers.
+    """
+    path = folder / INDEX_NAME
+    columns = index_columns(header, voxels, shards)
+    with new_file(path) as file:
+        file.attrs["format"] = np.bytes_("solidcloud")
+        file.attrs["format_version"] = np.uint32(header.format_version)
+        file.attrs["units"] = np.bytes_("m")
+        file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
+        file.attrs["sha256"] = np.frombuffer(index_digest(header.archive_id, columns), np.uint8)
+        for name, column in columns.items():
+            file.create_dataset(name, data=column)
+    publish(path)

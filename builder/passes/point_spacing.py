@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ..kernels.neighbours.box_tree import BoxTree, make_box_tree, near_boxes
-from ..kernels.neighbours.nearest_points import FAR, closest_in_record
+from ..kernels.neighbours.nearest_points import FAR, BoxTree, closest_in_record, make_box_tree, near_boxes
 from ..kernels.points.voxel_records import first_of_each
 from ..run.executor import Executor
 from ..run.progress import Progress, Silent

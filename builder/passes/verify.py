@@ -13,9 +13,8 @@ from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.process.interrupts import check
-from ..kernels.neighbours.enclosure import last_loose_node
 from ..kernels.points.content_hash import SEEDS
-from ..kernels.points.voxel_records import measure_points, sum_places
+from ..kernels.points.voxel_records import last_loose_node, measure_points, sum_places
 from ..run.executor import Executor, worker_count
 from ..run.progress import Progress, Silent
 from ..run.work_units import jobs_of, portions, run_units

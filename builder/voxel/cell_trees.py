@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from ...schemas.archive.voxel import CELL_BITS, Cells, Nodes
 from ..config import BuildConfig
 from ..kernels.trees.bounding_sphere import SPREAD
-from ..kernels.trees.build_tree import EXTREMES, build_cells
+from ..kernels.trees.build_tree import EXTREMES, build_cells, leaf_rows, take_runs
 from ..kernels.trees.pack_tree import most_nodes
-from ..kernels.trees.top_bounds import leaf_rows, take_runs
 
 HIGHEST = (1 << CELL_BITS) - 1
 

@@ -37,12 +37,11 @@ from ...schemas.archive.codec import (
     point_dtype,
     point_rows,
 )
-from ...schemas.archive.row_stream import RowStream, pwrite_all
 from ...schemas.archive.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
+from ...schemas.archive.zstd_frame import RowStream, pwrite_all
 from ...schemas.errors import BadRequestError, CorruptError
 from ..config import BuildConfig
-from ..kernels.points.cell_spill import by_axis, by_cell
-from ..kernels.points.octree_cells import split_octree
+from ..kernels.points.octree_cells import by_axis, by_cell, split_octree
 from ..kernels.trees.bounding_sphere import SPREAD
 from ..kernels.trees.build_tree import EXTREMES
 from ..spool.spool import Spool

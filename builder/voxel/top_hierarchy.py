@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from ...schemas.archive.voxel import Nodes, top_shift
 from ..config import BuildConfig
 from ..kernels.trees.bounding_sphere import ceil_sqrt
+from ..kernels.trees.build_tree import grow_bounds, guess_bounds
 from ..kernels.trees.pack_tree import pack_tree
-from ..kernels.trees.top_bounds import grow_bounds, guess_bounds
 from .cell_trees import HIGHEST
 
 
 class Top(NamedTuple):
     """Top hierarchy over c cells, with t nodes.
 
-    Its bounds grow as points are added, see kernels/trees/top_bounds.py.
+    Its bounds grow as points are added, see kernels/trees/build_tree.py.
 
     order: (c,) int64, cells in the order of its leaf nodes.  count: (t,) uint8.
     above: (h, c) int64, the node of each level above each cell in that order.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError, MisleadingIndexError
-from ..kernels.rows import delta_along, lanes_to_points, leaf_bytes, leaf_column
+from ..kernels.record_rows import delta_along, lanes_to_points, leaf_bytes, leaf_column
 from .radius_model import RADIUS_CLASSES
 from .voxel import (
     MAX_LEAF,

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError
-from ..kernels.links import link_rows
-from ..kernels.rows import LANES, NO_AXIS, leaf_lanes
+from ..kernels.record_rows import LANES, NO_AXIS, leaf_lanes, link_rows
 
 # A leaf node's points fill at most this many lanes of the vector test (server/kernels/overlap/overlap.py).
 # LLVM vectorises 32 lanes but not 8 or 16 (see there).

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...builder.voxel.masked_voxel import BuiltVoxel, build_rest, read_points
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.row_stream import pwrite_all
+from ...schemas.archive.zstd_frame import pwrite_all
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from .rigid_transform import archive_pose, moved, moved_boxes
 

@@ -9,7 +9,7 @@ and the 26 around it, nine runs of three cells.
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..points.bisection import first_at_least
+from ..points.octree_cells import first_at_least
 
 
 @nb.njit(nogil=True, cache=True)

@@ -1,10 +1,25 @@
-"""Octree of one voxel, split by number of points, over points in Morton order."""
+"""Cells of one voxel: an octree split by number of points, over points in Morton order."""
 
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
-from .bisection import first_at_least
+
+
+@nb.njit(nogil=True, cache=True)
+def first_at_least(values, lo, hi, value):
+    """Return the first index in [lo, hi) of values (n,) that is not below value; hi when there is none.
+
+    values must be sorted in [lo, hi). value must have the type of values: numba compares an
+    unsigned with a signed integer as float64.
+    """
+    while lo < hi:
+        mid = (lo + hi) // 2
+        if values[mid] < value:
+            lo = mid + 1
+        else:
+            hi = mid
+    return lo
 
 
 @nb.njit(nogil=True, cache=True)
@@ -98,3 +113,32 @@ def merge_order(codes, starts):
         values, spare_values = spare_values, values
         order, spare = spare, order
     return order
+
+
+@nb.njit(nogil=True, cache=True)
+def by_cell(xyz, starts):
+    """Return points (3, n) uint16 in cell order as (3 n,): x[], y[], z[] of each cell.
+
+    starts: (c + 1,), where the cells begin.
+    """
+    flat = np.empty(3 * xyz.shape[1], np.uint16)
+    for cell in range(starts.shape[0] - 1):
+        lo, held = np.uint64(starts[cell]), np.uint64(starts[cell + 1] - starts[cell])
+        for k in range(np.uint64(3)):
+            to = np.uint64(3) * lo + k * held
+            for i in range(held):
+                flat[to + i] = xyz[k, lo + i]
+    return flat
+
+
+@nb.njit(nogil=True, cache=True)
+def by_axis(flat, starts):
+    """Undo `by_cell`."""
+    xyz = np.empty((3, flat.shape[0] // 3), np.uint16)
+    for cell in range(starts.shape[0] - 1):
+        lo, held = np.uint64(starts[cell]), np.uint64(starts[cell + 1] - starts[cell])
+        for k in range(np.uint64(3)):
+            at = np.uint64(3) * lo + k * held
+            for i in range(held):
+                xyz[k, lo + i] = flat[at + i]
+    return xyz

@@ -6,7 +6,7 @@ multiple of the leaf size, until every part is one child.
 
 The points are moved while they are split, and every loop runs over consecutive memory. `own` holds
 x, y, z and rank in rows; its final order is the order of the leaf nodes. Loop indices are uint64,
-see schemas/kernels/rows.py.
+see schemas/kernels/record_rows.py.
 """
 
 import numpy as np

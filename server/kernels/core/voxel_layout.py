@@ -174,7 +174,7 @@ def lay_out(voxel, links, arena, at_bytes, block_words, where):
     first, is_leaf, cell_of = links
     words, ints, _ = arena
     n = first.shape[0]
-    # Unsigned: see schemas/kernels/rows.py.
+    # Unsigned: see schemas/kernels/record_rows.py.
     row = np.uint64(at_bytes // 4)
     block_at = row + np.uint64(n * ROW_WORDS)
     where[0], where[1] = row, block_at

@@ -11,8 +11,7 @@ import solidcloud.builder.passes.point_spacing as spacing
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.run.work_units as portions
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.neighbours.box_tree import make_box_tree
-from solidcloud.builder.kernels.neighbours.nearest_points import FAR
+from solidcloud.builder.kernels.neighbours.nearest_points import FAR, make_box_tree
 from solidcloud.builder.kernels.points.voxel_records import point_hash
 from solidcloud.builder.passes.point_spacing import Open, Sums, archive_mean, settle, sums_of
 from solidcloud.builder.pipeline import build_archive

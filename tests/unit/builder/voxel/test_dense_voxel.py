@@ -126,7 +126,7 @@ def test_which_voxels_are_dense() -> None:
 
 def test_a_frame_too_long_for_the_index_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spooled(tmp_path / "spool", rows_of(make_steps("noise", 3, 600, 1000)), 1000, [])
-    monkeypatch.setattr("solidcloud.schemas.archive.row_stream.MAX_FRAME_BYTES", 500)
+    monkeypatch.setattr("solidcloud.schemas.archive.zstd_frame.MAX_FRAME_BYTES", 500)
     with pytest.raises(BadRequestError, match=r"a voxel of [0-9]+ rows takes .* smaller --voxel"):
         build_dense(KEY, spool, BuildConfig(cell_points=40), bytes(16), tmp_path)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import split_octree
-from solidcloud.builder.kernels.trees.top_bounds import guess_bounds
+from solidcloud.builder.kernels.trees.build_tree import guess_bounds
 from solidcloud.builder.voxel.cell_trees import CellTrees, build_trees, take_cells
 from solidcloud.builder.voxel.top_hierarchy import Top, pack_top
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, canonical

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from solidcloud.schemas.archive import row_stream
-from solidcloud.schemas.archive.row_stream import RowStream, pwrite_all
-from solidcloud.schemas.archive.zstd_frame import Expansion, pack, unpack
+from solidcloud.schemas.archive import zstd_frame
+from solidcloud.schemas.archive.zstd_frame import Expansion, RowStream, pack, pwrite_all, unpack
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 
 
@@ -17,7 +16,7 @@ from solidcloud.schemas.errors import BadRequestError, CorruptError
 def test_rows_that_come_in_parts_are_one_frame_of_their_byte_planes(
     cuts: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(row_stream, "STREAM_BYTES", 700)
+    monkeypatch.setattr(zstd_frame, "STREAM_BYTES", 700)
     rows = np.zeros(1000, [("x", "<u2", (3,)), ("y", "<f4")])
     rows["x"] = np.arange(3000).reshape(1000, 3) % 517
     rows["y"] = np.sqrt(np.arange(1000))
@@ -60,7 +59,7 @@ def test_planes_that_end_too_soon_are_seen(tmp_path: Path) -> None:
 def test_a_frame_of_more_bytes_than_the_index_counts_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(row_stream, "MAX_FRAME_BYTES", 30)
+    monkeypatch.setattr(zstd_frame, "MAX_FRAME_BYTES", 30)
     stream = RowStream(tmp_path, np.dtype([("x", "<u2")]), 50)
     stream.put(0, np.array([(i * i,) for i in range(50)], [("x", "<u2")]))
     with pytest.raises(BadRequestError, match=r"a voxel of 50 rows takes \d+ bytes, a record holds 30"):

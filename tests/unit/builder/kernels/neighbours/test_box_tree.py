@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.neighbours.box_tree import make_box_tree, near_boxes
-from solidcloud.builder.kernels.neighbours.nearest_points import FAR
+from solidcloud.builder.kernels.neighbours.nearest_points import FAR, make_box_tree, near_boxes
 
 pytestmark = pytest.mark.interpreted
 

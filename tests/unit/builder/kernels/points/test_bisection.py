@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.points.bisection import first_at_least
+from solidcloud.builder.kernels.points.octree_cells import first_at_least
 
 
 @pytest.mark.interpreted

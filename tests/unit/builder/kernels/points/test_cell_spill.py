@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.points.cell_spill import by_axis, by_cell
+from solidcloud.builder.kernels.points.octree_cells import by_axis, by_cell
 
 pytestmark = pytest.mark.interpreted
 

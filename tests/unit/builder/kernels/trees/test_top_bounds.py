@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.trees.build_tree import DIRECTIONS, EXTREMES
-from solidcloud.builder.kernels.trees.top_bounds import (
+from solidcloud.builder.kernels.trees.build_tree import (
+    DIRECTIONS,
+    EXTREMES,
     _join_extremes,
     _stored_center,
     grow_bounds,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from opened_records import open_scan
-from solidcloud.builder.kernels.neighbours.enclosure import last_loose_node
+from solidcloud.builder.kernels.points.voxel_records import last_loose_node
 from solidcloud.builder.voxel.exact_enclosure import loose_nodes
 from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
 from solidcloud.schemas.archive.codec import OpenRecord

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from solidcloud.schemas.kernels.rows import (
+from solidcloud.schemas.kernels.record_rows import (
     LANES,
     NO_AXIS,
     delta_along,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.schemas.kernels.links import link_rows
+from solidcloud.schemas.kernels.record_rows import link_rows
 
 pytestmark = pytest.mark.interpreted
 

@@ -32,8 +32,8 @@ from .scenes.scene_archives import (
     read_avatars,
 )
 from .scenes.scene_questions import SceneQuestions
-from .simulation.assembly import simulate
 from .simulation.local_session import LocalSession
+from .simulation.make_simulation import make_simulation
 from .simulation.simulation import Simulation
 
 DEFAULT_BUDGET = 512 << 20
@@ -136,7 +136,7 @@ class Scene(SceneQuestions):
                 stack.callback(archive.close)
             with at_place(path, "$.effects"):
                 scene = cls(archives, name, metrics, file, own)
-                scene._simulation = simulate(scene, file)
+                scene._simulation = make_simulation(scene, file)
             stack.pop_all()
         return scene
 
@@ -244,7 +244,7 @@ class Scene(SceneQuestions):
         """Return what simulates the frames of this scene's users; made at its first use."""
         with self._making:
             if self._simulation is None:
-                self._simulation = simulate(self, self._file)
+                self._simulation = make_simulation(self, self._file)
             return self._simulation
 
     def move(

@@ -57,7 +57,7 @@ ALLOWED = {
     "server/archives": "observability runtime avatars residency queries/context queries",
     "server/simulation/world": "kernels runtime scene_interface.py avatars queries/context queries archives",
     "server/simulation/effects": (
-        "kernels runtime avatars residency queries/context queries archives simulation/world"
+        "runtime avatars residency queries/context queries archives simulation/world"
     ),
     "server/simulation": (
         "runtime scene_interface.py avatars queries/context queries archives simulation/world simulation/effects"

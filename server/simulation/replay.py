@@ -1,7 +1,8 @@
-"""A log's frames once more: the same wishes must give the same poses, bit for bit.
+"""Replay of a log: the same motion commands must give the same poses, bit for bit.
 
-On another machine, too: kernels round as NUMERICS.md has it, and between them effects add and multiply in one order
-(vectors.py). Only the probability of `uncertainty` is by the machine's own error function; no pose depends on it.
+This also holds on another machine: kernels round as NUMERICS.md states, and effects add and multiply
+in a fixed order (vectors.py). Only the probability of `uncertainty` depends on the machine's own
+error function, and no pose depends on it.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,23 +18,34 @@ from ...schemas.wire.key_expressions import User
 from ...schemas.wire.motion_messages import Wish
 from ..runtime.stop_flag import NO_STOP, StopFlag
 from ..scene_interface import FrameCommand, ServedScene
-from .replay_log import Begin, Dropped, Ended, Entered, Frame, FrameLog, Points, Record, Said, said
+from .replay_log import (
+    AvatarPoints,
+    Begin,
+    Dropped,
+    Ended,
+    Entered,
+    FrameLog,
+    FrameRecord,
+    Record,
+    TurnResult,
+    turn_result,
+)
 from .simulation import Simulation
 
 
-class Difference(NamedTuple):
-    """Where a replay differs from its log. logged, found: what came of the turn."""
+class TurnDifference(NamedTuple):
+    """FrameCommand whose replay differs from the log. logged, found: its results."""
 
     frame: int
     user: User
-    logged: Said
-    found: Said
+    logged: TurnResult
+    found: TurnResult
 
     def __str__(self) -> str:
-        """One line."""
+        """Return a description of one line."""
         where = f"frame {self.frame}, avatar {self.user.avatar} of client {self.user.client}"
         if self.logged.error or self.found.error:
-            return f"{where}: logged {_words(self.logged)}, replayed {_words(self.found)}"
+            return f"{where}: logged {_describe(self.logged)}, replayed {_describe(self.found)}"
         logged, found = np.frombuffer(self.logged.pose), np.frombuffer(self.found.pose)
         at = int(np.flatnonzero(logged.view(np.int64) != found.view(np.int64))[0])
         return (
@@ -42,40 +54,43 @@ class Difference(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """What a replay found. frames, turns: run again.  different: turns that came out otherwise; first: of them.
+    """Result of a replay.
 
-    reloaded: the frame that the replay ends before, since the log's scene had been reloaded; None: it was not.
+    frames, turns: numbers of those simulated.  different: number of turns with another result;
+    first: the first of them.
+    reloaded: the frame before which the replay ended, because the log's scene was reloaded then;
+    None: it was not.
     """
 
     frames: int
     turns: int
     different: int
-    first: Difference | None
+    first: TurnDifference | None
     reloaded: int | None
 
 
 def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
-    """Run the frames of a log, on a simulation of the same scene that nobody walked yet.
+    """Simulate the frames of a log, with a new simulation of the same scene.
 
-    Each frame skips the effects that the log says it skipped: why it did was a matter of time. The replay ends where
-    the log's scene was reloaded. Raises what reading the records raises, and BadRequestError for a log whose avatars
-    are not those of the scene.
+    Each frame skips the effects that the logged one skipped, because that depended on a clock. The
+    replay ends where the log's scene was reloaded. Raises the errors of reading the records, and
+    BadRequestError for a log whose avatars are not those of the scene.
     """
-    bodies = _Bodies(simulation)
+    avatars = _LoggedAvatars(simulation)
     opened: list[int] | None = None
     frames = turns = different = 0
-    first: Difference | None = None
+    first: TurnDifference | None = None
     for record in records:
-        if isinstance(record, Points):
-            bodies.known[record.digest] = record
+        if isinstance(record, AvatarPoints):
+            avatars.known[record.digest] = record
         elif isinstance(record, Entered):
-            bodies.enter(record)
+            avatars.enter(record)
         elif isinstance(record, Dropped):
-            bodies.drop(record.client)
+            avatars.drop(record.client)
         elif isinstance(record, Ended):
             for user in record.users:
                 simulation.end(user)
-        elif isinstance(record, Frame):
+        elif isinstance(record, FrameRecord):
             for logged in record.said:
                 opened = opened or logged.opened
                 if logged.opened not in ([], opened):
@@ -86,34 +101,34 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
     return Replayed(frames, turns, different, first, None)
 
 
-def _differences(simulation: Simulation, record: Frame) -> list[Difference]:
-    """Run one frame; what comes out otherwise."""
-    wished = [FrameCommand(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
-    # A turn that the server ended early depended on a clock: it is ended again, and moves nobody.
+def _differences(simulation: Simulation, record: FrameRecord) -> list[TurnDifference]:
+    """Simulate one frame; return the turns with another result."""
+    turns = [FrameCommand(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
+    # A turn that the server ended early depended on a clock: it is ended again, and moves no user.
     ended = StopFlag()
     ended.set("ended early when it was logged")
     stops = [ended if logged.error == ErrorCode.EXPIRED else NO_STOP for logged in record.said]
-    outcomes = simulation.step(wished, skips=[logged.skipped for logged in record.said], stops=stops)
+    outcomes = simulation.step(turns, skips=[logged.skipped for logged in record.said], stops=stops)
     return [
-        Difference(record.number, outcome.user, logged, found)
+        TurnDifference(record.number, outcome.user, logged, found)
         for outcome, logged in zip(outcomes, record.said, strict=True)
-        if ((found := said(outcome)).pose, found.error) != (logged.pose, logged.error)
+        if ((found := turn_result(outcome)).pose, found.error) != (logged.pose, logged.error)
     ]
 
 
-class _Bodies:
-    """The avatars of a log, put into a scene as users come in with them."""
+class _LoggedAvatars:
+    """Avatars of a log, added to the scene when their users enter."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
-        self.known: dict[bytes, Points] = {}
+        self.known: dict[bytes, AvatarPoints] = {}
         self._added: dict[User, bytes] = {}
 
     def enter(self, entered: Entered) -> None:
-        """Have an avatar known before its user's first turn."""
+        """Add an avatar before its user's first turn."""
         user = User(*entered.user)
         if self._added.get(user, entered.digest) != entered.digest:
-            # The client went and came again with another avatar of that name, all others of it too.
+            # The client reconnected with another avatar of that name: its other avatars are gone too.
             self.drop(user.client)
         if user not in self._added:
             record = self.known.get(entered.digest)
@@ -127,7 +142,7 @@ class _Bodies:
             self._added[user] = entered.digest
 
     def drop(self, client: str) -> None:
-        """Forget the avatars of a client."""
+        """Drop the avatars of a client."""
         self._simulation.drop_client(client)
         for user in [user for user in self._added if user.client == client]:
             del self._added[user]
@@ -144,14 +159,17 @@ def archives_of(simulation: Simulation) -> list[tuple[str, int]]:
 
 
 def begin_of(simulation: Simulation, path: Path) -> Begin:
-    """What a log of a scene begins with. path: of its archive or scene file."""
+    """Return the first record of a scene's log. path: of its archive or scene file."""
     file = path.read_bytes() if path.is_file() else b""
     return Begin(simulation.scene.name, str(path.resolve()), file, archives_of(simulation))
 
 
 @contextmanager
 def recorded(scene: ServedScene, path: Path, log: Path) -> Iterator[None]:
-    """Log the frames of a scene to a new file while inside. path: of its archive or scene file. BadRequestError."""
+    """Log the frames of a scene to a new file during the block.
+
+    path: of its archive or scene file. Raises BadRequestError.
+    """
     simulation: Any = scene.simulation
     with FrameLog(log, begin_of(simulation, path)) as frames:
         simulation.record(frames)
@@ -162,27 +180,27 @@ def recorded(scene: ServedScene, path: Path, log: Path) -> Iterator[None]:
 
 
 def check_same(begin: Begin, simulation: Simulation, path: Path) -> bool:
-    """Whether a scene's file is that which the log began with. BadRequestError unless its archives are.
+    """Return whether a scene's file is that of the log. Raises BadRequestError for other archives.
 
     path: of the archive or scene file.
     """
     found = archives_of(simulation)
     if [tuple(each) for each in begin.archives] != found:
         raise BadRequestError(
-            f"{path}: holds {_archives(found)}: expected {_archives(begin.archives)}, which the log is of "
-            f"({begin.path})"
+            f"{path}: holds {_describe_archives(found)}: expected {_describe_archives(begin.archives)}, which "
+            f"the log is of ({begin.path})"
         )
     return begin.file == (path.read_bytes() if path.is_file() else b"")
 
 
-def _archives(archives: Sequence[tuple[str, int]]) -> str:
-    """Archives in words."""
+def _describe_archives(archives: Sequence[tuple[str, int]]) -> str:
+    """Describe archives."""
     return " and ".join(f"archive {name[:8]} of generation {generation}" for name, generation in archives)
 
 
-def _words(said: Said) -> str:
-    """What came of a turn, for people."""
-    if said.error:
-        return f"error {said.error}"
-    x, y, z = np.frombuffer(said.pose, "<f8").reshape(4, 4)[:3, 3].tolist()
+def _describe(result: TurnResult) -> str:
+    """Describe the result of a turn."""
+    if result.error:
+        return f"error {result.error}"
+    x, y, z = np.frombuffer(result.pose, "<f8").reshape(4, 4)[:3, 3].tolist()
     return f"a pose at {x:g} {y:g} {z:g}"

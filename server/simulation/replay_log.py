@@ -1,9 +1,11 @@
-"""The log of a scene's frames: all that decides what came of wishes, and what did; written as it happens, read for a
-replay.
+"""The log of a scene's frames: everything that decides the results of motion commands, and the results.
 
-A file begins with MAGIC. A record is a head of 12 bytes, little-endian uint32: the length of its body, the CRC-32 of
-these four bytes, the CRC-32 of the body; then the body, MessagePack. It is written by one call that nothing buffers: a
-server that is killed leaves whole records, of which the last may be cut off.
+It is written frame by frame and read for a replay.
+
+A file begins with MAGIC. A record is a head of 12 bytes and a body. The head holds three
+little-endian uint32: the length of the body, the CRC-32 of these four bytes, and the CRC-32 of the
+body. The body is MessagePack. Each record is written by one unbuffered call: a killed server leaves
+whole records, of which the last may be cut off.
 """
 
 import hashlib
@@ -29,13 +31,14 @@ log = logging.getLogger(__name__)
 MAGIC = b"solidcloud frames 1\n"
 _HEAD = struct.Struct("<III")
 # A frame of a thousand users takes a megabyte; an avatar of a million points 24.
-_MOST_BYTES = 1 << 28
+_MAX_BYTES = 1 << 28
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
-    """What is simulated. scene: its name.  path: of the archive or scene file.  file: the scene file's bytes, or none.
+    """First record of a log: the simulated scene.
 
-    archives: id, hexadecimal, and generation of each.
+    scene: its name.  path: of the archive or scene file.  file: bytes of the scene file; empty for
+    an archive.  archives: id, hexadecimal, and generation of each.
     """
 
     scene: str
@@ -44,8 +47,8 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
     archives: list[tuple[str, int]]
 
 
-class Points(msgspec.Struct, frozen=True, tag="points"):
-    """An avatar, by its content. points: (n, 3) float64, little-endian [m].  radius: of each [m]."""
+class AvatarPoints(msgspec.Struct, frozen=True, tag="points"):
+    """Content of an avatar. points: (n, 3) float64, little-endian [m].  radius: of each [m]."""
 
     digest: bytes
     points: bytes
@@ -53,34 +56,36 @@ class Points(msgspec.Struct, frozen=True, tag="points"):
 
 
 class Entered(msgspec.Struct, frozen=True, tag="entered"):
-    """A user comes in with its next turn, as the avatar of this content."""
+    """A user enters with its next turn, as the avatar with this content."""
 
     user: User
     digest: bytes
 
 
 class Ended(msgspec.Struct, frozen=True, tag="ended"):
-    """Users left."""
+    """Users that left."""
 
     users: list[User]
 
 
 class Dropped(msgspec.Struct, frozen=True, tag="dropped"):
-    """A client's avatars were forgotten."""
+    """A client whose avatars were dropped."""
 
     client: str
 
 
 class Reloaded(msgspec.Struct, frozen=True, tag="reloaded"):
-    """The archives were opened anew."""
+    """A hot reload of the archives."""
 
     generation: int
 
 
-class Said(msgspec.Struct, frozen=True, array_like=True):
-    """What came of a turn. pose: (4, 4) float64, little-endian; b"": refused.  error: the code.  skipped: effects.
+class TurnResult(msgspec.Struct, frozen=True, array_like=True):
+    """Result of a turn.
 
-    opened: how often each archive had been reloaded when the user last moved; empty where it never did.
+    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.  skipped: effects.
+    opened: how often each archive had been reloaded when the user last moved; empty if it never
+    moved.
     """
 
     pose: bytes
@@ -89,40 +94,40 @@ class Said(msgspec.Struct, frozen=True, array_like=True):
     opened: list[int] = []
 
 
-class Frame(msgspec.Struct, frozen=True, tag="frame"):
-    """One frame. turns: user and wish (WIRE.md, MessagePack), in order.  said: of each."""
+class FrameRecord(msgspec.Struct, frozen=True, tag="frame"):
+    """One frame. turns: user and `Wish` (WIRE.md, MessagePack), in order.  said: result of each turn."""
 
     number: int
     turns: list[tuple[User, bytes]]
-    said: list[Said]
+    said: list[TurnResult]
 
 
-Record = Begin | Points | Entered | Ended | Dropped | Reloaded | Frame
+Record = Begin | AvatarPoints | Entered | Ended | Dropped | Reloaded | FrameRecord
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)
 
 
-def said(outcome: FrameResult, opened: Sequence[int] = ()) -> Said:
-    """What a log says of an outcome. opened: how often each archive had been reloaded."""
+def turn_result(outcome: FrameResult, opened: Sequence[int] = ()) -> TurnResult:
+    """Return an outcome as it is logged. opened: how often each archive had been reloaded."""
     if isinstance(outcome.state, SolidcloudError):
-        return Said(b"", str(outcome.state.code))
-    return Said(pose_bytes(outcome.state.pose), "", list(outcome.state.skipped), list(opened))
+        return TurnResult(b"", str(outcome.state.code))
+    return TurnResult(pose_bytes(outcome.state.pose), "", list(outcome.state.skipped), list(opened))
 
 
 def pose_bytes(pose: Any) -> bytes:
-    """A pose as it stands in a log."""
+    """Return a pose as it is logged."""
     return np.ascontiguousarray(pose, "<f8").tobytes()
 
 
 class FrameLog:
-    """Writes a log; a context manager. Not thread-safe: a simulation tells it one thing at a time.
+    """Writer of a log; a context manager. Not thread-safe: a simulation calls it during a frame.
 
-    What cannot be written is logged as an error, and nothing after it is: a scene is served all the same.
+    After a failed write nothing more is written, and an error is logged. The scene is still served.
     """
 
     def __init__(self, path: str | Path, begin: Begin) -> None:
-        """Begin a new file. BadRequestError: it exists, or cannot be written."""
+        """Create a new file. Raises BadRequestError if it exists or cannot be written."""
         self._path = Path(path)
         try:
             self._file: BinaryIO | None = open(path, "xb", buffering=0)  # noqa: SIM115
@@ -139,7 +144,7 @@ class FrameLog:
         self._write(begin)
 
     def __enter__(self) -> "FrameLog":
-        """The log itself."""
+        """Return the log itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -147,30 +152,30 @@ class FrameLog:
         self.close()
 
     def close(self) -> None:
-        """Close the file; nothing more is written."""
+        """Close the file. Later records are not written."""
         file, self._file = self._file, None
         if file is not None:
             file.close()
 
     def entered(self, user: User, avatar: AvatarModel) -> None:
-        """A user comes in with its next turn."""
+        """Record that a user enters with its next turn."""
         points = np.ascontiguousarray(avatar.points, "<f8").tobytes()
         digest = hashlib.sha256(struct.pack("<d", avatar.radius) + points).digest()
         if digest not in self._known:
             self._known.add(digest)
-            self._write(Points(digest, points, avatar.radius))
+            self._write(AvatarPoints(digest, points, avatar.radius))
         self._write(Entered(user, digest))
 
     def ended(self, users: list[User]) -> None:
-        """Users left."""
+        """Record that users left."""
         self._write(Ended(users))
 
     def dropped(self, client: str) -> None:
-        """A client's avatars were forgotten."""
+        """Record that a client's avatars were dropped."""
         self._write(Dropped(client))
 
     def reloaded(self, generation: int) -> None:
-        """The archives were opened anew."""
+        """Record a hot reload of the archives."""
         self._write(Reloaded(generation))
 
     def frame(
@@ -180,9 +185,10 @@ class FrameLog:
         outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
     ) -> None:
-        """One frame. opened: of each turn, how often each archive had been reloaded."""
-        wished = [(turn.user, encode(turn.wish)) for turn in turns]
-        self._write(Frame(number, wished, [said(*each) for each in zip(outcomes, opened, strict=True)]))
+        """Record one frame. opened: for each turn, how often each archive had been reloaded."""
+        commands = [(turn.user, encode(turn.wish)) for turn in turns]
+        results = [turn_result(*each) for each in zip(outcomes, opened, strict=True)]
+        self._write(FrameRecord(number, commands, results))
 
     def _write(self, record: Record) -> None:
         """Append one record."""
@@ -203,9 +209,10 @@ class FrameLog:
 
 
 def read_log(path: str | Path) -> Iterator[Record]:
-    """The whole records of a log, the first of them a `Begin`; one that is cut off at the end is left out.
+    """Yield the whole records of a log, the first of them a `Begin`; omit one that is cut off at the end.
 
-    FormatError: no such log. CorruptError: a record is not what was written, with its number and place.
+    Raises FormatError if it is no log, and CorruptError if a record was changed, with its number and
+    position.
     """
     try:
         file = open(path, "rb")  # noqa: SIM115
@@ -236,12 +243,12 @@ def _count_from_zero() -> Iterator[int]:
 
 
 def _read_record(file: BinaryIO, where: str) -> Record | None:
-    """The next record; None: there is none, or it is cut off."""
+    """Return the next record; None at the end, or if it is cut off."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
     length, of_length, of_body = _HEAD.unpack(head)
-    if zlib.crc32(head[:4]) != of_length or length > _MOST_BYTES:
+    if zlib.crc32(head[:4]) != of_length or length > _MAX_BYTES:
         raise CorruptError(f"{where}: its length, {length}, is not what was written: the file was changed")
     body = file.read(length)
     if len(body) < length:

@@ -1,21 +1,30 @@
 """Simulation: the frames of a scene, which move its users by the effects that the scene declares.
 
-`move` simulates one frame and remembers nothing. `step` simulates one frame of all users with a
-motion command, whose bodies are remembered until they end. The same commands in the same order give
-the same poses, bit for bit: nothing here reads a clock but to say how long a frame took.
+`move` simulates one frame and keeps no state. `step` simulates one frame of all users with a motion
+command, and keeps their bodies until they end. The same commands in the same order give the same
+poses, bit for bit: a clock is read only to report how long a frame took.
 """
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ...schemas.errors import BadRequestError, BusyError, ExpiredError, InternalError, SolidcloudError
-from ...schemas.scene.scene_file import SceneFile
+from ...schemas.errors import (
+    BadRequestError,
+    BadTransformError,
+    BusyError,
+    ExpiredError,
+    InternalError,
+    SolidcloudError,
+    UnknownAvatarError,
+)
+from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
 from ...schemas.wire.messages import AvatarInfo, SceneInfo
@@ -23,37 +32,30 @@ from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest, S
 from ...schemas.wire.requests import make_poses
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import EXACT, QueryBudget
+from ..queries.context.query_budget import QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
-from .world.frame import Body
-from .world.motion_commands import Pose, check_rigid, first_pose, frame_seconds, wished_pose
-from .world.vectors import size, unit
+from .world.frame import Body, Pose, Vec
+from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
+
+if TYPE_CHECKING:  # a scene that is only queried imports neither
+    from .effects.pipeline import Pipeline
+    from .world.bodies import Bodies
 
 log = logging.getLogger(__name__)
 
-# A user that wished nothing for so long has left: others may walk where it stood [s].
+# A user that has sent no motion command for this long has left: others may walk where it stood [s].
 SILENT_SECONDS = 30.0
-# No client's name either.
+# A longer pause is not one frame: a viewer that stood still continues as after a pause [s].
+LONGEST_FRAME = 0.1
+# Tolerance of the check that a pose is rigid (NUMERICS.md N6).
+_RIGID = 1e-9
+# Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
 
 
-class Pipeline(Protocol):
-    """The effects that a scene declares, as simulation/effects/pipeline.py makes them."""
-
-    def run(
-        self,
-        body: Body,
-        wish: Pose,
-        seconds: float,
-        budget: QueryBudget = EXACT,
-        *,
-        skip: Collection[str] | None = None,
-    ) -> Moved: ...
-
-
-class Stage(Protocol):
-    """The scene whose users are simulated."""
+class SimulatedScene(Protocol):
+    """Scene whose users are simulated."""
 
     name: str
     archives: list[PlacedArchive]
@@ -66,19 +68,8 @@ class Stage(Protocol):
     def forget_client(self, client: str) -> None: ...
 
 
-class Bodies(Protocol):
-    """All that moves and blocks, for effects that let users meet one another or objects.
-
-    See simulation/effects/bodies.py.
-    """
-
-    def __setitem__(self, user: User, body: Body) -> None: ...
-    def pop(self, user: User, default: None = None) -> Any: ...
-    def tell(self, poses: dict[str, list[list[float]]], stop: StopFlag) -> Callable[[], None]: ...
-
-
 class Recorder(Protocol):
-    """Who is told of all that decides what comes of wishes, in order; see replay_log.py."""
+    """Receives everything that decides the results of motion commands, in order; see replay_log.py."""
 
     def entered(self, user: User, avatar: AvatarModel) -> None: ...
     def ended(self, users: list[User]) -> None: ...
@@ -94,7 +85,7 @@ class Recorder(Protocol):
 
 
 class _Presence:
-    """A user who walks the scene: its body, when it wished last on its own clock and on the server's."""
+    """User in the scene: its body, and the time of its last command by its own and by the server's clock."""
 
     __slots__ = ("body", "heard", "time")
 
@@ -105,40 +96,40 @@ class _Presence:
 
 
 class Simulation:
-    """The frames of a scene. Thread-safe.
+    """Frames of a scene. Thread-safe.
 
     scene: whose users are simulated.  file: what it declares.  pipeline: its effects.
-    bodies: updated where users meet.  place: returns some scan point, (3,) world [m].
+    bodies: updated where users can meet.  place: returns some scan point, (3,) world [m].
     """
 
     def __init__(
         self,
-        scene: Stage,
+        scene: SimulatedScene,
         file: SceneFile,
-        pipeline: Pipeline,
-        bodies: Bodies | None = None,
+        pipeline: "Pipeline",
+        bodies: "Bodies | None" = None,
         place: Callable[[], Any] | None = None,
     ) -> None:
         self.scene, self.file, self._pipeline = scene, file, pipeline
-        self._up = unit(file.up)
+        self._up = unit_vector(file.up)
         self._present: dict[User, _Presence] = {}
         self._bodies, self._place = bodies, place
         self._recorder: Recorder | None = None
         self._frames = 0
-        self._frame = threading.Lock()  # held for a frame: bodies change under it alone
+        self._frame = threading.Lock()  # held for a frame; bodies change only while it is held
 
     @property
     def most_users(self) -> int:
-        """How many may walk it at a time."""
+        """Return the largest number of users at a time."""
         return self.file.limits.users
 
     @property
     def users(self) -> list[User]:
-        """Who walks it now."""
+        """Return the users that are present."""
         return list(self._present)
 
     def record(self, recorder: Recorder | None) -> None:
-        """Tell `recorder` of every frame from now on, before anybody walks the scene; None: nobody."""
+        """Record every frame from now on with `recorder`; call this before users enter. None: stop."""
         with self._frame:
             self._recorder = recorder
 
@@ -152,25 +143,26 @@ class Simulation:
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
-        """Where avatar `name` gets from one pose (1, 4, 4) towards another in a frame; nothing is remembered.
+        """Move avatar `name` from one pose (1, 4, 4) towards another for one frame; keep no state.
 
-        seconds: that the frame lasts [s].  stop: ends the frame early: the avatar stays, and its verdict is unknown.
+        seconds: duration of the frame [s].  stop: ends the frame early: the avatar stays, and its
+        verdict is unknown.
         Raises BadRequestError, BadTransformError, UnknownAvatarError.
         """
-        asked = MoveRequest(
+        request = MoveRequest(
             avatar=name,
             pose_from=make_poses(pose_from, "pose_from"),
             pose_to=make_poses(pose_to, "pose_to"),
             seconds=float(seconds),
         )
         user = User(client, name)
-        begin = check_rigid(asked.pose_from[0].copy(), "pose_from")
-        wish = check_rigid(asked.pose_to[0], "pose_to")
-        body = _body(user, self.scene.avatar(name, client), begin)
+        begin = check_rigid(request.pose_from[0].copy(), "pose_from")
+        target = check_rigid(request.pose_to[0], "pose_to")
+        body = _make_body(user, self.scene.avatar(name, client), begin)
         try:
-            return self._pipeline.run(body, wish, asked.seconds, QueryBudget(stop=stop))
+            return self._pipeline.run(body, target, request.seconds, QueryBudget(stop=stop))
         except StoppedError:
-            left = size(wish[:3, 3] - begin[:3, 3])
+            left = norm(target[:3, 3] - begin[:3, 3])
             return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
 
     def step(
@@ -180,17 +172,19 @@ class Simulation:
         skips: Sequence[Collection[str]] | None = None,
         stops: Sequence[StopFlag] | None = None,
     ) -> list[FrameResult]:
-        """One frame of everybody who wished, one after the other in the order of `turns`; what came of each.
+        """Simulate one frame of all users with a motion command, in the order of `turns`; return the outcomes.
 
-        A user's first wish puts its body where the scene's spawn is, or else where it wishes to be. What a wish is
-        refused for is its outcome; the others go on.
-        now: on a clock of the caller's [s]; who has not wished for SILENT_SECONDS of it ends first; None: nobody does.
-        skips: of each turn, the effects to be left out, as a frame recorded says; None: as the frame's budget has it.
-        stops: of each turn, what ends it early: its user stays where it was, and the outcome is ExpiredError.
+        A user's first command places its body at the scene's spawn, or else where the command leads.
+        The outcome of a refused command is its error; the others are simulated.
+        now: on a clock of the caller's [s]; users without a command for SILENT_SECONDS of it end
+        first; None: no user does.
+        skips: for each turn, the effects to skip, as a recorded frame states; None: those that do
+        not fit the frame's budget.
+        stops: for each turn, ends it early: its user stays, and the outcome is ExpiredError.
         """
         with self._frame:
             if now is not None:
-                self._leave([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
+                self._remove([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
             self._frames += 1
             outcomes, opened = [], []
             for number, turn in enumerate(turns):
@@ -198,63 +192,63 @@ class Simulation:
                 stop = NO_STOP if stops is None else stops[number]
                 used: list[bytes] = []
                 with recording_avatars(used):
-                    said = self._turn(turn, now, skip, stop)
+                    state = self._simulate_turn(turn, now, skip, stop)
                 there = self._present.get(turn.user)
                 about = b"".join(used) if there is None else there.body.avatar.digest
-                outcomes.append(FrameResult(turn.user, said, about))
+                outcomes.append(FrameResult(turn.user, state, about))
                 opened.append(() if there is None else there.body.generations)
             if self._recorder is not None:
                 self._recorder.frame(self._frames, turns, outcomes, opened)
             return outcomes
 
-    def _turn(
+    def _simulate_turn(
         self, turn: FrameCommand, now: float | None, skip: Collection[str] | None, stop: StopFlag
     ) -> State | SolidcloudError:
-        """One user's frame; what it is refused for is returned."""
+        """Simulate the frame of one user; return its state, or the error of a refused command."""
         begin = time.perf_counter()
         try:
-            moved = self._moved(turn.user, turn.wish, now, skip, stop)
+            moved = self._simulate_command(turn.user, turn.wish, now, skip, stop)
         except SolidcloudError as error:
             return error
         except StoppedError:
             return ExpiredError(f"{stop.reason}: the user stays where it was")
-        except Exception as error:  # of this user alone: the others' frames go on
+        except Exception as error:  # must not end the frames of the other users
             log.exception("a frame of %s in %s", _public_name(turn.user), self.scene.name)
             return InternalError(f"{type(error).__name__} in the server: its log says more")
-        wish = turn.wish
+        command = turn.wish
         return State(
             **{name: getattr(moved, name) for name in Moved.__struct_fields__},
-            seq=wish.seq,
-            time=wish.time,
+            seq=command.seq,
+            time=command.time,
             frame=self._frames,
             late=turn.late,
             seconds=time.perf_counter() - begin,
         )
 
-    def _moved(
-        self, user: User, wish: Wish, now: float | None, skip: Collection[str] | None, stop: StopFlag
+    def _simulate_command(
+        self, user: User, command: Wish, now: float | None, skip: Collection[str] | None, stop: StopFlag
     ) -> Moved:
-        """What comes of one wish; its user's body is begun with it, and not where it is refused."""
+        """Move a user by one command; a new user enters with it, unless the command is refused."""
         there = self._present.get(user)
-        present = self._begun(user, wish) if there is None else there
-        seconds = frame_seconds(wish, present.time)
-        aim = wished_pose(wish, present.body.pose, seconds, self._up)
-        with ExitStack() as refused:
-            if wish.objects:
+        present = self._enter(user, command) if there is None else there
+        seconds = frame_seconds(command, present.time)
+        target = target_pose(command, present.body.pose, seconds, self._up)
+        with ExitStack() as undo:
+            if command.objects:
                 if self._bodies is None:
                     raise BadRequestError(f"{self.scene.name}: a wish moves objects: this scene has none")
-                refused.callback(self._bodies.tell(wish.objects, stop))
-            moved = self._pipeline.run(present.body, aim, seconds, QueryBudget(stop=stop), skip=skip)
-            refused.pop_all()
-        present.time = wish.time
+                undo.callback(self._bodies.place_objects(command.objects, stop))
+            moved = self._pipeline.run(present.body, target, seconds, QueryBudget(stop=stop), skip=skip)
+            undo.pop_all()
+        present.time = command.time
         present.heard = present.heard if now is None else now
         self._present[user] = present
         if self._bodies is not None:
             self._bodies[user] = present.body
         return moved
 
-    def _begun(self, user: User, wish: Wish) -> _Presence:
-        """A user who comes in; BusyError where the scene is full."""
+    def _enter(self, user: User, command: Wish) -> _Presence:
+        """Return the presence of a new user. Raises BusyError if the scene is full."""
         if len(self._present) >= self.most_users:
             raise BusyError(
                 f"{self.scene.name}: {len(self._present)} users walk it, as many as its limits allow: come again later"
@@ -262,10 +256,10 @@ class Simulation:
         avatar = self.scene.avatar(user.avatar, user.client)
         if self._recorder is not None:
             self._recorder.entered(user, avatar)
-        return _Presence(_body(user, avatar, first_pose(wish, self.file.spawn, self._up)))
+        return _Presence(_make_body(user, avatar, first_pose(command, self.file.spawn, self._up)))
 
-    def _leave(self, users: list[User]) -> None:
-        """End bodies."""
+    def _remove(self, users: list[User]) -> None:
+        """Remove the bodies of users."""
         users = [user for user in users if user in self._present]
         for user in users:
             del self._present[user]
@@ -275,19 +269,19 @@ class Simulation:
             self._recorder.ended(users)
 
     def end(self, user: User) -> None:
-        """A user leaves the scene: others may walk where it stood. Its next wish is a first one."""
+        """Remove a user: others may walk where it stood. Its next command is again a first one."""
         with self._frame:
-            self._leave([user])
+            self._remove([user])
 
     def end_client(self, client: str) -> None:
-        """All users of a client leave the scene."""
+        """Remove all users of a client."""
         with self._frame:
-            self._leave([user for user in self._present if user.client == client])
+            self._remove([user for user in self._present if user.client == client])
 
     def drop_client(self, client: str) -> None:
-        """Forget the bodies and avatars of a client that is gone; see `Scene.drop_client`."""
+        """Remove the bodies and avatars of a client that disconnected; see `Scene.drop_client`."""
         with self._frame:
-            self._leave([user for user in self._present if user.client == client])
+            self._remove([user for user in self._present if user.client == client])
             self.scene.forget_client(client)
             if self._recorder is not None:
                 self._recorder.dropped(client)
@@ -295,7 +289,7 @@ class Simulation:
     def warm(self) -> None:
         """Simulate some frames, so that no user waits for compilation.
 
-        They go at a scan point from above, out of it and past it, and at another user.
+        They move onto a scan point from above, out of it and past it, and onto another user.
         """
         place = np.array(self.scene.info().bounds[0]) if self._place is None else self._place()
         user, other = User(_WARM, "warm"), User(_WARM, "other")
@@ -306,11 +300,10 @@ class Simulation:
             for begin, end in ((way, -way), (-0 * way, way), (way, way + across)):
                 poses = np.tile(np.eye(4), (2, 1, 1, 1))
                 poses[:, 0, :3, 3] = place + far * begin, place + far * end
-                with self._frame, suppress(SolidcloudError):  # of a place where a frame makes no sense
-                    body = _body(user, self.scene.avatar("warm", _WARM), poses[0, 0])
+                with self._frame, suppress(SolidcloudError):  # a place where no frame is possible
+                    body = _make_body(user, self.scene.avatar("warm", _WARM), poses[0, 0])
                     if self._bodies is not None:
-                        there = _body(other, body.avatar, poses[:, 0].mean(axis=0))
-                        self._bodies[other] = there
+                        self._bodies[other] = _make_body(other, body.avatar, poses[:, 0].mean(axis=0))
                     for pose in (poses[1, 0], poses[1, 0], poses[0, 0]):
                         self._pipeline.run(body, pose, FRAME_SECONDS)
         if self._bodies is not None:
@@ -324,11 +317,74 @@ class Simulation:
                 self._recorder.reloaded(generation)
 
 
-def _body(user: User, avatar: AvatarModel, pose: Pose) -> Body:
-    """Return a user's body where it begins."""
+def check_rigid(pose: Pose, what: str) -> Pose:
+    """Return the pose. Raises BadTransformError unless it is a rotation and a translation."""
+    # With Python's floats: for one pose this takes a fifth of numpy's time.
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), last = pose.tolist()
+    if last != [0.0, 0.0, 0.0, 1.0]:
+        raise BadTransformError(f"{what} has a last row that is not 0 0 0 1: give a row-major 4x4 pose")
+    off = max(
+        abs(a * a + b * b + c * c - 1), abs(d * d + e * e + f * f - 1), abs(g * g + h * h + i * i - 1),
+        abs(a * d + b * e + c * f), abs(a * g + b * h + c * i), abs(d * g + e * h + f * i),
+    )  # fmt: skip
+    mirrored = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0
+    if not off <= _RIGID or mirrored:
+        raise BadTransformError(
+            f"{what} {'mirrors' if mirrored else f'is not rigid (off by {off:g})'}: expected a rotation, within 1e-9, "
+            "and a translation: renormalise it"
+        )
+    return pose
+
+
+def frame_seconds(command: Wish, before: float | None) -> float:
+    """Return how long the frame of a motion command lasts [s].
+
+    before: time of the user's previous command, on its clock; None: it is the first.
+    """
+    if before is None:
+        return FRAME_SECONDS
+    return min(max(command.time - before, 0.0), LONGEST_FRAME)
+
+
+def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
+    """Return the pose that a motion command leads to from `pose`. up: unit vector.
+
+    A velocity applies for the duration of the frame.
+    """
+    if command.velocity is None:
+        return check_rigid(command.pose[0], "pose")
+    there = pose.copy()
+    there[:3, 3] += np.array(command.velocity) * seconds
+    if command.turn and seconds:
+        there[:3, :3] = orthonormalize(multiply(rotation_matrix(up, command.turn * seconds), pose))
+    return there
+
+
+def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
+    """Return the pose at which users enter."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
+    pose[:3, 3] = spawn.position
+    return pose
+
+
+def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
+    """Return the pose at which a user enters with its first command.
+
+    Raises UnknownAvatarError if neither scene nor command gives one.
+    """
+    if spawn is not None:
+        return spawn_pose(spawn, up)
+    if command.velocity is not None:
+        raise UnknownAvatarError("the avatar is nowhere yet, and the scene has no spawn: begin with a pose")
+    return check_rigid(command.pose[0].copy(), "pose")
+
+
+def _make_body(user: User, avatar: AvatarModel, pose: Pose) -> Body:
+    """Return a new body of a user."""
     return Body(_public_name(user), avatar, pose, user=user)
 
 
 def _public_name(user: User) -> str:
-    """Return a name that others may be told, and logs: the client's id is a secret."""
+    """Return a name that other users and logs may see: the client's id is a secret."""
     return f"{public_id(user.client)}/{user.avatar}"

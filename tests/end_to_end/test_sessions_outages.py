@@ -17,7 +17,7 @@ from solidcloud.schemas.wire.encoding import encode
 from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.client import Client
 from solidcloud.server.simulation.replay import replay
-from solidcloud.server.simulation.replay_log import Frame, read_log
+from solidcloud.server.simulation.replay_log import FrameRecord, read_log
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at, walking
@@ -152,5 +152,5 @@ def test_a_killed_server_leaves_a_log_that_replays(endpoint, tmp_path):
     records = list(read_log(log))
     found = replay(floor_simulation(), records)
     assert found == (200, 200, 0, None, None)
-    last = [record for record in records if isinstance(record, Frame)][-1]
+    last = [record for record in records if isinstance(record, FrameRecord)][-1]
     assert last.said[0].pose == session.latest().state.pose.tobytes()

@@ -30,9 +30,9 @@ from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
 from solidcloud.server.scene_interface import FrameCommand
-from solidcloud.server.simulation.assembly import simulate
+from solidcloud.server.simulation.make_simulation import make_simulation
 from solidcloud.server.simulation.replay import recorded, replay
-from solidcloud.server.simulation.replay_log import MAGIC, Frame, read_log
+from solidcloud.server.simulation.replay_log import MAGIC, FrameRecord, read_log
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 from solidcloud.server.zenoh_server.service import serving
 
@@ -142,7 +142,7 @@ ALL = [Stop(), Sweep(), Slide(), Step(), Ground(), Proximity(), Contacts(), Crow
 def test_who_walks_after_warming_waits_for_no_compiler(archive: Path) -> None:
     with Scene.open(archive) as scene:
         file = SceneFile(format=1, archives=scene_of("room").archives, effects=ALL)
-        simulation = simulate(scene, file)
+        simulation = make_simulation(scene, file)
         simulation.warm()
         before = compiled()
         scene.add_avatar("body", BODY, RADIUS)
@@ -202,7 +202,7 @@ def test_a_replay_gives_the_same_poses_bit_for_bit(
     for arguments in ([str(log)], [str(log), str(scene)]):
         assert run(["replay", *arguments]) == 0
         assert capsys.readouterr().out == "302 frames, 302 turns: none different\n"
-    frames = [record for record in read_log(log) if isinstance(record, Frame)]
+    frames = [record for record in read_log(log) if isinstance(record, FrameRecord)]
     moved = {said.pose for frame in frames for said in frame.said}
     assert len(moved) > 200, "they did not just stand there"
 

@@ -21,7 +21,7 @@ from solidcloud.schemas.scene.effect_order import ORDER
 from solidcloud.schemas.scene.scene_file import SceneFile
 from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, encode
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.assembly import simulate
+from solidcloud.server.simulation.make_simulation import make_simulation
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 from solidcloud.server.zenoh_server.service import Service
 
@@ -54,13 +54,12 @@ ALONE: dict[str, list[str]] = {
 }
 # What only some effects have a use for, and which; every effect has itself.
 HELPERS = {
-    "server.simulation.effects.separation_cache": {"proximity", "contacts", "uncertainty"},
-    "server.simulation.world.contact_probability": {"uncertainty"},
+    "server.simulation.world.separation_cache": {"proximity", "contacts", "uncertainty"},
     "server.queries.distance_per_scan": {"uncertainty"},
     "server.kernels.nearest.nearest_by_scan": {"uncertainty"},
     "server.archives.masked_archive": {"through"},
-    "server.simulation.effects.bodies": {"objects", "crowd"},
-    "server.simulation.effects.blocking": {"objects", "crowd"},
+    "server.simulation.world.bodies": {"objects", "crowd"},
+    "server.simulation.world.body_obstacles": {"objects", "crowd"},
     "server.kernels.bodies.body_sweep": {"objects", "crowd"},
     "server.queries.surface_normals": {"slide", "ground", "step"},
     "server.kernels.rays.stored_normals": {"slide", "ground", "step"},
@@ -83,12 +82,12 @@ from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.simulation.world import collision_world as world
 from solidcloud.server.simulation.effects import pipeline
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.assembly import simulate
+from solidcloud.server.simulation.make_simulation import make_simulation
 def child(names):
     effects = [{"effect": name} for name in names]
     file = msgspec.convert({"format": 1, "archives": [{"path": "a"}], "effects": effects}, SceneFile)
     with Scene.open(pathlib.Path(sys.argv[1])) as scene:
-        simulation = simulate(scene, file)
+        simulation = make_simulation(scene, file)
         scene.add_avatar("ball", np.zeros((1, 3)), 0.1, client="c")
         pose = np.eye(4)[None]
         pose[0, 2, 3] = 0.3
@@ -213,7 +212,7 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
                 scene.objects([("other", pose) for pose in poses], client="c")
                 scene.raycast(poses[:, :3, 3], poses[:, :3, 0], 1.0)
             if beside == "effects":
-                scene._simulation = simulate(scene, EVERY_EFFECT)
+                scene._simulation = make_simulation(scene, EVERY_EFFECT)
                 scene.add_avatar("other", other, 0.02, client="c")
                 for pose, wish in pairwise(poses):
                     moved = scene.move("other", pose[None], wish[None], client="c")

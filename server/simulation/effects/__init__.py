@@ -1,7 +1,8 @@
 """Effects of a scene. Only the effects that a scene declares are imported (NUMERICS.md case 31).
 
 Each effect is one file, named as in the scene file, whose `make(effect, world)` returns a `Runner`.
-pipeline.py composes the effects that a scene declares, in this order:
+What effects share is in simulation/world/. pipeline.py runs the effects that a scene declares, in
+this order:
 
 1. `objects`, `crowd`: place everything else that could be met, before anyone moves.
 2. `stop`, with `sweep`: follow the motion command as far as nothing is touched.
@@ -13,7 +14,7 @@ pipeline.py composes the effects that a scene declares, in this order:
 
 `through` has no part in a frame: it changes the scene once, when it is opened.
 
-May import server.archives, server.avatars, server.kernels, server.queries, server.queries.context,
+May import server.archives, server.avatars, server.queries, server.queries.context,
 server.residency, server.runtime, server.simulation.world, schemas.
 Begin with pipeline.py, then stop_effect.py.
 """

@@ -10,7 +10,7 @@ from ....schemas.scene.effect_options import Contacts
 from ....schemas.wire.answers import ContactsAnswers
 from ....schemas.wire.motion_messages import ContactCluster, ContactsReport
 from ..world.frame import Frame
-from .separation_cache import farther
+from ..world.separation_cache import scene_is_farther_than
 
 
 def make(effect: Contacts, world: Any) -> "ContactsRunner":
@@ -38,7 +38,7 @@ class ContactsRunner:
         """Return the report; after an incomplete search, what was found, with `unknown`."""
         effect = self._effect
         # Most frames have no contact; finding that out costs a fifth of gathering nothing.
-        if farther(frame, effect.margin):
+        if scene_is_farther_than(frame, effect.margin):
             return ContactsReport()
         of_archives = frame.world.contacts(
             frame.body.avatar, frame.pose, 0, effect.margin, effect.cluster_distance, budget=frame.budget

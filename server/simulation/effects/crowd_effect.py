@@ -12,19 +12,19 @@ from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_options import Crowd
 from ....schemas.wire.motion_messages import CrowdReport
 from ...queries.context.query_context import to_units
+from ..world.bodies import USER, Bodies
+from ..world.body_obstacles import BodyObstacle, warm_kernels
 from ..world.frame import Frame, Hit, Pose
-from .blocking import Blocking, warm
-from .bodies import USER, Bodies
 
 # Largest permitted margin [m].
-_MOST_MARGIN = 8.0
+_MAX_MARGIN = 8.0
 
 
 def make(effect: Crowd, world: Any) -> "CrowdRunner":
     """Create the effect of a scene."""
-    if effect.margin > _MOST_MARGIN:
-        raise BadRequestError(f"margin {effect.margin:g} m of crowd: expected at most {_MOST_MARGIN:g} m")
-    warm()
+    if effect.margin > _MAX_MARGIN:
+        raise BadRequestError(f"margin {effect.margin:g} m of crowd: expected at most {_MAX_MARGIN:g} m")
+    warm_kernels()
     with world as seen:
         bodies = Bodies(seen[0].data.arrays.origin, world.up)
     return CrowdRunner(bodies, to_units(effect.margin, "margin"))
@@ -46,10 +46,10 @@ class CrowdRunner:
         """Add the other users to the obstacles; the report counts those that block."""
         self.bodies.begin()
         frame.reports[self.name] = CrowdReport()
-        frame.obstacles.append(Others(self.name, self.bodies, frame, self._margin_units))
+        frame.obstacles.append(UserObstacle(self.name, self.bodies, frame, self._margin_units))
 
 
-class Others(Blocking):
+class UserObstacle(BodyObstacle):
     """Obstacle of the other users; counts those that ended a motion."""
 
     def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:

@@ -19,10 +19,10 @@ from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import ObjectsReport
 from ...queries.context.query_budget import QueryBudget
-from ..world.frame import Frame, Hit, Pose, Vec, moved_by
-from ..world.vectors import dot, level, size
-from .blocking import Blocking, warm
-from .bodies import PUSHED, TOLD, USER, Bodies
+from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
+from ..world.body_obstacles import BodyObstacle, warm_kernels
+from ..world.frame import Frame, Hit, Pose, Vec, translated
+from ..world.vectors import dot, horizontal, norm
 
 # A pushed object keeps this distance from what stops it, along its way [m], as `stop` does for
 # users.
@@ -30,10 +30,10 @@ _SKIN = 0.002
 # Largest distance any point may move between the last moment known to be clear and a touch [m].
 _TOLERANCE = 1e-5
 # A push that would move an object by less than this does not move it [m].
-_LEAST = 1e-4
+_MIN_PUSH = 1e-4
 # Cosine: an object moves where it is pushed within 60 degrees of head on; otherwise users slide
 # along it.
-_HEAD_ON = 0.5
+_HEAD_ON_COSINE = 0.5
 
 
 def make(effect: Objects, world: Any) -> "ObjectsRunner":
@@ -41,7 +41,7 @@ def make(effect: Objects, world: Any) -> "ObjectsRunner":
 
     Raises BadRequestError for invalid objects.
     """
-    warm()
+    warm_kernels()
     return ObjectsRunner(world, world.file.objects)
 
 
@@ -58,13 +58,13 @@ class ObjectsRunner:
         """Create the effect. items: the objects at their initial poses."""
         self._world = world
         with world as seen:
-            self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._begin)
+            self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._add_initial)
         self._items = list(items)
         # By row: the clock of its last move, and the archives, when its contacts were computed.
-        self._asked: dict[int, tuple[int, tuple[int, ...]]] = {}
-        self._touching: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
+        self._computed_for: dict[int, tuple[int, tuple[int, ...]]] = {}
+        self._contacts: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
 
-    def _begin(self, bodies: Bodies) -> None:
+    def _add_initial(self, bodies: Bodies) -> None:
         """Add the objects at their initial poses."""
         for item in self._items:
             model = self._world.avatar(item.avatar)
@@ -78,8 +78,8 @@ class ObjectsRunner:
         bodies = self.bodies
         with bodies.lock:
             bodies.begin()
-            since, frame.kept[self.name] = frame.body.kept.get(self.name, 0), bodies.clock
-            frame.obstacles.append(Things(self, frame, since))
+            since, frame.effect_state[self.name] = frame.body.effect_state.get(self.name, 0), bodies.clock
+            frame.obstacles.append(ObjectObstacle(self, frame, since))
             frame.reports[self.name] = self.report(since, frame.budget)
 
     def report(self, since: int, budget: QueryBudget) -> ObjectsReport:
@@ -92,35 +92,35 @@ class ObjectsRunner:
         }
         names = {-1: ""} | dict(enumerate(bodies.names))
         return ObjectsReport(
-            poses, [(names[one], names[other]) for one, other in self._find_touching(budget)]
+            poses, [(names[one], names[other]) for one, other in self._find_contacts(budget)]
         )
 
     def _objects(self) -> list[int]:
         """Return the objects' rows, which precede those of users."""
         return np.flatnonzero(self.bodies.kinds != USER).tolist()
 
-    def _find_touching(self, budget: QueryBudget) -> list[tuple[int, int]]:
+    def _find_contacts(self, budget: QueryBudget) -> list[tuple[int, int]]:
         """Return the contacts, by rows; recompute those of objects that have moved."""
         bodies, rows, archives = self.bodies, self._objects(), self._world.generations()
         for row in rows:
             now = bodies.changed[row], archives
-            if self._asked.get(row) == now:
+            if self._computed_for.get(row) == now:
                 continue
             shape, pose = bodies.shapes[row], bodies.poses[row]
-            self._touching = {pair for pair in self._touching if row not in pair}
+            self._contacts = {pair for pair in self._contacts if row not in pair}
             verdict = self._world.collide(shape.model, pose, budget)
             if verdict == Verdict.CONTACT:
-                self._touching.add((-1, row))
+                self._contacts.add((-1, row))
             apart = (bodies.bounds[:, 0] > bodies.bounds[row, 1]) | (
                 bodies.bounds[:, 1] < bodies.bounds[row, 0]
             )
             near = np.array([other for other in rows if other != row and not apart[other].any()], np.int64)
             for other in near[bodies.touching(shape, pose, near, 0, budget.stop)].tolist():
-                self._touching.add((min(row, other), max(row, other)))
+                self._contacts.add((min(row, other), max(row, other)))
             if verdict == Verdict.UNKNOWN or budget.stop:
                 continue  # query again, once missing voxels may be there
-            self._asked[row] = now
-        return sorted(self._touching)
+            self._computed_for[row] = now
+        return sorted(self._contacts)
 
     def push(self, name: str, way: Vec, user: str, budget: QueryBudget) -> bool:
         """Move an object by a level displacement; return whether it moved.
@@ -129,38 +129,38 @@ class ObjectsRunner:
         user: the one who pushes, and follows; it is no obstacle.
         """
         bodies = self.bodies
-        row, length = bodies.row_of(name, user=False), size(way)
-        if length < _LEAST:
+        row, length = bodies.row_of(name, user=False), norm(way)
+        if length < _MIN_PUSH:
             return False
         model, pose = bodies.shapes[row].model, bodies.poses[row].copy()
-        to = moved_by(pose, way)
+        to = translated(pose, way)
         swept = self._world.sweep(model, pose, to, _TOLERANCE, budget)
         clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
-        others = Blocking(
-            self.name, bodies, USER | TOLD | PUSHED, name, model, pose, user=False, skip=user, stop=budget.stop
+        others = BodyObstacle(
+            self.name, bodies, USER | KINEMATIC | PUSHED, name, model, pose, user=False, skip=user, stop=budget.stop
         )  # fmt: skip
         hit = others.sweep(model, pose, to, _TOLERANCE)
         if hit is not None:
             clear = min(clear, hit.fraction)
         if clear < 1.0:
             clear -= _SKIN / length
-            if clear * length < _LEAST:
+            if clear * length < _MIN_PUSH:
                 return False
-            to = moved_by(pose, way * clear)
+            to = translated(pose, way * clear)
         if budget.stop:
             return False  # the result may be incomplete
         bodies.put(row, to)
         return True
 
 
-class Things(Blocking):
+class ObjectObstacle(BodyObstacle):
     """Obstacle of the objects, for one user's frame. Pushable objects give way."""
 
     def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
         """Create the obstacle for a frame. since: the count of moves its user knows of."""
         body, stop = frame.body, frame.budget.stop
         super().__init__(
-            runner.name, runner.bodies, TOLD | PUSHED, body.name, body.avatar, body.pose, stop=stop
+            runner.name, runner.bodies, KINEMATIC | PUSHED, body.name, body.avatar, body.pose, stop=stop
         )
         self._runner, self._since = runner, since
 
@@ -174,13 +174,13 @@ class Things(Blocking):
             return False
         with bodies.lock:
             row = bodies.row_of(hit.what, user=False)
-            if row < 0 or bodies.kinds[row] != PUSHED or not bodies.remembers(frame.body):
+            if row < 0 or bodies.kinds[row] != PUSHED or not bodies.is_present(frame.body):
                 return False
             if hit.avatar is None or hit.cloud is None:
                 return False
-            left = level(to[:3, 3] - frame.pose[:3, 3], bodies.up)
-            inward = level(hit.cloud - hit.avatar, bodies.up)
-            if not dot(left, inward) > _HEAD_ON * size(left) * size(inward):
+            left = horizontal(to[:3, 3] - frame.pose[:3, 3], bodies.up)
+            inward = horizontal(hit.cloud - hit.avatar, bodies.up)
+            if not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
                 return False
             if not self._runner.push(hit.what, left, frame.body.name, frame.budget):
                 return False

@@ -2,7 +2,7 @@
 
 No other effect is imported, called or reported (NUMERICS.md case 31). The scene file's `limits` set
 a frame's budget. Before each effect that may be skipped, the time spent in the frame and the
-effect's usual time are added. If the sum exceeds the budget, the effect is skipped, and the answer
+effect's estimated time are added. If the sum exceeds the budget, the effect is skipped, and the answer
 says so. Later effects in ORDER that take less may still fit. Effects that prevent contact are never
 skipped.
 """
@@ -24,20 +24,20 @@ from ...queries.context.query_budget import EXACT, QueryBudget
 from ...runtime.stop_flag import NO_STOP, StoppedError
 from ..world.collision_world import World
 from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
-from ..world.vectors import size
+from ..world.vectors import norm
 
-# The usual time of an effect follows its last time by this share.
-_FOLLOWS = 0.1
+# The estimated time of an effect follows its last time by this share.
+_SMOOTHING = 0.1
 # The estimate for a skipped effect decays by this share a frame, so that the effect is tried again.
 # Otherwise one slow run, for example because of a compiler or a disk, would make it skipped for
 # ever. An effect that is always slow gets one frame in some dozens.
-_FADES = 0.02
+_DECAY = 0.02
 # Largest number of touched things that an answer names.
-_MOST_TOUCHED = 16
+_MAX_TOUCHED = 16
 
 
-class Usual:
-    """Usual cost of an effect: seconds and node visits. The first frame is ignored: it compiles."""
+class CostEstimate:
+    """Estimated cost of an effect: seconds and node visits. The first frame is ignored: it compiles."""
 
     __slots__ = ("frames", "seconds", "tried", "visits")
 
@@ -45,14 +45,14 @@ class Usual:
         self.frames, self.seconds, self.visits = 0, 0.0, 0.0
         self.tried = False  # whether its next run is the first after it was skipped
 
-    def took(self, seconds: float, visits: int) -> None:
+    def record(self, seconds: float, visits: int) -> None:
         """Record the cost of a run."""
         self.frames += 1
         if self.frames == 1:
             return
         # A decayed estimate is no longer valid: a trial counts whole; otherwise the next would
         # follow at once.
-        share = 1.0 if self.tried else max(_FOLLOWS, 1.0 / (self.frames - 1))
+        share = 1.0 if self.tried else max(_SMOOTHING, 1.0 / (self.frames - 1))
         self.tried = False
         self.seconds += share * (seconds - self.seconds)
         self.visits += share * (visits - self.visits)
@@ -60,21 +60,21 @@ class Usual:
     def skipped(self) -> None:
         """Record that the budget had no room for the effect."""
         self.tried = True
-        self.seconds *= 1.0 - _FADES
-        self.visits *= 1.0 - _FADES
+        self.seconds *= 1.0 - _DECAY
+        self.visits *= 1.0 - _DECAY
 
 
 class Pipeline:
     """Effects of one scene in their order. Thread-safe, except for two frames of one body.
 
-    runners: the effects.  usual: cost of each, by name, where there is a budget.  bodies: see
+    runners: the effects.  costs: estimate for each, by name, where there is a budget.  bodies: see
     bodies.py; None where no effect uses it.
     """
 
     def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
         """Create a pipeline; call `make_pipeline` instead."""
         self.file, self.world, self.runners = file, world, runners
-        self.usual = {runner.name: Usual() for runner in runners}
+        self.costs = {runner.name: CostEstimate() for runner in runners}
         # Users and objects: shared by all effects that use them, updated by the simulation. None:
         # no effect does.
         self.bodies: Any = None
@@ -82,7 +82,7 @@ class Pipeline:
             if hasattr(runner, "bodies"):
                 self.bodies = self.bodies or runner.bodies
                 runner.bodies = self.bodies
-        self._beginners: list[Any] = [runner for runner in runners if hasattr(runner, "begin")]
+        self._command_filters: list[Any] = [runner for runner in runners if hasattr(runner, "begin")]
         self._stops = any(runner.name == "stop" for runner in runners)
         limits = file.limits
         self._seconds = None if limits.frame_ms is None else limits.frame_ms / 1e3
@@ -92,7 +92,7 @@ class Pipeline:
     def run(
         self,
         body: Body,
-        wish: Pose,
+        target: Pose,
         seconds: float = FRAME_SECONDS,
         budget: QueryBudget = EXACT,
         *,
@@ -107,22 +107,22 @@ class Pipeline:
         """
         begin = time.perf_counter()
         body.pose = np.ascontiguousarray(body.pose, np.float64)
-        wish = np.array(wish, np.float64)
-        far = size(wish[:3, 3] - body.pose[:3, 3])
+        target = np.array(target, np.float64)
+        far = norm(target[:3, 3] - body.pose[:3, 3])
         if not far <= self.file.limits.longest_move:
             raise BadRequestError(
                 f"the commanded pose is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the "
                 "scene's longest_move: send a nearer pose, or begin there"
             )
-        frame = Frame(body, wish, seconds, self.world, budget, body.pose)
+        frame = Frame(body, target, seconds, self.world, budget, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
         self.world.begin(budget.stop)
-        with self._undone_if_stopped(body, budget), self.world as seen:
+        with self._restored_if_stopped(body, budget), self.world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
-            for runner in self._beginners:
+            for runner in self._command_filters:
                 runner.begin(frame)
             if not self._stops:
-                frame.pose = frame.wish
+                frame.pose = frame.target
             since = self.world.visits
             for runner in self.runners:
                 if budget.stop:
@@ -143,46 +143,46 @@ class Pipeline:
             self.world.saw(body.user, body.avatar, frame.pose)
         body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
         body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
-        body.kept.update(frame.kept)
+        body.effect_state.update(frame.effect_state)
         return _moved(frame, self.world.unknown)
 
     @contextmanager
-    def _undone_if_stopped(self, body: Body, budget: QueryBudget) -> Iterator[None]:
+    def _restored_if_stopped(self, body: Body, budget: QueryBudget) -> Iterator[None]:
         """Restore the poses of pushed objects if the frame is stopped.
 
         A clock decides when a frame is stopped, and no pose may depend on a clock.
         """
-        if budget.stop is NO_STOP or self.bodies is None or not self.bodies.remembers(body):
+        if budget.stop is NO_STOP or self.bodies is None or not self.bodies.is_present(body):
             yield
             return
-        standing = self.bodies.standing()
+        poses = self.bodies.snapshot()
         try:
             yield
         except StoppedError:
-            self.bodies.put_back(standing)
+            self.bodies.restore(poses)
             raise
 
     def _run_one(
         self, runner: Runner, frame: Frame, begin: float, since: int, skip: Collection[str] | None
     ) -> None:
         """Run or skip one effect of a frame."""
-        name, usual = runner.name, self.usual[runner.name]
+        name, cost = runner.name, self.costs[runner.name]
         visits, now = self.world.visits, time.perf_counter()
         if name not in NEVER_SKIPPED:
-            skips = self._no_room(usual, now - begin, visits - since) if skip is None else name in skip
+            skips = self._exceeds_budget(cost, now - begin, visits - since) if skip is None else name in skip
             if skips:
                 frame.skipped.append(name)
-                usual.skipped()
+                cost.skipped()
                 return
         runner.run(frame)
         frame.simulated.append(name)
-        usual.took(time.perf_counter() - now, self.world.visits - visits)
+        cost.record(time.perf_counter() - now, self.world.visits - visits)
 
-    def _no_room(self, usual: Usual, seconds: float, visits: int) -> bool:
-        """Return whether an effect's usual cost exceeds the rest of the frame's budget."""
-        if self._seconds is not None and seconds + usual.seconds > self._seconds:
+    def _exceeds_budget(self, cost: CostEstimate, seconds: float, visits: int) -> bool:
+        """Return whether an effect's estimated cost exceeds the rest of the frame's budget."""
+        if self._seconds is not None and seconds + cost.seconds > self._seconds:
             return True
-        return self._visits is not None and visits + usual.visits > self._visits
+        return self._visits is not None and visits + cost.visits > self._visits
 
 
 def _vector(place: Vec) -> tuple[float, float, float]:
@@ -200,12 +200,12 @@ def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
         place = _vector(there if hit.cloud is None else hit.cloud)
         normal = None if hit.normal is None else _vector(hit.normal)
         found[hit.what, place] = Touched(place, normal, hit.what, hit.verdict == Verdict.UNKNOWN)
-    return list(found.values())[:_MOST_TOUCHED]
+    return list(found.values())[:_MAX_TOUCHED]
 
 
 def _moved(frame: Frame, unknown: bool) -> Moved:
     """Return the answer for a frame. unknown: as in `Moved`."""
-    x, y, z = frame.left.tolist()
+    x, y, z = frame.remaining.tolist()
     return Moved(
         pose=frame.pose[None].copy(),
         verdict=int(frame.verdict),

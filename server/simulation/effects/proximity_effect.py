@@ -9,7 +9,7 @@ from typing import Any
 from ....schemas.scene.effect_options import Proximity
 from ....schemas.wire.motion_messages import ProximityReport
 from ..world.frame import Frame
-from .separation_cache import nearest
+from ..world.separation_cache import nearest
 
 
 def make(effect: Proximity, world: Any) -> "ProximityRunner":

@@ -11,7 +11,7 @@ same plane, a bump is in the way. The avatar then moves off the surface by a few
 on; the result is kept if it led farther along the motion command. Each frame of one motion command
 therefore improves on the previous one or changes nothing, and an avatar that keeps pushing does not
 tremble for ever. For a nearly head-on push, the remainder along a surface is mostly the error of
-the normal: the avatar then stays, as by friction (STICK).
+the normal: the avatar then stays, as by friction (MIN_SLIDE_SHARE).
 
 For turns, the screw motion of the motion command is tried first. The rest of its translation slides
 at the orientation reached. Then the rest of the turn is tried on the spot.
@@ -26,31 +26,31 @@ from ....schemas.scene.effect_options import Ground, Slide, Stop
 from ....schemas.wire.answers import Verdict
 from ...queries.surface_normals import warm
 from ..world.collision_world import World
-from ..world.frame import Frame, Hit, Vec, moved_by
-from ..world.vectors import dot, size
+from ..world.frame import Frame, Hit, Vec, translated
+from ..world.vectors import dot, norm
 
 # A smaller share of the remainder along the surfaces is not followed: 6 degrees off head on, or
 # less. Smoothed normals are off by a few degrees: at 0.02, an avatar pushed straight at a flat wall
 # crept along it.
-STICK = 0.1
+MIN_SLIDE_SHARE = 0.1
 # A shorter way is not followed either [m]: an avatar in a corner would tremble.
-LEAST_SLIDE = 5e-5
+MIN_SLIDE = 5e-5
 # Normals this close belong to one plane: 8 degrees.
-SAME_PLANE = 0.99
+SAME_PLANE_COSINE = 0.99
 # Distances to move off a surface with a bump, as multiples of `skin`, tried in turn, and the least
 # distance [m].
-LIFTS, LEAST_LIFT = (1.0, 3.0), 5e-4
+LIFT_FACTORS, MIN_LIFT = (1.0, 3.0), 5e-4
 # Moving over a bump counts if it leads this much farther along the motion command, as a share of
 # the way.
-GAIN = 1e-3
+MIN_GAIN = 1e-3
 # Motions of a frame for each surface: bumps take some of them.
-_MOTIONS = 2
+_MOTIONS_PER_SURFACE = 2
 # A way that goes into a surface by no more than this share of itself, its rounding, does not go
 # into it.
 _ROUNDING = 1e-9
 
 
-class Sliding:
+class SlideRunner:
     """Effect `slide` of one scene. surfaces, normal_reach: of `Slide`."""
 
     name = "slide"
@@ -62,7 +62,7 @@ class Sliding:
 
         skin: of `stop` [m].  slope: anything steeper is a wall [degrees]; None: there is no ground.
         """
-        self._lift = max(skin, LEAST_LIFT)
+        self._lift = max(skin, MIN_LIFT)
         self.surfaces, self.normal_reach = surfaces, normal_reach
         self._up = world.up
         self._walkable = None if slope is None else math.cos(math.radians(slope))
@@ -70,81 +70,87 @@ class Sliding:
     def run(self, frame: Frame) -> None:
         """Slide, then turn on the spot."""
         hit = frame.blocked
-        if hit is None or frame.go is None:
+        if hit is None or frame.advance is None:
             return
         begin = frame.body.pose[:3, 3]
-        wish, left = frame.wish[:3, 3] - begin, frame.wish[:3, 3] - frame.pose[:3, 3]
-        far = size(left)
+        command, rest = frame.target[:3, 3] - begin, frame.target[:3, 3] - frame.pose[:3, 3]
+        far = norm(rest)
         if far > 0.0:
             # A turning avatar moves along an arc: with the whole remainder it could get farther
             # than commanded.
-            left = left * min(1.0, max(0.0, size(wish) - size(frame.pose[:3, 3] - begin)) / far)
-            self.along(frame, hit, left, wish, upright=True)
-        if frame.pose[:3, :3].tobytes() != frame.wish[:3, :3].tobytes():
-            turned = frame.wish.copy()
+            rest = rest * min(1.0, max(0.0, norm(command) - norm(frame.pose[:3, 3] - begin)) / far)
+            self.slide_along(frame, hit, rest, command, upright=True)
+        if frame.pose[:3, :3].tobytes() != frame.target[:3, :3].tobytes():
+            turned = frame.target.copy()
             turned[:3, 3] = frame.pose[:3, 3]
-            frame.go(frame, turned)
-        frame.left = frame.wish[:3, 3] - frame.pose[:3, 3]
+            frame.advance(frame, turned)
+        frame.remaining = frame.target[:3, 3] - frame.pose[:3, 3]
 
-    def along(self, frame: Frame, hit: Hit, left: Vec, wish: Vec, *, upright: bool) -> Hit | None:
+    def slide_along(self, frame: Frame, hit: Hit, rest: Vec, command: Vec, *, upright: bool) -> Hit | None:
         """Continue along what ended a motion.
 
-        left: (3,), the rest of its translation.  wish: (3,), the whole translation [m].  upright:
+        rest: (3,), the rest of its translation.  command: (3,), the whole translation [m].  upright:
         treat what is too steep to walk on as a wall, where there is ground. Returns what ended the
         motion finally, or None.
         """
-        assert frame.go is not None
-        start, most = frame.pose[:3, 3] - (wish - left), size(wish)
+        assert frame.advance is not None
+        start, most = frame.pose[:3, 3] - (command - rest), norm(command)
         planes: list[Vec] = []
         ended: Hit | None = hit
-        for _ in range(_MOTIONS * self.surfaces):
+        for _ in range(_MOTIONS_PER_SURFACE * self.surfaces):
             bump: Vec | None = None
             if ended is not None:
                 plane = self._surface(frame, ended, upright=upright)
                 if plane is None:
                     return ended
-                if dot(plane, left) >= -_ROUNDING * size(left) or any(
-                    dot(plane, each) > SAME_PLANE for each in planes
+                if dot(plane, rest) >= -_ROUNDING * norm(rest) or any(
+                    dot(plane, each) > SAME_PLANE_COSINE for each in planes
                 ):
                     bump = plane
                 elif len(planes) == self.surfaces:
                     return ended
                 else:
                     planes.append(plane)
-            way = clip(left, planes)
+            way = clip(rest, planes)
             if way is not None:
-                way = within(frame.pose[:3, 3] - start, way, most)
-            if way is None or size(way) < max(STICK * size(left), LEAST_SLIDE) or dot(way, wish) <= 0.0:
+                way = limit_displacement(frame.pose[:3, 3] - start, way, most)
+            if (
+                way is None
+                or norm(way) < max(MIN_SLIDE_SHARE * norm(rest), MIN_SLIDE)
+                or dot(way, command) <= 0.0
+            ):
                 return ended
             begin = frame.pose
             if bump is None:
-                ended = frame.go(frame, moved_by(begin, way))
+                ended = frame.advance(frame, translated(begin, way))
             else:
-                over, ended = self._over(frame, bump, way, wish, start)
+                over, ended = self._over_bump(frame, bump, way, command, start)
                 if not over:
                     return ended
             gone = dot(frame.pose[:3, 3] - begin[:3, 3], way) / dot(way, way)
-            left = way * max(0.0, 1.0 - gone)
+            rest = way * max(0.0, 1.0 - gone)
             if ended is None:
                 return None
         return ended
 
-    def _over(self, frame: Frame, out: Vec, way: Vec, wish: Vec, start: Vec) -> tuple[bool, Hit | None]:
+    def _over_bump(
+        self, frame: Frame, out: Vec, way: Vec, command: Vec, start: Vec
+    ) -> tuple[bool, Hit | None]:
         """Move over a bump of a surface that was met: off it a little, then on.
 
         out: (3,), its normal.  start: (3,), where the motion command began. Returns whether that
         led farther along the motion command, and what ended it; otherwise everything is as before.
         """
-        assert frame.go is not None
+        assert frame.advance is not None
         before, hits, ended = frame.pose, len(frame.hits), None
-        most, least = size(wish), GAIN * size(way) * size(wish)
-        for lift in LIFTS:
-            off = within(before[:3, 3] - start, lift * self._lift * out, most)
-            frame.go(frame, moved_by(before, off))
+        most, least = norm(command), MIN_GAIN * norm(way) * norm(command)
+        for lift in LIFT_FACTORS:
+            off = limit_displacement(before[:3, 3] - start, lift * self._lift * out, most)
+            frame.advance(frame, translated(before, off))
             del frame.hits[hits:]
-            on = within(frame.pose[:3, 3] - start, way, most)
-            ended = frame.go(frame, moved_by(frame.pose, on))
-            if dot(frame.pose[:3, 3] - before[:3, 3], wish) >= least:
+            on = limit_displacement(frame.pose[:3, 3] - start, way, most)
+            ended = frame.advance(frame, translated(frame.pose, on))
+            if dot(frame.pose[:3, 3] - before[:3, 3], command) >= least:
                 return True, ended
             frame.pose = before
             del frame.hits[hits:]
@@ -157,7 +163,7 @@ class Sliding:
         normal: Vec | None = frame.world.normal(hit, self.normal_reach)
         if normal is None:
             out = hit.avatar - hit.cloud
-            across = size(out)
+            across = norm(out)
             if across == 0.0:
                 return None
             normal = out / across
@@ -171,11 +177,11 @@ class Sliding:
         if self._walkable is None or rises >= self._walkable:
             return normal
         level = normal - rises * self._up
-        length = size(level)
+        length = norm(level)
         return normal if length < 0.1 else level / length
 
 
-def within(gone: Vec, way: Vec, most: float) -> Vec:
+def limit_displacement(gone: Vec, way: Vec, most: float) -> Vec:
     """Shorten a displacement so that the total of it and `gone` is at most `most` long [m].
 
     gone, way: (3,). The direction of `way` is kept.
@@ -189,20 +195,20 @@ def within(gone: Vec, way: Vec, most: float) -> Vec:
     return shortened
 
 
-def clip(left: Vec, planes: list[Vec]) -> Vec | None:
+def clip(rest: Vec, planes: list[Vec]) -> Vec | None:
     """Return the longest part of a displacement (3,) that goes into none of the planes.
 
     planes: unit normals, on the free side. The part is the whole displacement, else along one
     plane, else along the crease of two; None if there is none.
     """
-    least = -_ROUNDING * size(left)
+    least = -_ROUNDING * norm(rest)
 
     def free(way: Vec) -> bool:
         return all(dot(way, each) >= least for each in planes)
 
-    if free(left):
-        return left
-    ways = [left - dot(left, each) * each for each in planes]
+    if free(rest):
+        return rest
+    ways = [rest - dot(rest, each) * each for each in planes]
     found = [way for way in ways if free(way)]
     if not found:
         for one, other in combinations(planes, 2):
@@ -210,15 +216,15 @@ def clip(left: Vec, planes: list[Vec]) -> Vec | None:
             crease = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
             square = dot(crease, crease)
             if square > 1e-6:
-                found.append(crease * (dot(left, crease) / square))
+                found.append(crease * (dot(rest, crease) / square))
         found = [way for way in found if free(way)]
-    return max(found, key=size, default=None)
+    return max(found, key=norm, default=None)
 
 
-def make(effect: Slide, world: World) -> Sliding:
+def make(effect: Slide, world: World) -> SlideRunner:
     """Create the effect of a scene."""
     slope = next((each.slope for each in world.file.effects if isinstance(each, Ground)), None)
     with world as seen:
         warm(seen[0].data)
     skin = next(each.skin for each in world.file.effects if isinstance(each, Stop))
-    return Sliding(effect.surfaces, effect.normal_reach, skin, slope, world)
+    return SlideRunner(effect.surfaces, effect.normal_reach, skin, slope, world)

@@ -8,50 +8,49 @@ as before. `ground` does the descending: it searches that far down for ground.
 
 from ....schemas.scene.effect_options import Ground, Step
 from ..world.collision_world import World
-from ..world.frame import Frame, Pose, Vec, lowest, moved_by
-from ..world.vectors import dot, size
-from .ground_effect import DEAD_BAND, Grounded
+from ..world.frame import MIN_MOTION, Frame, Pose, Vec, lowest_height, translated
+from ..world.vectors import dot, norm
+from .ground_effect import DEAD_BAND, GroundRunner
 from .ground_effect import make as make_ground
-from .motion import LEAST_WAY
 
 # The climb must lead this much farther than sliding [m], and by this share of the remainder.
-_FARTHER, _SHARE = 2e-4, 0.02
+_MIN_GAIN, _MIN_GAIN_SHARE = 2e-4, 0.02
 
 
-class Stepping:
+class StepRunner:
     """Effect `step` of one scene."""
 
     name = "step"
 
-    def __init__(self, height: float, ground: Grounded) -> None:
+    def __init__(self, height: float, ground: GroundRunner) -> None:
         self._height, self._ground = height, ground
 
     def run(self, frame: Frame) -> None:
         """Climb what stopped the motion command, if possible."""
-        hit, met = frame.blocked, frame.met
-        if hit is None or met is None or not frame.body.on_ground or hit.cloud is None:
+        hit, blocked_pose = frame.blocked, frame.blocked_pose
+        if hit is None or blocked_pose is None or not frame.body.on_ground or hit.cloud is None:
             return
-        feet = lowest(frame.body.avatar, met, frame.world.up)
+        feet = lowest_height(frame.body.avatar, blocked_pose, frame.world.up)
         if dot(hit.cloud, frame.world.up) - feet > self._height:
             return  # a wall
         begin = frame.body.pose[:3, 3]
-        wish = frame.wish[:3, 3] - begin
-        length = size(wish)
-        if length < LEAST_WAY:
+        command = frame.target[:3, 3] - begin
+        length = norm(command)
+        if length < MIN_MOTION:
             return
-        along = wish / length
+        along = command / length
         so_far = dot(frame.pose[:3, 3] - begin, along)
-        least = so_far + max(_FARTHER, _SHARE * (length - so_far))
+        least = so_far + max(_MIN_GAIN, _MIN_GAIN_SHARE * (length - so_far))
         if least >= length:
             return
         before, hits, verdict = frame.pose, len(frame.hits), frame.verdict
-        frame.pose = met
+        frame.pose = blocked_pose
         rose = self._climb(frame, along, length, least)
         if rose is None:
             frame.pose, frame.verdict = before, verdict
         else:
             frame.reports["stepped"] = max(rose, 0.0)
-            frame.left = frame.wish[:3, 3] + rose * frame.world.up - frame.pose[:3, 3]
+            frame.remaining = frame.target[:3, 3] + rose * frame.world.up - frame.pose[:3, 3]
         del frame.hits[hits:]
 
     def _climb(self, frame: Frame, along: Vec, length: float, least: float) -> float | None:
@@ -59,16 +58,16 @@ class Stepping:
 
         Returns how far it rose [m], None: not onto ground, or too far.
         """
-        assert frame.go is not None
+        assert frame.advance is not None
         up, begin, start = frame.world.up, frame.body.pose[:3, 3], frame.pose
         self._ground.slide(frame, self._height * up)  # beside a riser, its bumps are in the way up
         rose = self._rise(start, frame.pose, up)
-        if rose < LEAST_WAY:
+        if rose < MIN_MOTION:
             return None
-        frame.go(frame, moved_by(frame.pose, (length - dot(frame.pose[:3, 3] - begin, along)) * along))
+        frame.advance(frame, translated(frame.pose, (length - dot(frame.pose[:3, 3] - begin, along)) * along))
         if dot(frame.pose[:3, 3] - begin, along) < least:
             return None
-        below = self._ground.below(frame, rose + 2.0 * self._ground.clearance)
+        below = self._ground.search_below(frame, rose + 2.0 * self._ground.clearance)
         if below.normal is None:
             return None
         lower = below.free - self._ground.clearance
@@ -85,7 +84,7 @@ class Stepping:
         return dot(pose[:3, 3] - start[:3, 3], up)
 
 
-def make(effect: Step, world: World) -> Stepping:
+def make(effect: Step, world: World) -> StepRunner:
     """Create the effect of a scene."""
     ground = next(each for each in world.file.effects if isinstance(each, Ground))
-    return Stepping(effect.height, make_ground(ground, world))
+    return StepRunner(effect.height, make_ground(ground, world))

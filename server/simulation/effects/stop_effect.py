@@ -6,23 +6,33 @@ avatar stays where it is. With `sweep`, it moves as far as it can.
 An avatar that touches something before it moves (because it was placed there, or the archive was
 hot-reloaded) gets free first. It moves by the motion command, if that does not go deeper into the
 deepest contact, or by the shortest of a few ways, along the contact normal and up, of at most
-MOST_FREE, whose end is clear. What lies between is not tested: an avatar in a wall has no clear
+MAX_ESCAPE, whose end is clear. What lies between is not tested: an avatar in a wall has no clear
 side to stay on. If no end is clear, it stays, and the verdict says so.
 """
 
 from ....schemas.scene.effect_options import Stop, Sweep
 from ....schemas.wire.answers import Verdict
 from ..world.collision_world import World
-from ..world.frame import Frame, Hit, Pose, Vec, moved_by
-from ..world.vectors import dot, size
-from .motion import gives_way, is_clear, note, set_out, touched_at
+from ..world.frame import (
+    Frame,
+    Hit,
+    Pose,
+    Vec,
+    find_touched,
+    follow_command,
+    is_clear,
+    pushes_on,
+    record_hit,
+    translated,
+)
+from ..world.vectors import dot, norm
 
 # How far an avatar gets free by itself [m], and the distances it tries.
-MOST_FREE = 0.5
-_WAYS = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MOST_FREE)
+MAX_ESCAPE = 0.5
+_ESCAPE_DISTANCES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MAX_ESCAPE)
 
 
-class Stopping:
+class StopRunner:
     """Effect `stop` of one scene."""
 
     name = "stop"
@@ -33,61 +43,61 @@ class Stopping:
 
     def run(self, frame: Frame) -> None:
         """Begin clear; without `sweep`, move to the commanded pose."""
-        frame.go = go
+        frame.advance = move_if_clear
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
-            get_free(frame)
+            escape_contact(frame)
         if not self._continuous:
-            set_out(frame)
+            follow_command(frame)
 
 
-def go(frame: Frame, to: Pose) -> Hit | None:
+def move_if_clear(frame: Frame, to: Pose) -> Hit | None:
     """Move to a pose if nothing is touched there; return what is touched."""
     if frame.pose.tobytes() == to.tobytes():
         return None
-    hit = touched_at(frame, to)
-    if hit is not None and gives_way(frame, hit, to):
-        hit = touched_at(frame, to)
+    hit = find_touched(frame, to)
+    if hit is not None and pushes_on(frame, hit, to):
+        hit = find_touched(frame, to)
     if hit is None:
         frame.pose, frame.clear = to, True
         if frame.verdict == Verdict.CONTACT:
             frame.verdict = Verdict.CLEAR
         return None
-    note(frame, hit)
+    record_hit(frame, hit)
     return hit
 
 
-def get_free(frame: Frame) -> None:
+def escape_contact(frame: Frame) -> None:
     """Leave what is touched at frame.pose, if anything is, for a near clear pose."""
-    hit = touched_at(frame, frame.pose)
+    hit = find_touched(frame, frame.pose)
     frame.clear = hit is None
     if hit is None:
         return
-    for way in _ways(frame, hit):
-        pose = moved_by(frame.pose, way)
+    for way in _escape_displacements(frame, hit):
+        pose = translated(frame.pose, way)
         if is_clear(frame, pose):
             frame.pose, frame.clear = pose, True
             return
     frame.verdict = hit.verdict
 
 
-def _ways(frame: Frame, hit: Hit) -> list[Vec]:
+def _escape_displacements(frame: Frame, hit: Hit) -> list[Vec]:
     """Return the ways to get free, shortest first."""
     directions: list[Vec] = [frame.world.up]
-    wished = frame.wish[:3, 3] - frame.pose[:3, 3]
+    commanded = frame.target[:3, 3] - frame.pose[:3, 3]
     deeper = False
     if hit.avatar is not None and hit.cloud is not None:
         out = hit.avatar - hit.cloud
-        across = size(out)
+        across = norm(out)
         if across > 0.0:
             directions.insert(0, out / across)
-            deeper = dot(wished, out) < 0.0  # it might lead through what is touched
-    ways = [way * direction for way in _WAYS for direction in directions]
-    if not deeper and 0.0 < size(wished) <= MOST_FREE:
-        ways.insert(0, wished)
+            deeper = dot(commanded, out) < 0.0  # it might lead through what is touched
+    ways = [way * direction for way in _ESCAPE_DISTANCES for direction in directions]
+    if not deeper and 0.0 < norm(commanded) <= MAX_ESCAPE:
+        ways.insert(0, commanded)
     return ways
 
 
-def make(effect: Stop, world: World) -> Stopping:
+def make(effect: Stop, world: World) -> StopRunner:
     """Create the effect of a scene."""
-    return Stopping(any(isinstance(each, Sweep) for each in world.file.effects))
+    return StopRunner(any(isinstance(each, Sweep) for each in world.file.effects))

@@ -7,14 +7,23 @@ is the sweep's bit for bit; otherwise it is queried.
 
 from ....schemas.scene.effect_options import Stop, Sweep
 from ..world.collision_world import World
-from ..world.frame import Frame, Hit, Pose
-from .motion import first_hit, gives_way, note, set_out, settle, way_back
+from ..world.frame import (
+    Frame,
+    Hit,
+    Pose,
+    find_first_hit,
+    follow_command,
+    pushes_on,
+    record_hit,
+    settle_before,
+    skin_fraction,
+)
 
 # Largest number of pushes of what gives way, in one motion.
-_PUSHES = 4
+_MAX_PUSHES = 4
 
 
-class Sweeping:
+class SweepRunner:
     """Effect `sweep` of one scene. skin, tolerance: of `Stop` and `Sweep`."""
 
     name = "sweep"
@@ -24,28 +33,28 @@ class Sweeping:
 
     def run(self, frame: Frame) -> None:
         """Follow the motion command."""
-        frame.go = self.go
-        set_out(frame)
+        frame.advance = self.sweep_towards
+        follow_command(frame)
 
-    def go(self, frame: Frame, to: Pose) -> Hit | None:
+    def sweep_towards(self, frame: Frame, to: Pose) -> Hit | None:
         """Move towards a pose as far as nothing is touched; return what ended the motion."""
         hit: Hit | None = None
-        for _ in range(_PUSHES):
+        for _ in range(_MAX_PUSHES):
             if frame.pose.tobytes() == to.tobytes():
                 return None
-            hit = first_hit(frame, to, self.tolerance)
+            hit = find_first_hit(frame, to, self.tolerance)
             if hit is None:
                 frame.pose = to
                 return None
-            settle(frame, to, hit.fraction - way_back(frame, to, hit, self.skin), hit.fraction)
-            if not gives_way(frame, hit, to):
+            settle_before(frame, to, hit.fraction - skin_fraction(frame, to, hit, self.skin), hit.fraction)
+            if not pushes_on(frame, hit, to):
                 break
         if hit is not None:
-            note(frame, hit)
+            record_hit(frame, hit)
         return hit
 
 
-def make(effect: Sweep, world: World) -> Sweeping:
+def make(effect: Sweep, world: World) -> SweepRunner:
     """Create the effect of a scene."""
     skin = next(each.skin for each in world.file.effects if isinstance(each, Stop))
-    return Sweeping(skin, effect.tolerance)
+    return SweepRunner(skin, effect.tolerance)

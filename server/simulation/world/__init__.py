@@ -1,4 +1,4 @@
-"""The scene as effects query it, and the state of one user in one frame.
+"""What effects share: the scene as they query it, other bodies, and the frame of one user.
 
 May import server.archives, server.avatars, server.kernels, server.queries, server.queries.context,
 server.runtime, server/scene_interface.py, schemas.

@@ -1,7 +1,8 @@
-"""The archives of a scene as one, asked about one avatar at a time: what effects ask (effects/).
+"""The archives of a scene as one: the queries of effects, for one avatar at a time.
 
-An archive that lies at a pose in the world is asked under the inverse of it, and witnesses are carried back. Where
-there is one, at the identity, as nearly always, its questions are asked as they are.
+An archive with a pose in the world is queried under the inverse of that pose, and witnesses are
+transformed back. A single archive at the identity, by far the most frequent case, is queried
+directly.
 """
 
 import threading
@@ -28,20 +29,21 @@ from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from ...scene_interface import EVERYBODY
 from .frame import Hit, Pose, Vec
-from .least_answer import comes_first, earlier, nearer
-from .vectors import lowest_of, unit
+from .least_answer import comes_first, merge_distances, merge_swept
+from .vectors import min_height, unit_vector
 
-# Avatars a thread has probes of at a time: users of one scene, and its objects.
-_PROBES = 256
-# And points of theirs, so that avatars long dropped do not fill the memory: some 100 MB a thread.
-_PROBED_POINTS = 1 << 20
-_NOWHERE = np.zeros(3)
-# Where a scan is so thin that the points near one make no surface, those so many times as near are asked.
-SPARSE = 3.0
+# Largest number of avatars for which a thread keeps probes: users of one scene, and its objects.
+_MAX_PROBES = 256
+# Largest number of their points: dropped avatars must not fill the memory. Some 100 MB a thread.
+_MAX_PROBED_POINTS = 1 << 20
+_NO_ORIGIN = np.zeros(3)
+# If the points near a touched one form no surface, because the scan is sparse, the reach of its
+# normal is multiplied by this factor.
+SPARSE_FACTOR = 3.0
 
 
-class Seen(NamedTuple):
-    """An archive as it is held now. data: under the scene's radius model."""
+class HeldArchive(NamedTuple):
+    """Archive generation that a thread holds. data: with the scene's radius model."""
 
     opened: ArchiveGeneration
     data: SceneData
@@ -49,7 +51,7 @@ class Seen(NamedTuple):
 
 
 class _Held(threading.local):
-    """What one thread holds, and its probes."""
+    """State of one thread: the archives it holds, and its probes."""
 
     depth = 0
     visits = 0
@@ -57,36 +59,36 @@ class _Held(threading.local):
     unknown = False
 
     def __init__(self) -> None:
-        self.seen: list[Seen] = []
+        self.seen: list[HeldArchive] = []
         self.probes: OrderedDict[int, ResidentQueries] = OrderedDict()
         self.points = 0
 
 
 class World:
-    """A scene as its effects see it. Thread-safe.
+    """Scene as effects query it. Thread-safe.
 
-    file: what it calls for.  up: (3,) unit, against gravity.  archives: of the scene.
+    file: the scene file.  up: (3,) unit, against gravity.  archives: of the scene.
     """
 
     def __init__(self, scene: Any, file: SceneFile) -> None:
-        """Query a scene's archives. scene: has `archives` and `avatar`, as a `Scene` has."""
+        """Create the world of a scene. scene: has `archives` and `avatar`, as a `Scene` has."""
         self.file, self._scene = file, scene
-        self.up: Vec = unit(file.up)
+        self.up: Vec = unit_vector(file.up)
         self.archives: list[PlacedArchive] = list(scene.archives)
         self._alone = len(self.archives) == 1 and self.archives[0].pose is None
         self._held = _Held()
 
-    def __enter__(self) -> list[Seen]:
-        """Hold the archives that are current, for a `with`: what this thread asks in it is asked of these."""
+    def __enter__(self) -> list[HeldArchive]:
+        """Hold the current archive generations, which this thread then queries inside the `with` block."""
         held = self._held
         if not held.depth:
-            seen: list[Seen] = []
+            seen: list[HeldArchive] = []
             try:
                 for placed in self.archives:
                     opened = placed.take()
-                    seen.append(Seen(opened, opened.data, placed))
+                    seen.append(HeldArchive(opened, opened.data, placed))
                     data = with_stop(opened.radius_model(self.file.radius_model), held.stop)
-                    seen[-1] = Seen(opened, data, placed)
+                    seen[-1] = HeldArchive(opened, data, placed)
             except BaseException:
                 for each in seen:
                     each.opened.release()
@@ -96,25 +98,25 @@ class World:
         return held.seen
 
     def begin(self, stop: StopFlag) -> None:
-        """Begin a frame of this thread's. stop: ends early what it asks from the next hold on."""
+        """Begin a frame of this thread. stop: ends its queries early, from the next hold on."""
         self._held.stop, self._held.unknown = stop, False
 
     @property
     def unknown(self) -> bool:
-        """Return whether something that this thread's frame asked could not be looked at."""
+        """Return whether a query of this thread's frame was incomplete."""
         return self._held.unknown
 
     def count(self, visits: int, missing: int = 0) -> None:
-        """Add what a question took that this thread asked of the archives it holds.
+        """Add the cost of a query of this thread.
 
-        visits: of nodes.  missing: voxels that could not be looked at.
+        visits: of nodes.  missing: number of voxels that were not available.
         """
         self._held.visits += visits
         if missing:
             self._held.unknown = True
 
     def __exit__(self, *_: object) -> None:
-        """Let them go."""
+        """Release the archives."""
         held = self._held
         held.depth -= 1
         if not held.depth:
@@ -123,33 +125,33 @@ class World:
                 each.opened.release()
 
     def avatar(self, name: str) -> AvatarModel:
-        """One of the scene's own avatars, once they have been added; UnknownAvatarError."""
+        """Return one of the scene's own avatars. Raises UnknownAvatarError until they are added."""
         model: AvatarModel = self._scene.avatar(name, EVERYBODY)
         return model
 
     @property
     def visits(self) -> int:
-        """Node visits of all that this thread has asked."""
+        """Return the node visits of all queries of this thread."""
         return self._held.visits
 
     def _count_of(self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers) -> None:
-        """Add what one row of answers took."""
+        """Add the cost of one row of answers."""
         unknown = answers.verdict[0] == Verdict.UNKNOWN
         self.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]) or unknown)
 
     def generations(self) -> tuple[int, ...]:
-        """What tells the archives held now from those before a reload."""
+        """Return the generation numbers of the current archives, which a reload changes."""
         with self as seen:
             return tuple([each.opened.number for each in seen])
 
     def saw(self, user: tuple[str, str], avatar: AvatarModel, pose: Pose, around: float = 0.0) -> None:
-        """A user is there: what is around it is loaded before it is asked for. around: beyond the avatar [m]."""
+        """Record a user's pose, around which voxels are prefetched. around: distance beyond the avatar [m]."""
         with self as seen:
             for each in seen:
-                each.opened.record_user(user, avatar, _into(each, pose)[None], around)
+                each.opened.record_user(user, avatar, _to_archive(each, pose)[None], around)
 
     def _probe(self, avatar: AvatarModel) -> ResidentQueries:
-        """This thread's probe of an avatar."""
+        """Return this thread's probe of an avatar."""
         probes, key = self._held.probes, id(avatar.points)
         probe = probes.get(key)
         if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
@@ -157,17 +159,17 @@ class World:
                 self._held.points -= len(probes.pop(key).avatar.points)
             probe = probes[key] = ResidentQueries(avatar)
             self._held.points += len(avatar.points)
-            while len(probes) > 1 and (len(probes) > _PROBES or self._held.points > _PROBED_POINTS):
+            while len(probes) > 1 and (len(probes) > _MAX_PROBES or self._held.points > _MAX_PROBED_POINTS):
                 _, oldest = probes.popitem(last=False)
                 self._held.points -= len(oldest.avatar.points)
         return probe
 
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
-        """Whether the avatar touches any archive under a pose (4, 4); see server/queries/collide.py."""
+        """Return whether the avatar touches any archive at a pose (4, 4); see server/queries/collide.py."""
         found, probe = Verdict.CLEAR, self._probe(avatar)
         with self as seen:
             for each in seen:
-                verdict, visits = probe.collide(each.data, _into(each, pose), budget)
+                verdict, visits = probe.collide(each.data, _to_archive(each, pose), budget)
                 self.count(visits, verdict == Verdict.UNKNOWN)
                 if verdict == Verdict.CONTACT:
                     return verdict
@@ -197,26 +199,26 @@ class World:
             found: SweepResult | None = None
             for number, each in enumerate(seen):
                 swept = probe.sweep(
-                    each.data, _into(each, pose_from), _into(each, pose_to), tolerance, budget
+                    each.data, _to_archive(each, pose_from), _to_archive(each, pose_to), tolerance, budget
                 )
                 self.count(swept.visits, swept.unknown)
                 if not self._alone:
-                    swept = _carried(swept, each, number)
-                found = swept if found is None else earlier(found, swept)
+                    swept = _swept_in_world(swept, each, number)
+                found = swept if found is None else merge_swept(found, swept)
         assert found is not None
         return found
 
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
     ) -> tuple[Pose, bool]:
-        """The pose at a fraction of a motion, and whether what `sweep` proved of the motion holds for it."""
+        """Return the pose at a fraction of a motion, and whether the proof of `sweep` applies to it."""
         with self as seen:
-            origin = seen[0].data.arrays.origin if self._alone else _NOWHERE
+            origin = seen[0].data.arrays.origin if self._alone else _NO_ORIGIN
             pose, same = self._probe(avatar).between(origin, pose_from, pose_to, fraction)
         return pose, same and self._alone
 
-    def lowest(self) -> float:
-        """How far up the lowest corner of the archives' boxes is from the world's origin, spheres included [m]."""
+    def lowest_height(self) -> float:
+        """Return the height of the lowest corner of the archives' boxes, spheres included [m]."""
         least = np.inf
         with self as seen:
             for each in seen:
@@ -226,7 +228,7 @@ class World:
                 if each.placed.pose is not None:
                     corners = moved(each.placed.pose, corners)
                 radius = each.data.radius_units / UNITS_PER_METRE
-                least = min(least, lowest_of(corners, self.up) - radius)
+                least = min(least, min_height(corners, self.up) - radius)
         return least
 
     def deepest(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Hit | None:
@@ -235,12 +237,12 @@ class World:
         depth = np.inf
         with self as seen:
             for number, each in enumerate(seen):
-                answers = contacts(each.data, avatar, _into(each, pose)[None], 1, budget=budget)
+                answers = contacts(each.data, avatar, _to_archive(each, pose)[None], 1, budget=budget)
                 self._count_of(answers)
                 if len(answers.signed_distance):
                     value = float(answers.signed_distance[0])
                     own, cloud = (
-                        _out(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
+                        _to_world(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
                     )
                     if found is None or comes_first(value, (cloud, own), depth, (found.cloud, found.avatar)):
                         depth, found = value, Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
@@ -261,7 +263,7 @@ class World:
                 value = float(answers.distance[0])
                 if value > least or value == np.inf:
                     continue
-                cloud = _out(each, answers.cloud_point[0])
+                cloud = _to_world(each, answers.cloud_point[0])
                 if found is None or comes_first(value, (cloud,), least, (found.cloud,)):
                     least = value
                     found = Hit(0.0, Verdict(int(answers.verdict[0])), None, cloud, "", number)
@@ -270,14 +272,14 @@ class World:
     def distance(
         self, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget = EXACT
     ) -> DistanceAnswers:
-        """Return how far the avatar is from what is nearest of all archives, of one pose.
+        """Return the distance of the avatar from the nearest archive at one pose.
 
         See server/queries/distance.py, and `comes_first` for several at the same distance.
         """
         found: DistanceAnswers | None = None
         with self as seen:
             for each in seen:
-                answers = distance_fast(each.data, avatar, _into(each, pose), reach, budget)
+                answers = distance_fast(each.data, avatar, _to_archive(each, pose), reach, budget)
                 self._count_of(answers)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
@@ -286,7 +288,7 @@ class World:
                         witness_cloud=moved(each.placed.pose, answers.witness_cloud),
                         normal=turned(each.placed.pose, answers.normal),
                     )
-                found = answers if found is None else nearer(found, answers)
+                found = answers if found is None else merge_distances(found, answers)
         assert found is not None
         return found
 
@@ -299,12 +301,12 @@ class World:
         cluster_distance: float | None = None,
         budget: QueryBudget = EXACT,
     ) -> list[ContactsAnswers]:
-        """What is touched at a pose, of each archive; see server/queries/contacts.py."""
+        """Return the contacts at a pose, for each archive; see server/queries/contacts.py."""
         found = []
         with self as seen:
             for each in seen:
                 answers = contacts(
-                    each.data, avatar, _into(each, pose)[None], limit, margin, cluster_distance, budget
+                    each.data, avatar, _to_archive(each, pose)[None], limit, margin, cluster_distance, budget
                 )
                 self._count_of(answers)
                 if each.placed.pose is not None:
@@ -315,20 +317,20 @@ class World:
         return found
 
     def normal(self, hit: Hit, reach: float) -> Vec | None:
-        """The unit normal of the surface that was touched, towards the avatar; None where the points make none.
+        """Return the unit normal of the touched surface, towards the avatar; None if the points form none.
 
-        reach: points so near the one touched are its surface [m]; those SPARSE times as near, but
-        no farther than MAX_NORMAL_REACH, where these make none.
+        reach: distance within which points form the surface of the touched one [m]. If they form
+        none, it is multiplied by SPARSE_FACTOR, up to MAX_NORMAL_REACH.
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
-            return hit.normal  # what is none of the scene's brings its own
+            return hit.normal  # of a body, which has its own normal
         held = self._held
         with self as seen:
             each = seen[hit.archive]
             kept = each.opened.kept
             normals = kept.get("normals")
             if normals is None:
-                # Here: what no effect asks for is not imported.
+                # Imported here: only some effects need normals.
                 from ...queries.surface_normals import Normals
 
                 normals = kept.setdefault("normals", Normals(each.opened.store, each.data))
@@ -340,27 +342,29 @@ class World:
             try:
                 found: Vec | None = normals.at(place, way, reach, held.stop)
                 if found is None:
-                    found = normals.at(place, way, min(SPARSE * reach, MAX_NORMAL_REACH), held.stop)
+                    found = normals.at(place, way, min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH), held.stop)
             except CorruptError:
                 held.unknown = True
                 return None
             return found if found is None or pose is None else turned(pose, found[None])[0]
 
 
-def _into(seen: Seen, pose: Pose) -> Pose:
-    """A pose of the world as an archive has it."""
+def _to_archive(seen: HeldArchive, pose: Pose) -> Pose:
+    """Return a pose of the world in an archive's frame."""
     inverse = seen.placed.inverse
     return pose if inverse is None else under(inverse, pose[None])[0]
 
 
-def _out(seen: Seen, place: NDArray[np.float64]) -> Vec:
-    """A place (3,) of an archive in the world."""
+def _to_world(seen: HeldArchive, place: NDArray[np.float64]) -> Vec:
+    """Return a point (3,) of an archive in the world frame."""
     pose = seen.placed.pose
     return place if pose is None else moved(pose, place[None])[0]
 
 
-def _carried(swept: SweepResult, seen: Seen, number: int) -> SweepResult:
-    """What an archive says of a motion, in the world."""
+def _swept_in_world(swept: SweepResult, seen: HeldArchive, number: int) -> SweepResult:
+    """Return an archive's answer about a motion, in the world frame."""
     if swept.avatar is None or swept.cloud is None:
         return swept._replace(archive=number)
-    return swept._replace(archive=number, avatar=_out(seen, swept.avatar), cloud=_out(seen, swept.cloud))
+    return swept._replace(
+        archive=number, avatar=_to_world(seen, swept.avatar), cloud=_to_world(seen, swept.cloud)
+    )

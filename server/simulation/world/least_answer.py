@@ -1,6 +1,6 @@
-"""Answers of several archives to one query of an effect, as one: the least, and at a tie one rule.
+"""Answers of several archives to one query of an effect, merged: the least, with one rule for ties.
 
-archives/merge_answers.py does the same for the answers of questions, many poses at a time.
+archives/merge_answers.py does the same for the answers of queries, many poses at a time.
 """
 
 import msgspec
@@ -17,7 +17,7 @@ def comes_first(
     """Return whether an answer comes before that of an earlier archive (NUMERICS.md N11).
 
     The lesser value does; of equal values the one with the least witness: scan point, then avatar
-    centre, as merge_answers.py has it for questions.
+    centre, as in merge_answers.py.
     """
     if value != other:
         return value < other
@@ -30,8 +30,8 @@ def comes_first(
     return False
 
 
-def earlier(one: SweepResult, other: SweepResult) -> SweepResult:
-    """Return what two archives together say of a motion."""
+def merge_swept(one: SweepResult, other: SweepResult) -> SweepResult:
+    """Return the merged answer of two archives about a motion."""
     other_first = comes_first(other.upper, (other.cloud, other.avatar), one.upper, (one.cloud, one.avatar))
     first = other if other_first else one
     lower = min(one.lower, other.lower)
@@ -48,8 +48,8 @@ def earlier(one: SweepResult, other: SweepResult) -> SweepResult:
     )
 
 
-def nearer(one: DistanceAnswers, other: DistanceAnswers) -> DistanceAnswers:
-    """Return what two archives together say of how near they are."""
+def merge_distances(one: DistanceAnswers, other: DistanceAnswers) -> DistanceAnswers:
+    """Return the merged answer of two archives about a distance."""
     other_first = comes_first(
         float(other.signed_distance[0]), (other.witness_cloud[0], other.witness_avatar[0]),
         float(one.signed_distance[0]), (one.witness_cloud[0], one.witness_avatar[0]),

@@ -1,8 +1,9 @@
-"""Vectors and rotations of a frame, a few at a time, in Python's numbers: each sum in one order, the same everywhere.
+"""Vectors and rotations of a frame, a few at a time, computed with Python's floats in a fixed order of sums.
 
-numpy's products of matrices are a library's, which adds and contracts as the processor has it: another machine could
-have other bits, and the same wishes would lead elsewhere. Nor does any library promise a sine. Of three numbers this is
-faster, too: a product by numpy takes a microsecond.
+numpy multiplies matrices by a library that adds and contracts as the processor allows. Another
+machine could get other bits, and the same motion commands would lead elsewhere. No library
+guarantees the bits of a sine either. For three numbers this is also faster: a product by numpy
+takes a microsecond.
 """
 
 import math
@@ -19,72 +20,75 @@ _QUARTER = 0.5 * math.pi
 
 
 def dot(one: Vec, other: Vec) -> float:
-    """The product of two vectors (3,)."""
+    """Return the dot product of two vectors (3,)."""
     (a, b, c), (x, y, z) = one.tolist(), other.tolist()
     return float(a * x + b * y + c * z)
 
 
-def size(way: Vec) -> float:
-    """The length of a vector (3,)."""
-    x, y, z = way.tolist()
+def norm(vector: Vec) -> float:
+    """Return the length of a vector (3,)."""
+    x, y, z = vector.tolist()
     return math.sqrt(x * x + y * y + z * z)
 
 
-def unit(way: tuple[float, float, float]) -> Vec:
-    """The direction of a vector, not zero."""
-    found = np.array(way, np.float64)
-    return found / size(found)
+def unit_vector(vector: tuple[float, float, float]) -> Vec:
+    """Return the direction of a vector that is not zero."""
+    found = np.array(vector, np.float64)
+    return found / norm(found)
 
 
-def level(way: Vec, up: Vec) -> Vec:
-    """What of a vector is square to a unit vector."""
-    flat: Vec = way - dot(way, up) * up
+def horizontal(vector: Vec, up: Vec) -> Vec:
+    """Return the part of a vector that is perpendicular to a unit vector."""
+    flat: Vec = vector - dot(vector, up) * up
     return flat
 
 
-def turned_by(turn: Matrix, way: Vec) -> Vec:
-    """A vector turned by a rotation: turn @ way."""
-    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in turn[:3].tolist())
-    x, y, z = way.tolist()
+def rotate(rotation: Matrix, vector: Vec) -> Vec:
+    """Return rotation @ vector."""
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rotation[:3].tolist())
+    x, y, z = vector.tolist()
     return np.array([a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z])
 
 
-def turned_back(turn: Matrix, way: Vec) -> Vec:
-    """A vector turned back by a rotation: way @ turn."""
-    return turned_by(turn[:3, :3].T, way)
+def rotate_back(rotation: Matrix, vector: Vec) -> Vec:
+    """Return vector @ rotation, which inverts `rotate`."""
+    return rotate(rotation[:3, :3].T, vector)
 
 
-def product(one: Matrix, other: Matrix) -> Matrix:
-    """The product (3, 3) of two matrices."""
-    return np.column_stack([turned_by(one, other[:3, column]) for column in range(3)])
+def multiply(one: Matrix, other: Matrix) -> Matrix:
+    """Return the product (3, 3) of two matrices."""
+    return np.column_stack([rotate(one, other[:3, column]) for column in range(3)])
 
 
-def spread(matrix: Matrix) -> float:
-    """The root of the sum of the squares of a matrix (3, 3): it makes no vector longer by more."""
+def frobenius_norm(matrix: Matrix) -> float:
+    """Return the root of the sum of the squares of a matrix (3, 3).
+
+    The matrix makes no vector longer by a larger factor.
+    """
     return math.sqrt(sum(x * x for row in matrix.tolist() for x in row[:3]))
 
 
-def lowest_of(points: NDArray[np.float64], up: Vec) -> float:
-    """How far up the lowest of points (n, 3), not none, is."""
+def min_height(points: NDArray[np.float64], up: Vec) -> float:
+    """Return the least height of points (n, 3) along a direction; n > 0."""
     x, y, z = up.tolist()
     return float((points[:, 0] * x + points[:, 1] * y + points[:, 2] * z).min())
 
 
-def rotation(axis: Vec, angle: float) -> Matrix:
-    """The rotation (3, 3) about a unit vector by an angle [rad], after Rodrigues."""
+def rotation_matrix(axis: Vec, angle: float) -> Matrix:
+    """Return the rotation (3, 3) about a unit vector by an angle [rad], by Rodrigues' formula."""
     quarters = math.floor(angle / _QUARTER)
     s, c = sine_cosine(min(max(angle - quarters * _QUARTER, 0.0), _QUARTER))
     for _ in range(quarters % 4):
         s, c = c, -s
     x, y, z = axis.tolist()
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + s * cross + (1.0 - c) * product(cross, cross)
+    return np.eye(3) + s * cross + (1.0 - c) * multiply(cross, cross)
 
 
-def straightened(turn: Matrix) -> Matrix:
-    """A rotation made one again: turned for hours, rounding would add up."""
-    first = turn[:, 0] / size(turn[:, 0])
-    second = turn[:, 1] - first * dot(first, turn[:, 1])
-    second /= size(second)
+def orthonormalize(rotation: Matrix) -> Matrix:
+    """Return a rotation without the rounding errors that products of many rotations accumulate."""
+    first = rotation[:, 0] / norm(rotation[:, 0])
+    second = rotation[:, 1] - first * dot(first, rotation[:, 1])
+    second /= norm(second)
     (a, b, c), (x, y, z) = first.tolist(), second.tolist()
     return np.column_stack([first, second, [b * z - c * y, c * x - a * z, a * y - b * x]])

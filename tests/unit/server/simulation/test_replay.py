@@ -12,7 +12,15 @@ from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.motion_messages import Moved, Wish
 from solidcloud.server.scene_interface import FrameCommand
 from solidcloud.server.simulation.replay import replay
-from solidcloud.server.simulation.replay_log import Begin, Entered, Frame, FrameLog, Points, Record, read_log
+from solidcloud.server.simulation.replay_log import (
+    AvatarPoints,
+    Begin,
+    Entered,
+    FrameLog,
+    FrameRecord,
+    Record,
+    read_log,
+)
 
 pytestmark = pytest.mark.interpreted
 
@@ -72,11 +80,11 @@ def log(tmp_path):
 
 def test_the_same_wishes_give_the_same_poses(log):
     records = list(read_log(log))
-    assert sum(isinstance(record, Points) for record in records) == 2
+    assert sum(isinstance(record, AvatarPoints) for record in records) == 2
     found = replay(simulated(), records)
-    turns = sum(len(record.turns) for record in records if isinstance(record, Frame))
+    turns = sum(len(record.turns) for record in records if isinstance(record, FrameRecord))
     assert found == (60, turns, 0, None, None)
-    codes = {said.error for record in records if isinstance(record, Frame) for said in record.said}
+    codes = {said.error for record in records if isinstance(record, FrameRecord) for said in record.said}
     assert codes == {"", "bad_transform", "unknown_avatar", "busy"}
 
 
@@ -89,7 +97,7 @@ def test_a_replay_skips_what_was_skipped_and_nothing_else(log):
 def changed(records, number, edit):
     """Records with one turn's outcome in one frame edited."""
     for record in records:
-        if isinstance(record, Frame) and record.number == number:
+        if isinstance(record, FrameRecord) and record.number == number:
             said = [edit(record.said[0]), *record.said[1:]]
             yield msgspec.structs.replace(record, said=said)
         else:
@@ -98,7 +106,7 @@ def changed(records, number, edit):
 
 def test_one_bit_of_one_pose_is_found_and_named(log):
     records = list(read_log(log))
-    frames = [record for record in records if isinstance(record, Frame) and record.said[0].pose]
+    frames = [record for record in records if isinstance(record, FrameRecord) and record.said[0].pose]
     frame = frames[len(frames) // 2]
     user = User(*frame.turns[0][0])
 

@@ -11,13 +11,13 @@ from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.scene_interface import FrameCommand
 from solidcloud.server.simulation.replay_log import (
     MAGIC,
+    AvatarPoints,
     Begin,
     Dropped,
     Ended,
     Entered,
-    Frame,
     FrameLog,
-    Points,
+    FrameRecord,
     Reloaded,
     read_log,
 )
@@ -55,7 +55,18 @@ def test_all_that_decides_is_in_it_in_order_and_points_once(tmp_path):
     write(tmp_path / "log")
     records = list(read_log(tmp_path / "log"))
     kinds = [type(record) for record in records]
-    assert kinds == [Begin, Points, Entered, Entered, Frame, Ended, Frame, Reloaded, Ended, Dropped]
+    assert kinds == [
+        Begin,
+        AvatarPoints,
+        Entered,
+        Entered,
+        FrameRecord,
+        Ended,
+        FrameRecord,
+        Reloaded,
+        Ended,
+        Dropped,
+    ]
     begin, points, first, second, frame, left, later, reloaded, _, dropped = records
     assert begin == BEGIN and points.points == POINTS.tobytes() and points.radius == 0.125
     assert (first.user, second.user) == (AL, BO) and first.digest == second.digest == points.digest
@@ -72,7 +83,7 @@ def test_another_radius_is_another_avatar(tmp_path):
     with FrameLog(tmp_path / "log", BEGIN) as log:
         simulation.record(log)
         simulation.step([FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))])
-    points = [record for record in read_log(tmp_path / "log") if isinstance(record, Points)]
+    points = [record for record in read_log(tmp_path / "log") if isinstance(record, AvatarPoints)]
     assert [record.radius for record in points] == [0.125, 0.25] and points[0].digest != points[1].digest
 
 

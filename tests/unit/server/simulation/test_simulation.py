@@ -168,11 +168,11 @@ def test_wishes_for_objects_where_there_are_none_are_refused(floor):
 
 def test_the_bodies_that_may_meet_are_kept_up_to_date():
     class Bodies(dict):
-        put_back = 0
+        restored = 0
 
-        def tell(self, poses, stop):
+        def place_objects(self, poses, stop):
             self.told = poses
-            return lambda: setattr(self, "put_back", self.put_back + 1)
+            return lambda: setattr(self, "restored", self.restored + 1)
 
     bodies = Bodies()
     file = SceneFile(format=1, archives=scene_of("floor").archives)
@@ -182,10 +182,10 @@ def test_the_bodies_that_may_meet_are_kept_up_to_date():
     objects = {"door": np.eye(4).tolist()}
     simulation.step([FrameCommand(AL, wish(1, 0.5, objects=objects))])
     assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
-    assert bodies.told == objects and not bodies.put_back
+    assert bodies.told == objects and not bodies.restored
     simulation._pipeline.run = None
     ((_, error, _),) = simulation.step([FrameCommand(AL, wish(2, 0.5, objects=objects))])
-    assert isinstance(error, InternalError) and bodies.put_back == 1
+    assert isinstance(error, InternalError) and bodies.restored == 1
     simulation.end(AL)
     assert not bodies
 

@@ -205,7 +205,8 @@ def test_what_is_not_declared_is_not_imported() -> None:
     program = """
 import sys
 from solidcloud.server.simulation.effects import pipeline, stop_effect, sweep_effect
-names = ["simulation.effects." + name for name in ("crowd_effect", "objects_effect", "bodies", "blocking")]
+names = ["simulation.effects." + name for name in ("crowd_effect", "objects_effect")]
+names += ["simulation.world." + name for name in ("bodies", "body_obstacles")]
 names += ["kernels.bodies." + name for name in ("body_sweep", "moving_bodies", "near_bodies")]
 print([name for name in names if "solidcloud.server." + name in sys.modules])
 """

@@ -16,7 +16,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.runtime.stop_flag import StopFlag as Ending
 from solidcloud.server.runtime.stop_flag import StoppedError
-from solidcloud.server.simulation.effects.bodies import Bodies
+from solidcloud.server.simulation.world.bodies import Bodies
 from solidcloud.server.simulation.world.frame import Body
 
 COARSE = INTERPRETED
@@ -192,7 +192,7 @@ def test_who_stands_on_a_crate_is_on_the_ground_and_who_walks_along_a_leaf_slide
         stage.go("c/u", body.pose.copy())
         assert np.array_equal(body.pose, stood), "at rest it stays, bit for bit"
         for rise in np.linspace(0.02, 0.2, 10):
-            stage.bodies.tell({"lift": at(-1.2, 0, rise).tolist()})
+            stage.bodies.place_objects({"lift": at(-1.2, 0, rise).tolist()})
             stage.go("c/u", body.pose.copy())
             assert not touch(USER, body.pose, CRATE, where(stage, "lift"), stage.bodies.origin)
         assert 0.58 < body.pose[2, 3] < 0.65 and np.array_equal(body.pose[:2], stood[:2]), "it is lifted"
@@ -216,7 +216,7 @@ def test_a_door_blocks_until_it_is_opened(tmp_path: Path) -> None:
         for wish in (at(0.5, 1), at(0.5, 49), at(0.5, 0.5)):
             moved = stage.go("c/u", wish)
             assert body.pose[1, 3] < -0.2 and [each.what for each in moved.touched] == ["door"]
-        stage.bodies.tell({"door": at(0, heading=np.pi / 2).tolist()})
+        stage.bodies.place_objects({"door": at(0, heading=np.pi / 2).tolist()})
         moved = stage.go("c/u", at(0.5, 1))
         assert np.array_equal(body.pose, at(0.5, 1)) and not moved.touched
         assert moved.objects is not None
@@ -235,7 +235,7 @@ def test_a_door_that_closes_on_a_user_lets_go_of_it_on_the_side_it_was_on(
         body = stage.enter("c/u", USER, at(0.5, 0.08 * side))
         stage.go("c/u", body.pose.copy())
         for swing in np.linspace(angle, -angle / 6, 4)[1:]:
-            stage.bodies.tell({"door": at(0, heading=float(swing)).tolist()})
+            stage.bodies.place_objects({"door": at(0, heading=float(swing)).tolist()})
             moved = stage.go("c/u", body.pose.copy())
             assert np.array_equal(body.pose, at(0.5, 0.08 * side)), "a door moves nobody"
             inside = touch(USER, body.pose, LEAF, where(stage, "door"), stage.bodies.origin)
@@ -275,21 +275,21 @@ def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves
         ]
         for name, pose, error, text in refused:
             with pytest.raises(error, match=text):
-                stage.bodies.tell({**good, name: pose})
+                stage.bodies.place_objects({**good, name: pose})
             assert np.array_equal(where(stage, "door"), at(0)), name
 
 
 @pytest.mark.interpreted
-def test_what_a_wish_told_is_put_back_where_the_wish_is_refused(tmp_path: Path) -> None:
+def test_what_a_wish_told_is_restore_where_the_wish_is_refused(tmp_path: Path) -> None:
     objects = (
         item("door", at(0), avatar="leaf", pushed=False),
         item("gate", at(0, 1), avatar="leaf", pushed=False),
     )
     with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
         body = stage.enter("c/u", USER, at(0.4, -0.5))
-        stage.bodies.tell({"gate": at(0, 1.5).tolist()})
-        put_back = stage.bodies.tell({"door": at(0, -0.5).tolist(), "gate": at(0, 2).tolist()})
-        put_back()
+        stage.bodies.place_objects({"gate": at(0, 1.5).tolist()})
+        restore = stage.bodies.place_objects({"door": at(0, -0.5).tolist(), "gate": at(0, 2).tolist()})
+        restore()
         assert np.array_equal(where(stage, "door"), at(0)) and np.array_equal(
             where(stage, "gate"), at(0, 1.5)
         )
@@ -315,7 +315,7 @@ def test_what_is_reported_to_touch_does_by_brute_force(tmp_path: Path) -> None:
         for _ in range(2 if COARSE else 12):
             told = rng.choice(names, 2, replace=False).tolist()
             places = {name: rng.uniform(-0.6, 0.6, 3) for name in told}
-            stage.bodies.tell(
+            stage.bodies.place_objects(
                 {name: at(1.2 + x, y, z, heading=5 * x).tolist() for name, (x, y, z) in places.items()}
             )
             report = stage.go("c/u", body.pose.copy()).objects
@@ -350,7 +350,7 @@ def test_what_has_not_moved_is_not_asked_again(tmp_path: Path, monkeypatch: pyte
 
         monkeypatch.setattr(stage.world, "collide", counted)
         for told, count in (({}, 3), ({}, 0), ({"b": at(1, 1).tolist()}, 1), ({"b": at(1, 1).tolist()}, 0)):
-            stage.bodies.tell(told)
+            stage.bodies.place_objects(told)
             stage.go("c/u", body.pose.copy())
             assert len([avatar for avatar in asked if avatar is not USER]) == count
             asked.clear()
@@ -365,7 +365,7 @@ def test_what_moved_is_said_once_a_frame_is_done_and_not_lost_with_one_that_fail
         body = stage.enter("c/u", USER, at(0, -1))
         stage.go("c/u", at(0, -1))
         there = at(0, 1.5).tolist()
-        stage.bodies.tell({"door": there})
+        stage.bodies.place_objects({"door": there})
         with monkeypatch.context() as broken, pytest.raises(OSError, match="disk"):
             broken.setattr(stage.world, "sweep", lambda *_: (_ for _ in ()).throw(OSError("disk")))
             stage.go("c/u", at(0.1, -1))
@@ -414,7 +414,7 @@ def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None
             for number in range(2):
                 stage.enter(f"c/{number}", USER, at(-0.5, number))
             for _ in range(2 if COARSE else 15):
-                stage.bodies.tell({"door": at(0.4, 0.6, heading=rng.uniform(0, 1)).tolist()})
+                stage.bodies.place_objects({"door": at(0.4, 0.6, heading=rng.uniform(0, 1)).tolist()})
                 for name in stage.users:
                     stage.go(name, at(*rng.uniform(-1, 1, 3) * [1, 1, 0.1]))
                 poses.append(stage.bodies.poses.tobytes())

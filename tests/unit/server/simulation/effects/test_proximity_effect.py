@@ -16,7 +16,7 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.proximity_effect import make
-from solidcloud.server.simulation.effects.separation_cache import KEPT, went
+from solidcloud.server.simulation.world.separation_cache import CACHE_KEY, displacement_bound
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 GRID = np.stack(np.meshgrid(np.arange(0, 1, 0.05), np.arange(0, 1, 0.05), [0.0]), axis=-1).reshape(-1, 3)
@@ -109,7 +109,7 @@ def test_what_could_not_be_read_is_unknown_and_never_remembered(tmp_path: Path) 
     with Scene.open(case.archive, "scene") as scene:
         world = world_of(scene)
         found = report(runner, world, body, at(1.5, 0, 0.2))
-        assert found == ProximityReport(unknown=True) and KEPT not in body.kept
+        assert found == ProximityReport(unknown=True) and CACHE_KEY not in body.kept
         found = report(runner, world, body, at(0.7, 0, 0.2))
         assert found.unknown is False and found.distance == pytest.approx(0.09, abs=1e-3), (
             "nearer than it can be"
@@ -174,9 +174,9 @@ def test_no_sphere_goes_farther_than_is_said(rng: np.random.Generator) -> None:
             turn = np.linalg.qr(first[:3, :3] + size * rng.normal(size=(3, 3)))[0]
             second = archive_cases.pose_of(turn, first[:3, 3] + size * rng.normal(size=3))
             moved = np.linalg.norm(points @ (second - first)[:3, :3].T + (second - first)[:3, 3], axis=1)
-            assert moved.max() <= went(first.tolist(), second.tolist(), avatar)
+            assert moved.max() <= displacement_bound(first.tolist(), second.tolist(), avatar)
             # Not by much: bounds that are loose spare no search.
-            assert went(first.tolist(), first.tolist(), avatar) < 1e-4
+            assert displacement_bound(first.tolist(), first.tolist(), avatar) < 1e-4
 
 
 def test_a_scene_file_says_how_far() -> None:

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from solidcloud.server.simulation.world.vectors import (
     dot,
-    level,
-    lowest_of,
-    product,
-    rotation,
-    size,
-    spread,
-    straightened,
-    turned_back,
-    turned_by,
-    unit,
+    frobenius_norm,
+    horizontal,
+    min_height,
+    multiply,
+    norm,
+    orthonormalize,
+    rotate,
+    rotate_back,
+    rotation_matrix,
+    unit_vector,
 )
 
 pytestmark = pytest.mark.interpreted
@@ -27,10 +27,10 @@ UP = np.array([0.0, 0.0, 1.0])
 )
 def test_rotation_is_that_of_its_angle(angle: float) -> None:
     c, s = math.cos(angle), math.sin(angle)
-    found = rotation(UP, angle)
+    found = rotation_matrix(UP, angle)
     assert np.allclose(found, [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], atol=1e-14)
-    axis = unit((1.0, -2.0, 0.5))
-    turn = rotation(axis, angle)
+    axis = unit_vector((1.0, -2.0, 0.5))
+    turn = rotation_matrix(axis, angle)
     assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-14) and np.allclose(turn @ axis, axis, atol=1e-15)
 
 
@@ -38,22 +38,22 @@ def test_products_are_numpys_but_for_rounding(rng: np.random.Generator) -> None:
     for _ in range(50):
         one, other = rng.normal(size=(2, 4, 4))
         a, b = rng.normal(size=(2, 3))
-        assert np.allclose(turned_by(one, a), one[:3, :3] @ a, rtol=1e-13, atol=1e-13)
-        assert np.allclose(turned_back(one, a), one[:3, :3].T @ a, rtol=1e-13, atol=1e-13)
-        assert np.allclose(product(one, other), one[:3, :3] @ other[:3, :3], rtol=1e-13, atol=1e-13)
+        assert np.allclose(rotate(one, a), one[:3, :3] @ a, rtol=1e-13, atol=1e-13)
+        assert np.allclose(rotate_back(one, a), one[:3, :3].T @ a, rtol=1e-13, atol=1e-13)
+        assert np.allclose(multiply(one, other), one[:3, :3] @ other[:3, :3], rtol=1e-13, atol=1e-13)
         assert dot(a, b) == pytest.approx(float(a @ b), abs=1e-13)
-        assert size(a) == pytest.approx(float(np.linalg.norm(a)), rel=1e-14)
-        assert spread(one[:3, :3]) == pytest.approx(float(np.linalg.norm(one[:3, :3])), rel=1e-14)
-        assert abs(dot(level(a, UP), UP)) < 1e-15 and np.allclose(level(a, UP)[:2], a[:2])
+        assert norm(a) == pytest.approx(float(np.linalg.norm(a)), rel=1e-14)
+        assert frobenius_norm(one[:3, :3]) == pytest.approx(float(np.linalg.norm(one[:3, :3])), rel=1e-14)
+        assert abs(dot(horizontal(a, UP), UP)) < 1e-15 and np.allclose(horizontal(a, UP)[:2], a[:2])
         points = rng.normal(size=(20, 3))
-        assert lowest_of(points, b) == pytest.approx(float((points @ b).min()), abs=1e-13)
+        assert min_height(points, b) == pytest.approx(float((points @ b).min()), abs=1e-13)
 
 
 def test_bits_are_those_of_one_order_of_sums() -> None:
     """Two products and a sum of which a contracted multiply-add, or another order, would have other bits."""
     one, other = np.array([0.1, 0.2, 0.3]), np.array([0.7, 0.11, 0.13])
     assert dot(one, other).hex() == (0.1 * 0.7 + 0.2 * 0.11 + 0.3 * 0.13).hex()
-    turn = rotation(unit((1.0, 2.0, 3.0)), 0.7)
+    turn = rotation_matrix(unit_vector((1.0, 2.0, 3.0)), 0.7)
     assert [value.hex() for value in turn[0].tolist()] == [
         "0x1.9033028268008p-1",
         "-0x1.ee8503a7ec44ap-2",
@@ -62,8 +62,8 @@ def test_bits_are_those_of_one_order_of_sums() -> None:
 
 
 def test_what_was_turned_again_and_again_is_a_rotation_still() -> None:
-    step, turn = rotation(unit((0.2, 0.1, 1.0)), 0.01), np.eye(3)
+    step, turn = rotation_matrix(unit_vector((0.2, 0.1, 1.0)), 0.01), np.eye(3)
     for _ in range(2000):
-        turn = straightened(product(step, turn))
+        turn = orthonormalize(multiply(step, turn))
     assert np.abs(turn @ turn.T - np.eye(3)).max() < 1e-15
-    assert np.allclose(turn, rotation(unit((0.2, 0.1, 1.0)), 20.0), atol=1e-12)
+    assert np.allclose(turn, rotation_matrix(unit_vector((0.2, 0.1, 1.0)), 20.0), atol=1e-12)

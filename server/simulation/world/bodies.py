@@ -1,8 +1,8 @@
 """Bodies: everything that moves in one scene, users and objects, with their current poses.
 
 Each simulation has one. It updates the bodies like a dict of its users (`bodies[user] = body` after
-each frame, `pop`), and passes on the poses at which motion commands place objects (`tell`). Effects
-query it through `Blocking` (blocking.py).
+each frame, `pop`), and passes on the poses at which motion commands place objects (`place_objects`). Effects
+query it through `BodyObstacle` (blocking.py).
 """
 
 import threading
@@ -23,15 +23,15 @@ from ...kernels.core.pose_transform import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ...kernels.core.stop_flag_checks import NO_LIMIT
 from ...queries.context.query_context import kernel_poses, to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
-from ..world.frame import Body, Pose, Vec
-from ..world.vectors import level, turned_back, turned_by
+from .frame import Body, Pose, Vec
+from .vectors import horizontal, rotate, rotate_back
 
-USER, TOLD, PUSHED = 1, 2, 4  # kinds, one bit each
+USER, KINEMATIC, PUSHED = 1, 2, 4  # kinds, one bit each
 # Points this near to one another form a body's surface [m], as `slide` and `ground` define it for
 # scans.
 _SURFACE = 0.08
 # Number of cached shapes of avatars that belong to no body, beyond which they are dropped.
-_MOST_LOOSE = 64
+_MAX_LOOSE_SHAPES = 64
 
 
 class Shape(NamedTuple):
@@ -49,7 +49,7 @@ class Shape(NamedTuple):
 
     def center(self, pose: Pose) -> Vec:
         """Return the placed centre of its box."""
-        placed: Vec = turned_by(pose, 0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
+        placed: Vec = rotate(pose, 0.5 * (self.box[0] + self.box[1])) + pose[:3, 3]
         return placed
 
     def normal_at(self, point: int) -> Vec | None:
@@ -103,7 +103,7 @@ class Bodies:
         self._users: dict[Hashable, Body] = {}
         self._known: dict[int, Shape] = {}
         self._numbered = 0
-        # By user and object, see `_remember_way`.
+        # By user and object, see `_remember_origin`.
         self._came_from: dict[tuple[str, str], Vec] = {}
 
     # --- shapes --------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class Bodies:
         shape = self._known.get(id(model.points))
         if shape is not None and shape.model.arrays is model.arrays and shape.model.radius == model.radius:
             return shape
-        if len(self._known) > _MOST_LOOSE + len(self.names):
+        if len(self._known) > _MAX_LOOSE_SHAPES + len(self.names):
             self._known = {id(kept.model.points): kept for kept in self.shapes}
         box = np.zeros((2, 3))
         if len(model.points):
@@ -174,7 +174,7 @@ class Bodies:
                 self._remove(self._rows[True, body.name])
             return body
 
-    def remembers(self, body: Body) -> bool:
+    def is_present(self, body: Body) -> bool:
         """Return whether this is the body of a present user.
 
         The body of a move that keeps no state is a different one.
@@ -184,7 +184,7 @@ class Bodies:
     def add_object(self, name: str, model: AvatarModel, pose: Pose, *, pushed: bool) -> None:
         """Add an object at its initial pose; BadTransformError unless the pose is rigid."""
         with self.lock:
-            self._add(name, PUSHED if pushed else TOLD, model, _checked(name, pose))
+            self._add(name, PUSHED if pushed else KINEMATIC, model, _checked(name, pose))
 
     def row_of(self, name: str, *, user: bool) -> int:
         """Return the row of a user or an object, or -1."""
@@ -218,14 +218,14 @@ class Bodies:
 
     # --- poses ---------------------------------------------------------------------------------
 
-    def standing(self) -> tuple[int, NDArray[np.float64]]:
-        """Return the layout and the poses (n, 4, 4) of all bodies now, for `put_back`."""
+    def snapshot(self) -> tuple[int, NDArray[np.float64]]:
+        """Return the layout and the poses (n, 4, 4) of all bodies now, for `restore`."""
         with self.lock:
             return self.layout, self.poses.copy()
 
-    def put_back(self, standing: tuple[int, NDArray[np.float64]]) -> None:
-        """Restore the poses that `standing` returned, if the bodies are still the same."""
-        layout, poses = standing
+    def restore(self, snapshot: tuple[int, NDArray[np.float64]]) -> None:
+        """Restore the poses that `snapshot` returned, if the bodies are still the same."""
+        layout, poses = snapshot
         with self.lock:
             if layout == self.layout:
                 for row in np.flatnonzero((poses != self.poses).any(axis=(1, 2))).tolist():
@@ -250,7 +250,7 @@ class Bodies:
             self.clock += 1
             self.changed[row] = self.clock
 
-    def tell(
+    def place_objects(
         self, poses: Mapping[str, Sequence[Sequence[float]]], stop: StopFlag = NO_STOP
     ) -> Callable[[], None]:
         """Place objects where a motion command puts them, even into users.
@@ -263,35 +263,35 @@ class Bodies:
         """
         with self.lock:
             self.begin()
-            checked = [(self._told(name), _checked(name, poses[name])) for name in sorted(poses)]
+            checked = [(self._kinematic_row(name), _checked(name, poses[name])) for name in sorted(poses)]
             came_from, stood = dict(self._came_from), [(row, self.poses[row].copy()) for row, _ in checked]
             for (row, pose), (_, before) in zip(checked, stood, strict=True):
                 self._put(row, pose)
-                self._remember_way(row, before, stop)
+                self._remember_origin(row, before, stop)
 
-        def put_back() -> None:
+        def restore() -> None:
             with self.lock:
                 for row, before in stood:
                     self._put(row, before)
                 self._came_from = came_from
 
-        return put_back
+        return restore
 
-    def _told(self, name: str) -> int:
+    def _kinematic_row(self, name: str) -> int:
         """Return the row of an object that motion commands may place, else BadRequestError."""
         row = self.row_of(name, user=False)
-        if row < 0 or self.kinds[row] != TOLD:
-            told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == TOLD]
+        if row < 0 or self.kinds[row] != KINEMATIC:
+            told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == KINEMATIC]
             found = "is not in this scene" if row < 0 else "is pushed by users and cannot be placed"
             raise BadRequestError(
                 f"object {name!r} {found}: expected a kinematic object: {', '.join(told) or 'there is none'}"
             )
         return row
 
-    def _remember_way(self, thing: int, before: Pose, stop: StopFlag) -> None:
+    def _remember_origin(self, thing: int, before: Pose, stop: StopFlag) -> None:
         """Store the direction from which a placed object has moved into users.
 
-        The direction is in the object's frame; `way_out` uses it.
+        The direction is in the object's frame; `escape_direction` uses it.
         """
         bounds, now = self.bounds, self.poses[thing]
         apart = (bounds[:, 0] > bounds[thing, 1]) | (bounds[:, 1] < bounds[thing, 0])
@@ -302,10 +302,10 @@ class Bodies:
         touching &= ~self.touching(self.shapes[thing], before, near, 0, stop)
         for row in near[touching].tolist():
             center = self.shapes[row].center(self.poses[row])
-            own = [turned_back(pose, center - pose[:3, 3]) for pose in (before, now)]
+            own = [rotate_back(pose, center - pose[:3, 3]) for pose in (before, now)]
             self._came_from[self.names[row], self.names[thing]] = own[0] - own[1]
 
-    def way_out(self, row: int, user: str, center: Vec) -> Vec:
+    def escape_direction(self, row: int, user: str, center: Vec) -> Vec:
         """Return the level direction in which a mover gets free of a body it overlaps; zeros: any.
 
         The direction is away from the body's centre. For an object that was moved into a user, it
@@ -314,8 +314,8 @@ class Bodies:
         """
         came_from = self._came_from.get((user, self.names[row])) if self.kinds[row] != USER else None
         pose = self.poses[row]
-        way = center - self.shapes[row].center(pose) if came_from is None else turned_by(pose, came_from)
-        return level(way, self.up)
+        way = center - self.shapes[row].center(pose) if came_from is None else rotate(pose, came_from)
+        return horizontal(way, self.up)
 
     def touching(
         self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: StopFlag = NO_STOP

@@ -7,15 +7,15 @@ import pytest
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.scene.scene_file import Spawn
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, MoveRequest, Wish
-from solidcloud.server.simulation.world.motion_commands import (
+from solidcloud.server.simulation.simulation import (
     LONGEST_FRAME,
     check_rigid,
     first_pose,
     frame_seconds,
     spawn_pose,
-    wished_pose,
+    target_pose,
 )
-from solidcloud.server.simulation.world.vectors import rotation
+from solidcloud.server.simulation.world.vectors import rotation_matrix
 
 pytestmark = pytest.mark.interpreted
 
@@ -24,7 +24,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def pose_at(x, y, z, heading=0.0):
     pose = np.eye(4)
-    pose[:3, :3] = rotation(UP, heading)
+    pose[:3, :3] = rotation_matrix(UP, heading)
     pose[:3, 3] = x, y, z
     return pose
 
@@ -36,7 +36,7 @@ def wish(pose=None, velocity=None, turn=0.0, time=0.0, seq=0):
 
 def test_a_velocity_lasts_for_the_frame():
     begin = pose_at(1.0, 2.0, 3.0, 0.5)
-    there = wished_pose(wish(velocity=(1.0, -2.0, 4.0)), begin, 0.25, UP)
+    there = target_pose(wish(velocity=(1.0, -2.0, 4.0)), begin, 0.25, UP)
     assert np.array_equal(there[:3, 3], [1.25, 1.5, 4.0])
     assert np.array_equal(there[:3, :3], begin[:3, :3]), "not turned: the very same rotation"
     assert np.array_equal(begin, pose_at(1.0, 2.0, 3.0, 0.5)), "where it began is not written to"
@@ -47,21 +47,21 @@ def test_a_turn_is_about_up_and_at_the_avatars_origin(up):
     axis = np.array(up)
     begin = np.eye(4)
     begin[:3, 3] = 7.0, 8.0, 9.0
-    there = wished_pose(wish(velocity=(0.0, 0.0, 0.0), turn=math.pi), begin, 0.5, axis)
+    there = target_pose(wish(velocity=(0.0, 0.0, 0.0), turn=math.pi), begin, 0.5, axis)
     assert np.array_equal(there[:3, 3], begin[:3, 3])
     assert np.allclose(there[:3, :3] @ axis, axis, atol=1e-15)
     assert math.isclose(np.trace(there[:3, :3]), 1.0, abs_tol=1e-14), "a quarter turn"
 
 
 def test_positive_turns_are_to_the_left():
-    there = wished_pose(wish(velocity=(0.0, 0.0, 0.0), turn=math.pi / 2), np.eye(4), 1.0, UP)
+    there = target_pose(wish(velocity=(0.0, 0.0, 0.0), turn=math.pi / 2), np.eye(4), 1.0, UP)
     assert np.allclose(there[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
 
 
 def test_a_pose_turned_for_long_stays_rigid():
     pose = np.eye(4)
     for _ in range(3000):
-        pose = wished_pose(wish(velocity=(0.0, 0.0, 0.0), turn=1.7), pose, 0.1, np.array([0.6, 0.0, 0.8]))
+        pose = target_pose(wish(velocity=(0.0, 0.0, 0.0), turn=1.7), pose, 0.1, np.array([0.6, 0.0, 0.8]))
         check_rigid(pose, "pose")
     assert np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-15
 
@@ -105,7 +105,7 @@ def test_what_is_not_rigid_is_refused(change, said):
     with pytest.raises(BadTransformError, match=said):
         check_rigid(pose, "pose")
     with pytest.raises(BadTransformError, match=said):
-        wished_pose(wish(pose), np.eye(4), 0.1, UP)
+        target_pose(wish(pose), np.eye(4), 0.1, UP)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
-"""Blocking: the bodies of a scene that obstruct one mover, as an `Obstacle` of one frame.
+"""BodyObstacle: the bodies of a scene that obstruct one mover, as an `Obstacle` of one frame.
 
 First, one kernel call of some microseconds tests the bounds of all bodies against those of the
 motion; usually none is near. Then the near bodies are tested exactly (kernels/bodies/body_sweep.py,
 kernels/bodies/body_pairs.py).
 
 A body that the mover overlaps when the frame begins blocks only a translation against
-`Bodies.way_out`. A translation along it, across it, up or down is permitted, and so is a turn.
+`Bodies.escape_direction`. A translation along it, across it, up or down is permitted, and so is a turn.
 Bodies that came to overlap, by their initial poses or because a motion command placed an object
 there, can therefore separate, and none is ever trapped.
 """
@@ -21,15 +21,15 @@ from ...avatars.avatar_model import AvatarModel, make_avatar
 from ...kernels.bodies.body_sweep import sweep_bodies
 from ...kernels.bodies.near_bodies import find_near
 from ...runtime.stop_flag import NO_STOP, StopFlag
-from ..world.frame import Body, Frame, Hit, Pose, Vec
-from ..world.vectors import dot, level, size, turned_by
 from .bodies import USER, Bodies, Shape
+from .frame import Body, Frame, Hit, Pose, Vec
+from .vectors import dot, horizontal, norm, rotate
 
 # Tolerance for a translation across what is overlapped: rounding does not count as going deeper.
 _ACROSS = 1e-9
 
 
-class _First(NamedTuple):
+class _FirstHit(NamedTuple):
     """First body that ends a motion.
 
     row: of the body.  witness: (2, 3) centres of the two spheres, world [m].  point: of the body's
@@ -42,7 +42,7 @@ class _First(NamedTuple):
     point: int
 
 
-class Blocking:
+class BodyObstacle:
     """Bodies of some kinds, as obstacles for one mover and one frame."""
 
     def __init__(
@@ -98,9 +98,9 @@ class Blocking:
                 if first is None:
                     break
                 if first.fraction > 0.0 or not self._is_overlapped(first.row):
-                    return self._goes_deeper(shape, pose_from, pose_to) or self._hit_of(first)
+                    return self._deepening_hit(shape, pose_from, pose_to) or self._hit_of(first)
                 rows = rows[rows != first.row]
-            return self._goes_deeper(shape, pose_from, pose_to)
+            return self._deepening_hit(shape, pose_from, pose_to)
 
     def _touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
         """Implement `touches`."""
@@ -114,7 +114,7 @@ class Blocking:
             for row in rows.tolist():
                 if not self._is_overlapped(row):
                     return self._hit_at(shape, pose, row)
-            return self._goes_deeper(shape, self._start, pose)
+            return self._deepening_hit(shape, self._start, pose)
 
     def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
         """Return whether any body is touched at a pose, whatever the margin.
@@ -162,10 +162,10 @@ class Blocking:
 
     def _first(
         self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
-    ) -> "_First | None":
+    ) -> "_FirstHit | None":
         """Return what ends a motion first among the bodies of these rows."""
         bodies, numbers = self._bodies, self._bodies.numbers[rows]
-        best: _First | None = None
+        best: _FirstHit | None = None
         until = np.inf
         while len(rows):
             same = numbers == numbers[0]
@@ -179,18 +179,18 @@ class Blocking:
                 )  # fmt: skip
                 if row >= 0:
                     best, until = (
-                        _First(row, fraction, witness, int(other.model.rows[named[0], named[1]])),
+                        _FirstHit(row, fraction, witness, int(other.model.rows[named[0], named[1]])),
                         fraction,
                     )
             rows, numbers = rows[~same], numbers[~same]
         return best
 
-    def _hit_of(self, first: "_First") -> Hit:
+    def _hit_of(self, first: "_FirstHit") -> Hit:
         """Return the hit of the body that ended a motion, with its normal for an object."""
         bodies, row, (own, other) = self._bodies, first.row, first.witness
         normal = bodies.shapes[row].normal_at(first.point)
         if normal is not None:
-            normal = turned_by(bodies.poses[row], normal)
+            normal = rotate(bodies.poses[row], normal)
             normal = -normal if dot(normal, own - other) < 0.0 else normal
         return Hit(first.fraction, Verdict.CONTACT, own, other, bodies.names[row], normal=normal)
 
@@ -204,7 +204,7 @@ class Blocking:
             found = self._overlapped[row] = bool(touching[0])
         return found
 
-    def _goes_deeper(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
+    def _deepening_hit(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
         """Return a hit of a body, overlapped at the start, that a motion goes deeper into.
 
         A motion does so if its translation is directed against the body's `_out`. None: no body.
@@ -212,7 +212,7 @@ class Blocking:
         way = pose_to[:3, 3] - pose_from[:3, 3]
         for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
             out = self._out(row)
-            if dot(way, out) < -_ACROSS * size(out) * size(way):
+            if dot(way, out) < -_ACROSS * norm(out) * norm(way):
                 center = shape.center(pose_from)
                 return Hit(0.0, Verdict.CONTACT, center, center - out, self._bodies.names[row])
         return None
@@ -221,7 +221,7 @@ class Blocking:
         """Return the direction out of a body that the mover overlapped when the frame began."""
         bodies = self._bodies
         center = bodies.shape_of(self._model).center(self._start)
-        return bodies.way_out(row, self._mover if self._user else "", center)
+        return bodies.escape_direction(row, self._mover if self._user else "", center)
 
     def _hit_at(self, shape: Shape, pose: Pose, row: int) -> Hit:
         """Return the hit of a body touched at a pose.
@@ -231,10 +231,10 @@ class Blocking:
         """
         bodies, center = self._bodies, shape.center(pose)
         out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])
-        return Hit(0.0, Verdict.CONTACT, center, center - level(out, bodies.up), bodies.names[row])
+        return Hit(0.0, Verdict.CONTACT, center, center - horizontal(out, bodies.up), bodies.names[row])
 
 
-def warm() -> None:
+def warm_kernels() -> None:
     """Compile the kernels before the first request needs them."""
     model = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05)
     bodies = Bodies(np.zeros(3), np.array([0.0, 0.0, 1.0]))
@@ -242,7 +242,7 @@ def warm() -> None:
     poses[1][0, 3] = 1.0
     for name, pose in zip("ab", poses, strict=True):
         bodies[name] = Body(name, model, pose)
-    blocking = Blocking("", bodies, USER, "a", model, poses[0])
+    blocking = BodyObstacle("", bodies, USER, "a", model, poses[0])
     blocking.sweep(model, poses[0], poses[1], 1e-6)
     blocking.touches(model, poses[1])
     bodies.shape_of(model).normal_at(0)

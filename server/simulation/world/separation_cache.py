@@ -13,38 +13,38 @@ from typing import Any, NamedTuple
 from ....schemas.errors import SolidcloudError
 from ....schemas.wire.answers import DistanceAnswers
 from ...avatars.avatar_model import AvatarModel
-from ..world.frame import Frame
+from .frame import Frame
 
-KEPT = "apart"
+CACHE_KEY = "separation"
 # If nothing was in reach so far, a search extends farther by this distance, or to twice the reach
 # where that is less [m]. The extra cost saves searches in later frames, as many as the avatar needs
 # for that distance.
-AHEAD = 1.0
+EXTRA_REACH = 1.0
 # Distances are rounded, reaches to exact units of 15 nm: below this difference, only a search can
 # decide [m].
-ROUNDED = 1e-7
+ROUNDING = 1e-7
 # Largest error of placing a point, at 1e9 m from the origin [m].
-PLACED = 1e-5
+PLACEMENT_ERROR = 1e-5
 
 Rows = list[list[float]]
 
 
-class Known(NamedTuple):
+class CachedSeparation(NamedTuple):
     """Exact result at one pose.
 
     generations: of the world's archives; the result does not apply to others.
-    rows: the pose.  looked: reach of the search [m].  answers: of `distance`.
+    rows: the pose.  searched_reach: reach of the search [m].  answers: of `distance`.
     """
 
     world: Any
     generations: tuple[int, ...]
     avatar: AvatarModel
     rows: Rows
-    looked: float
+    searched_reach: float
     answers: DistanceAnswers
 
 
-def went(before: Rows, now: Rows, avatar: AvatarModel) -> float:
+def displacement_bound(before: Rows, now: Rows, avatar: AvatarModel) -> float:
     """Return an upper bound of the distance that any point of the avatar's spheres moved [m].
 
     avatar: not empty.
@@ -55,7 +55,7 @@ def went(before: Rows, now: Rows, avatar: AvatarModel) -> float:
         a, b, c = d - a, e - b, f - c
         turn += a * a + b * b + c * c
         shift += (a * x + b * y + c * z + (u - t)) ** 2
-    return (math.sqrt(shift) + math.sqrt(turn) * avatar.bounding_radius) * (1.0 + 1e-9) + PLACED
+    return (math.sqrt(shift) + math.sqrt(turn) * avatar.bounding_radius) * (1.0 + 1e-9) + PLACEMENT_ERROR
 
 
 def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
@@ -67,7 +67,7 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
     body, world = frame.body, frame.world
     avatar, rows = body.avatar, frame.pose.tolist()
     generations = world.generations()
-    known: Known | None = body.kept.get(KEPT)
+    known: CachedSeparation | None = body.effect_state.get(CACHE_KEY)
     if (
         known is not None
         and known.world is world
@@ -76,44 +76,48 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
     ):
         at_least = float(known.answers.lower[0])
         if known.rows == rows:
-            if known.looked == reach or (known.looked > reach and abs(at_least - reach) > ROUNDED):
+            if known.searched_reach == reach or (
+                known.searched_reach > reach and abs(at_least - reach) > ROUNDING
+            ):
                 return known.answers
-        elif at_least - went(known.rows, rows, avatar) > reach + ROUNDED:
+        elif at_least - displacement_bound(known.rows, rows, avatar) > reach + ROUNDING:
             return None
-        if at_least >= reach > ROUNDED:  # with no reach, twice the reach is no farther
-            looked = reach + min(reach, AHEAD)
-            ahead = _ahead(frame, reach, looked)
+        if at_least >= reach > ROUNDING:  # with no reach, twice the reach is no farther
+            searched_reach = reach + min(reach, EXTRA_REACH)
+            ahead = _search_farther(frame, reach, searched_reach)
             if ahead is not None:
-                body.kept[KEPT] = Known(world, generations, avatar, rows, looked, ahead)
+                body.effect_state[CACHE_KEY] = CachedSeparation(
+                    world, generations, avatar, rows, searched_reach, ahead
+                )
                 return ahead
     answers: DistanceAnswers = world.distance(avatar, frame.pose, reach, budget=frame.budget)
     if answers.exact[0] and len(avatar.points):
-        body.kept[KEPT] = Known(world, generations, avatar, rows, reach, answers)
+        body.effect_state[CACHE_KEY] = CachedSeparation(world, generations, avatar, rows, reach, answers)
     else:
-        body.kept.pop(KEPT, None)
+        body.effect_state.pop(CACHE_KEY, None)
     return answers
 
 
-def _ahead(frame: Frame, reach: float, looked: float) -> DistanceAnswers | None:
-    """Return the answer of a search up to `looked` if it also answers for `reach`, else None."""
+def _search_farther(frame: Frame, reach: float, searched_reach: float) -> DistanceAnswers | None:
+    """Return the answer of a search up to `searched_reach` if it also answers for `reach`, else None."""
     try:
         answers: DistanceAnswers = frame.world.distance(
-            frame.body.avatar, frame.pose, looked, budget=frame.budget
+            frame.body.avatar, frame.pose, searched_reach, budget=frame.budget
         )
     except SolidcloudError:  # too far to search; `reach` may not be
         return None
     # A voxel that is missing beyond `reach` must not make the answer less certain.
-    return answers if answers.exact[0] and abs(answers.lower[0] - reach) > ROUNDED else None
+    return answers if answers.exact[0] and abs(answers.lower[0] - reach) > ROUNDING else None
 
 
-def surely_farther(answers: DistanceAnswers | None, metres: float) -> bool:
+def is_farther_than(answers: DistanceAnswers | None, metres: float) -> bool:
     """Return whether the spheres are surely more than `metres` apart, by an answer of `nearest`."""
-    return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDED)
+    return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDING)
 
 
-def farther(frame: Frame, metres: float) -> bool:
+def scene_is_farther_than(frame: Frame, metres: float) -> bool:
     """Return whether the avatar is surely more than `metres` from the scene.
 
     The distance is that of its spheres from all spheres of the scan.
     """
-    return surely_farther(nearest(frame, metres), metres)
+    return is_farther_than(nearest(frame, metres), metres)

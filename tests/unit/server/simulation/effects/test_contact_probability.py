@@ -5,12 +5,12 @@ import statistics
 
 import numpy as np
 import pytest
-from solidcloud.server.simulation.world.contact_probability import (
-    FARTHEST,
-    LEFT_OUT,
+from solidcloud.server.simulation.effects.uncertainty_effect import (
+    MAX_SIGMAS,
+    OMITTED_PROBABILITY,
+    combined_probability,
     contact_probability,
-    each_alone,
-    together,
+    single_probabilities,
 )
 
 # Upper tails of the normal distribution, from tables (Abramowitz and Stegun, table 26.1; 26.2 for the last).
@@ -40,7 +40,7 @@ def test_both_ends_are_zero_and_one_and_nothing_overflows() -> None:
         assert contact_probability(-16.0, sigma) == 1.0 or sigma == 1.0
         assert 0.0 <= contact_probability(16.0, sigma) < 1e-50
     assert contact_probability(-16.0, 1e-300) == 1.0 and contact_probability(16.0, 1e-300) == 0.0
-    assert together(each_alone({}, {0: 0.01}).values()) == 0.0
+    assert combined_probability(single_probabilities({}, {0: 0.01}).values()) == 0.0
 
 
 def test_scans_are_independent(rng: np.random.Generator) -> None:
@@ -49,20 +49,20 @@ def test_scans_are_independent(rng: np.random.Generator) -> None:
         sigmas = dict(enumerate(rng.uniform(0.001, 0.05, 6).tolist()))
         gaps = {number: float(sigmas[number] * rng.uniform(-3, 3)) for number in range(5, -1, -1)}
         expected = 1 - math.prod(normal.cdf(gaps[number] / sigmas[number]) for number in gaps)
-        alone = each_alone(gaps, sigmas)
-        assert together(alone.values()) == pytest.approx(expected, abs=1e-14)
+        alone = single_probabilities(gaps, sigmas)
+        assert combined_probability(alone.values()) == pytest.approx(expected, abs=1e-14)
         assert list(alone) == sorted(gaps)
-        assert max(alone.values()) <= together(alone.values()) <= min(1.0, sum(alone.values()))
+        assert max(alone.values()) <= combined_probability(alone.values()) <= min(1.0, sum(alone.values()))
 
 
 def test_what_is_farther_than_four_deviations_is_left_out_and_adds_less_than_said() -> None:
     sigma = 0.01
-    at, beyond = FARTHEST * sigma, np.nextafter(FARTHEST * sigma, 1.0)
-    assert each_alone({0: at}, {0: sigma}) == {0: pytest.approx(LEFT_OUT)}
-    assert each_alone({0: float(beyond)}, {0: sigma}) == {}
-    assert 3.1e-5 < LEFT_OUT < 3.2e-5
+    at, beyond = MAX_SIGMAS * sigma, np.nextafter(MAX_SIGMAS * sigma, 1.0)
+    assert single_probabilities({0: at}, {0: sigma}) == {0: pytest.approx(OMITTED_PROBABILITY)}
+    assert single_probabilities({0: float(beyond)}, {0: sigma}) == {}
+    assert 3.1e-5 < OMITTED_PROBABILITY < 3.2e-5
     # Of each scan its own.
-    assert list(each_alone({0: at, 1: at}, {0: sigma, 1: sigma / 2})) == [0]
+    assert list(single_probabilities({0: at, 1: at}, {0: sigma, 1: sigma / 2})) == [0]
 
 
 def test_more_noise_or_less_gap_never_lessens_the_probability_of_what_is_clear(

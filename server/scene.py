@@ -18,8 +18,8 @@ from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats
 from .observability.request_stats import RequestStats
 from .queries.context.query_context import SceneData
-from .residency.voxel_cache import Residency
-from .residency.voxel_store import OpenStore, Store
+from .residency.voxel_cache import VoxelCache
+from .residency.voxel_store import OpenStore, VoxelStore
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag
 from .scene_interface import EVERYBODY, AvatarLimits
@@ -109,7 +109,7 @@ class Scene(SceneQuestions):
             name,
             budget_bytes=budget_bytes,
             policy=policy,
-            open_store=open_store or Store,
+            open_store=open_store or VoxelStore,
             radius_model=radius_model,
             took=metrics.loaded,
         )
@@ -191,7 +191,7 @@ class Scene(SceneQuestions):
             return opened.data
 
     @property
-    def residency(self) -> Residency:
+    def residency(self) -> VoxelCache:
         """Return the resident voxels of the first archive, for counters and checks."""
         return self.archives[0].residency
 

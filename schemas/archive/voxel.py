@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..errors import CorruptError
 from ..kernels.record_rows import LANES, NO_AXIS, leaf_lanes, link_rows
 
-# A leaf node's points fill at most this many lanes of the vector test (server/kernels/overlap/overlap.py).
+# A leaf node's points fill at most this many lanes of the vector test (server/kernels/collide/collide_poses.py).
 # LLVM vectorises 32 lanes but not 8 or 16 (see there).
 MAX_LEAF = LANES
 MIN_DEGREE, MAX_DEGREE = 2, 16

@@ -27,7 +27,7 @@ MIN_STEP = 1e-6
 
 # Morton codes hold 21 bits per axis, so the octree of a larger voxel would map distinct points to
 # the same code. Node centres, in voxel steps, must also be exact in float32 for the fast pass of
-# server/kernels/overlap/overlap.py: a voxel and its neighbours within reach stay below 2^24 steps.
+# server/kernels/collide/collide_poses.py: a voxel and its neighbours within reach stay below 2^24 steps.
 MAX_VOXEL_STEPS = 1 << 21
 
 # Input with world coordinates beyond this is refused (NUMERICS.md case 16).

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 from .archives import PAPER_VOXEL, archive_bytes
 from .context import Bench, our_name
@@ -20,7 +20,7 @@ def run(bench: Bench, clock: Clock) -> Part:
     part = Part("memory")
     for voxel, path in bench.archives.items():
         name = our_name(voxel)
-        store = Store(path)
+        store = VoxelStore(path)
         try:
             points = store.archive.header.points
             resident = part.add("façade", name, "resident", store.sizes.sum() / points, "bytes/point", points)
@@ -34,7 +34,7 @@ def run(bench: Bench, clock: Clock) -> Part:
     return part
 
 
-def _loads(bench: Bench, clock: Clock, part: Part, store: Store, name: str) -> float:
+def _loads(bench: Bench, clock: Clock, part: Part, store: VoxelStore, name: str) -> float:
     """Time loading the largest voxel [ms], from its record's bytes, with the file in the page cache."""
     row = int(np.argmax(store.sizes))
     arena = ArenaBuffer(ArenaBuffer.rounded(int(store.sizes[row]))).arena

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
-from solidcloud.server.residency.eviction import Policy, make_policy
-from solidcloud.server.residency.motion_prediction import AHEAD, Ahead, Neighbourhood
+from solidcloud.server.residency.eviction import EvictionPolicy, make_policy
+from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
 
 from .traces import Centers
 
@@ -46,9 +46,9 @@ class Town(NamedTuple):
     sizes: NDArray[np.int64]
     radius: float
 
-    def neighbourhood(self, ahead: Ahead = AHEAD) -> Neighbourhood:
+    def neighbourhood(self, ahead: PrefetchOptions = PREFETCH_OPTIONS) -> UserTracks:
         """Return a new motion prediction, without any user."""
-        return Neighbourhood(self.index, self.voxel_steps, self.origin, self.step, ahead)
+        return UserTracks(self.index, self.voxel_steps, self.origin, self.step, ahead)
 
 
 def town_of(archive: Archive, sizes: NDArray[np.int64]) -> Town:
@@ -200,12 +200,12 @@ class Replay:
         *,
         prefetch: bool,
         loading: Loading = LOADING,
-        ahead: Ahead = AHEAD,
+        ahead: PrefetchOptions = PREFETCH_OPTIONS,
     ) -> None:
         """Prepare an empty cache. name: of the policy."""
         self.budget_bytes, self.prefetch, self.loading = budget_bytes, prefetch, loading
         self.neighbourhood = town.neighbourhood(ahead)
-        self.policy: Policy = make_policy(name, budget_bytes, self.neighbourhood.nearness)
+        self.policy: EvictionPolicy = make_policy(name, budget_bytes, self.neighbourhood.path_distances)
         self.sizes = town.sizes.tolist()
         self.costs = (loading.per_load + town.sizes * loading.per_byte).tolist()
         self.usual = float(np.quantile(self.costs, USUAL)) if self.costs else 0.0
@@ -265,7 +265,7 @@ class Replay:
                 self.plan(now)
             upto = int(np.searchsorted(somebody, end, side="right"))
             some = slice(seen, upto)
-            scans[somebody[some]] |= self.neighbourhood.saw_each(
+            scans[somebody[some]] |= self.neighbourhood.record_poses(
                 users[some], times[some], centers[some], reaches[some]
             )
             seen = upto

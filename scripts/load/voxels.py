@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 
 class Voxels(NamedTuple):
@@ -38,7 +38,7 @@ class Voxels(NamedTuple):
 
 def read_voxels(archive: Path) -> Voxels:
     """Read the voxels of the archive in this folder."""
-    store = Store(archive)
+    store = VoxelStore(archive)
     try:
         found, header = store.archive, store.archive.header
         lattice = header.lattice

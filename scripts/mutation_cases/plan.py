@@ -166,17 +166,20 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/motion/screw_motion.py": (SERVER + "kernels/motion/test_screw_motion.py", *work("sweep")),
     "server/kernels/prediction/track_prediction.py": AHEAD,
     "server/kernels/motion/sweep_advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
-    "server/kernels/core/gap_order.py": (SERVER + "kernels/core/test_gap_order.py", *work("distance")),
+    "server/kernels/core/separation_order.py": (
+        SERVER + "kernels/core/test_separation_order.py",
+        *work("distance"),
+    ),
     "server/kernels/nearest/nearest_pair.py": work("distance", "distance deep", "distance bounded"),
-    "server/kernels/overlap/coarse_overlap.py": (
+    "server/kernels/collide/coarse_clearance.py": (
         SERVER + "residency/test_coarse_bounds.py::test_the_nodes_of_a_top_enclose_all_points",
         SERVER + "residency/test_coarse_bounds.py::test_filled_and_remembered_are_the_same_rows",
         SERVER + "residency/test_coarse_bounds.py::test_no_point_has_a_larger_sphere_than_its_node_says",
-        SERVER + "kernels/overlap/test_settle.py",
+        SERVER + "kernels/collide/test_coarse_clearance.py",
     ),
     "server/kernels/contacts/contact_pairs.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
     "server/kernels/core/avatar_front.py": work("collide", "distance"),
-    "server/kernels/core/vector_lanes.py": work("distance", "distance deep", "bounded deep"),
+    "server/kernels/nearest/block_distances.py": work("distance", "distance deep", "bounded deep"),
     "server/kernels/core/voxel_layout.py": (
         SERVER + "kernels/core/test_outward.py",
         SERVER + "kernels/core/test_voxel_layout.py",
@@ -197,7 +200,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/bodies/moving_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/bodies/near_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/rays/stored_normals.py": NORMALS,
-    "server/kernels/overlap/overlap.py": (
+    "server/kernels/collide/collide_poses.py": (
         *work("collide", "collide deep", "collide one"),
         *tangent("collide"),
     ),
@@ -215,7 +218,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/motion/sweep_interval.py": work("sweep", "sweep bounded"),
     "server/kernels/core/voxel_tree.py": (SERVER + "kernels/core/test_voxel_tree.py",),
     "server/kernels/prediction/user_tracks.py": (SERVER + "residency/test_motion_prediction.py",),
-    "server/kernels/rays/nearest_point.py": (
+    "server/kernels/rays/within_point.py": (
         *work("within", "within bounded"),
         SERVER + "queries/test_within_exact.py",
     ),
@@ -236,7 +239,7 @@ NONE = {
     "schemas/kernels/compiling.py": "no kernel: how kernels are compiled",
     "schemas/kernels/kernel_files.py": "no kernel: how compiled kernels are kept",
     "schemas/kernels/kernel_sources.py": "no kernel: what compiled kernels depend on",
-    "server/kernels/core/borrowing_kernels.py": (
+    "server/kernels/core/kernel_decorators.py": (
         "options of the compiler only, which an interpreted kernel does not see"
     ),
     "server/kernels/core/stop_flag_checks.py": "an atomic load, which is not interpreted, and limits of time",

@@ -16,10 +16,10 @@ from ...schemas.wire.messages import (
     SourceInfo,
     SpawnInfo,
 )
-from ..residency.voxel_store import Store
+from ..residency.voxel_store import VoxelStore
 
 
-def describe(store: Store, name: str) -> SceneInfo:
+def describe(store: VoxelStore, name: str) -> SceneInfo:
     """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
     header = store.archive.header
     lattice, now = header.lattice, header.radius_now

@@ -32,13 +32,13 @@ from ..queries.context.query_context import SceneData, make_scene_data, with_rad
 from ..queries.engines import warm_engines
 from ..queries.raycast import make_directions
 from ..residency.arena import ArenaBuffer
-from ..residency.coarse_bounds import Coarse
+from ..residency.coarse_bounds import CoarseBounds
 from ..residency.eviction import make_policy, prefetches
-from ..residency.index_proof import Bounds
-from ..residency.motion_prediction import Neighbourhood, User
+from ..residency.index_proof import ProvedBounds
+from ..residency.motion_prediction import User, UserTracks
 from ..residency.prefetch import Prefetcher
-from ..residency.voxel_cache import Residency
-from ..residency.voxel_store import OpenStore, Store
+from ..residency.voxel_cache import VoxelCache
+from ..residency.voxel_store import OpenStore, VoxelStore
 from ..runtime.threads import start_thread
 from .archive_info import describe
 from .rigid_transform import archive_pose, inverse_of, moved, turned, under
@@ -79,7 +79,7 @@ class ArchiveGeneration:
 
     def __init__(
         self,
-        store: Store,
+        store: VoxelStore,
         budget_bytes: int,
         policy: str = "lru",
         number: int = 0,
@@ -95,19 +95,19 @@ class ArchiveGeneration:
         self.store, self.number = store, number
         self.kept: dict[str, Any] = {}
         self.ended = threading.Event()
-        bounds, lattice = Bounds(store.archive), store.archive.header.lattice
-        around = Neighbourhood(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
+        bounds, lattice = ProvedBounds(store.archive), store.archive.header.lattice
+        around = UserTracks(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
         ahead = prefetches(policy)
         coarse = _make_coarse(store, budget_bytes) if ahead else None
         if coarse is not None:
             budget_bytes -= coarse.bytes
-        residency = Residency(store, budget_bytes, make_policy(policy, budget_bytes, around.nearness))
-        residency.took = took
+        residency = VoxelCache(store, budget_bytes, make_policy(policy, budget_bytes, around.path_distances))
+        residency.on_load_time = took
         if coarse is not None:
-            arena, remember = residency.buffer.arena, coarse.remember
-            residency.loaded = lambda row, where: remember(row, arena, where)
+            arena, remember = residency.buffer.arena, coarse.store_from_arena
+            residency.on_loaded = lambda row, where: remember(row, arena, where)
         # Without room for all voxels, the room is for those that requests load.
-        fill = _coarse_filling(coarse, store) if coarse is not None and coarse.holds_all else None
+        fill = _coarse_filling(coarse, store) if coarse is not None and coarse.has_room_for_all else None
         self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
         figure = make_scene_data(store.archive, residency, bounds, coarse)
         data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
@@ -195,7 +195,7 @@ class ArchiveGeneration:
             return False
         near = around if around < _USER_REACH else _USER_REACH
         reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
-        return self.prefetcher.saw(user, (x, y, z), reach)
+        return self.prefetcher.record_pose(user, (x, y, z), reach)
 
     def warm(self) -> None:
         """Run every query once, with a load, so that no request waits for compilation."""
@@ -228,20 +228,20 @@ class ArchiveGeneration:
                 pass
 
 
-def _make_coarse(store: Store, budget_bytes: int) -> Coarse | None:
+def _make_coarse(store: VoxelStore, budget_bytes: int) -> CoarseBounds | None:
     """Return storage for the coarse bounds of all voxels, or of as many as their share of the budget holds.
 
     None if the budget has no room for any beside the largest voxel.
     """
     voxels, largest = len(store.sizes), int(store.sizes.max(initial=0))
     most = min(int(budget_bytes * _COARSE_SHARE), budget_bytes - ArenaBuffer.rounded(largest))
-    coarse = Coarse(voxels, most)
+    coarse = CoarseBounds(voxels, most)
     return coarse if len(coarse.arrays.count) else None
 
 
-def _coarse_filling(coarse: Coarse, store: Store) -> Callable[[], bool]:
+def _coarse_filling(coarse: CoarseBounds, store: VoxelStore) -> Callable[[], bool]:
     """Return a function that stores the coarse bounds of one more voxel; False if none is left."""
-    missing = coarse.missing()
+    missing = coarse.rows_without_bounds()
 
     def fill_one() -> bool:
         row = next(missing, None)
@@ -249,7 +249,7 @@ def _coarse_filling(coarse: Coarse, store: Store) -> Callable[[], bool]:
             return False
         # An unreadable voxel has none; the request that loads it gets the error.
         with suppress(CorruptError, OSError):
-            coarse.fill(store, row)
+            coarse.store_from_archive(store, row)
         return True
 
     return fill_one
@@ -264,11 +264,11 @@ class PlacedArchive:
 
     def __init__(
         self,
-        store: Store,
+        store: VoxelStore,
         name: str,
         budget_bytes: int,
         policy: str = "lru",
-        open_store: OpenStore = Store,
+        open_store: OpenStore = VoxelStore,
         radius_model: str | None = None,
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
@@ -298,7 +298,7 @@ class PlacedArchive:
         *,
         budget_bytes: int,
         policy: str = "lru",
-        open_store: OpenStore = Store,
+        open_store: OpenStore = VoxelStore,
         radius_model: str | None = None,
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
@@ -312,7 +312,7 @@ class PlacedArchive:
             store.close()
             raise
 
-    def _open(self, store: Store, number: int) -> ArchiveGeneration:
+    def _open(self, store: VoxelStore, number: int) -> ArchiveGeneration:
         """Return a generation, opened as this archive is served."""
         return ArchiveGeneration(
             store, self._budget_bytes, self._policy, number, self._took, self._radius_model
@@ -328,7 +328,7 @@ class PlacedArchive:
                 return opened.taken()
 
     @property
-    def residency(self) -> Residency:
+    def residency(self) -> VoxelCache:
         """Return the resident voxels, for counters and checks."""
         return self._opened.data.residency
 

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.voxels_in_reach import Reach
-from ..kernels.overlap.overlap import CLEAR, CONTACT, UNKNOWN, overlap_poses
-from ..residency.coarse_bounds import settle
+from ..kernels.collide.collide_poses import CLEAR, CONTACT, UNKNOWN, collide_poses
+from ..kernels.core.voxels_in_reach import VoxelsInReach
+from ..residency.coarse_bounds import drop_clear_pairs
 from .context.anytime_search import collide_bounded
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
@@ -47,10 +47,10 @@ def collide(
     k = len(array)
     residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
 
-    def settled(reach: Reach) -> Reach:
+    def settled(reach: VoxelsInReach) -> VoxelsInReach:
         if data.coarse is None or not len(avatar.points):
             return reach
-        return settle(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)[0]
+        return drop_clear_pairs(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)[0]
 
     reach = find_proved_reach(data, avatar, array, other_units, budget, spent, settled)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
@@ -63,7 +63,7 @@ def collide(
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            overlap_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
+            collide_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
         spent.add(held)
     # A load may have proved the index wrong by now.
     if (data.nothing_clear or len(data.unknown)) and len(avatar.points):

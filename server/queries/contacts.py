@@ -17,12 +17,13 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import ContactsAnswers, Verdict
 from ...schemas.wire.requests import MAX_CONTACTS
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.collide.collide_poses import STACK
 from ..kernels.contacts.contact_clusters import (
     CELLS,
     CENTER,
     CLUSTER,
     CLUSTERS,
-    DROP,
+    DEFICIT,
     HIGH,
     LISTED,
     LOW,
@@ -33,13 +34,12 @@ from ..kernels.contacts.contact_clusters import (
     SCAN,
     SQUARE,
     TAG,
-    Memory,
+    ContactState,
     make_cells,
 )
-from ..kernels.contacts.contact_pairs import Asked, Tally, gather_contacts
+from ..kernels.contacts.contact_pairs import ContactOptions, ContactResults, gather_contacts
 from ..kernels.core.voxel_layout import LANES
-from ..kernels.core.voxels_in_reach import Reach
-from ..kernels.overlap.overlap import STACK
+from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
@@ -100,13 +100,13 @@ def contacts(
     spent = CostCounter(begin, data.residency, data.broad.keys)
     reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
     k = len(array)
-    tally = Tally(
+    tally = ContactResults(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
     )
     memory = _empty_memory(limit)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        asked = Asked(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MOST_CELLS)
+        asked = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MOST_CELLS)
         parts = list(pieces(reach, data.residency, budget.share, budget.stop))
         for number, (which, rows, part) in enumerate(parts):
             # A pose that is split over several pieces is alone in each, and the pieces are
@@ -138,7 +138,7 @@ def _checked_limit(limit: int) -> int:
     return number
 
 
-def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:
+def _edges(reach: VoxelsInReach, edge_units: int | None, units_per_step: float) -> NDArray[np.int64]:
     """Return the edge (k,) of a cell under each pose [steps].
 
     reach: its units are those of the largest sphere.
@@ -151,9 +151,9 @@ def _edges(reach: Reach, edge_units: int | None, units_per_step: float) -> NDArr
     return np.asarray(np.maximum(steps, 1.0).astype(np.int64))
 
 
-def _empty_memory(limit: int) -> Memory:
+def _empty_memory(limit: int) -> ContactState:
     """Return the memory of a search that has not begun."""
-    return Memory(
+    return ContactState(
         make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
         np.zeros(3, np.int64), np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
         np.empty((0, CLUSTER), np.int64),
@@ -164,14 +164,14 @@ def _gather(
     data: SceneData,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
-    part: Reach,
+    part: VoxelsInReach,
     which: NDArray[np.int64],
-    asked: Asked,
+    asked: ContactOptions,
     closes: bool,
     budget: QueryBudget,
-    memory: Memory,
-    tally: Tally,
-) -> Memory:
+    memory: ContactState,
+    tally: ContactResults,
+) -> ContactState:
     """Answer one piece, to its end or to the deadline; mark poses left over as cut."""
     memory.cursor[:] = 0, -1, 0
     pause = SIZE_VISITS if budget.deadline == math.inf else SLICE_VISITS
@@ -185,7 +185,7 @@ def _gather(
     return memory
 
 
-def _check_room(memory: Memory) -> None:
+def _check_room(memory: ContactState) -> None:
     """Raise TooLargeError if the lists or the cells touched by a pose exceed their limits."""
     if memory.sizes[CELLS] + LANES > MOST_CELLS:
         raise TooLargeError(
@@ -208,7 +208,12 @@ def _by_pose(rows: NDArray[np.int64], runs: NDArray[np.int64]) -> tuple[NDArray[
 
 
 def _columns(
-    data: SceneData, reach: Reach, margin_units: int, tally: Tally, memory: Memory, has_points: bool
+    data: SceneData,
+    reach: VoxelsInReach,
+    margin_units: int,
+    tally: ContactResults,
+    memory: ContactState,
+    has_points: bool,
 ) -> dict[str, Any]:
     """Return the fields of `ContactsAnswers` except the cost of the request."""
     exact = ~tally.cut & (tally.counts[0] == 0)
@@ -257,5 +262,5 @@ def _places(
     return (
         avatar,
         _to_world(data, records[:, POINT : POINT + 3]),
-        signed_from_square(records[:, SQUARE], radii - records[:, DROP]),
+        signed_from_square(records[:, SQUARE], radii - records[:, DEFICIT]),
     )

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...schemas.wire.answers import DistanceAnswers
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.nearest.nearest_pair import Nearest
+from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.anytime_search import distance_bounded
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
@@ -46,14 +46,14 @@ def distance(
     k = len(array)
     residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
     around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, budget, spent)
-    nearest = Nearest(
+    nearest = NearestPairs(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
     )
     counts = np.zeros((3, k), np.uint32)
     if len(avatar.points):
         for which, rows, part in pieces(around, residency, budget.share, budget.stop):
             if budget.stop:
-                nearest.gap[which] = 0.0
+                nearest.missing_bound[which] = 0.0
                 continue
             with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
@@ -70,7 +70,7 @@ def distance(
                     counts,
                 )
             spent.add(held)
-        np.minimum(nearest.gap, unknown_gaps(data, around), out=nearest.gap)
+        np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
     return DistanceAnswers(
         **distance_columns(data, around, float(reach), reach_units, nearest, counts),
         **spent.fields(),

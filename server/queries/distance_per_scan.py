@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.nearest.nearest_by_scan import Nearer, nearest_by_scan
+from ..kernels.nearest.nearest_by_scan import NearestPerScan, nearest_by_scan
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -63,7 +63,7 @@ def separation_per_scan(
     reach = find_proved_reach(data, avatar, poses, units, budget, spent)
     if not len(avatar.points):
         return ScanSeparations({}, True)
-    nearer = Nearer(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
+    nearer = NearestPerScan(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
     counts, exact = np.zeros(3, np.int64), True
     for _, rows, part in pieces(reach, data.residency, budget.share, budget.stop):
         if budget.spent:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ...schemas.wire.answers import SweepAnswers
 from ...schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, QUESTIONS, RAYCAST, SWEEP, WITHIN
 from ..avatars.avatar_model import AvatarModel, make_avatar
-from ..residency.coarse_bounds import settle
+from ..residency.coarse_bounds import drop_clear_pairs
 from .collide import collide
 from .contacts import contacts
 from .context.query_budget import EXACT, QueryBudget
@@ -78,4 +78,4 @@ def warm_engines(data: SceneData, place: Sequence[float]) -> None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
         reach = check_request(data, avatar, pose, data.radius_units)
         nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-        settle(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
+        drop_clear_pairs(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)

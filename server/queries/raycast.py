@@ -10,8 +10,8 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.pose_transform import MAX_REACH_UNITS
-from ..kernels.core.voxel_tree import Lists
-from ..kernels.rays.rays import Nearest, Rays, follow_rays
+from ..kernels.core.voxel_tree import VoxelLists
+from ..kernels.rays.rays import ClosestHits, RayBatch, follow_rays
 from .context.front_to_back import finish, look, make_origins
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
@@ -64,12 +64,12 @@ def raycast(
     def kernel(
         first: int,
         last: int,
-        lists: Lists,
+        lists: VoxelLists,
         cursor: NDArray[np.int64],
         held: NDArray[np.bool_],
-        best: Nearest,
+        best: ClosestHits,
     ) -> None:
-        rays = Rays(units[first:last], unit[first:last], reach_units, data.radius_units)
+        rays = RayBatch(units[first:last], unit[first:last], reach_units, data.radius_units)
         follow_rays(rays, lists, cursor, held, data.arrays, tolerance, budget.visits, best)
 
     best = look(data, units, unit, reach_units, data.radius_units, budget, kernel, spent)
@@ -91,7 +91,7 @@ def _where(
     world: NDArray[np.float64],
     units: NDArray[np.int64],
     unit: NDArray[np.float64],
-    best: Nearest,
+    best: ClosestHits,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return hit, cloud_point and normal (k, 3); NaN for rays that hit nothing.
 

@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.collide.collide_poses import collide_resident
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
-from ..kernels.overlap.overlap import answer_resident
-from ..residency.voxel_cache import Residency
+from ..residency.voxel_cache import VoxelCache
 from .collide import collide
 from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units
@@ -71,8 +71,8 @@ def collide_fast(
     rows, outside = np.empty(MAX_FAST_VOXELS, np.int64), np.zeros(1, bool)
     verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
     other_units = data.radius_units + to_units(margin, "margin")
-    with residency.still():
-        fault, pose, found, needed = answer_resident(
+    with residency.frozen():
+        fault, pose, found, needed = collide_resident(
             array,
             avatar.arrays,
             avatar.radius,
@@ -106,7 +106,7 @@ def distance_fast(
     reach_units = to_units(reach, "reach")
     residency = data.residency
     rows, result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_nearest.COLUMNS)
-    with residency.still():
+    with residency.frozen():
         fault, at, found, needed, outside, visits, tests = nearest_resident(
             poses, avatar.arrays, avatar.radius, data.radius_units, reach_units, float(reach), data.arrays,
             data.broad, rows, result,
@@ -193,7 +193,7 @@ class ResidentQueries:
         """Find when the avatar first touches between two poses (4, 4); errors as for `sweep`."""
         if self._small and not budget.limited:
             avatar, residency, rows, result = self.avatar, data.residency, self._rows, self._result
-            with residency.still():
+            with residency.frozen():
                 needed, verdict, visits, _, _ = sweep_resident(
                     pose_from, pose_to, avatar.arrays, avatar.radius, data.radius_units, self._box, data.arrays,
                     data.broad, data.unknown, data.nothing_clear, max(tolerance, budget.tolerance), rows, result,
@@ -229,7 +229,7 @@ class ResidentQueries:
             missing > 0 or verdict == Verdict.UNKNOWN or (not exact and partial),
         )
 
-    def _use(self, residency: Residency, rows: list[int]) -> None:
+    def _use(self, residency: VoxelCache, rows: list[int]) -> None:
         """Record a use of voxels, once for _QUERIES_PER_USE consecutive queries in the same voxels.
 
         Recording takes as long as a tenth of a query.
@@ -247,8 +247,8 @@ class ResidentQueries:
             poses[0] = pose
             verdict[0] = _CLEAR
             counts[:] = 0
-            with residency.still():
-                fault, at, found, needed = answer_resident(
+            with residency.frozen():
+                fault, at, found, needed = collide_resident(
                     poses, avatar.arrays, avatar.radius, data.radius_units, data.arrays, data.broad, rows,
                     self._outside, verdict, counts,
                 )  # fmt: skip

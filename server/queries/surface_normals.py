@@ -13,8 +13,8 @@ from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.errors import CorruptError
 from ...schemas.kernels.normal_codes import NONE, decode_normal
 from ..kernels.core.voxel_layout import LANES
-from ..kernels.rays.stored_normals import UNASKED, code_at, find_voxel, stored_code_at
-from ..residency.voxel_store import Store
+from ..kernels.rays.stored_normals import NOT_ESTIMATED, code_at, find_voxel, stored_code_at
+from ..residency.voxel_store import VoxelStore
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .context.query_context import SceneData, with_stop
 
@@ -28,20 +28,20 @@ def warm(data: SceneData) -> None:
     find_voxel(data.broad.keys, nowhere.voxel_steps, 0, 0, 0)
     code_at(nowhere, 0, 0, 0, 0, 1, np.empty(0, np.uint16))
     stored_code_at(nowhere, 0, 0, 0, 0, data.keeps_scan)
-    decode_normal(int(UNASKED) << 8 | 1)
+    decode_normal(int(NOT_ESTIMATED) << 8 | 1)
 
 
 class Normals:
     """Normals of one generation of an archive. Thread-safe.
 
-    Normals that the store has loaded (`Store.with_normals`) are looked up for requests of their
+    Normals that the store has loaded (`VoxelStore.with_normals`) are looked up for requests of their
     reach. Other normals are estimated and cached: a voxel takes two bytes a point from the first
     request until the voxel is evicted or others need the memory, first in, first out.
     used_bytes: memory of the cached normals.  most_bytes: its limit.
     estimated: number of estimated normals.  visits: tree nodes visited for all normals.
     """
 
-    def __init__(self, store: Store, data: SceneData, most_bytes: int | None = None) -> None:
+    def __init__(self, store: VoxelStore, data: SceneData, most_bytes: int | None = None) -> None:
         """Make an empty cache for the voxels of `store`, which `data` holds in memory.
 
         Both must stay open while this object is used.
@@ -103,7 +103,7 @@ class Normals:
         if row < 0:
             return int(NONE)
         residency = self._data.residency
-        with residency.still():
+        with residency.frozen():
             if self._data.arrays.where[row, 0] >= 0:
                 residency.use([row])
                 return self._look(row, x, y, z, square)
@@ -112,7 +112,7 @@ class Normals:
                 raise StoppedError
             if held.faults:
                 raise CorruptError(held.faults[0])
-            with residency.still():
+            with residency.frozen():
                 return self._look(row, x, y, z, square)
 
     def _look(self, row: int, x: int, y: int, z: int, square: int) -> int:
@@ -145,9 +145,9 @@ class Normals:
     def _make(self, row: int, square: int) -> NDArray[np.uint16]:
         """Make an array for the codes of a voxel, dropping others; empty if it is too large."""
         points = int(self._leaves[row]) * LANES
-        if points * UNASKED.itemsize > self.most_bytes:
+        if points * NOT_ESTIMATED.itemsize > self.most_bytes:
             return np.empty(0, np.uint16)
-        codes = np.full(points, UNASKED)
+        codes = np.full(points, NOT_ESTIMATED)
         while self.used_bytes + codes.nbytes > self.most_bytes:
             self._drop(next(iter(self._codes)))
         self._codes[row, square] = codes

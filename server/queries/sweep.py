@@ -12,8 +12,14 @@ from ...schemas.errors import BadRequestError, BadTransformError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.pose_transform import SIMILARITY_TOLERANCE, check_poses
-from ..kernels.core.voxels_in_reach import Reach
-from ..kernels.motion.sweep_advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
+from ..kernels.core.voxels_in_reach import VoxelsInReach
+from ..kernels.motion.sweep_advance import (
+    SweepProgress,
+    avatar_box,
+    find_unknown_regions,
+    plan_segments,
+    sweep_segments,
+)
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
 from .context.query_budget import EXACT, CostCounter, QueryBudget
@@ -77,7 +83,7 @@ def _from_origin(
 
 
 def _answers(
-    progress: Progress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
+    progress: SweepProgress, frozen: NDArray[np.float64], counts: NDArray[np.uint32], outside: NDArray[np.bool_],
     tolerance: float,
 ) -> SweepAnswers:  # fmt: skip
     """Make the answers from the progress of each motion.
@@ -135,7 +141,7 @@ def sweep(
     other_units = data.radius_units + to_units(margin, "margin")
     scales, units, loose = _check(data, avatar, first, last, other_units)
     data, first, last, origin = _from_origin(data, first, last)
-    progress = Progress(
+    progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
         np.full(k, budget.visits, np.int64),
     )  # fmt: skip
@@ -178,7 +184,7 @@ def sweep(
                 continue
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # unused here
-        around = Reach(scales, units, starts, rows, boxes, outside)
+        around = VoxelsInReach(scales, units, starts, rows, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
             chunk = len(part) if budget.deadline == np.inf else _PER_CALL
             if budget.stop:
@@ -202,7 +208,7 @@ def sweep(
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)
-    look_around(
+    find_unknown_regions(
         box,
         first,
         last,
@@ -260,7 +266,7 @@ def _pairs(
 
 
 def _next_round(
-    which: NDArray[np.int64], progress: Progress, proved: NDArray[np.float64]
+    which: NDArray[np.int64], progress: SweepProgress, proved: NDArray[np.float64]
 ) -> NDArray[np.int64]:
     """Evaluate a round of segments; return the motions that continue.
 

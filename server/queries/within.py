@@ -9,9 +9,9 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
 from ..kernels.core.pose_transform import MAX_REACH_UNITS
-from ..kernels.core.voxel_tree import Lists
-from ..kernels.rays.nearest_point import search_points
-from ..kernels.rays.rays import Nearest
+from ..kernels.core.voxel_tree import VoxelLists
+from ..kernels.rays.rays import ClosestHits
+from ..kernels.rays.within_point import search_points
 from .context.front_to_back import finish, look, make_origins
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
@@ -21,7 +21,7 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
     """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
-    kernels/rays/nearest_point.py has the definition. A point is `outside` if its reach, a cube of
+    kernels/rays/within_point.py has the definition. A point is `outside` if its reach, a cube of
     exact units, leaves the box of all scan points. Verdicts, bounds and budget are as for
     `raycast`. Raise BadRequestError.
     """
@@ -35,10 +35,10 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
     def kernel(
         first: int,
         last: int,
-        lists: Lists,
+        lists: VoxelLists,
         cursor: NDArray[np.int64],
         held: NDArray[np.bool_],
-        best: Nearest,
+        best: ClosestHits,
     ) -> None:
         search_points(
             units[first:last], reach_units, lists, cursor, held, data.arrays, tolerance, budget.visits, best

@@ -1,6 +1,6 @@
 """Allocator of the arena: assigns its bytes to voxels, and evicts and moves voxels to make room.
 
-Not thread-safe: `Residency` calls it under its lock.
+Not thread-safe: `VoxelCache` calls it under its lock.
 """
 
 import bisect
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arena import ArenaBuffer
-from .eviction import Policy
+from .eviction import EvictionPolicy
 
 Which = Callable[[int], bool]
 
@@ -26,22 +26,22 @@ AROUND = 32
 AROUND_SIZES = 16
 # Victims that one search finds beyond those it needs. A search skips all pinned voxels at the front
 # of the policy's order, so it is not repeated for each victim.
-MORE = 32
+SPARE_VICTIMS = 32
 # Share of the buffer that may be evicted beyond the requested bytes before all runs are searched.
 SLACK = 1 / 32
 
 
-class Room:
+class VoxelAllocator:
     """Allocation of the arena's bytes to the voxels that are resident or being loaded.
 
     A run is a contiguous range of bytes.
-    offsets: row -> byte offset.  where: (v, 3) int64, see Residency.
+    offsets: row -> byte offset.  where: (v, 3) int64, see VoxelCache.
     used_bytes: the total of all runs.  evictions: voxels evicted to make room for others.
     moved_bytes: bytes of voxels that were moved to join free runs.
     """
 
     def __init__(
-        self, buffer: ArenaBuffer, sizes: list[int], where: NDArray[np.int64], policy: Policy
+        self, buffer: ArenaBuffer, sizes: list[int], where: NDArray[np.int64], policy: EvictionPolicy
     ) -> None:
         """Begin with an empty `buffer`.
 
@@ -53,10 +53,10 @@ class Room:
         self._address = buffer.arena.halves.ctypes.data
         self._runs: list[tuple[int, int]] = []  # (offset, row), ascending
 
-    def make(
+    def allocate(
         self,
         row: int,
-        may_go: Which,
+        may_evict: Which,
         may_move: Which,
         gone: Callable[[int], None],
         *,
@@ -66,7 +66,7 @@ class Room:
         """Allocate a run for a voxel without one, evicting others in the policy's order if needed.
 
         Return whether the voxel has a run now.
-        may_go, may_move: whether the voxel of a row may be evicted or moved.
+        may_evict, may_move: whether the voxel of a row may be evicted or moved.
         gone: called with each evicted row.  most: rows examined to find victims; None: all.
         Nothing is evicted if evicting everything allowed would free too few bytes. If free bytes
         are fragmented, more voxels are evicted than the size requires; if voxels that must stay lie
@@ -75,7 +75,7 @@ class Room:
         size = self.sizes[row]
         offset = self.buffer.allocate(size)
         if offset is None:
-            offset = self._clear(size, may_go, may_move, gone, most)
+            offset = self._clear(size, may_evict, may_move, gone, most)
         if offset is None:
             return False
         self.offsets[row] = offset
@@ -85,15 +85,15 @@ class Room:
         return True
 
     def _clear(
-        self, size: int, may_go: Which, may_move: Which, gone: Callable[[int], None], most: int | None
+        self, size: int, may_evict: Which, may_move: Which, gone: Callable[[int], None], most: int | None
     ) -> int | None:
         """Evict and move voxels for a run of `size` bytes; return its offset, or None on failure.
 
-        See `make` for the parameters. Free runs are joined around the last victim and around the
-        largest free run. While that yields too little, more voxels are evicted, up to SLACK of the
-        buffer; then all runs are searched.
+        See `allocate` for the parameters. Free runs are joined around the last victim and around
+        the largest free run. While that yields too little, more voxels are evicted, up to SLACK of
+        the buffer; then all runs are searched.
         """
-        found = self._enough(size, may_go, most)
+        found = self._select_victims(size, may_evict, most)
         if found is None:
             return None
         needed, more = found
@@ -107,7 +107,7 @@ class Room:
             if offset is not None:
                 return offset
             if not more:
-                more = deque(islice(filter(may_go, islice(self.policy.victims(), most)), MORE))
+                more = deque(islice(filter(may_evict, islice(self.policy.victims(), most)), SPARE_VICTIMS))
             victim = more.popleft() if more else -1
             free = self.buffer.total_bytes - self.used_bytes
             if victim < 0 or free >= all_at:
@@ -118,20 +118,22 @@ class Room:
             near = self.offsets[victim]  # pinned voxels may separate it from the other free runs
             self._evict(victim, gone)
 
-    def _enough(self, size: int, may_go: Which, most: int | None) -> tuple[list[int], deque[int]] | None:
+    def _select_victims(
+        self, size: int, may_evict: Which, most: int | None
+    ) -> tuple[list[int], deque[int]] | None:
         """Select the voxels to evict for a run of `size` bytes, in order, and some further ones.
 
         Return None if all voxels that may be evicted are too small together.
         """
         free, found = self.buffer.total_bytes - self.used_bytes, list[int]()
-        candidates = filter(may_go, islice(self.policy.victims(), most))
+        candidates = filter(may_evict, islice(self.policy.victims(), most))
         while free < size:
             row = next(candidates, -1)
             if row < 0:
                 return None
             found.append(row)
             free += self.sizes[row]
-        return found, deque(islice(candidates, MORE))
+        return found, deque(islice(candidates, SPARE_VICTIMS))
 
     def _join_around(self, size: int, may_move: Which, near: int) -> int | None:
         """Allocate a run of `size` bytes, moving voxels together near an offset if needed.
@@ -222,7 +224,7 @@ class Room:
         self.forget(row, evicted=True)
         gone(row)
 
-    def leave_only(self, rows: Collection[int], gone: Callable[[int], None]) -> None:
+    def evict_all_but(self, rows: Collection[int], gone: Callable[[int], None]) -> None:
         """Evict all voxels but these and move these together; no voxel may be in use or loading."""
         for row in [row for row in self.offsets if row not in rows]:
             self._evict(row, gone)

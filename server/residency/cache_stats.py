@@ -1,6 +1,6 @@
 """Statistics of a voxel cache: hits, misses, prefetches, wasted prefetches and early evictions.
 
-`Residency` updates them under its lock.
+`VoxelCache` updates them under its lock.
 """
 
 import math
@@ -14,12 +14,12 @@ from ...schemas.wire.stats import Counters
 # (`Counters.too_soon`) [s].
 TOO_SOON = 10.0
 # Number of evictions whose times are kept for longer than TOO_SOON.
-MOST_WENT = 4096
+MAX_EVICTION_TIMES = 4096
 # Number of loads whose durations are kept.
-TIMES = 256
+MAX_LOAD_TIMES = 256
 
 
-class Accounts:
+class CacheStats:
     """Counts of a voxel cache; `Counters` documents them. Not thread-safe.
 
     fresh: rows prefetched or being prefetched that no request has used yet.
@@ -32,8 +32,8 @@ class Accounts:
         self.hits = self.waits = self.misses = self.late = self.failed = self.too_soon = 0
         self.prefetched = self.prefetched_bytes = self.used = self.wasted = self.wasted_bytes = 0
         self.fresh: set[int] = set()
-        self.times: deque[float] = deque(maxlen=TIMES)
-        self._went: dict[int, float] = {}  # row -> time of its last eviction
+        self.times: deque[float] = deque(maxlen=MAX_LOAD_TIMES)
+        self._evicted_at: dict[int, float] = {}  # row -> time of its last eviction
 
     def found(self, rows: Sequence[int]) -> None:
         """Count requested voxels that are resident or being loaded."""
@@ -47,7 +47,7 @@ class Accounts:
         """Count requested voxels that the request itself loads."""
         self.misses += len(rows)
         now = time.perf_counter()
-        self.too_soon += sum(now - self._went.get(row, -math.inf) < TOO_SOON for row in rows)
+        self.too_soon += sum(now - self._evicted_at.get(row, -math.inf) < TOO_SOON for row in rows)
 
     def waited(self, rows: Sequence[int], loading: Collection[int]) -> None:
         """Count the requested voxels that other threads are loading."""
@@ -56,11 +56,14 @@ class Accounts:
     def evicted(self, row: int) -> None:
         """Count the eviction of a voxel."""
         now = time.perf_counter()
-        self._went.pop(row, None)
-        self._went[row] = now  # in order of time
-        while len(self._went) > MOST_WENT and now - next(iter(self._went.values())) > TOO_SOON:
-            del self._went[next(iter(self._went))]
-        self._in_vain(row)
+        self._evicted_at.pop(row, None)
+        self._evicted_at[row] = now  # in order of time
+        while (
+            len(self._evicted_at) > MAX_EVICTION_TIMES
+            and now - next(iter(self._evicted_at.values())) > TOO_SOON
+        ):
+            del self._evicted_at[next(iter(self._evicted_at))]
+        self._count_wasted(row)
 
     def begun_ahead(self, row: int) -> None:
         """Count a prefetch that begins."""
@@ -71,9 +74,9 @@ class Accounts:
     def lost(self, row: int) -> None:
         """Count a failed load."""
         self.failed += 1
-        self._in_vain(row)
+        self._count_wasted(row)
 
-    def _in_vain(self, row: int) -> None:
+    def _count_wasted(self, row: int) -> None:
         """Count a wasted prefetch if the voxel was prefetched and no request has used it."""
         if row in self.fresh:
             self.fresh.discard(row)

@@ -1,8 +1,8 @@
 """Coarse bounds: the top nodes of every voxel, kept in memory to answer clear poses without a load.
 
 [Fig12] section 4 keeps a voxel in memory whole or not at all. A descent begins with a small part of
-the voxel, and often that part alone proves a pose clear. kernels/overlap/coarse_overlap.py defines
-this part and what it proves.
+the voxel, and often that part alone proves a pose clear. kernels/collide/coarse_clearance.py
+defines this part and what it proves.
 """
 
 import threading
@@ -12,6 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.voxel import top_shift
+from ..kernels.collide.coarse_clearance import (
+    SLOT_WORDS,
+    CoarseArrays,
+    any_with_coarse_bounds,
+    copy_unproved_pairs,
+    write_coarse_bounds,
+)
 from ..kernels.core.pose_transform import Avatar
 from ..kernels.core.voxel_layout import (
     BLOCK_WORDS,
@@ -22,9 +29,8 @@ from ..kernels.core.voxel_layout import (
     SceneArrays,
     lay_out,
 )
-from ..kernels.core.voxels_in_reach import Reach
-from ..kernels.overlap.coarse_overlap import SLOT_WORDS, CoarseArrays, any_to_settle, settle_pairs, take_top
-from .voxel_store import Store
+from ..kernels.core.voxels_in_reach import VoxelsInReach
+from .voxel_store import VoxelStore
 
 # Bytes of the rows of a slot and of its entry in `count`.
 SLOT_BYTES = 4 * SLOT_WORDS + 4
@@ -32,7 +38,7 @@ SLOT_BYTES = 4 * SLOT_WORDS + 4
 LARGEST_CLASS = LOCAL_MASK << CLASS_SHIFT
 
 
-class Coarse:
+class CoarseBounds:
     """Coarse bounds of one scene's voxels. Thread-safe.
 
     Slots are never evicted or overwritten: once all are taken, further voxels get none. A voxel
@@ -54,38 +60,38 @@ class Coarse:
         self.arrays = CoarseArrays(words, words.view(np.int32), slot, np.zeros(slots, np.int32))
         self.bytes = words.nbytes + slot.nbytes + self.arrays.count.nbytes
         self._lock = threading.Lock()
-        self._begun = 0  # slots that were ever assigned; those returned since are in `_back`
-        self._back: list[int] = []
+        self._assigned = 0  # slots that were ever assigned; those returned since are in `_returned`
+        self._returned: list[int] = []
         self._making: set[int] = set()
 
     @property
-    def known(self) -> int:
+    def stored(self) -> int:
         """Return the number of voxels that have coarse bounds."""
         with self._lock:
-            return self._begun - len(self._back) - len(self._making)
+            return self._assigned - len(self._returned) - len(self._making)
 
     @property
-    def holds_all(self) -> bool:
+    def has_room_for_all(self) -> bool:
         """Return whether there is a slot for every voxel."""
         return len(self.arrays.count) >= len(self.arrays.slot) > 0
 
     @property
-    def _room(self) -> bool:
-        return self._begun - len(self._back) < len(self.arrays.count)
+    def _has_free_slot(self) -> bool:
+        return self._assigned - len(self._returned) < len(self.arrays.count)
 
-    def missing(self) -> Iterator[int]:
+    def rows_without_bounds(self) -> Iterator[int]:
         """Iterate over the rows of voxels without a slot, ascending, while slots are free.
 
         Slots may be filled during the iteration. Each row comes once, even if its voxel turns out
         to be unreadable.
         """
         for row in range(len(self.arrays.slot)):
-            if not self._room:
+            if not self._has_free_slot:
                 return
             if self.arrays.slot[row] < 0 and row not in self._making:
                 yield row
 
-    def remember(self, row: int, arena: Arena, where: NDArray[np.int64]) -> None:
+    def store_from_arena(self, row: int, arena: Arena, where: NDArray[np.int64]) -> None:
         """Store the coarse bounds of a voxel in the arena, unless it has a slot or none is free.
 
         where: (3,) int64, the voxel's runs (voxel_layout.py). The voxel must stay there until this
@@ -95,14 +101,14 @@ class Coarse:
         if number >= 0:
             self._write(row, number, arena, int(where[0]), 0)
 
-    def fill(self, store: Store, row: int) -> None:
-        """Store the coarse bounds of a voxel of the archive, as `remember` does, without points.
+    def store_from_archive(self, store: VoxelStore, row: int) -> None:
+        """Store the coarse bounds of a voxel of the archive, as `store_from_arena`, without points.
 
         The radius class of a node is computed from its points. If the archive has radius classes,
         these bounds therefore assume the largest class, and prove slightly less than those stored
-        by `remember`.
-        Raise CorruptError or OSError as `Store.load` does; the voxel then has no slot, and the call
-        may be repeated.
+        by `store_from_arena`.
+        Raise CorruptError or OSError as `VoxelStore.load` does; the voxel then has no slot, and the
+        call may be repeated.
         """
         number = self._take(row)
         if number < 0:
@@ -117,24 +123,26 @@ class Coarse:
     def _take(self, row: int) -> int:
         """Assign a slot to a voxel; return -1 if it has or is being given one, or none is free."""
         with self._lock:
-            if not self._room or self.arrays.slot[row] >= 0 or row in self._making:
+            if not self._has_free_slot or self.arrays.slot[row] >= 0 or row in self._making:
                 return -1
             self._making.add(row)
-            if self._back:
-                return self._back.pop()
-            self._begun += 1
-            return self._begun - 1
+            if self._returned:
+                return self._returned.pop()
+            self._assigned += 1
+            return self._assigned - 1
 
     def _give_back(self, row: int, number: int) -> None:
         """Return a slot that was not published."""
         with self._lock:
             self._making.discard(row)
-            self._back.append(number)
+            self._returned.append(number)
 
     def _write(self, row: int, number: int, arena: Arena, root: int, assumed: int) -> None:
         """Write a slot, then publish it: first its rows, then its count, and its number last."""
         try:
-            count = take_top(arena.words, arena.ints, root, np.int32(assumed), self.arrays.ints, number)
+            count = write_coarse_bounds(
+                arena.words, arena.ints, root, np.int32(assumed), self.arrays.ints, number
+            )
         except BaseException:
             self._give_back(row, number)
             raise
@@ -147,8 +155,8 @@ class Coarse:
             self._making.discard(row)
 
 
-def _lay_out_tree(store: Store, row: int) -> Arena:
-    """Lay out the nodes of a voxel, without points, as `Store.load` does, in a new arena."""
+def _lay_out_tree(store: VoxelStore, row: int) -> Arena:
+    """Lay out the nodes of a voxel, without points, as `VoxelStore.load` does, in a new arena."""
     tree = store.archive.open_tree(row)
     links = tree.links
     words = np.empty(ROW_WORDS * len(links.first) + BLOCK_WORDS * tree.leaves, np.float32)
@@ -165,19 +173,23 @@ def _lay_out_tree(store: Store, row: int) -> Arena:
     return arena
 
 
-def settle(
-    arrays: SceneArrays, coarse: CoarseArrays, avatar: Avatar, poses: NDArray[np.float64], reach: Reach
-) -> tuple[Reach, int]:
+def drop_clear_pairs(
+    arrays: SceneArrays,
+    coarse: CoarseArrays,
+    avatar: Avatar,
+    poses: NDArray[np.float64],
+    reach: VoxelsInReach,
+) -> tuple[VoxelsInReach, int]:
     """Remove from `reach` the pairs of pose and voxel that coarse bounds prove clear.
 
     Return the new reach and the number of pairs removed; return `reach` itself if none is removed.
     poses: (k, 4, 4) float64, checked.  reach: the reach of these poses and this avatar.
     Voxels that are resident or have no slot stay, and the order stays. Every removed pair is one
-    that `overlap_poses` would find clear.
+    that `collide_poses` would find clear.
     """
     needed = reach.starts[-1]
-    if not len(coarse.count) or not any_to_settle(arrays.where, coarse.slot, reach.rows, needed):
+    if not len(coarse.count) or not any_with_coarse_bounds(arrays.where, coarse.slot, reach.rows, needed):
         return reach, 0
     starts, rows = np.empty_like(reach.starts), np.empty(needed, np.int64)
-    settled = settle_pairs(poses, avatar, arrays, coarse, reach, starts, rows)
-    return (reach._replace(starts=starts, rows=rows), settled) if settled else (reach, 0)
+    removed = copy_unproved_pairs(poses, avatar, arrays, coarse, reach, starts, rows)
+    return (reach._replace(starts=starts, rows=rows), removed) if removed else (reach, 0)

@@ -1,6 +1,6 @@
 """Eviction policies: the orders in which resident voxels are evicted, behind one interface.
 
-A policy uses no threads, no clock and no voxel data: `Residency` calls it under its lock, and
+A policy uses no threads, no clock and no voxel data: `VoxelCache` calls it under its lock, and
 scripts/simulate_cache replays traces with the same objects. A policy does not know about pins or
 predictions. Its caller does: `victims` yields every resident row, and the caller skips those in
 use.
@@ -26,15 +26,15 @@ POLICIES = ("lru", "lru+prefetch", "distance", "s3fifo")
 SCAN_SHARE = 0.1
 # S3-FIFO: the small queue's share of the budget, and the largest use count, two bits ([Yang23]).
 SMALL_SHARE = 0.1
-MOST_USES = 3
+MAX_USES = 3
 # `distance`: initial capacity in rows, and the number of rows at the front that are sorted before
 # the others.
-FEW_ROWS, SOME_ROWS = 64, 256
+INITIAL_ROWS, SORTED_ROWS = 64, 256
 
-Nearness = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+PathDistances = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 
-class Policy(Protocol):
+class EvictionPolicy(Protocol):
     """Order of eviction.
 
     Rows are index rows of voxels; a row is added at most once before it is removed.
@@ -66,10 +66,10 @@ def prefetches(name: str) -> bool:
     return name != "lru"
 
 
-def make_policy(name: str, budget_bytes: int, nearness: Nearness | None = None) -> Policy:
+def make_policy(name: str, budget_bytes: int, path_distances: PathDistances | None = None) -> EvictionPolicy:
     """Make an empty policy by its name.
 
-    nearness: required by `distance`, see `Distance`.
+    nearness: required by `distance`, see `FarthestFirst`.
     Raise BadRequestError for an unknown name, ValueError for `distance` without nearness.
     """
     if name in ("lru", "lru+prefetch"):
@@ -78,9 +78,9 @@ def make_policy(name: str, budget_bytes: int, nearness: Nearness | None = None) 
         return S3Fifo(budget_bytes)
     if name != "distance":
         raise BadRequestError(f"policy {name!r}: expected one of {', '.join(POLICIES)}")
-    if nearness is None:
+    if path_distances is None:
         raise ValueError("policy distance: needs to know how near rows are to users")
-    return Distance(nearness)
+    return FarthestFirst(path_distances)
 
 
 class Lru:
@@ -99,17 +99,17 @@ class Lru:
         )  # row -> bytes, of all rows; least recently used first
         self._scans: OrderedDict[int, int] = OrderedDict()  # the rows that only scans have used
         self._scan_bytes = 0
-        self._scan_most = int(budget_bytes * SCAN_SHARE)
+        self._max_scan_bytes = int(budget_bytes * SCAN_SHARE)
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         self._order[row] = size
         if scan:
             self._scans[row] = size
             self._scan_bytes += size
 
     def used(self, row: int, *, scan: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         self._order.move_to_end(row)
         if row in self._scans:
             if scan:
@@ -118,13 +118,13 @@ class Lru:
                 self._scan_bytes -= self._scans.pop(row)
 
     def removed(self, row: int, *, evicted: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         del self._order[row]
         self._scan_bytes -= self._scans.pop(row, 0)
 
     def victims(self) -> Iterator[int]:
-        """See `Policy`."""
-        over = self._scan_bytes - self._scan_most
+        """See `EvictionPolicy`."""
+        over = self._scan_bytes - self._max_scan_bytes
         named: set[int] = set()
         if over > 0:
             for row, size in self._scans.items():
@@ -138,7 +138,7 @@ class Lru:
                 yield row
 
 
-class Distance:
+class FarthestFirst:
     """Farthest from every user's predicted path first; of equals, least recently used first.
 
     Scans need no bounded share here: their rows are far from users and evicted first anyway. Rows
@@ -148,20 +148,20 @@ class Distance:
 
     name = "distance"
 
-    def __init__(self, nearness: Nearness) -> None:
+    def __init__(self, path_distances: PathDistances) -> None:
         """Begin without rows.
 
         nearness: maps rows to the least distance (n,) float64 of each from any user's predicted
         path [m]; inf without users.
         """
-        self._nearness = nearness
+        self._nearness = path_distances
         self._at: dict[int, int] = {}  # row -> its position in the arrays
-        self._rows = np.empty(FEW_ROWS, np.int64)
-        self._used = np.empty(FEW_ROWS, np.int64)  # value of `_uses` at the last use of the row
+        self._rows = np.empty(INITIAL_ROWS, np.int64)
+        self._used = np.empty(INITIAL_ROWS, np.int64)  # value of `_uses` at the last use of the row
         self._uses = 0
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         count = len(self._at)
         if count == len(self._rows):
             self._rows, self._used = np.resize(self._rows, 2 * count), np.resize(self._used, 2 * count)
@@ -170,19 +170,19 @@ class Distance:
         self.used(row, scan=scan)
 
     def used(self, row: int, *, scan: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         self._uses += 1
         self._used[self._at[row]] = self._uses
 
     def removed(self, row: int, *, evicted: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         at, last = self._at.pop(row), len(self._at)
         if at < last:  # the last row takes its position
             moved = int(self._rows[last])
             self._rows[at], self._used[at], self._at[moved] = moved, self._used[last], at
 
     def victims(self) -> Iterator[int]:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         count = len(self._at)
         if not count:
             return
@@ -192,7 +192,9 @@ class Distance:
         first = int(rows[farthest[np.argmin(used[farthest])]])
         yield first
         # A caller that continues could not evict the first rows; it seldom needs more than a few.
-        least = np.partition(far, count - SOME_ROWS)[count - SOME_ROWS] if count > SOME_ROWS else -np.inf
+        least = (
+            np.partition(far, count - SORTED_ROWS)[count - SORTED_ROWS] if count > SORTED_ROWS else -np.inf
+        )
         for some in (far >= least, far < least):
             at = np.flatnonzero(some)
             order = at[np.lexsort((used[at], -far[at]))]
@@ -202,14 +204,14 @@ class Distance:
 class _Queues:
     """Small and main queue of S3-FIFO.
 
-    small, main: row -> bytes, oldest first.  uses: row -> use count, 0 to MOST_USES.
+    small, main: row -> bytes, oldest first.  uses: row -> use count, 0 to MAX_USES.
     """
 
-    def __init__(self, small_most: int) -> None:
+    def __init__(self, max_small_bytes: int) -> None:
         self.small: OrderedDict[int, int] = OrderedDict()
         self.main: OrderedDict[int, int] = OrderedDict()
         self.uses: dict[int, int] = {}
-        self.small_bytes, self.small_most = 0, small_most
+        self.small_bytes, self.max_small_bytes = 0, max_small_bytes
 
     def remove(self, row: int) -> int | None:
         """Remove a row; return its bytes if it was in the small queue, else None."""
@@ -221,10 +223,10 @@ class _Queues:
         self.small_bytes -= size
         return size
 
-    def settle(self) -> None:
+    def move_used(self) -> None:
         """Move used rows until the next victim is at the front of its queue, as in algorithm 1."""
         while self.small or self.main:
-            if self.small and (self.small_bytes >= self.small_most or not self.main):
+            if self.small and (self.small_bytes >= self.max_small_bytes or not self.main):
                 row = next(iter(self.small))
                 if self.uses[row] <= 1:
                     return
@@ -242,14 +244,14 @@ class _Queues:
     def victims(self) -> Iterator[int]:
         """Iterate over the victims in the order in which repeated evictions would select them.
 
-        This simulates `settle` between evictions without moving any row.
+        This simulates `move_used` between evictions without moving any row.
         """
         small, small_bytes = iter(self.small.items()), self.small_bytes
         main = ((row, self.uses[row]) for row in self.main)
         again: deque[tuple[int, int]] = deque()  # moved to the end of the main queue: row, uses left
         new, old = next(small, None), next(main, None)
         while new or old:
-            if new and (small_bytes >= self.small_most or not old):
+            if new and (small_bytes >= self.max_small_bytes or not old):
                 row, size = new
                 new, small_bytes = next(small, None), small_bytes - size
                 if self.uses[row] <= 1:
@@ -282,15 +284,18 @@ class S3Fifo:
 
     def __init__(self, budget_bytes: int) -> None:
         """Begin without rows."""
-        small_most = int(budget_bytes * SMALL_SHARE)
-        self._queues = _Queues(small_most)
+        max_small_bytes = int(budget_bytes * SMALL_SHARE)
+        self._queues = _Queues(max_small_bytes)
         self._ghost: OrderedDict[int, int] = (
             OrderedDict()
         )  # row -> bytes, of rows evicted from the small queue
-        self._ghost_bytes, self._ghost_most = 0, budget_bytes - small_most  # as large as the main queue
+        self._ghost_bytes, self._max_ghost_bytes = (
+            0,
+            budget_bytes - max_small_bytes,
+        )  # as large as the main queue
 
     def added(self, row: int, size: int, *, scan: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         queues = self._queues
         queues.uses[row] = 0
         if row in self._ghost and not scan:
@@ -301,25 +306,25 @@ class S3Fifo:
             queues.small_bytes += size
 
     def used(self, row: int, *, scan: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         uses = self._queues.uses
-        if not scan and uses[row] < MOST_USES:
+        if not scan and uses[row] < MAX_USES:
             uses[row] += 1
 
     def removed(self, row: int, *, evicted: bool) -> None:
-        """See `Policy`."""
+        """See `EvictionPolicy`."""
         size = self._queues.remove(row)
         if size is None or not evicted:
             return
         self._ghost_bytes += size - self._ghost.pop(row, 0)
         self._ghost[row] = size
-        while self._ghost_bytes > self._ghost_most:
+        while self._ghost_bytes > self._max_ghost_bytes:
             self._ghost_bytes -= self._ghost.popitem(last=False)[1]
 
     def victims(self) -> Iterator[int]:
-        """See `Policy`. Finding the first victim moves rows, as in algorithm 1; the others do not.
+        """See `EvictionPolicy`. Finding the first victim moves rows, as in algorithm 1.
 
         Iterating over all rows therefore changes the counts as one eviction does.
         """
-        self._queues.settle()
+        self._queues.move_used()
         yield from self._queues.victims()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
 from ..kernels.core.voxel_tree import VoxelTree, make_voxel_tree, tighten
-from ..kernels.core.voxels_in_reach import Reach, SceneIndex
+from ..kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach
 from ..runtime.stop_flag import NO_STOP, StopFlag
 
 _Int64 = NDArray[np.int64]
@@ -25,7 +25,7 @@ _Int64 = NDArray[np.int64]
 ENTRIES_AT_ONCE = 1 << 15
 
 
-class Bounds:
+class ProvedBounds:
     """Boxes around the points of each of the v voxels of an opened archive. Thread-safe.
 
     index: the boxes that the broad phase reads: the cell of an unproved voxel, and the box in the
@@ -99,7 +99,7 @@ class Bounds:
                     self._trees = trees
         return trees
 
-    def rows_to_prove(self, reach: Reach, unproved: int, stop: StopFlag = NO_STOP) -> list[int]:
+    def rows_to_prove(self, reach: VoxelsInReach, unproved: int, stop: StopFlag = NO_STOP) -> list[int]:
         """Find the rows in `reach` that would not be in it by the boxes in the index.
 
         Return them ascending, each once.

@@ -6,8 +6,8 @@ The voxels in a ring around the user's position follow, in case the user turns. 
 pins and evicts nothing, and reads no clock: callers pass `now` in seconds, all from the same clock.
 
 Thread-safe. One lock guards the poses and is held for microseconds. Callers may hold other locks
-when they take it; no lock is taken while it is held. `nearness` takes no lock: the caller that
-evicts holds its own.
+when they take it; no lock is taken while it is held. `path_distances` takes no lock: the caller
+that evicts holds its own.
 """
 
 import threading
@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels.core.voxels_in_reach import SceneIndex
-from ..kernels.prediction.track_prediction import Motion, distance_to_ways, rows_in_reach
+from ..kernels.prediction.track_prediction import PredictionLimits, rows_in_reach, write_path_distances
 from ..kernels.prediction.user_tracks import (
     COUNT,
     LAST,
-    MOST_SPEED,
+    MAX_SPEED,
     PIECES,
-    WALK,
-    WIDER,
-    Look,
-    note_pose,
-    note_poses,
-    plan_walks,
+    RELATIVE_SLACK,
+    TRACK_WORDS,
+    PredictionOptions,
+    plan_tracks,
+    record_pose,
+    record_poses,
     rows_kept,
 )
 
@@ -39,10 +39,10 @@ User = tuple[str, str]
 EXPIRY = 10.0
 # Initial and largest capacity in users, 2 KB each. The capacity doubles when it is exhausted; at
 # the largest, a new user replaces the one whose last pose is the oldest.
-FEW_USERS, MOST_USERS = 16, 4096
+INITIAL_USERS, MAX_USERS = 16, 4096
 
 
-class Ahead(NamedTuple):
+class PrefetchOptions(NamedTuple):
     """Parameters of prefetching: how far ahead to look.
 
     loads: horizon as a multiple of the time one load takes, clamped to `least` and `most` [s].
@@ -73,17 +73,17 @@ class Ahead(NamedTuple):
     # 1,354 voxels.
     settled: float = 2.0
     most_wanted: int = 128
-    motion: Motion = Motion(history=0.5, speed=MOST_SPEED, acceleration=6.0, fade=0.5)
+    motion: PredictionLimits = PredictionLimits(history=0.5, speed=MAX_SPEED, acceleration=6.0, fade=0.5)
 
     def horizon(self, load_seconds: float) -> float:
         """Return how far ahead to look when one load takes `load_seconds` [s]."""
         return min(max(self.loads * load_seconds, self.least), self.most)
 
 
-AHEAD = Ahead()
+PREFETCH_OPTIONS = PrefetchOptions()
 
 
-class Wanted(NamedTuple):
+class PredictedVoxels(NamedTuple):
     """Voxels that users will need.
 
     rows: (n,) int64, each once, soonest first.
@@ -96,7 +96,7 @@ class Wanted(NamedTuple):
     need: NDArray[np.float64]
 
 
-class Neighbourhood:
+class UserTracks:
     """Users of one scene and the voxels they will need."""
 
     def __init__(
@@ -105,7 +105,7 @@ class Neighbourhood:
         voxel_steps: int,
         origin: ArrayLike,
         step: float,
-        ahead: Ahead = AHEAD,
+        ahead: PrefetchOptions = PREFETCH_OPTIONS,
     ) -> None:
         """Begin without users.
 
@@ -113,25 +113,26 @@ class Neighbourhood:
         """
         self.ahead = ahead
         self._index, self._step = index, step
-        self._look = Look(
+        self._options = PredictionOptions(
             0.0, ahead.ring, ahead.settled, ahead.most_wanted, np.array(origin, np.float64), step, voxel_steps,
             ahead.motion,
         )  # fmt: skip
         self._lock = threading.Lock()
-        self._users: dict[User, int] = {}  # user -> its row in `_walks`, ascending
-        self._walks = np.zeros((FEW_USERS, WALK))
-        # The predicted ways of the last plan [steps] and the plan's number; replaced, never
-        # written. `_far` is the distance of each row from these ways [m], valid where `_asked`
-        # equals the plan's number. The system commits the pages of both as rows are queried.
-        self._planned = np.empty((0, PIECES + 1, 3)), 1
-        self._asked, self._far = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
+        self._users: dict[User, int] = {}  # user -> its row in `_tracks`, ascending
+        self._tracks = np.zeros((INITIAL_USERS, TRACK_WORDS))
+        # The predicted paths of the last plan [steps] and the plan's number; replaced, never
+        # written. `_distances` is the distance of each row from these paths [m], valid where
+        # `_distance_plan` equals the plan's number. The system commits the pages of both as rows
+        # are queried.
+        self._planned_paths = np.empty((0, PIECES + 1, 3)), 1
+        self._distance_plan, self._distances = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
 
     @property
     def users(self) -> list[User]:
         """Return the known users, in order of arrival."""
         return list(self._users)
 
-    def saw(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
+    def record_pose(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
         """Record a pose and return whether it is a teleport, which discards the poses before it.
 
         center: of the avatar's root sphere [m].  reach: its radius with spheres and margin [m].
@@ -143,38 +144,38 @@ class Neighbourhood:
             row = self._users.get(user)
             if row is None:
                 row = self._add(user)
-            return bool(note_pose(self._walks, row, now, x, y, z, reach))
+            return bool(record_pose(self._tracks, row, now, x, y, z, reach))
 
-    def saw_each(
+    def record_poses(
         self,
         users: Sequence[User],
         times: NDArray[np.float64],
         centers: NDArray[np.float64],
         reaches: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Call `saw` for n poses in order; return whether each is a teleport (n,).
+        """Call `record_pose` for n poses in order; return whether each is a teleport (n,).
 
-        n is at most MOST_USERS.
+        n is at most MAX_USERS.
         """
         teleports = np.empty(len(users), np.bool_)
         with self._lock:
             known = self._users
             rows = [known[user] if user in known else self._add(user) for user in users]
-            note_poses(self._walks, np.array(rows, np.int64), times, centers, reaches, teleports)
+            record_poses(self._tracks, np.array(rows, np.int64), times, centers, reaches, teleports)
         return teleports
 
     def _add(self, user: User) -> int:
         """Add a user and return its row."""
         count = len(self._users)
-        if count == MOST_USERS:
-            silent = int(np.argmin(self._walks[:count, LAST]))
+        if count == MAX_USERS:
+            silent = int(np.argmin(self._tracks[:count, LAST]))
             self._drop(lambda row: row == silent)
             count -= 1
-        if count == len(self._walks):
-            grown = np.zeros((2 * count, WALK))
-            grown[:count] = self._walks
-            self._walks = grown
-        self._walks[count, COUNT] = 0
+        if count == len(self._tracks):
+            grown = np.zeros((2 * count, TRACK_WORDS))
+            grown[:count] = self._tracks
+            self._tracks = grown
+        self._tracks[count, COUNT] = 0
         self._users[user] = count
         return count
 
@@ -182,7 +183,7 @@ class Neighbourhood:
         """Remove the users whose rows satisfy `gone`; the others move up, in order."""
         left = [(user, row) for user, row in self._users.items() if not gone(row)]
         if len(left) < len(self._users):
-            self._walks[: len(left)] = self._walks[[row for _, row in left]]
+            self._tracks[: len(left)] = self._tracks[[row for _, row in left]]
             self._users = {user: row for row, (user, _) in enumerate(left)}
 
     def leave(self, user: User) -> None:
@@ -200,16 +201,16 @@ class Neighbourhood:
     def expire(self, now: float, after: float = EXPIRY) -> None:
         """Remove users whose last pose is more than `after` seconds old."""
         with self._lock:
-            silent = now - self._walks[: len(self._users), LAST] > after
+            silent = now - self._tracks[: len(self._users), LAST] > after
             if silent.any():
                 self._drop(lambda row: bool(silent[row]))
 
     def _snapshot(self) -> NDArray[np.float64]:
         """Return a copy of the tracks, which kernels read without the lock."""
         with self._lock:
-            return self._walks[: len(self._users)].copy()
+            return self._tracks[: len(self._users)].copy()
 
-    def plan(self, now: float, load_seconds: float) -> Wanted:
+    def plan(self, now: float, load_seconds: float) -> PredictedVoxels:
         """Predict the voxels that users will need.
 
         Each row is listed once, with the earliest need of all users; equal needs are in order of
@@ -217,17 +218,17 @@ class Neighbourhood:
         load_seconds: current time to load one voxel including queueing, an upper percentile of the
         measured times.
         """
-        look = self._look._replace(horizon=self.ahead.horizon(load_seconds))
-        rows, need, ways = plan_walks(self._snapshot(), now, look, self._index)
-        self._planned = ways, self._planned[1] + 1
-        return Wanted(rows, need)
+        options = self._options._replace(horizon=self.ahead.horizon(load_seconds))
+        rows, need, paths = plan_tracks(self._snapshot(), now, options, self._index)
+        self._planned_paths = paths, self._planned_paths[1] + 1
+        return PredictedVoxels(rows, need)
 
     def kept(self, now: float, after: float = EXPIRY) -> NDArray[np.int64]:
         """Return the rows (n,), each once, that users can touch at their current positions.
 
         Users whose last pose is more than `after` seconds old are ignored.
         """
-        rows: NDArray[np.int64] = rows_kept(self._snapshot(), now, after, self._look, self._index)
+        rows: NDArray[np.int64] = rows_kept(self._snapshot(), now, after, self._options, self._index)
         return rows
 
     def rows_in_reach(
@@ -237,17 +238,17 @@ class Neighbourhood:
 
         centers: (k, 3) [m].  reaches: the radii (k,) [m].
         """
-        look = self._look
-        steps = np.ascontiguousarray((centers - look.origin) / look.step)
-        spans = np.ascontiguousarray(reaches / look.step * (1.0 + WIDER) + 1.0)
+        options = self._options
+        steps = np.ascontiguousarray((centers - options.origin) / options.step)
+        spans = np.ascontiguousarray(reaches / options.step * (1.0 + RELATIVE_SLACK) + 1.0)
         starts, needed = np.zeros(len(steps) + 1, np.int64), 8 * len(steps) + 8
         while True:
             rows = np.empty(needed, np.int64)
-            needed = rows_in_reach(steps, spans, self._index, look.voxel_steps, starts, rows)
+            needed = rows_in_reach(steps, spans, self._index, options.voxel_steps, starts, rows)
             if needed <= len(rows):
                 return starts, rows[:needed]
 
-    def nearness(self, rows: ArrayLike) -> NDArray[np.float64]:
+    def path_distances(self, rows: ArrayLike) -> NDArray[np.float64]:
         """Return the distance (n,) of each row's box from the nearest user's predicted path [m].
 
         The paths are those of the last plan; without users the distance is inf. Not thread-safe.
@@ -255,10 +256,10 @@ class Neighbourhood:
         a millisecond, and looking them up some 20 µs (scripts/bench_cache).
         """
         each = np.asarray(rows, np.int64)
-        ways, number = self._planned
-        new = each[self._asked[each] != number]
+        paths, number = self._planned_paths
+        new = each[self._distance_plan[each] != number]
         if len(new):
             far = np.empty(len(new))
-            distance_to_ways(ways, new, self._index, far)
-            self._far[new], self._asked[new] = far * self._step, number
-        return self._far[each]
+            write_path_distances(paths, new, self._index, far)
+            self._distances[new], self._distance_plan[new] = far * self._step, number
+        return self._distances[each]

@@ -15,9 +15,9 @@ from collections.abc import Callable
 from typing import Self
 
 from ..runtime.threads import start_thread
-from .held import Ahead
-from .motion_prediction import Neighbourhood, User
-from .voxel_cache import Residency
+from .held_voxels import BackgroundLoad
+from .motion_prediction import User, UserTracks
+from .voxel_cache import VoxelCache
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ PLAN_SECONDS, PLAN_REST = 0.05, 10.0
 # is not prefetched again for as long.
 SILENCE = 10.0
 # The longest pause [s].
-MOST_REST = 0.25
+MAX_REST = 0.25
 # A pause between pieces of idle work is this many times as long as the work: much of it is Python
 # code, and requests wait for the interpreter's lock meanwhile.
 IDLE_REST = 4.0
@@ -37,10 +37,10 @@ IDLE_REST = 4.0
 # requests.
 KEPT_SHARE = 0.5
 # Quantile of the measured load times that predictions assume.
-USUAL = 0.9
+LOAD_TIME_QUANTILE = 0.9
 
 
-def _wanted_later(need: dict[int, float], than: float) -> Callable[[int], bool]:
+def _is_needed_later(need: dict[int, float], than: float) -> Callable[[int], bool]:
     """Return a function that tells whether a row is needed later than `than`, or not at all."""
     return lambda row: need.get(row, math.inf) > than
 
@@ -53,8 +53,8 @@ class Prefetcher:
 
     def __init__(
         self,
-        residency: Residency,
-        neighbourhood: Neighbourhood,
+        residency: VoxelCache,
+        tracks: UserTracks,
         *,
         ahead: bool = True,
         idle: Callable[[], bool] | None = None,
@@ -67,9 +67,9 @@ class Prefetcher:
         does some milliseconds of work.
         clock: returns the time [s].
         """
-        self._residency, self._neighbourhood, self._clock, self._ahead = (
+        self._residency, self._tracks, self._clock, self._ahead = (
             residency,
-            neighbourhood,
+            tracks,
             clock,
             ahead,
         )
@@ -80,7 +80,7 @@ class Prefetcher:
         self._stopped = self._seen = False
         self._idle = idle
         self._failed: dict[int, float] = {}  # row -> time; a request for the voxel tries again
-        residency.owed = self._owed
+        residency.on_owed = self._owed
 
     def __enter__(self) -> Self:
         """Return the prefetcher itself."""
@@ -94,19 +94,19 @@ class Prefetcher:
         """Stop loading, and wait for the thread."""
         with self._lock:
             self._stopped, thread = True, self._thread
-        self._residency.owed = None
+        self._residency.on_owed = None
         self._work.set()
         self._urgent.set()
         if thread is not None and thread is not threading.current_thread():
             thread.join()
         self._residency.kept = frozenset()
 
-    def saw(self, user: User, center: tuple[float, float, float], reach: float) -> bool:
+    def record_pose(self, user: User, center: tuple[float, float, float], reach: float) -> bool:
         """Record that a user's avatar is within `reach` [m] of `center` [m].
 
         Return whether it teleported there.
         """
-        jumped = self._neighbourhood.saw(user, self._clock(), center, reach)
+        jumped = self._tracks.record_pose(user, self._clock(), center, reach)
         self._seen = True
         self._wake()
         return jumped
@@ -114,16 +114,16 @@ class Prefetcher:
     def warm(self, center: tuple[float, float, float]) -> None:
         """Make a plan for a dummy user, so that all kernels are compiled before the first user."""
         user = ("", "")
-        self._neighbourhood.saw(user, self._clock(), center, 1.0)
-        self._neighbourhood.plan(self._clock(), 0.0)
-        self._neighbourhood.kept(self._clock())
-        self._neighbourhood.nearness([0])
-        self._neighbourhood.leave(user)
-        self._neighbourhood.plan(self._clock(), 0.0)
+        self._tracks.record_pose(user, self._clock(), center, 1.0)
+        self._tracks.plan(self._clock(), 0.0)
+        self._tracks.kept(self._clock())
+        self._tracks.path_distances([0])
+        self._tracks.leave(user)
+        self._tracks.plan(self._clock(), 0.0)
 
     def leave_client(self, client: str) -> None:
         """Stop keeping and prefetching voxels for a client's avatars."""
-        self._neighbourhood.leave_client(client)
+        self._tracks.leave_client(client)
         self._seen = True
         self._wake()
 
@@ -177,7 +177,7 @@ class Prefetcher:
 
     def _rest(self, seconds: float) -> None:
         """Pause; an owed load or `stop` ends the pause."""
-        self._urgent.wait(min(max(0.0, seconds), MOST_REST))
+        self._urgent.wait(min(max(0.0, seconds), MAX_REST))
         self._urgent.clear()
 
     def _planned(self, now: float) -> tuple[dict[int, float], float]:
@@ -187,12 +187,12 @@ class Prefetcher:
             need = self._plan(now)
         except Exception:  # for example out of memory: requested voxels are loaded all the same
             log.exception("the prefetch plan failed")
-            return {}, now + MOST_REST
-        return need, now + min(max(PLAN_SECONDS, PLAN_REST * (time.thread_time() - begin)), MOST_REST)
+            return {}, now + MAX_REST
+        return need, now + min(max(PLAN_SECONDS, PLAN_REST * (time.thread_time() - begin)), MAX_REST)
 
     def _use_idle_time(self, idle: Callable[[], bool]) -> float:
         """Do one piece of idle work; return how long to pause afterwards [s]."""
-        self._residency.wait_for_nobody()
+        self._residency.wait_until_idle()
         begin = time.thread_time()
         try:
             left = idle()
@@ -209,16 +209,16 @@ class Prefetcher:
         try:
             owed = residency.take_owed()
             if owed is not None:
-                residency.load_ahead(owed, lambda _: True, owed=True)
+                residency.load_in_background(owed, lambda _: True, owed=True)
                 return True
             while queue:
                 row, at = queue.popleft()
                 if residency.is_resident(row) or self._clock() < self._failed.get(row, -math.inf) + SILENCE:
                     continue
-                found = residency.load_ahead(row, _wanted_later(need, at))
-                if found is Ahead.NO_ROOM:
+                found = residency.load_in_background(row, _is_needed_later(need, at))
+                if found is BackgroundLoad.NO_ROOM:
                     queue.clear()  # voxels needed later would find no room either
-                elif found is Ahead.FAILED:
+                elif found is BackgroundLoad.FAILED:
                     self._failed[row] = self._clock()
                 return True
         except Exception:  # for example out of memory: a request for the voxel reports it
@@ -233,11 +233,11 @@ class Prefetcher:
         Update the set of voxels kept for users' current positions.
         """
         times = sorted(self._residency.load_times())
-        usual = times[int(USUAL * (len(times) - 1))] if times else 0.0
-        self._neighbourhood.expire(now, SILENCE)
-        wanted = self._neighbourhood.plan(now, usual)
+        usual = times[int(LOAD_TIME_QUANTILE * (len(times) - 1))] if times else 0.0
+        self._tracks.expire(now, SILENCE)
+        wanted = self._tracks.plan(now, usual)
         need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
-        self._residency.kept = self._within_share(self._neighbourhood.kept(now, SILENCE).tolist(), need)
+        self._residency.kept = self._within_share(self._tracks.kept(now, SILENCE).tolist(), need)
         return need
 
     def _within_share(self, rows: list[int], need: dict[int, float]) -> frozenset[int]:

@@ -21,7 +21,7 @@ from ..kernels.core.voxel_layout import (
 )
 
 
-class Store:
+class VoxelStore:
     """Voxels of an archive by index row.
 
     archive: see schemas/archive/archive.py.  sizes: (v,) int64, bytes of each decoded voxel.
@@ -97,4 +97,4 @@ class Store:
 
 
 # Function that opens the archive in a folder.
-OpenStore = Callable[[str | Path], Store]
+OpenStore = Callable[[str | Path], VoxelStore]

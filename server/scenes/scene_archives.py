@@ -25,7 +25,7 @@ from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import make_avatar
 from ..kernels.core.pose_transform import MAX_REACH_UNITS
 from ..residency.arena import ArenaBuffer
-from ..residency.voxel_store import OpenStore, Store
+from ..residency.voxel_store import OpenStore, VoxelStore
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/effects/bodies.py).
@@ -72,7 +72,7 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
     found = []
     for number, item in enumerate(file.archives):
         with at_place(path, f"$.archives[{number}].path"):
-            store = Store(_beside(path, item.path), normals=normals_asked(file))
+            store = VoxelStore(_beside(path, item.path), normals=normals_asked(file))
         try:
             header = store.archive.header
             if file.radius_model is not None:
@@ -123,7 +123,7 @@ def store_opener(file: SceneFile, number: int) -> OpenStore:
             from ..simulation.effects.through_effect import store_without
 
             return store_without(effect, file.archives[number].pose, reach)
-    return partial(Store, normals=reach)
+    return partial(VoxelStore, normals=reach)
 
 
 def normals_asked(file: SceneFile) -> float | None:
@@ -143,7 +143,7 @@ def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]
     Raises BadRequestError if the largest voxels together exceed the budget.
     """
     if len(sizes) == 1:
-        return [budget_bytes]  # `Residency` reports a budget that is too small
+        return [budget_bytes]  # `VoxelCache` reports a budget that is too small
     least = [ArenaBuffer.rounded(int(each.max(initial=0))) for each in sizes]
     rest = budget_bytes - sum(least)
     if rest < 0:

@@ -41,7 +41,7 @@ def judge(
     """
     points = spheres(made, model)
     for row in range(made.voxels):
-        made.remember(row) if row % 2 else made.coarse.fill(made.store, row)
+        made.remember(row) if row % 2 else made.coarse.store_from_archive(made.store, row)
     settled = clear = 0
     for pose in poses:
         if np.abs(pose[:3, 3]).max() > 1e9:

@@ -18,8 +18,8 @@ from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import make_scene_data
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 BUDGETS = (*range(0, 150, 7), 200, 300, 500, 1000, 5000)
 
@@ -44,8 +44,8 @@ def test_a_larger_budget_takes_nothing_back(tmp_path: Path, seed: int, tolerance
     points, avatar = cloud(rng, rng.choice(KINDS[:-1]), 200), cloud(rng, "noise", 60) * 0.3
     case = archive_cases.build(tmp_path, points, voxel=0.6, leaf=1, cell_points=20)
     poses = archive_cases.near_poses(rng, points, avatar, 20, 0.4)
-    store = Store(case.archive)
-    data = make_scene_data(store.archive, Residency(store, 2 * int(store.sizes.max()) + 128))
+    store = VoxelStore(case.archive)
+    data = make_scene_data(store.archive, VoxelCache(store, 2 * int(store.sizes.max()) + 128))
     model = make_avatar(avatar, 0.02)
     judge(lambda budget: distance_bounded(data, model, poses, 0.5, budget), tolerance)
     judge(lambda budget: collide_bounded(data, model, poses, 0.05, budget), tolerance)

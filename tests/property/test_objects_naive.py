@@ -17,8 +17,8 @@ from point_clouds import signed_permutations
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 ALL = 0xFFFF_FFFF
 ORIGIN_SHIFT = 3.0
@@ -29,8 +29,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneData]:
     """A scene of 60 points, far enough from the origin for its own not to be zero."""
     points = synthetic_scans.make_scan("noise", 11, 60) + ORIGIN_SHIFT
     case = archive_cases.build(tmp_path_factory.mktemp("objects"), points, radius=0.05)
-    store = Store(case.archive)
-    yield make_scene_data(store.archive, Residency(store, 64 << 20))
+    store = VoxelStore(case.archive)
+    yield make_scene_data(store.archive, VoxelCache(store, 64 << 20))
     store.close()
 
 
@@ -237,8 +237,8 @@ def test_against_the_scene_as_each_alone(data: SceneData, rng: np.random.Generat
 def test_a_scene_path_is_not_needed(tmp_path: Path) -> None:
     """Objects far outside the dataset meet all the same."""
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 50))
-    store = Store(case.archive)
-    far = make_scene_data(store.archive, Residency(store, 1 << 20))
+    store = VoxelStore(case.archive)
+    far = make_scene_data(store.archive, VoxelCache(store, 1 << 20))
     ball = make_avatar([[0.0, 0, 0]], 0.5)
     poses = np.array([archive_cases.pose_of(np.eye(3), np.array([x, 5e6, -4e6])) for x in (0.0, 0.9, 1.95)])
     answers = objects(far, [ball] * 3, poses, [1] * 3, [ALL] * 3)

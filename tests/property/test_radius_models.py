@@ -102,4 +102,4 @@ def test_reach_is_that_of_the_largest_sphere_there_is(tmp_path: Path) -> None:
     with Scene.open(case.archive) as scene:
         data = scene.archives[0]._opened.radius_model("local")
         assert data.radius_units == radii.max() < 0.02 * naive.UNITS
-        assert data.arrays.drop.min() == 0 and data.arrays.drop.max() > 0
+        assert data.arrays.radius_deficit.min() == 0 and data.arrays.radius_deficit.max() > 0

@@ -11,8 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from solidcloud.server.residency.eviction import POLICIES, make_policy
-from solidcloud.server.residency.held import Ahead, Held
-from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.held_voxels import BackgroundLoad, HeldVoxels
+from solidcloud.server.residency.voxel_cache import VoxelCache
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9
@@ -30,7 +30,7 @@ def _refuse(*_: object) -> None:
 class Holding(NamedTuple):
     """A hold that is open, and what it was promised."""
 
-    context: AbstractContextManager[Held]
+    context: AbstractContextManager[HeldVoxels]
     rows: list[int]
     good: set[int]
 
@@ -50,8 +50,8 @@ class ResidencyMachine(RuleBasedStateMachine):
     def begin(self, policy: str) -> None:
         """An empty residency under a policy; to `distance`, greater rows are farther."""
         order = make_policy(policy, BUDGET * BLOCK, lambda rows: np.array(rows, np.float64))
-        self.residency = Residency(self.store, BUDGET * BLOCK, order)
-        self.residency.owed = lambda: None
+        self.residency = VoxelCache(self.store, BUDGET * BLOCK, order)
+        self.residency.on_owed = lambda: None
         self.residency._changed.wait = _refuse  # type: ignore[method-assign,assignment]
         self.open: list[Holding] = []
         self.corrupt: set[int] = set()
@@ -101,23 +101,25 @@ class ResidencyMachine(RuleBasedStateMachine):
         self.residency.kept = frozenset(rows)
 
     @rule(row=st.integers(0, len(SIZES) - 1), sooner=ROWS, owed=st.booleans())
-    def load_ahead(self, row: int, sooner: list[int], owed: bool) -> None:
+    def load_in_background(self, row: int, sooner: list[int], owed: bool) -> None:
         """Load a voxel that nobody waits for, others being wanted sooner: none of those goes, nor what is stood in."""
         before = {other for other in range(len(SIZES)) if self.residency.where[other, 0] >= 0}
         loads = self.store.loads[row]
-        found = self.residency.load_ahead(row, lambda other: other not in sooner, owed=owed)
+        found = self.residency.load_in_background(row, lambda other: other not in sooner, owed=owed)
         after = {other for other in range(len(SIZES)) if self.residency.where[other, 0] >= 0}
         stays = before & (set(sooner) | self.residency.kept | self._held())
         assert stays <= after <= before | {row}
         fault = self.store.faults.get(row)
         bad = row in self.corrupt | (self.failed & self._held())
-        assert self.store.loads[row] - loads == (found is not Ahead.NO_ROOM and not bad and row not in before)
-        assert (found is Ahead.THERE) == (row in after)
+        assert self.store.loads[row] - loads == (
+            found is not BackgroundLoad.NO_ROOM and not bad and row not in before
+        )
+        assert (found is BackgroundLoad.RESIDENT) == (row in after)
         if self.store.loads[row] > loads and fault == "corrupt":
             self.corrupt.add(row)
         elif self.store.loads[row] > loads and fault and row in self._held():
             self.failed.add(row)
-        if found is Ahead.NO_ROOM:
+        if found is BackgroundLoad.NO_ROOM:
             free = BUDGET - sum(SIZES[other] for other in stays)
             assert free < SIZES[row] or self._held() or stays, "there was room"
 

@@ -11,13 +11,13 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.radius_model import class_radii
 from solidcloud.server.avatars.avatar_model import AvatarModel
-from solidcloud.server.kernels.core.pose_transform import GOOD
+from solidcloud.server.kernels.collide.coarse_clearance import MAX_SLOT_NODES
+from solidcloud.server.kernels.core.pose_transform import VALID
 from solidcloud.server.kernels.core.voxel_layout import ROW_WORDS, Arena, SceneArrays, block_words
-from solidcloud.server.kernels.core.voxels_in_reach import Reach, SceneIndex, find_reach
-from solidcloud.server.kernels.overlap.coarse_overlap import MOST_NODES
+from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
 from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.coarse_bounds import Coarse, settle
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 # For the tops of all voxels of any scene here.
 ROOM = 1 << 25
@@ -29,13 +29,13 @@ class Made(NamedTuple):
     arrays, broad: what kernels read; nothing is resident.  largest: radius of the largest sphere, exact units.
     """
 
-    store: Store
+    store: VoxelStore
     arena: Arena
     loaded: NDArray[np.int64]
     arrays: SceneArrays
     broad: SceneIndex
     largest: int
-    coarse: Coarse
+    coarse: CoarseBounds
 
     @property
     def voxels(self) -> int:
@@ -50,24 +50,24 @@ class Made(NamedTuple):
 
     def remember(self, row: int) -> None:
         """Keep the top of a voxel."""
-        self.coarse.remember(row, self.arena, self.loaded[row])
+        self.coarse.store_from_arena(row, self.arena, self.loaded[row])
 
     def fill(self, *but: int) -> None:
         """Keep the tops of all voxels but these."""
         for row in set(range(self.voxels)) - set(but):
-            self.coarse.fill(self.store, row)
+            self.coarse.store_from_archive(self.store, row)
 
-    def top(self, row: int, coarse: Coarse | None = None) -> NDArray[np.int32]:
+    def top(self, row: int, coarse: CoarseBounds | None = None) -> NDArray[np.int32]:
         """The rows (n, ROW_WORDS) of a voxel's slot, as they are."""
         arrays = (coarse or self.coarse).arrays
         number = arrays.slot[row]
         assert number >= 0
-        return arrays.ints.reshape(-1, MOST_NODES, ROW_WORDS)[number, : arrays.count[number]].copy()
+        return arrays.ints.reshape(-1, MAX_SLOT_NODES, ROW_WORDS)[number, : arrays.count[number]].copy()
 
-    def reach(self, avatar: AvatarModel, poses: NDArray[np.float64], margin: int = 0) -> Reach:
+    def reach(self, avatar: AvatarModel, poses: NDArray[np.float64], margin: int = 0) -> VoxelsInReach:
         """What the avatar could touch; margin: exact units."""
         k = len(poses)
-        reach = Reach(
+        reach = VoxelsInReach(
             np.empty(k),
             np.empty(k, np.int64),
             np.zeros(k + 1, np.int64),
@@ -77,7 +77,7 @@ class Made(NamedTuple):
         )
         other = self.largest + margin
         fault, *_ = find_reach(poses, avatar.arrays, avatar.radius, other, self.arrays, self.broad, reach)
-        assert fault == GOOD
+        assert fault == VALID
         return reach
 
     def settled(
@@ -85,7 +85,7 @@ class Made(NamedTuple):
     ) -> tuple[list[list[int]], list[list[int]]]:
         """The voxel rows in reach of each pose, and those of them that tops prove clear."""
         reach = self.reach(avatar, poses, margin)
-        found, count = settle(self.arrays, self.coarse.arrays, avatar.arrays, poses, reach)
+        found, count = drop_clear_pairs(self.arrays, self.coarse.arrays, avatar.arrays, poses, reach)
         before, left = rows_of(reach), rows_of(found)
         gone = [[row for row in b if row not in a] for b, a in zip(before, left, strict=True)]
         assert [[r for r in b if r in a] for b, a in zip(before, left, strict=True)] == left
@@ -93,7 +93,7 @@ class Made(NamedTuple):
         return before, gone
 
 
-def rows_of(reach: Reach) -> list[list[int]]:
+def rows_of(reach: VoxelsInReach) -> list[list[int]]:
     """The voxel rows of each pose."""
     ends = zip(reach.starts[:-1], reach.starts[1:], strict=True)
     return [reach.rows[begin:end].tolist() for begin, end in ends]
@@ -101,7 +101,7 @@ def rows_of(reach: Reach) -> list[list[int]]:
 
 def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) -> Made:
     """Open an archive and load all its voxels; with the spheres of a radius model."""
-    store = Store(folder)
+    store = VoxelStore(folder)
     archive, header = store.archive, store.archive.header
     sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
     buffer = ArenaBuffer(sum(sizes))
@@ -131,7 +131,7 @@ def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) 
         header.low,
         header.high,
     )
-    coarse = Coarse(len(sizes), budget_bytes)
+    coarse = CoarseBounds(len(sizes), budget_bytes)
     return Made(store, buffer.arena, loaded, arrays, broad, int(radii.max()), coarse)
 
 

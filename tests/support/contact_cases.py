@@ -17,8 +17,8 @@ from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 
 class ScanCase(NamedTuple):
@@ -27,7 +27,7 @@ class ScanCase(NamedTuple):
     radii: (n,) of the points' spheres, exact units.
     """
 
-    store: Store
+    store: VoxelStore
     data: SceneData
     points: NDArray[np.float64]
     numbers: NDArray[np.int64]
@@ -54,8 +54,8 @@ def open_case(
     options = {"voxel": 0.5, "resolution": 1e-4, "radius": 0.01, "jobs": 1} | options
     keep = frozenset({"scan"}) if kept else frozenset()
     build_archive(paths, own / "archive", BuildConfig(keep=keep, **options))
-    store = Store(own / "archive")
-    data = make_scene_data(store.archive, Residency(store, budget_bytes))
+    store = VoxelStore(own / "archive")
+    data = make_scene_data(store.archive, VoxelCache(store, budget_bytes))
     # The numbers that a user sees: rows of SceneInfo.sources.
     listed = [Path(source.path).name for source in describe(store, "scene").sources]
     rows = np.array([listed.index(path.name) for path in paths])
@@ -75,8 +75,8 @@ def with_model(case: ScanCase, model: str | None) -> ScanCase:
 
 def tight(case: ScanCase, budget_bytes: int) -> ScanCase:
     """The case with a cache of budget_bytes, empty."""
-    small = make_scene_data(case.store.archive, Residency(case.store, budget_bytes))
-    arrays = small.arrays._replace(drop=case.data.arrays.drop)
+    small = make_scene_data(case.store.archive, VoxelCache(case.store, budget_bytes))
+    arrays = small.arrays._replace(radius_deficit=case.data.arrays.radius_deficit)
     return case._replace(data=small._replace(arrays=arrays, radius_units=case.data.radius_units))
 
 

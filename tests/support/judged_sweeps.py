@@ -14,8 +14,8 @@ from solidcloud.schemas.wire.answers import SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from solidcloud.server.queries.sweep import sweep
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 CLOUDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point")
 
@@ -53,9 +53,9 @@ def opened(
     case: archive_cases.Case, budget_bytes: int = 1 << 26, model: str | None = None
 ) -> Iterator[SceneData]:
     """What `sweep` reads of an archive, with the radii of a model."""
-    store = Store(case.archive)
+    store = VoxelStore(case.archive)
     try:
-        data = make_scene_data(store.archive, Residency(store, budget_bytes))
+        data = make_scene_data(store.archive, VoxelCache(store, budget_bytes))
         yield with_radius_model(data, store.archive, model)
         data.residency.check()
     finally:

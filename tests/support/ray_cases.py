@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import RaycastAnswers, WithinAnswers
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data, with_radius_model
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 KINDS = ("cluster", "plane", "line", "grid", "duplicates", "noise", "one point")
 
@@ -19,10 +19,10 @@ KINDS = ("cluster", "plane", "line", "grid", "duplicates", "noise", "one point")
 @contextmanager
 def opened(case: archive_cases.Case, budget: int = 64 << 20, model: str | None = None) -> Iterator[SceneData]:
     """What the questions read of an archive, with a radius model."""
-    store = Store(case.archive)
+    store = VoxelStore(case.archive)
     try:
         yield with_radius_model(
-            make_scene_data(store.archive, Residency(store, budget)), store.archive, model
+            make_scene_data(store.archive, VoxelCache(store, budget)), store.archive, model
         )
     finally:
         store.close()

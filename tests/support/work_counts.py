@@ -269,7 +269,7 @@ def opened(archive: Path) -> Iterator[Scene]:
     """A scene just opened, with the avatars."""
     with Scene.open(archive) as scene:
         # Loads that a question did not wait for would go on beside the next, and their calls be counted or not.
-        scene.residency.owed = None
+        scene.residency.on_owed = None
         for name, (points, radius) in AVATARS.items():
             scene.add_avatar(name, points, radius)
         # As avatars of 8,000 points and more, whose leaf nodes are too many for a front: inner nodes are their front,

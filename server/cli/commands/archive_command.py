@@ -13,11 +13,11 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
 
     from ....schemas.archive.radius_model import radius_distribution
     from ...archives.archive_info import describe
-    from ...residency.voxel_store import Store
+    from ...residency.voxel_store import VoxelStore
     from ..output.archive_facts import archive_details, detail_facts
     from ..output.console import print_info
 
-    store = Store(archive)
+    store = VoxelStore(archive)
     found = describe(store, archive.resolve().name)
     header = store.archive.header
     classes = radius_distribution(header.models, header.radius_counts, header.radius_capped)

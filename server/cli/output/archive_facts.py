@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
     from ....builder.export.export_archive import Exported
     from ....schemas.archive.index import Source
-    from ...residency.voxel_store import Store
+    from ...residency.voxel_store import VoxelStore
 
 
 def print_export(done: "Exported") -> None:
@@ -30,7 +30,7 @@ def _export_facts(done: "Exported") -> Iterator[tuple[str, str]]:
         yield "note", note
 
 
-def archive_details(store: "Store") -> dict[str, Any]:
+def archive_details(store: "VoxelStore") -> dict[str, Any]:
     """Return the details that `info` adds to a scene's description, in JSON types.
 
     densest: the voxel with the most points, their number and its decoded size in bytes.

@@ -14,7 +14,7 @@ from ....schemas.process.os_errors import write_error_words
 from ....schemas.scene.scene_file import SUFFIX, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
 from ...archives.archive_info import describe
-from ...residency.voxel_store import Store
+from ...residency.voxel_store import VoxelStore
 from .scene_text import Beginning, scene_text
 
 # Characters that an avatar's name must not contain (schemas/scene/scene_file.py, SceneName), and
@@ -48,7 +48,7 @@ def new_scene(
         check_name(name, "--name")
     infos = []
     for folder in archives:
-        with closing(Store(folder)) as store:
+        with closing(VoxelStore(folder)) as store:
             infos.append(describe(store, folder.resolve().name))
     bounds = np.array([info.bounds for info in infos])
     begin = Beginning(

@@ -22,7 +22,7 @@ from ..core.stop_flag_checks import stopped
 from ..core.voxel_layout import LANES
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
-# As in overlap.py: a pair of trees leaves at most 15 pairs a level on the stack.
+# As in collide_poses.py: a pair of trees leaves at most 15 pairs a level on the stack.
 STACK = 2 * 80 * 15 + 16
 # A similarity may shear by SIMILARITY_TOLERANCE, 1e-9, and stretch a radius by as much.
 STRETCH = 1.0 + 1e-8
@@ -159,7 +159,8 @@ def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, a
     """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the search ended early.
 
     It ends early when the visits are spent or the stop flag is set. The descent follows [Fig12]
-    figures 5 and 6, corrected as in overlap.py: the larger inner node is opened, a leaf never is.
+    figures 5 and 6, corrected as in collide_poses.py: the larger inner node is opened, a leaf never
+    is.
     nodes: (STACK, 2) int64, at: (STACK, 6) float64, scratch: pairs still to examine, and their
     placed centres.
     """
@@ -232,7 +233,8 @@ def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits,
     own = np.zeros(2, np.int64)
     for number in range(pairs.shape[0]):
         if stopped(stop):
-            # The root nodes of the remaining pairs alone would take tens of milliseconds: 0.5 µs a pair.
+            # The root nodes of the remaining pairs alone would take tens of milliseconds: 0.5 µs a
+            # pair.
             verdict[number:] = UNKNOWN
             break
         i, j = pairs[number, 0], pairs[number, 1]

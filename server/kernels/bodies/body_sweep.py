@@ -1,9 +1,10 @@
 """First contact of a moving avatar with a standing one: a joint descent of two avatar trees.
 
-The motion is that of kernels/motion/screw_motion.py, the contact that of kernels/bodies/body_pairs.py: both bodies are
-placed relative to the dataset's origin, in float64, and each centre is rounded once to exact units.
-The proof is that of kernels/motion/sweep_interval.py, with a rounded point of the standing avatar in place of the
-scan point. Over [t0, t1], every moving point is taken along its chord, at most `band` from its true
+The motion is that of kernels/motion/screw_motion.py, the contact that of
+kernels/bodies/body_pairs.py: both bodies are placed relative to the dataset's origin, in float64,
+and each centre is rounded once to exact units. The proof is that of
+kernels/motion/sweep_interval.py, with a rounded point of the standing avatar in place of the scan
+point. Over [t0, t1], every moving point is taken along its chord, at most `band` from its true
 position:
 
     band = sqrt(3) / 2 + B (t1 - t0)^2 / 8 + 2 slip
@@ -22,15 +23,15 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.pose_transform import largest_term, place, to_units
 from ..core.stop_flag_checks import stopped
 from ..core.voxel_layout import LANES
 from ..motion.contact_times import INFINITE, pair_times
 from ..motion.screw_motion import make_motion, pose_at
 from .moving_bodies import (
-    Chord,
-    Meeting,
+    BodyChord,
+    BodySweep,
     least_square,
     place_moving,
     place_moving_nodes,
@@ -38,86 +39,90 @@ from .moving_bodies import (
     place_standing_nodes,
 )
 
-# As in sweep_interval.py and sweep_advance.py: the sagitta below which halving is useless; the sagitta of a first
-# chord, in avatar sizes; the number of advances that may settle nothing.
+# As in sweep_interval.py and sweep_advance.py: the sagitta below which halving is useless; the
+# sagitta of a first chord, in avatar sizes; the number of advances that may settle nothing.
 _LEAST_SAGITTA = 0.25
 _CHORD_BEND = 1.0 / 16.0
-_MOST_REFUSED = 512
+_MAX_REFUSED = 512
 
 
-@borrowing
+@njit_no_refcount
 def _latest(scratch):
     """Return the fraction of a chord that still matters, rounded up."""
     return min(scratch.first[0] * (1.0 + 1e-9) + 1e-30, 1.0)
 
 
-@borrowing
-def _goes_away(meeting, chord, x, y, z, block_b, lane_b):
+@njit_no_refcount
+def _separates(sweep, chord, x, y, z, block_b, lane_b):
     """Return whether a pair within the band at the start does not touch there and comes no nearer.
 
     x, y, z: the moving point.  block_b, lane_b: the standing point.
     """
-    scratch = meeting.scratch
-    gap, way = scratch.gap, scratch.way
+    scratch = sweep.scratch
+    gap, displacement = scratch.gap, scratch.displacement
     if chord.t0 > 0.0 or not chord.final:
         return False
-    if gap[0] * way[0] + gap[1] * way[1] + gap[2] * way[2] < 0.0:
+    if gap[0] * displacement[0] + gap[1] * displacement[1] + gap[2] * displacement[2] < 0.0:
         return False
     square = np.int64(0)
     for r in range(3):
         begin = to_units(place(scratch.ends[0], scratch.shifts[0], r, x, y, z))
         difference = begin - to_units(scratch.lanes[block_b, r, lane_b])
         square += difference * difference
-    return square > meeting.units * meeting.units
+    return square > sweep.units * sweep.units
 
 
-@borrowing
-def _try_pair(meeting, chord, block_a, lane_a, block_b, lane_b):
+@njit_no_refcount
+def _try_pair(sweep, chord, block_a, lane_a, block_b, lane_b):
     """Update scratch.first with one pair of points; lanes are those of block_b."""
-    scratch, points = meeting.scratch, meeting.a.points
-    gap, way, ends, first = scratch.gap, scratch.way, scratch.ends, scratch.first
+    scratch, points = sweep.scratch, sweep.a.points
+    gap, displacement, ends, first = scratch.gap, scratch.displacement, scratch.ends, scratch.first
     x, y, z = points[block_a, 0, lane_a], points[block_a, 1, lane_a], points[block_a, 2, lane_a]
     for r in range(3):
         begin = place(ends[0], scratch.shifts[0], r, x, y, z) * UNITS_PER_METRE
         end = place(ends[1], scratch.shifts[1], r, x, y, z) * UNITS_PER_METRE
         gap[r] = begin - np.float64(to_units(scratch.lanes[block_b, r, lane_b]))
-        way[r] = end - begin
-    enters, certain, _ = pair_times(gap, way, chord.inner, chord.outer)
-    if enters == 0.0 and certain > 0.0 and _goes_away(meeting, chord, x, y, z, block_b, lane_b):
+        displacement[r] = end - begin
+    earliest_possible, earliest_certain, _ = pair_times(gap, displacement, chord.inner, chord.outer)
+    if (
+        earliest_possible == 0.0
+        and earliest_certain > 0.0
+        and _separates(sweep, chord, x, y, z, block_b, lane_b)
+    ):
         return
-    if enters < first[0]:
-        first[0] = enters
+    if earliest_possible < first[0]:
+        first[0] = earliest_possible
         pair = scratch.pair
         pair[0], pair[1], pair[2], pair[3] = block_a, lane_a, block_b, lane_b
-    first[1] = min(first[1], certain)
+    first[1] = min(first[1], earliest_certain)
 
 
-@borrowing
-def _bounds_of(lane, room):
-    """Return the least and the greatest of coordinates (LANES,), widened by `room` on each side."""
+@njit_no_refcount
+def _bounds_of(lane, threshold):
+    """Return the least and greatest coordinate of (LANES,), widened by `threshold` on each side."""
     least, most = lane[0], lane[0]
     for k in range(LANES):
         least, most = min(least, lane[k]), max(most, lane[k])
-    return least - room * (1.0 + 1e-12), most + room * (1.0 + 1e-12)
+    return least - threshold * (1.0 + 1e-12), most + threshold * (1.0 + 1e-12)
 
 
-@borrowing
-def _sift(scratch, block_a, block_b, j, room):
+@njit_no_refcount
+def _mark_near(scratch, block_a, block_b, j, threshold):
     """Mark in scratch.keep the points of a moving block that come near a standing block.
 
-    Near: within `room` of the sphere of its node j and of the box of its points.
+    Near: within `threshold` of the sphere of its node j and of the box of its points.
     """
-    standing, ways, keep, latest = scratch.standing, scratch.ways, scratch.keep, _latest(scratch)
+    standing, paths, keep, latest = scratch.standing, scratch.paths, scratch.keep, _latest(scratch)
     bx, by, bz = standing[0, j], standing[1, j], standing[2, j]
-    span = (standing[3, j] + room) * (1.0 + 1e-12)
+    span = (standing[3, j] + threshold) * (1.0 + 1e-12)
     span *= span
-    low_x, high_x = _bounds_of(scratch.lanes[block_b, 0], room)
-    low_y, high_y = _bounds_of(scratch.lanes[block_b, 1], room)
-    low_z, high_z = _bounds_of(scratch.lanes[block_b, 2], room)
+    low_x, high_x = _bounds_of(scratch.lanes[block_b, 0], threshold)
+    low_y, high_y = _bounds_of(scratch.lanes[block_b, 1], threshold)
+    low_z, high_z = _bounds_of(scratch.lanes[block_b, 2], threshold)
     for k in range(LANES):
-        px, py, pz = ways[block_a, 0, k], ways[block_a, 1, k], ways[block_a, 2, k]
-        wx, wy, wz = ways[block_a, 3, k], ways[block_a, 4, k], ways[block_a, 5, k]
-        square = least_square(px - bx, py - by, pz - bz, wx, wy, wz, ways[block_a, 6, k], latest)
+        px, py, pz = paths[block_a, 0, k], paths[block_a, 1, k], paths[block_a, 2, k]
+        wx, wy, wz = paths[block_a, 3, k], paths[block_a, 4, k], paths[block_a, 5, k]
+        square = least_square(px - bx, py - by, pz - bz, wx, wy, wz, paths[block_a, 6, k], latest)
         qx, qy, qz = px + latest * wx, py + latest * wy, pz + latest * wz
         keep[k] = (
             (square <= span)
@@ -130,53 +135,53 @@ def _sift(scratch, block_a, block_b, j, room):
         )
 
 
-@borrowing
-def _leaves(meeting, chord, i, j):
+@njit_no_refcount
+def _leaves(sweep, chord, i, j):
     """Update scratch.first with all pairs of two leaf nodes.
 
     Moving points are tested against the standing node's bounds, then against its points, each in
     one vector loop. LANES is a constant; the loops therefore include the entries beyond a node's
     count, which repeat its last point.
     """
-    scratch = meeting.scratch
-    lanes, ways, stamps, turns = scratch.lanes, scratch.ways, scratch.stamps, scratch.turns
-    block_a, block_b = ~meeting.a.first[i], ~meeting.b.first[j]
+    scratch = sweep.scratch
+    lanes, paths, stamps, turns = scratch.lanes, scratch.paths, scratch.stamps, scratch.turns
+    block_a, block_b = ~sweep.a.first[i], ~sweep.b.first[j]
     if stamps[0, block_a] != turns[0]:
-        place_moving(meeting, block_a)
+        place_moving(sweep, block_a)
         stamps[0, block_a] = turns[0]
     if stamps[1, block_b] != turns[1]:
-        place_standing(meeting, block_b)
+        place_standing(sweep, block_b)
         stamps[1, block_b] = turns[1]
-    _sift(scratch, block_a, block_b, j, chord.room)
-    far, latest = chord.room * chord.room * (1.0 + 1e-12), _latest(scratch)
-    for lane in range(meeting.a.count[i]):
+    _mark_near(scratch, block_a, block_b, j, chord.threshold)
+    far, latest = chord.threshold * chord.threshold * (1.0 + 1e-12), _latest(scratch)
+    for lane in range(sweep.a.count[i]):
         if not scratch.keep[lane]:
             continue
         scratch.counters[1] += LANES
-        px, py, pz = ways[block_a, 0, lane], ways[block_a, 1, lane], ways[block_a, 2, lane]
-        wx, wy, wz = ways[block_a, 3, lane], ways[block_a, 4, lane], ways[block_a, 5, lane]
-        inverse = ways[block_a, 6, lane]
+        px, py, pz = paths[block_a, 0, lane], paths[block_a, 1, lane], paths[block_a, 2, lane]
+        wx, wy, wz = paths[block_a, 3, lane], paths[block_a, 4, lane], paths[block_a, 5, lane]
+        inverse = paths[block_a, 6, lane]
         touched = False
         for k in range(LANES):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
             touched |= least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far
         if not touched:
             continue
-        for k in range(meeting.b.count[j]):
+        for k in range(sweep.b.count[j]):
             gx, gy, gz = px - lanes[block_b, 0, k], py - lanes[block_b, 1, k], pz - lanes[block_b, 2, k]
             if least_square(gx, gy, gz, wx, wy, wz, inverse, latest) <= far:
-                _try_pair(meeting, chord, block_a, lane, block_b, k)
+                _try_pair(sweep, chord, block_a, lane, block_b, k)
                 latest = _latest(scratch)
 
 
-@borrowing
-def _nearest(scratch, room, i, j):
+@njit_no_refcount
+def _nearest(scratch, threshold, i, j):
     """Return the least squared distance that the centres of two nodes reach.
 
     inf where nothing below them can touch before the contact found so far.
     """
     moving, standing = scratch.moving, scratch.standing
-    both = (moving[7, i] + standing[3, j] + room) * (1.0 + 1e-12)
+    both = (moving[7, i] + standing[3, j] + threshold) * (1.0 + 1e-12)
     square = least_square(
         moving[0, i] - standing[0, j], moving[1, i] - standing[1, j], moving[2, i] - standing[2, j],
         moving[3, i], moving[4, i], moving[5, i], moving[6, i], _latest(scratch),
@@ -184,32 +189,32 @@ def _nearest(scratch, room, i, j):
     return square if square <= both * both else INFINITE
 
 
-@borrowing
-def _descend(meeting, chord):
+@njit_no_refcount
+def _descend(sweep, chord):
     """Descend both trees once for one chord; fill scratch.first.
 
     The larger inner node is opened, a leaf never is. Among children, the pair whose centres come
     nearest is visited first: early contacts are then found early, and prune.
     """
-    scratch, a, b = meeting.scratch, meeting.a, meeting.b
+    scratch, a, b = sweep.scratch, sweep.a, sweep.b
     stack, counters = scratch.stack, scratch.counters
     scratch.turns[0] += 1
     scratch.first[0], scratch.first[1] = INFINITE, INFINITE
     counters[0] += 1
-    place_moving_nodes(meeting, 1)
-    if _nearest(scratch, chord.room, 0, 0) == INFINITE:
+    place_moving_nodes(sweep, 1)
+    if _nearest(scratch, chord.threshold, 0, 0) == INFINITE:
         return
-    place_moving_nodes(meeting, a.center.shape[0])
+    place_moving_nodes(sweep, a.center.shape[0])
     stack[0, 0], stack[0, 1] = 0, 0
     depth = 1
-    while depth > 0 and not stopped(meeting.stop):
+    while depth > 0 and not stopped(sweep.stop):
         depth -= 1
         i, j = stack[depth, 0], stack[depth, 1]
-        if _nearest(scratch, chord.room, i, j) == INFINITE:
+        if _nearest(scratch, chord.threshold, i, j) == INFINITE:
             continue
         first_a, first_b = a.first[i], b.first[j]
         if first_a < 0 and first_b < 0:
-            _leaves(meeting, chord, i, j)
+            _leaves(sweep, chord, i, j)
             if scratch.first[0] <= 0.0:
                 return
             continue
@@ -219,7 +224,7 @@ def _descend(meeting, chord):
         nearest, least = depth, INFINITE
         for child in range(first, first + count):
             one, other = (child, j) if opens_a else (i, child)
-            square = _nearest(scratch, chord.room, one, other)
+            square = _nearest(scratch, chord.threshold, one, other)
             if square == INFINITE:
                 continue
             stack[depth, 0], stack[depth, 1] = one, other
@@ -233,13 +238,13 @@ def _descend(meeting, chord):
             stack[last, 0], stack[last, 1] = one, other
 
 
-@borrowing
-def _search(meeting, t0, t1):
+@njit_no_refcount
+def _search(sweep, t0, t1):
     """Descend once over [t0, t1]; fill scratch.first and pair.
 
     Returns whether halving the interval is useless.
     """
-    motion, scratch = meeting.motion, meeting.scratch
+    motion, scratch = sweep.motion, sweep.scratch
     ends, shifts = scratch.ends, scratch.shifts
     pose_at(motion, t0, ends[0])
     pose_at(motion, t1, ends[1])
@@ -248,30 +253,30 @@ def _search(meeting, t0, t1):
     sagitta = motion.bend * (t1 - t0) * (t1 - t0) / 8.0 * UNITS_PER_METRE
     # The standing point is an integer, except far out where float64 cannot represent it; `error`
     # covers that.
-    loose = (2.0 * motion.slip + meeting.error) * UNITS_PER_METRE
+    loose = (2.0 * motion.slip + sweep.error) * UNITS_PER_METRE
     band = (0.8661 + sagitta + loose) * (1.0 + 1e-9)
-    outer = np.float64(meeting.units) + band
+    outer = np.float64(sweep.units) + band
     final = sagitta <= _LEAST_SAGITTA
-    room = outer / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE + 8.0 * meeting.error
-    _descend(meeting, Chord(t0, np.float64(meeting.units) - band, outer, room, final))
+    threshold = outer / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE + 8.0 * sweep.error
+    _descend(sweep, BodyChord(t0, np.float64(sweep.units) - band, outer, threshold, final))
     return final
 
 
-@borrowing
-def _advance(meeting, size, until, tolerance):
+@njit_no_refcount
+def _advance(sweep, size, until, tolerance):
     """Return how far nothing touches, if that is before `until`; else inf.
 
     scratch.pair is then the pair that touches first.
     """
-    motion, first = meeting.motion, meeting.scratch.first
+    motion, first = sweep.motion, sweep.scratch.first
     longest = 1.0
     if motion.bend > 8.0 * _CHORD_BEND * size:
         longest = math.sqrt(8.0 * _CHORD_BEND * size / motion.bend)
     t, length, refused = 0.0, longest, 0
     while True:
         after = until if t + length >= until else t + length
-        final = _search(meeting, t, after)
-        if stopped(meeting.stop):
+        final = _search(sweep, t, after)
+        if stopped(sweep.stop):
             return INFINITE
         if first[0] == INFINITE:
             if after >= until:
@@ -281,7 +286,7 @@ def _advance(meeting, size, until, tolerance):
         since = max(t, t + first[0] * (after - t) - 2.0**-52)
         sure = t + first[1] * (after - t) if first[1] <= 1.0 else INFINITE
         refused += 1
-        if final or refused > _MOST_REFUSED or motion.speed * (sure - since) <= tolerance:
+        if final or refused > _MAX_REFUSED or motion.speed * (sure - since) <= tolerance:
             return since
         length = max(min(sure - since, 0.25 * (after - t)), 2.0**-52)
         t = since
@@ -327,10 +332,10 @@ def sweep_bodies(
         largest = largest_term(poses[row], shifts[2], b.center[0, 0], b.center[0, 1], b.center[0, 2])
         error = max(largest_a, largest + b.radius[0]) * 2.0**-49
         units = np.int64(units_a + units_b + margin_units)
-        meeting = Meeting(motion, a, b, poses[row], units, error, scratch, stop)
+        sweep = BodySweep(motion, a, b, poses[row], units, error, scratch, stop)
         scratch.turns[1] += 1
-        place_standing_nodes(meeting, b.center.shape[0])
-        since = _advance(meeting, size, min(found, 1.0), tolerance)
+        place_standing_nodes(sweep, b.center.shape[0])
+        since = _advance(sweep, size, min(found, 1.0), tolerance)
         if since >= found or since == INFINITE:
             continue
         best, found = row, since

@@ -27,7 +27,7 @@ def bound_body(box, pose, origin, more, bounds):
 
 
 @nb.njit(nogil=True, cache=True)
-def find_near(box, first, last, more, bounds, kinds, wanted, skip, rows):
+def find_near_bodies(box, first, last, more, bounds, kinds, wanted, skip, rows):
     """Write the bodies whose bounds meet those of a motion, ascending, to rows (n,) int64.
 
     Returns how many.

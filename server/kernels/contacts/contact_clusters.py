@@ -14,29 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
-from ..core.gap_order import compare_gaps
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import U32
+from ..core.separation_order import compare_separations
 from ..core.stop_flag_checks import ROWS_AT_ONCE, copy_rows, stopped
 
 # Columns of a record. The first ORDER of them determine which pair is deeper: |a - b|^2 [exact
 # units^2], and the largest radius minus that of the scan point [exact units]. Pairs of equal
 # separation compare, in turn: scan point x, y, z [lattice], avatar centre x, y, z [exact units],
 # row of the avatar's point, scan number.
-SQUARE, DROP, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9, 10, 10, 11
+SQUARE, DEFICIT, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9, 10, 10, 11
 # A cluster is the record of its deepest pair, then the number of its pairs and the box of its
 # touched points. A cell is the same, followed by its place in the grid.
 PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 11, 12, 15, 18, 18, 21
-# Counters of `Memory.sizes`: cells, pairs kept, pairs listed, clusters listed, the last cell used.
+# Counters of `ContactState.sizes`: cells, pairs kept, pairs listed, clusters listed, the last cell
+# used.
 CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
 
 
-class Cells(NamedTuple):
+class ContactCells(NamedTuple):
     """Grid cells touched under one pose: an open-addressing hash table.
 
     table: (c, CELL) int64.
-    bound: (c,) float64 [steps]: a pair farther apart, the drop of its sphere included, is not the
-    cell's deepest.
+    bound: (c,) float64 [steps]: a pair farther apart, the deficit of its sphere included, is not
+    the cell's deepest.
     slots: (s,) int64, s a power of two, rows of `table` or -1; at most half of them are taken.
     """
 
@@ -45,7 +46,7 @@ class Cells(NamedTuple):
     slots: NDArray[np.int64]
 
 
-class Memory(NamedTuple):
+class ContactState(NamedTuple):
     """Results and state of a request, so that it can be resumed; the kernels grow it.
 
     cells: of the current pose.
@@ -58,7 +59,7 @@ class Memory(NamedTuple):
     rows; a pair's TAG is its row among the pose's clusters.
     """
 
-    cells: Cells
+    cells: ContactCells
     heap: NDArray[np.int64]
     sizes: NDArray[np.int64]
     cursor: NDArray[np.int64]
@@ -67,11 +68,11 @@ class Memory(NamedTuple):
     clusters: NDArray[np.int64]
 
 
-@borrowing
+@njit_no_refcount
 def deeper(a, i, b, j):
     """Return whether record a[i] precedes record b[j]: the deeper pair precedes."""
-    if a[i, DROP] != b[j, DROP]:
-        order = compare_gaps(a[i, SQUARE], -a[i, DROP], b[j, SQUARE], -b[j, DROP])
+    if a[i, DEFICIT] != b[j, DEFICIT]:
+        order = compare_separations(a[i, SQUARE], -a[i, DEFICIT], b[j, SQUARE], -b[j, DEFICIT])
         if order != 0:
             return order < 0
     elif a[i, SQUARE] != b[j, SQUARE]:
@@ -82,13 +83,13 @@ def deeper(a, i, b, j):
     return False
 
 
-@borrowing
+@njit_no_refcount
 def _swap(rows, i, j):
     for c in range(rows.shape[1]):
         rows[i, c], rows[j, c] = rows[j, c], rows[i, c]
 
 
-@borrowing
+@njit_no_refcount
 def _sift_down(rows, n, at):
     """Restore the heap rows[:n], least deep first, below row `at`."""
     while True:
@@ -120,14 +121,14 @@ def sort_rows(rows, n, stop):
         _sift_down(rows, end, 0)
 
 
-@borrowing
+@njit_no_refcount
 def _copy(record, rows, at):
     """Write record[0] to rows[at]."""
     for c in range(rows.shape[1]):
         rows[at, c] = record[0, c]
 
 
-@borrowing
+@njit_no_refcount
 def keep_deepest(heap, kept, record):
     """Insert record[0] into the `kept` deepest pairs if it belongs there; return the new number."""
     if kept < heap.shape[0]:
@@ -143,31 +144,31 @@ def keep_deepest(heap, kept, record):
     return kept
 
 
-@borrowing
+@njit_no_refcount
 def bound_after(record, at, units_per_step, error):
-    """Return the bound, as in `Cells`, set by record[at].
+    """Return the bound, as in `ContactCells`, set by record[at].
 
     Every pair that is not deeper lies beyond it, whatever float32 rounds.
     """
-    gap = np.sqrt(np.float64(record[at, SQUARE])) + np.float64(record[at, DROP])
+    gap = np.sqrt(np.float64(record[at, SQUARE])) + np.float64(record[at, DEFICIT])
     return gap / units_per_step * (1.0 + 2.0 * U32) + error
 
 
-@borrowing
-def square_below(bound, drop_steps):
-    """Return the float32 square above which no pair with this drop is within a bound.
+@njit_no_refcount
+def square_below(bound, deficit_steps):
+    """Return the float32 square above which no pair with this deficit is within a bound.
 
-    drop_steps: the drop [steps]. The counterpart is `far` of make_limits.
+    deficit_steps: the deficit [steps]. The counterpart is `far` of make_thresholds.
     """
-    above = bound - drop_steps
+    above = bound - deficit_steps
     # 8 as there, plus 2 for the rounding to float32: np.nextafter is a call, and this runs for
     # every scan point in contact.
     return np.float32(above * above * (1.0 + 10.0 * U32)) if above >= 0.0 else np.float32(-1.0)
 
 
-@borrowing
+@njit_no_refcount
 def listing_bound(heap, kept, units_per_step, error):
-    """Return the bound, as in `Cells`, of pairs that may be among those listed.
+    """Return the bound, as in `ContactCells`, of pairs that may be among those listed.
 
     kept: how many are listed so far.
     """
@@ -186,10 +187,10 @@ def make_cells(count, stop):
         if at % (64 * ROWS_AT_ONCE) == 0 and stopped(stop):
             break
         slots[at] = -1
-    return Cells(np.empty((count, CELL), np.int64), np.empty(count), slots)
+    return ContactCells(np.empty((count, CELL), np.int64), np.empty(count), slots)
 
 
-@borrowing
+@njit_no_refcount
 def find_slot(cells, x, y, z):
     """Return the slot of cell (x, y, z), or the free slot where it belongs."""
     # 21 bits of each, so that every product fits 63 bits.
@@ -204,7 +205,7 @@ def find_slot(cells, x, y, z):
         slot = (slot + 1) & last
 
 
-@borrowing
+@njit_no_refcount
 def enter_cell(cells, used, x, y, z):
     """Return the row of cell (x, y, z), created as row `used` if it is new.
 
@@ -217,16 +218,16 @@ def enter_cell(cells, used, x, y, z):
         cells.slots[slot] = row
         table = cells.table
         table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2] = x, y, z
-        # Every pair is deeper than this one, whose root is 2^31.5: a reach plus a drop is below
+        # Every pair is deeper than this one, whose root is 2^31.5: a reach plus a deficit is below
         # 2^31.
-        table[row, SQUARE], table[row, DROP], table[row, PAIRS] = np.iinfo(np.int64).max, 0, 0
+        table[row, SQUARE], table[row, DEFICIT], table[row, PAIRS] = np.iinfo(np.int64).max, 0, 0
         for r in range(3):
             table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
         cells.bound[row] = np.inf
     return row
 
 
-@borrowing
+@njit_no_refcount
 def cell_of(cells, sizes, record, edge):
     """Return the row of the cell of the record's scan point.
 
@@ -311,7 +312,7 @@ def _join_neighbours(cells, used, parent, stop):
 
 
 @nb.njit(nogil=True, cache=True)
-def _with_room(rows, used, more, stop):
+def _with_capacity(rows, used, more, stop):
     """Return `rows` with space for `more` rows after the used ones.
 
     Returns the rows unchanged once the stop flag is set.
@@ -324,20 +325,20 @@ def _with_room(rows, used, more, stop):
 
 
 @nb.njit(nogil=True, cache=True)
-def list_pose(memory, runs, stop):
+def list_pose(state, runs, stop):
     """List the pairs and clusters of the current pose, deepest first, and remove its cells.
 
     Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its
     lists grown, and whether the pose is listed. When the stop flag (1,) is set, the pose has no
     pairs and no clusters, and the memory must not be used for further poses.
     """
-    cells, heap, sizes = memory.cells, memory.heap, memory.sizes
+    cells, heap, sizes = state.cells, state.heap, state.sizes
     table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]
     parent, found = np.empty(used, np.int64), 0
     _join_neighbours(cells, used, parent, stop)
     for row in range(used):
         found += 1 if parent[row] == row else 0
-    clusters = _with_room(memory.clusters, sizes[CLUSTERS], found, stop)
+    clusters = _with_capacity(state.clusters, sizes[CLUSTERS], found, stop)
     own = clusters[sizes[CLUSTERS] :]
     rank, at = np.empty(used, np.int64), 0
     for row in range(used):  # a root precedes all rows below it
@@ -362,11 +363,11 @@ def list_pose(memory, runs, stop):
         for at in range(found):
             rank[own[at, TAG]] = at
     sort_rows(heap, kept, stop)
-    pairs = _with_room(memory.pairs, sizes[LISTED], kept, stop)
+    pairs = _with_capacity(state.pairs, sizes[LISTED], kept, stop)
     if stopped(stop):  # the rows above may be in any order
         runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], 0, sizes[CLUSTERS], 0
         sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
-        return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters), False
+        return ContactState(cells, heap, sizes, state.cursor, state.stack, pairs, clusters), False
     for i in range(kept):
         pairs[sizes[LISTED] + i] = heap[i]
         pairs[sizes[LISTED] + i, TAG] = rank[_root(parent, heap[i, TAG])]
@@ -375,4 +376,4 @@ def list_pose(memory, runs, stop):
     sizes[CLUSTERS] += found
     empty_cells(cells, used, stop)
     sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
-    return Memory(cells, heap, sizes, memory.cursor, memory.stack, pairs, clusters), True
+    return ContactState(cells, heap, sizes, state.cursor, state.stack, pairs, clusters), True

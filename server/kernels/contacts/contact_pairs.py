@@ -1,7 +1,7 @@
 """All pairs of points in contact under a pose: a complete joint descent of two hierarchies.
 
-The descent is that of overlap.py ([Fig12] section 6, corrected), but it does not end early: it
-examines every pair of leaf nodes whose bounds meet. There a float32 pass certifies most pairs as
+The descent is that of collide_poses.py ([Fig12] section 6, corrected), but it does not end early:
+it examines every pair of leaf nodes whose bounds meet. There a float32 pass certifies most pairs as
 near or far. Integers (NUMERICS.md N5) decide the pairs between, and measure those pairs that may be
 the deepest of their cell or among the deepest listed.
 
@@ -16,26 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
+from ..collide.collide_poses import nodes_meet
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import (
     ONE_SLACK,
     SLACK,
-    ByClass,
-    make_by_class,
-    make_limits,
+    ClassThresholds,
+    make_class_thresholds,
     make_placed,
+    make_thresholds,
     place_block,
     place_nodes,
-    set_by_class,
+    set_class_thresholds,
 )
 from ..core.pose_transform import MAX_REACH_UNITS, lattice_to_units, place, to_units
 from ..core.stop_flag_checks import stopped
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
-from ..overlap.overlap import nodes_meet
 from .contact_clusters import (
     CELLS,
     CENTER,
-    DROP,
+    DEFICIT,
     HIGH,
     KEPT,
     LOW,
@@ -47,7 +47,7 @@ from .contact_clusters import (
     SCAN,
     SQUARE,
     TAG,
-    Memory,
+    ContactState,
     bound_after,
     cell_of,
     deeper,
@@ -59,12 +59,12 @@ from .contact_clusters import (
 )
 
 
-class Asked(NamedTuple):
+class ContactOptions(NamedTuple):
     """Parameters of a request, in addition to the poses.
 
     rows: (b, LANES) int32, the row of the avatar's point in each lane.
     edges: (k,) int64, edge of a cell [steps].
-    kept: whether the arena holds scan numbers.
+    with_scan: whether the arena holds scan numbers.
     limit: number of pairs to list for each pose.
     visits: node visits a pose; -1: time is up, examine nothing more.
     cells: limit of the table of cells, a power of two.
@@ -72,13 +72,13 @@ class Asked(NamedTuple):
 
     rows: NDArray[np.int32]
     edges: NDArray[np.int64]
-    kept: bool
+    with_scan: bool
     limit: int
     visits: int
     cells: int
 
 
-class Tally(NamedTuple):
+class ContactResults(NamedTuple):
     """Results for k poses.
 
     counts: (3, k) int64, voxels missing, node visits, point tests.  pairs: (k,) int64.
@@ -92,26 +92,26 @@ class Tally(NamedTuple):
     runs: NDArray[np.int64]
 
 
-class Work(NamedTuple):
+class ContactScratch(NamedTuple):
     """Scratch of one call.
 
-    keep: (LANES,) bool.  mine: (3, LANES), squares: (LANES,), off: (3,) float32.
-    bound: (1,) float64, as in `Cells`, of the pairs listed.  error: (1,) float64, that of the
-    pose's `Limits`.
+    keep: (LANES,) bool.  avatar_lanes: (3, LANES), squares: (LANES,), off: (3,) float32.
+    bound: (1,) float64, as in `ContactCells`, of the pairs listed.  error: (1,) float64, that of
+    the pose's `Thresholds`.
     record: (1, RECORD) int64.  by_class: the pose's thresholds.
     """
 
     keep: NDArray[np.bool_]
-    mine: NDArray[np.float32]
+    avatar_lanes: NDArray[np.float32]
     squares: NDArray[np.float32]
     off: NDArray[np.float32]
     bound: NDArray[np.float64]
     error: NDArray[np.float64]
     record: NDArray[np.int64]
-    by_class: ByClass
+    by_class: ClassThresholds
 
 
-@borrowing
+@njit_no_refcount
 def _measure(avatar, m, block, lane, placed, scene, record):
     """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`.
 
@@ -134,21 +134,22 @@ def _measure(avatar, m, block, lane, placed, scene, record):
     return True
 
 
-@borrowing
-def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work):
+@njit_no_refcount
+def _gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch):
     """Count the pairs of one scan point with the points of a block.
 
-    The scan point is in work.record, the float32 squares of the block's points in work.squares.
+    The scan point is in scratch.record, the float32 squares of the block's points in
+    scratch.squares.
     own: the scan point's radius class. Returns how many are in contact.
     """
-    record, squares, listing, rows = work.record, work.squares, work.bound, asked.rows
-    cells, heap, sizes, per_step = memory.cells, memory.heap, memory.sizes, scene.units_per_step
-    table, bounds, error = cells.table, cells.bound, work.error[0]
-    drop, units = scene.drop[own], work.by_class.units[own]
-    near, far = work.by_class.near[own], work.by_class.far[own]
-    record[0, DROP] = drop
-    drop_steps = np.float64(drop) / per_step
-    listed, deepest = square_below(listing[0], drop_steps), np.float32(np.inf)
+    record, squares, listing, rows = scratch.record, scratch.squares, scratch.bound, options.rows
+    cells, heap, sizes, per_step = state.cells, state.heap, state.sizes, scene.units_per_step
+    table, bounds, error = cells.table, cells.bound, scratch.error[0]
+    deficit, units = scene.radius_deficit[own], scratch.by_class.units[own]
+    near, far = scratch.by_class.near[own], scratch.by_class.far[own]
+    record[0, DEFICIT] = deficit
+    deficit_steps = np.float64(deficit) / per_step
+    listed, deepest = square_below(listing[0], deficit_steps), np.float32(np.inf)
     cell, count = np.int64(-1), np.int64(0)
     for lane in range(avatar.count[a]):
         square = squares[lane]
@@ -157,7 +158,7 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
         if square <= near:
             if cell < 0:
                 cell = cell_of(cells, sizes, record, edge)
-                deepest = square_below(bounds[cell], drop_steps)
+                deepest = square_below(bounds[cell], deficit_steps)
             count += 1
             if square > deepest and square > listed:
                 continue
@@ -169,7 +170,7 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
                 continue
             if cell < 0:
                 cell = cell_of(cells, sizes, record, edge)
-                deepest = square_below(bounds[cell], drop_steps)
+                deepest = square_below(bounds[cell], deficit_steps)
             count += 1
         record[0, ROW] = rows[block, lane]
         record[0, TAG] = cell
@@ -177,11 +178,11 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
             for c in range(ORDER):
                 table[cell, c] = record[0, c]
             bounds[cell] = bound_after(record, 0, per_step, error)
-            deepest = square_below(bounds[cell], drop_steps)
+            deepest = square_below(bounds[cell], deficit_steps)
         if square <= listed:
             sizes[KEPT] = keep_deepest(heap, sizes[KEPT], record)
             listing[0] = listing_bound(heap, sizes[KEPT], per_step, error)
-            listed = square_below(listing[0], drop_steps)
+            listed = square_below(listing[0], deficit_steps)
     if count > 0:
         table[cell, PAIRS] += count
         for r in range(3):
@@ -190,22 +191,28 @@ def _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, 
     return count
 
 
-@borrowing
-def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, memory, work, i, tally):
+@njit_no_refcount
+def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge, state, scratch, i, results):
     """Gather the pairs in contact of a leaf node of the avatar and one of the scene.
 
-    voxel: the scene's voxel, at work.off. First, vector loops test all avatar points against the
+    voxel: the scene's voxel, at scratch.off. First, vector loops test all avatar points against the
     scene node's bound and all scan points against the avatar node's sphere. Then each remaining
     scan point is tested against all points of the avatar.
     """
     words, ints, halves = scene.words, scene.ints, scene.halves
-    lanes, nodes, off, keep, mine = placed.lanes, placed.nodes, work.off, work.keep, work.mine
-    fars, mask = work.by_class.far, work.by_class.mask
-    room = work.by_class.room[node_class(ints, row, mask)]
+    lanes, nodes, off, keep, avatar_lanes = (
+        placed.lanes,
+        placed.nodes,
+        scratch.off,
+        scratch.keep,
+        scratch.avatar_lanes,
+    )
+    fars, mask = scratch.by_class.far, scratch.by_class.mask
+    threshold = scratch.by_class.threshold[node_class(ints, row, mask)]
     cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
     nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
-    both = words[row + 3] + room
-    wide = words[row + 7] * (room + SLACK * both + SLACK * both)
+    both = words[row + 3] + threshold
+    wide = words[row + 7] * (threshold + SLACK * both + SLACK * both)
     least, most = words[row + 8] - wide, words[row + 9] + wide
     square = both * both * ONE_SLACK
     met = False
@@ -222,7 +229,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, 
     ly = off[1] + np.float32(ints[block_at + 1])
     lz = off[2] + np.float32(ints[block_at + 2])
     cx, cy, cz = nodes[0, a] - lx, nodes[1, a] - ly, nodes[2, a] - lz
-    both = nodes[3, a] + room
+    both = nodes[3, a] + threshold
     square = both * both * ONE_SLACK
     for j in range(LANES):
         dx = np.float32(halves[lane_at + j]) - cx
@@ -230,13 +237,13 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, 
         dz = np.float32(halves[lane_at + 2 * LANES + j]) - cz
         keep[j] = dx * dx + dy * dy + dz * dz <= square
     for j in range(LANES):
-        mine[0, j], mine[1, j], mine[2, j] = (
+        avatar_lanes[0, j], avatar_lanes[1, j], avatar_lanes[2, j] = (
             lanes[block, 0, j] - lx,
             lanes[block, 1, j] - ly,
             lanes[block, 2, j] - lz,
         )
-    record, squares = work.record, work.squares
-    coordinates, where, counts, pairs = scene.coordinates, scene.where, tally.counts, tally.pairs
+    record, squares = scratch.record, scratch.squares
+    coordinates, where, counts, pairs = scene.coordinates, scene.where, results.counts, results.pairs
     for j in range(ints[row + COUNT] & COUNTED):
         if not keep[j]:
             continue
@@ -248,7 +255,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, 
         far = fars[own]
         touched = False
         for lane in range(LANES):
-            dx, dy, dz = x - mine[0, lane], y - mine[1, lane], z - mine[2, lane]
+            dx, dy, dz = x - avatar_lanes[0, lane], y - avatar_lanes[1, lane], z - avatar_lanes[2, lane]
             squares[lane] = dx * dx + dy * dy + dz * dz
             touched |= squares[lane] <= far
         if not touched:
@@ -257,33 +264,33 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, asked, edge, 
             low = coordinates[voxel, r] * scene.voxel_steps + np.int64(ints[block_at + r])
             record[0, POINT + r] = low + np.int64(halves[lane_at + r * LANES + j])
         record[0, SCAN] = -1
-        if asked.kept:
+        if options.with_scan:
             record[0, SCAN] = halves[scan_run(where, voxel, scene.block_words) + scene_block * LANES + j]
-        pairs[i] += _gather_point(avatar, m, a, block, placed, scene, own, asked, edge, memory, work)
+        pairs[i] += _gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch)
 
 
-@borrowing
-def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally, stop):
+@njit_no_refcount
+def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, results, stop):
     """Gather all pairs in contact of the placed avatar and one resident voxel by a joint descent.
 
-    Continues from memory.cursor and its stack. Suspends, with a cursor depth other than 0, before a
+    Continues from state.cursor and its stack. Suspends, with a cursor depth other than 0, before a
     node test once the pose has cost `stop` node visits, where the cells have no space for another
     LANES, and when the scene's stop flag is set.
     """
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
-    nodes, off, stack, counts = placed.nodes, work.off, memory.stack, tally.counts
-    first, held, stamp, edges = avatar.first, avatar.count, placed.stamp, asked.edges
-    sizes, most_cells = memory.sizes, memory.cells.table.shape[0]
-    rooms, mask, flag = work.by_class.room, work.by_class.mask, scene.stop
+    nodes, off, stack, counts = placed.nodes, scratch.off, state.stack, results.counts
+    first, held, stamp, edges = avatar.first, avatar.count, placed.stamp, options.edges
+    sizes, most_cells = state.sizes, state.cells.table.shape[0]
+    thresholds, mask, flag = scratch.by_class.threshold, scratch.by_class.mask, scene.stop
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
-    depth = memory.cursor[2]
+    depth = state.cursor[2]
     if depth == 0:
         counts[1, i] += 1
         if nodes_meet(
             words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2], nodes[3, 0],
-            rooms[node_class(ints, base, mask)],
+            thresholds[node_class(ints, base, mask)],
         ):  # fmt: skip
             stack[0, 0], stack[0, 1] = 0, base
             depth = 1
@@ -303,15 +310,15 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
                 place_block(avatar, m, block, placed, scene)
                 stamp[block] = i
             _gather_leaves(
-                avatar, m, a, block, placed, scene, voxel, row, asked, edges[i], memory, work, i, tally
+                avatar, m, a, block, placed, scene, voxel, row, options, edges[i], state, scratch, i, results
             )
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
             counts[1, i] += held[a]
-            room = rooms[node_class(ints, row, mask)]
+            threshold = thresholds[node_class(ints, row, mask)]
             for child in range(a_first, a_first + held[a]):
                 if nodes_meet(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
-                    nodes[3, child], room,
+                    nodes[3, child], threshold,
                 ):  # fmt: skip
                     stack[depth, 0], stack[depth, 1] = child, row
                     depth += 1
@@ -320,99 +327,101 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, asked, memory, work, tally
             counts[1, i] += ints[row + COUNT] & COUNTED
             for child in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + child) * ROW_WORDS
-                room = rooms[node_class(ints, child_row, mask)]
-                if nodes_meet(words, child_row, x, y, z, nodes[3, a], room):
+                threshold = thresholds[node_class(ints, child_row, mask)]
+                if nodes_meet(words, child_row, x, y, z, nodes[3, a], threshold):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
-    memory.cursor[2] = depth
+    state.cursor[2] = depth
 
 
-@borrowing
-def _set_thresholds(units, extent, farthest, scene, work):
-    """Fill work.error and work.by_class for one pose.
+@njit_no_refcount
+def _set_thresholds(units, extent, farthest, scene, scratch):
+    """Fill scratch.error and scratch.by_class for one pose.
 
     units: reach of the largest sphere.  extent, farthest: of `place_nodes`.
     """
     per_step, steps = scene.units_per_step, scene.voxel_steps
     # No class has a larger error.
-    work.error[0] = make_limits(units, per_step, extent, farthest, steps).error
-    set_by_class(work.by_class, scene.drop, units, per_step, extent, farthest, steps)
+    scratch.error[0] = make_thresholds(units, per_step, extent, farthest, steps).error
+    set_class_thresholds(scratch.by_class, scene.radius_deficit, units, per_step, extent, farthest, steps)
 
 
-@borrowing
-def _cut_rest(reach, which, cursor, tally):
+@njit_no_refcount
+def _cut_rest(reach, which, cursor, results):
     """Mark the current pose and the remaining ones as cut."""
     for number in range(cursor[0], which.shape[0]):
         i = which[number]
-        tally.cut[i] |= reach.starts[i + 1] > reach.starts[i]
+        results.cut[i] |= reach.starts[i + 1] > reach.starts[i]
     cursor[0] = which.shape[0]
 
 
 @nb.njit(nogil=True, cache=True)
-def gather_contacts(poses, avatar, scene, reach, which, asked, closes, pause, memory, tally):
+def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, state, results):
     """Answer `contacts` for the poses numbered in `which`, usually in one call a request.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses; a voxel in it that
-    is not resident is counted as missing.  closes: whether this call sees the last voxels of its
-    poses; they are then listed.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses; a voxel in
+    it that is not resident is counted as missing.  closes: whether this call sees the last voxels
+    of its poses; they are then listed.
     pause: node visits after which the call returns with the work unfinished, 1 or more. The work is
-    finished when memory.cursor[0] == len(which). Until then, call again with the returned memory,
-    unless its table of cells has reached `asked.cells` and has no space for LANES more. A pose that
-    has cost `asked.visits` with work left is cut. Adds to `tally`.
+    finished when state.cursor[0] == len(which). Until then, call again with the returned memory,
+    unless its table of cells has reached `options.cells` and has no space for LANES more. A pose
+    that has cost `options.visits` with work left is cut. Adds to `results`.
     """
     placed = make_placed(avatar)
-    work = Work(
+    scratch = ContactScratch(
         np.empty(LANES, np.bool_), np.empty((3, LANES), np.float32), np.empty(LANES, np.float32),
         np.empty(3, np.float32), np.empty(1), np.empty(1), np.empty((1, RECORD), np.int64),
-        make_by_class(scene.drop),
+        make_class_thresholds(scene.radius_deficit),
     )  # fmt: skip
-    cursor, left = memory.cursor, np.int64(pause)
+    cursor, left = state.cursor, np.int64(pause)
     while cursor[0] < which.shape[0]:
         if stopped(scene.stop):
-            _cut_rest(reach, which, cursor, tally)
+            _cut_rest(reach, which, cursor, results)
             break
         i = which[cursor[0]]
         end = reach.starts[i + 1]
         if cursor[1] < 0:
             cursor[1], cursor[2] = reach.starts[i], 0
-        if cursor[1] < end and asked.visits >= 0:
+        if cursor[1] < end and options.visits >= 0:
             extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
-            _set_thresholds(reach.units[i], extent, farthest, scene, work)
-            work.bound[0] = listing_bound(
-                memory.heap, memory.sizes[KEPT], scene.units_per_step, work.error[0]
+            _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
+            scratch.bound[0] = listing_bound(
+                state.heap, state.sizes[KEPT], scene.units_per_step, scratch.error[0]
             )
             while cursor[1] < end:
                 voxel = reach.rows[cursor[1]]
                 if scene.where[voxel, 0] < 0:
-                    tally.counts[0, i] += 1
+                    results.counts[0, i] += 1
                     cursor[1] += 1
                     continue
-                before = tally.counts[1, i]
-                short = memory.sizes[CELLS] + LANES > memory.cells.table.shape[0]
+                before = results.counts[1, i]
+                short = state.sizes[CELLS] + LANES > state.cells.table.shape[0]
                 # Over the budget, and not merely suspended for lack of space?
-                if before >= asked.visits and not (short and cursor[2] > 0):
+                if before >= options.visits and not (short and cursor[2] > 0):
                     break
                 if stopped(scene.stop):
                     break
-                if left <= 0 or (short and memory.cells.table.shape[0] >= asked.cells):
-                    return memory
-                stop = min(np.int64(asked.visits), before + left)
+                if left <= 0 or (short and state.cells.table.shape[0] >= options.cells):
+                    return state
+                stop = min(np.int64(options.visits), before + left)
                 if short:
                     # Here and not in the descent: a loop that changes a tuple of arrays counts
                     # their references in every iteration, which took a third of the time.
-                    memory = Memory(
-                        grow_cells(memory.cells, memory.sizes[CELLS], scene.stop), memory.heap, memory.sizes, cursor,
-                        memory.stack, memory.pairs, memory.clusters,
+                    state = ContactState(
+                        grow_cells(state.cells, state.sizes[CELLS], scene.stop), state.heap, state.sizes, cursor,
+                        state.stack, state.pairs, state.clusters,
                     )  # fmt: skip
-                _gather_voxel(avatar, poses[i], i, placed, scene, voxel, asked, memory, work, tally, stop)
-                left -= tally.counts[1, i] - before
+                _gather_voxel(
+                    avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results, stop
+                )
+                left -= results.counts[1, i] - before
                 if cursor[2] == 0:
                     cursor[1] += 1
         if cursor[1] < end:
-            tally.cut[i] = True
+            results.cut[i] = True
         if closes:
-            memory, listed = list_pose(memory, tally.runs[i], scene.stop)
-            tally.cut[i] |= not listed
+            state, listed = list_pose(state, results.runs[i], scene.stop)
+            results.cut[i] |= not listed
         cursor[0] += 1
         cursor[1] = -1
-    return memory
+    return state

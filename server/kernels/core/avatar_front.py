@@ -17,26 +17,26 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
-from .borrowing_kernels import borrowing, inlined
+from .kernel_decorators import njit_inlined, njit_no_refcount
 from .placed_avatar import ONE_SLACK, SLACK, node_reach
 from .voxel_layout import LANES
 
 U = np.uint64
 # The front of a larger avatar consists of inner nodes. 256 are eight vector steps.
 MAX_FRONT = 256
-MOST_LEVELS = MAX_LEVELS
 # One list is written for each level of the descent; none is longer than the list above it.
-POOL = MAX_FRONT * (MOST_LEVELS + 2)
+LIST_CAPACITY = MAX_FRONT * (MAX_LEVELS + 2)
 # Coordinate that pads a list to whole vector steps: so far away that, with radius 0, no test keeps
 # it.
-NOWHERE = np.float32(1e30)
+FAR_AWAY = np.float32(1e30)
 
 
-class Front(NamedTuple):
+class AvatarFront(NamedTuple):
     """Lists of placed front nodes, one after another; scratch of one call.
 
-    bounds: (4, POOL) float32: x[], y[], z[] from the frame, radius[] [steps], rounded outward.
-    which: (POOL,) int32, numbers in the front.
+    bounds: (4, LIST_CAPACITY) float32: x[], y[], z[] from the frame, radius[] [steps], rounded
+    outward.
+    which: (LIST_CAPACITY,) int32, numbers in the front.
     keep: (MAX_FRONT,) bool, marks; keep8: the same memory as uint64, eight marks each.
     """
 
@@ -49,24 +49,24 @@ class Front(NamedTuple):
 @nb.njit(nogil=True, cache=True)
 def make_front(avatar):
     """Allocate scratch for one avatar (not empty); nothing is placed yet."""
-    which = np.empty(POOL, np.int32)
+    which = np.empty(LIST_CAPACITY, np.int32)
     for i in range(avatar.front.shape[1]):
         which[i] = i
     keep = np.zeros(MAX_FRONT, np.bool_)
-    return Front(np.empty((4, POOL), np.float32), which, keep, keep.view(np.uint64))
+    return AvatarFront(np.empty((4, LIST_CAPACITY), np.float32), which, keep, keep.view(np.uint64))
 
 
-@borrowing
-def pad(bounds, begin, end):
+@njit_no_refcount
+def pad_list(bounds, begin, end):
     """Fill entries [begin, end) of the lists with nodes that no test keeps."""
     for i in range(begin, end):
-        bounds[0, U(i)] = NOWHERE
+        bounds[0, U(i)] = FAR_AWAY
         bounds[1, U(i)] = np.float32(0.0)
         bounds[2, U(i)] = np.float32(0.0)
         bounds[3, U(i)] = np.float32(0.0)
 
 
-@borrowing
+@njit_no_refcount
 def place_front(avatar, m, scale, placed, scene, extent, bounds):
     """Place the front, after `place_root`, as the first list of `bounds`. Returns its length."""
     step = scene.step
@@ -82,17 +82,17 @@ def place_front(avatar, m, scale, placed, scene, extent, bounds):
             bounds[r, i] = np.float32((world - base) * per_step)
     for i in range(n):
         bounds[3, i] = node_reach(front[3, i], scale * per_step, extent)
-    pad(bounds, n, (n + LANES - 1) // LANES * LANES)
+    pad_list(bounds, n, (n + LANES - 1) // LANES * LANES)
     return n
 
 
-@inlined
-def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
+@njit_inlined
+def mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, threshold, keep):
     """Mark in `keep` the nodes of a list that meet the scene node `row`.
 
     The test is that of `nodes_meet`: the sphere, then the slab.
     at: the start of the list.  steps: its length in units of LANES nodes.  off: from the frame to
-    the voxel's low corner.  room: reach plus error. Returns whether any node meets.
+    the voxel's low corner.  threshold: reach plus error. Returns whether any node meets.
     """
     w = U(row)
     cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
@@ -105,7 +105,7 @@ def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
         for j in range(LANES):
             i = begin + U(j)
             dx, dy, dz = bounds[0, i] - cx, bounds[1, i] - cy, bounds[2, i] - cz
-            span = bounds[3, i] + room
+            span = bounds[3, i] + threshold
             both = radius + span
             along = nx * dx + ny * dy + nz * dz
             wide = length * (span + (SLACK * both + SLACK * both))
@@ -121,8 +121,8 @@ def sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, keep):
     return any_meets
 
 
-@inlined
-def take_kept(bounds, which, keep, keep8, at, steps, to):
+@njit_inlined
+def compact_marked(bounds, which, keep, keep8, at, steps, to):
     """Write the marked nodes of the list at `at` as a new list at `to`. Returns its length."""
     n = U(to)
     for eight in range(4 * steps):
@@ -130,15 +130,15 @@ def take_kept(bounds, which, keep, keep8, at, steps, to):
             continue
         for j in range(8 * eight, 8 * eight + 8):
             if keep[U(j)]:
-                move_node(bounds, which, U(at) + U(j), n)
+                copy_node(bounds, which, U(at) + U(j), n)
                 n += U(1)
     count = np.int64(n) - to
-    pad(bounds, to + count, to + (count + LANES - 1) // LANES * LANES)
+    pad_list(bounds, to + count, to + (count + LANES - 1) // LANES * LANES)
     return count
 
 
-@borrowing
-def move_node(bounds, which, at, to):
+@njit_no_refcount
+def copy_node(bounds, which, at, to):
     """Copy one node of the lists; at, to: uint64."""
     bounds[0, to] = bounds[0, at]
     bounds[1, to] = bounds[1, at]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from .borrowing_kernels import borrowing
+from .kernel_decorators import njit_no_refcount
 from .pose_transform import MAX_REACH_UNITS, largest_term, lattice_to_units, place, to_units
 from .voxel_layout import LANES
 
@@ -23,7 +23,7 @@ SLACK = np.float32(1e-6)
 ONE_SLACK = np.float32(1.0 + 2e-6)
 
 
-class Placed(NamedTuple):
+class PlacedAvatar(NamedTuple):
     """Avatar under one pose, float32 steps from `frame`, a lattice point; scratch of one call.
 
     nodes: (4, a): x[], y[], z[], radius[], rounded outward.  lanes: (b, 3, LANES), points.
@@ -39,7 +39,7 @@ class Placed(NamedTuple):
     shift: NDArray[np.float64]
 
 
-class Limits(NamedTuple):
+class Thresholds(NamedTuple):
     """Thresholds of one pose.
 
     reach, error: [steps], float32, rounded up.  near, far: squares, float32. A pair below `near`
@@ -54,14 +54,14 @@ class Limits(NamedTuple):
     units: np.int64
 
 
-class ByClass(NamedTuple):
-    """Thresholds of one pose by radius class; scratch of one call, as long as `SceneArrays.drop`.
+class ClassThresholds(NamedTuple):
+    """Thresholds of one pose by radius class; scratch of one call. As long as `radius_deficit`.
 
-    room: reach plus error, float32 [steps].  near, far, units: as in `Limits`.
+    threshold: reach plus error, float32 [steps].  near, far, units: as in `Thresholds`.
     mask: the number of classes minus one, uint64, for `node_class` and `point_class`.
     """
 
-    room: NDArray[np.float32]
+    threshold: NDArray[np.float32]
     near: NDArray[np.float32]
     far: NDArray[np.float32]
     units: NDArray[np.int64]
@@ -69,27 +69,31 @@ class ByClass(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_by_class(drop):
-    """Allocate scratch for the radius classes of `SceneArrays.drop`."""
-    n = drop.shape[0]
-    room, near, far = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    return ByClass(room, near, far, np.empty(n, np.int64), np.uint64(n - 1))
+def make_class_thresholds(deficit):
+    """Allocate scratch for the radius classes of `SceneArrays.radius_deficit`."""
+    n = deficit.shape[0]
+    threshold, near, far = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    return ClassThresholds(threshold, near, far, np.empty(n, np.int64), np.uint64(n - 1))
 
 
-@borrowing
-def set_by_class(by_class, drop, units, units_per_step, extent, farthest, voxel_steps):
+@njit_no_refcount
+def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farthest, voxel_steps):
     """Compute the thresholds of one pose for each radius class.
 
-    Arguments as for `make_limits`; `units` is for the largest radius.
+    Arguments as for `make_thresholds`; `units` is for the largest radius.
     """
-    for c in range(drop.shape[0]):
-        limits = make_limits(units - drop[c], units_per_step, extent, farthest, voxel_steps)
-        by_class.room[c] = limits.reach + limits.error
-        by_class.near[c], by_class.far[c], by_class.units[c] = limits.near, limits.far, limits.units
+    for c in range(deficit.shape[0]):
+        thresholds = make_thresholds(units - deficit[c], units_per_step, extent, farthest, voxel_steps)
+        by_class.threshold[c] = thresholds.reach + thresholds.error
+        by_class.near[c], by_class.far[c], by_class.units[c] = (
+            thresholds.near,
+            thresholds.far,
+            thresholds.units,
+        )
 
 
-@borrowing
-def make_limits(units, units_per_step, extent, farthest, voxel_steps):
+@njit_no_refcount
+def make_thresholds(units, units_per_step, extent, farthest, voxel_steps):
     """Compute the thresholds for a reach of `units`.
 
     extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed
@@ -116,7 +120,7 @@ def make_limits(units, units_per_step, extent, farthest, voxel_steps):
     far = np.float32(above * above * (1.0 + 8.0 * U32))
     # One float32 step outward covers the rounding to float32. At 0, nothing is certified near.
     near = np.nextafter(near, np.float32(-1.0)) if below > 0.0 else np.float32(-1.0)
-    return Limits(
+    return Thresholds(
         np.nextafter(np.float32(reach), np.float32(np.inf)),
         np.nextafter(np.float32(around), np.float32(np.inf)),
         near,
@@ -125,11 +129,11 @@ def make_limits(units, units_per_step, extent, farthest, voxel_steps):
     )
 
 
-@borrowing
+@njit_no_refcount
 def place_root(avatar, m, scale, placed, scene):
     """Choose the frame and place an avatar's root; fill placed.frame, shift and node 0.
 
-    Returns (extent, farthest) for `make_limits`, of the whole avatar.
+    Returns (extent, farthest) for `make_thresholds`, of the whole avatar.
     """
     per_step = 1.0 / scene.step
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
@@ -143,7 +147,7 @@ def place_root(avatar, m, scale, placed, scene):
     return extent, largest_term(m, placed.shift, x, y, z) * per_step + extent
 
 
-@borrowing
+@njit_no_refcount
 def node_reach(radius, steps, extent):
     """Return the radius [steps] of a placed node, rounded outward.
 
@@ -153,7 +157,7 @@ def node_reach(radius, steps, extent):
     return np.float32(radius * steps * (1.0 + 1e-6) + extent * 1e-6)
 
 
-@borrowing
+@njit_no_refcount
 def place_nodes(avatar, m, scale, placed, scene):
     """Place all nodes of an avatar; fill placed.frame, shift and nodes.
 
@@ -173,13 +177,13 @@ def place_nodes(avatar, m, scale, placed, scene):
     return extent, farthest
 
 
-@borrowing
+@njit_no_refcount
 def place_block(avatar, m, block, placed, scene):
     """Place the points of one leaf node of the avatar, all LANES at once."""
     place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
 
 
-@borrowing
+@njit_no_refcount
 def place_lanes(points, m, block, lanes, shift, frame, step):
     """Place the points of one leaf node, given the arrays themselves.
 
@@ -201,7 +205,7 @@ def place_lanes(points, m, block, lanes, shift, frame, step):
 def make_placed(avatar):
     """Allocate scratch for one avatar (not empty); nothing is placed yet."""
     blocks = avatar.points.shape[0]
-    return Placed(
+    return PlacedAvatar(
         np.empty((4, avatar.center.shape[0]), np.float32),
         np.empty((blocks, 3, LANES), np.float32),
         np.full(blocks, -1, np.int64),
@@ -210,7 +214,7 @@ def make_placed(avatar):
     )
 
 
-@borrowing
+@njit_no_refcount
 def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j):
     """Compute |a - b|^2 of one pair by the definition (NUMERICS.md N5), int64, exact units.
 
@@ -234,7 +238,7 @@ def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at,
     return square
 
 
-@borrowing
+@njit_no_refcount
 def pair_in_reach(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, units):
     """Return whether one pair is within `units`, tangency included."""
     square = pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j)

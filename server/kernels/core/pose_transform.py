@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
-from .borrowing_kernels import borrowing
+from .kernel_decorators import njit_no_refcount
 from .stop_flag_checks import stopped
 
 # Poses checked between two checks of the stop flag.
@@ -24,10 +24,10 @@ SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 
 # Distances are compared in exact units whose squares must fit 63 bits (NUMERICS.md N5): 16 m.
 MAX_REACH_UNITS = 1 << 30
-# Coordinates near a pose must be exact in float32, with a bit to spare (overlap.py).
+# Coordinates near a pose must be exact in float32, with a bit to spare (collide_poses.py).
 MAX_FRAME_STEPS = 1 << 23
 
-GOOD, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
+VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
 
 
 class Avatar(NamedTuple):
@@ -50,7 +50,7 @@ class Avatar(NamedTuple):
     front_first: int
 
 
-@borrowing
+@njit_no_refcount
 def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
     """Check that poses (k, 4, 4) float64 are similarities (N6); compute scales and reaches.
 
@@ -112,10 +112,10 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
         extent = reach / UNITS_PER_METRE + (node_radius[0] * scales[i] if node_radius.shape[0] else 0.0)
         if extent / scene.step + scene.voxel_steps > MAX_FRAME_STEPS:
             return LARGE_AVATAR, i, extent
-    return GOOD, 0, 0.0
+    return VALID, 0, 0.0
 
 
-@borrowing
+@njit_no_refcount
 def place(m, shift, r, x, y, z):
     """Return coordinate r of an avatar point placed by pose m, from the dataset's origin [m].
 
@@ -124,7 +124,7 @@ def place(m, shift, r, x, y, z):
     return ((m[r, 0] * x + m[r, 1] * y) + m[r, 2] * z) + shift[r]
 
 
-@borrowing
+@njit_no_refcount
 def largest_term(m, shift, x, y, z):
     """Return the largest sum of the absolute values of the terms of a placed coordinate [m].
 
@@ -138,13 +138,13 @@ def largest_term(m, shift, x, y, z):
     return largest
 
 
-@borrowing
+@njit_no_refcount
 def to_units(metres):
     """Convert a placed coordinate to exact units: times 2^26, half to even, int64."""
     return np.int64(np.rint(metres * UNITS_PER_METRE))
 
 
-@borrowing
+@njit_no_refcount
 def lattice_to_units(steps, units_per_step):
     """Convert a lattice coordinate to exact units: one float64 product, half to even, int64."""
     return np.int64(np.rint(np.float64(steps) * units_per_step))

@@ -5,13 +5,13 @@ loop, but not an atomic one. An atomic load costs the same as an ordinary load.
 """
 
 from ....schemas.kernels import compiling as nb
-from .borrowing_kernels import inlined
+from .kernel_decorators import njit_inlined
 
 # Largest number of node visits, for a search without a budget.
 NO_LIMIT = 1 << 62
 # Limit of node visits for a pose or a motion that is answered while the residency is locked: a few
 # milliseconds at most. A query that needs more is answered by the general path.
-MOST_QUICK_VISITS = 1 << 16
+MAX_RESIDENT_PATH_VISITS = 1 << 16
 # Rows copied, sorted or cleared between two checks of the stop flag: some hundred microseconds.
 ROWS_AT_ONCE = 512
 
@@ -27,7 +27,7 @@ def _load(context, flag):  # type: ignore[no-untyped-def]
     return nb.types.int64(flag), generate
 
 
-@inlined
+@njit_inlined
 def _stopped(flag):
     return _load(flag) != 0  # type: ignore[call-arg]  # an intrinsic's first parameter is the compiler's
 
@@ -40,8 +40,8 @@ def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
 stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
 
 
-@inlined
-def is_over(flag, visits, most):
+@njit_inlined
+def should_end(flag, visits, most):
     """Return whether a search ends early.
 
     It does once its request is stopped or it has cost more than `most` node visits.

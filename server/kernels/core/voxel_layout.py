@@ -21,9 +21,9 @@ another one where a scene requests normals:
 For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory).
 Scans take 2 more and radius classes 1.1 more, where kept.
 
-The radius class of a node (schemas/archive/radius_model.py) is the largest local class of the points below
-it, with RIM_BIT where all of them have it. It is the class of the largest sphere below the node
-under every radius model.
+The radius class of a node (schemas/archive/radius_model.py) is the largest local class of the
+points below it, with RIM_BIT where all of them have it. It is the class of the largest sphere below
+the node under every radius model.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT
 from ....schemas.archive.voxel import MAX_LEAF
 from ....schemas.kernels import compiling as nb
-from .borrowing_kernels import borrowing
+from .kernel_decorators import njit_no_refcount
 
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant
 # iterations and then does not vectorise them, which costs several times as much a pair.
@@ -69,8 +69,8 @@ class SceneArrays(NamedTuple):
     coordinates: (v, 3) int64, voxel coordinates.
     origin: (3,) float64 [m].  step: [m].
     block_words: words of a block, with or without radius classes.
-    drop: (1,) or (RADIUS_CLASSES,) int64, the largest radius minus the radius of each class, exact
-    units; one element where all spheres have the same radius.
+    radius_deficit: (1,) or (RADIUS_CLASSES,) int64, the largest radius minus the radius of each
+    class, exact units; one element where all spheres have the same radius.
     stop: (1,) int64, the request's stop flag (stop_flag_checks.py).
     """
 
@@ -84,7 +84,7 @@ class SceneArrays(NamedTuple):
     units_per_step: float
     voxel_steps: int
     block_words: int
-    drop: NDArray[np.int64]
+    radius_deficit: NDArray[np.int64]
     stop: NDArray[np.int64]
 
 
@@ -130,15 +130,15 @@ def normal_run(where, voxel, block_words, with_scan):
     return where[voxel, 2] + leaves * LANES * (4 if with_scan else 3)
 
 
-@borrowing
+@njit_no_refcount
 def node_class(ints, row, mask):
-    """Return the index of a scene node into `drop`. mask: the number of classes minus one."""
+    """Return a scene node's index into `radius_deficit`. mask: the number of classes minus one."""
     return np.uint64(ints[np.uint64(row + COUNT)] >> CLASS_SHIFT) & mask
 
 
-@borrowing
+@njit_no_refcount
 def point_class(ints, block_at, lane, mask):
-    """Return the index into `drop` of a point of the block at `block_at`.
+    """Return the index into `radius_deficit` of a point of the block at `block_at`.
 
     mask: the number of classes minus one. Where blocks hold no classes, this reads whatever follows
     the block in the arena, and the mask of 0 discards it.
@@ -165,7 +165,8 @@ def lay_out(voxel, links, arena, at_bytes, block_words, where):
     """Write the rows and blocks of a checked voxel into the arena, from byte `at_bytes` on.
 
     at_bytes: a multiple of 16.
-    voxel: (cells, nodes, top_shift) of schemas/archive/codec.py `OpenRecord`; center is therefore (3, n).
+    voxel: (cells, nodes, top_shift) of schemas/archive/codec.py `OpenRecord`; center is therefore
+    (3, n).
     links: its Links without the height.
     Writes where (3,) int64: first row [words], first block [ints], first lane [halves]. The points
     belong at the first lane (schemas/archive/codec.py, `OpenRecord.read_points`).

@@ -33,7 +33,7 @@ class VoxelTree(NamedTuple):
     unknown: NDArray[np.float64]
 
 
-class Lists(NamedTuple):
+class VoxelLists(NamedTuple):
     """Voxels that k rays or points reach, for each of them by ascending `near`.
 
     starts: (k + 1,) int64: the entries of i are [starts[i], starts[i + 1]).  rows: int64, index
@@ -108,7 +108,7 @@ def _enter(at, direction, low, high, grow, limit):
 
 
 @nb.njit(nogil=True, cache=True)
-def _apart(at, low, high, grow, limit):
+def _distance(at, low, high, grow, limit):
     """Return the distance of a point from the box [low, high] minus `grow`, at least 0.
 
     inf when it is beyond `limit`.
@@ -180,7 +180,7 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
             if along:
                 near = _enter(at, direction[i], box[0], box[1], grow, limit)
             else:
-                near = _apart(at, box[0], box[1], slack, limit)
+                near = _distance(at, box[0], box[1], slack, limit)
             lists.unseen[i] = min(lists.unseen[i], near * units_per_step)
         depth = 0
         if last >= 0:
@@ -196,7 +196,7 @@ def list_voxels(tree, at_units, direction, along, reach_units, radius_units, uni
             if along:
                 near = _enter(at, direction[i], tree.low[box], tree.high[box], grow, limit)
             else:
-                near = _apart(at, tree.low[box], tree.high[box], slack, limit)
+                near = _distance(at, tree.low[box], tree.high[box], slack, limit)
             if near == np.inf:
                 continue
             if level == 0:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
-from .borrowing_kernels import borrowing
-from .pose_transform import GOOD, check_poses, largest_term, place
+from .kernel_decorators import njit_no_refcount
+from .pose_transform import VALID, check_poses, largest_term, place
 from .stop_flag_checks import stopped
 
 # Cells or voxels examined between two checks of the stop flag.
@@ -37,7 +37,7 @@ class SceneIndex(NamedTuple):
     scene_high: NDArray[np.int64]
 
 
-class Reach(NamedTuple):
+class VoxelsInReach(NamedTuple):
     """Voxels that k poses could touch.
 
     scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.
@@ -54,7 +54,7 @@ class Reach(NamedTuple):
     outside: NDArray[np.bool_]
 
 
-@borrowing
+@njit_no_refcount
 def find_key(keys, key):
     """Return the row of `key` in sorted keys (v,) uint64, or -1."""
     lo, hi = 0, keys.shape[0]
@@ -67,7 +67,7 @@ def find_key(keys, key):
     return lo if lo < keys.shape[0] and keys[lo] == key else -1
 
 
-@borrowing
+@njit_no_refcount
 def grid_low(scene_low, voxel_steps):
     """Return the lowest lattice coordinate along an axis of the grid cells that hold points.
 
@@ -76,7 +76,7 @@ def grid_low(scene_low, voxel_steps):
     return np.float64(scene_low // voxel_steps * voxel_steps)
 
 
-@borrowing
+@njit_no_refcount
 def grid_high(scene_high, voxel_steps):
     """Return the highest lattice coordinate along an axis of the grid cells that hold points.
 
@@ -85,7 +85,7 @@ def grid_high(scene_high, voxel_steps):
     return np.float64((scene_high // voxel_steps + 1) * voxel_steps - 1)
 
 
-@borrowing
+@njit_no_refcount
 def _near_box(center, reach, low, high):
     """Return whether a ball (center (3,), reach) touches a box.
 
@@ -109,7 +109,7 @@ def find_reach(poses, avatar, radius, other_units, scene, index, reach):
     fault, pose, found = check_poses(
         poses, avatar.radius, radius, other_units, scene, reach.scales, reach.units
     )
-    if fault != GOOD or avatar.radius.shape[0] == 0:
+    if fault != VALID or avatar.radius.shape[0] == 0:
         return fault, pose, found, 0
     return fault, pose, found, voxels_in_reach(poses, avatar, scene, index, reach)
 

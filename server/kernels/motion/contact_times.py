@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import pair_square
 from ..core.pose_transform import SIMILARITY_TOLERANCE, lattice_to_units, place
 from ..core.voxel_layout import LANES, point_class
@@ -17,16 +17,20 @@ from .screw_motion import pose_at
 INFINITE = np.inf
 
 
-@borrowing
-def pair_times(gap, way, inner, outer):
-    """Compute when a point moving from `gap` by `way` (3,) comes within `outer` and `inner` of 0.
+@njit_no_refcount
+def pair_times(gap, displacement, inner, outer):
+    """Compute when a point moving from `gap` by `displacement` is within `outer` and `inner`.
 
-    Returns (enters, certain, closest), fractions. enters: when it comes within `outer`, rounded
-    down; inf when it never does in [0, 1]. certain: when it comes within `inner`, rounded up; inf
-    likewise. closest: the fraction of closest approach, within [0, 1].
+    Returns (enters, certain, closest), fractions. earliest_possible: when it comes within `outer`,
+    rounded down; inf when it never does in [0, 1]. earliest_certain: when it comes within `inner`,
+    rounded up; inf likewise. closest: the fraction of closest approach, within [0, 1].
     """
-    dot = gap[0] * way[0] + gap[1] * way[1] + gap[2] * way[2]
-    length = math.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    dot = gap[0] * displacement[0] + gap[1] * displacement[1] + gap[2] * displacement[2]
+    length = math.sqrt(
+        displacement[0] * displacement[0]
+        + displacement[1] * displacement[1]
+        + displacement[2] * displacement[2]
+    )
     apart = math.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2])
     # Rounding of these lines: a few half units in the last place of the lengths, which are integers
     # or far above 2^-500.
@@ -34,35 +38,45 @@ def pair_times(gap, way, inner, outer):
     outer, inner = outer + slack, inner - slack
     at = -dot / (length * length) if length > 1e-100 else 0.0
     closest = min(max(at, 0.0), 1.0)
-    ex, ey, ez = gap[0] + closest * way[0], gap[1] + closest * way[1], gap[2] + closest * way[2]
+    ex, ey, ez = (
+        gap[0] + closest * displacement[0],
+        gap[1] + closest * displacement[1],
+        gap[2] + closest * displacement[2],
+    )
     if ex * ex + ey * ey + ez * ez > outer * outer:
         return INFINITE, INFINITE, closest
-    enters, certain = INFINITE, INFINITE
+    earliest_possible, earliest_certain = INFINITE, INFINITE
     if apart <= outer:
-        enters = 0.0
+        earliest_possible = 0.0
         if apart <= inner:
             return 0.0, 0.0, closest
     if length <= 1e-100 or at <= 0.0:
-        return enters, certain, closest  # never nearer than now, and contact is not certain now
-    ex, ey, ez = gap[0] + at * way[0], gap[1] + at * way[1], gap[2] + at * way[2]
+        return (
+            earliest_possible,
+            earliest_certain,
+            closest,
+        )  # never nearer than now, and contact is not certain now
+    ex, ey, ez = gap[0] + at * displacement[0], gap[1] + at * displacement[1], gap[2] + at * displacement[2]
     square = ex * ex + ey * ey + ez * ez
     late = 2.0**-48 * (1.0 + apart / length)
-    if enters > 0.0:
-        enters = max(at - math.sqrt(max(outer * outer - square, 0.0)) / length - late, 0.0)
+    if earliest_possible > 0.0:
+        earliest_possible = max(at - math.sqrt(max(outer * outer - square, 0.0)) / length - late, 0.0)
     if inner > 0.0 and square < inner * inner:
-        certain = max(at - math.sqrt(inner * inner - square) / length + late, 0.0)
-        if certain > 1.0:
-            certain = INFINITE
-    return enters, certain, closest
+        earliest_certain = max(at - math.sqrt(inner * inner - square) / length + late, 0.0)
+        if earliest_certain > 1.0:
+            earliest_certain = INFINITE
+    return earliest_possible, earliest_certain, closest
 
 
-@borrowing
-def _drop_of(scene, pair):
+@njit_no_refcount
+def _deficit_of(scene, pair):
     """Return the largest radius of the scan minus that of a pair's scan point, exact units."""
-    return scene.drop[point_class(scene.ints, pair[4], pair[5], np.uint64(scene.drop.shape[0] - 1))]
+    return scene.radius_deficit[
+        point_class(scene.ints, pair[4], pair[5], np.uint64(scene.radius_deficit.shape[0] - 1))
+    ]
 
 
-@borrowing
+@njit_no_refcount
 def _scale_of(pose):
     """Return the scale of a pose, as `check_poses` computes it."""
     square = 0.0
@@ -73,65 +87,70 @@ def _scale_of(pose):
     return 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
 
 
-@borrowing
-def touches_at(job, t, pair):
-    """Return whether one pair (as in Moving) is in contact under M(t), by NUMERICS.md N5."""
-    scene, moving = job.scene, job.moving
-    pose_at(job.motion, t, moving.pose)
+@njit_no_refcount
+def touches_at(sweep, t, pair):
+    """Return whether one pair (as in MovingAvatar) is in contact under M(t), by NUMERICS.md N5."""
+    scene, moving = sweep.scene, sweep.moving
+    pose_at(sweep.motion, t, moving.pose)
     for r in range(3):
         moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
-    own = np.int64(np.rint(_scale_of(moving.pose) * job.radius * UNITS_PER_METRE))
-    units = own + job.other_units - _drop_of(scene, pair)
+    own = np.int64(np.rint(_scale_of(moving.pose) * sweep.radius * UNITS_PER_METRE))
+    units = own + sweep.other_units - _deficit_of(scene, pair)
     block, lane, voxel, lane_at, block_at, j = pair
-    square = pair_square(job.avatar, moving.pose, block, lane, moving, scene, voxel, lane_at, block_at, j)
+    square = pair_square(sweep.avatar, moving.pose, block, lane, moving, scene, voxel, lane_at, block_at, j)
     return square >= 0 and square <= units * units
 
 
-@borrowing
+@njit_no_refcount
 def scan_coordinate(scene, pair, r):
     """Return lattice coordinate r of a pair's scan point [steps]."""
     low = scene.coordinates[pair[2], r] * scene.voxel_steps + np.int64(scene.ints[pair[4] + r])
     return low + np.int64(scene.halves[pair[3] + r * LANES + pair[5]])
 
 
-@borrowing
-def _comes_first(job, pair, other):
+@njit_no_refcount
+def _comes_first(sweep, pair, other):
     """Return whether `pair` precedes `other`, which touches at the same moment.
 
     The scan point decides first, then the avatar's point.
     """
     for r in range(3):
-        one, two = scan_coordinate(job.scene, pair, r), scan_coordinate(job.scene, other, r)
+        one, two = scan_coordinate(sweep.scene, pair, r), scan_coordinate(sweep.scene, other, r)
         if one != two:
             return one < two
-    points = job.avatar.points
+    points = sweep.avatar.points
     for r in range(3):
         if points[pair[0], r, pair[1]] != points[other[0], r, other[1]]:
             return points[pair[0], r, pair[1]] < points[other[0], r, other[1]]
     return False
 
 
-@borrowing
-def _certain_by_integers(job, chord, pair, enters, certain, closest):
+@njit_no_refcount
+def _certain_by_integers(sweep, chord, pair, earliest_possible, earliest_certain, closest):
     """Return the fraction at which a pair is known to touch, tested by integers at two poses.
 
     The chord is final. The poses are the first pose of the whole motion, whose contacts are those
     of `collide`, and the pose where the pair is closest.
     """
-    if enters == 0.0 and chord.t0 == 0.0 and certain > 0.0 and touches_at(job, 0.0, pair):
+    if (
+        earliest_possible == 0.0
+        and chord.t0 == 0.0
+        and earliest_certain > 0.0
+        and touches_at(sweep, 0.0, pair)
+    ):
         return 0.0
-    if certain == INFINITE:
+    if earliest_certain == INFINITE:
         t = chord.t1 if closest >= 1.0 else chord.t0 + closest * (chord.t1 - chord.t0)
-        if touches_at(job, t, pair):
+        if touches_at(sweep, t, pair):
             return closest
-    return certain
+    return earliest_certain
 
 
-@borrowing
-def try_pair(job, chord, pair):
+@njit_no_refcount
+def try_pair(sweep, chord, pair):
     """Update moving.first and moving.pair with one pair, in float64."""
-    scene, moving, points = job.scene, job.moving, job.avatar.points
-    gap, way, first = moving.gap, moving.way, moving.first
+    scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
+    gap, displacement, first = moving.gap, moving.displacement, moving.first
     block, lane = pair[0], pair[1]
     x, y, z = points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
     for r in range(3):
@@ -139,17 +158,21 @@ def try_pair(job, chord, pair):
         end = place(moving.ends[1], moving.shifts[1], r, x, y, z) * UNITS_PER_METRE
         steps = scan_coordinate(scene, pair, r)
         gap[r] = begin - np.float64(lattice_to_units(steps, scene.units_per_step))
-        way[r] = end - begin
-    drop = np.float64(_drop_of(scene, pair))
-    enters, certain, closest = pair_times(gap, way, chord.inner - drop, chord.outer - drop)
-    if enters > first[2]:
+        displacement[r] = end - begin
+    deficit = np.float64(_deficit_of(scene, pair))
+    earliest_possible, earliest_certain, closest = pair_times(
+        gap, displacement, chord.inner - deficit, chord.outer - deficit
+    )
+    if earliest_possible > first[2]:
         return
-    key, best = enters, first[0]
+    key, best = earliest_possible, first[0]
     if chord.final:
-        certain = _certain_by_integers(job, chord, pair, enters, certain, closest)
-        key, best = certain, first[1]
-    first[0] = min(first[0], enters)
-    if key < best or (key == best and key < INFINITE and _comes_first(job, pair, moving.pair)):
-        first[1], first[2] = certain, key
+        earliest_certain = _certain_by_integers(
+            sweep, chord, pair, earliest_possible, earliest_certain, closest
+        )
+        key, best = earliest_certain, first[1]
+    first[0] = min(first[0], earliest_possible)
+    if key < best or (key == best and key < INFINITE and _comes_first(sweep, pair, moving.pair)):
+        first[1], first[2] = earliest_certain, key
         for n in range(6):
             moving.pair[n] = pair[n]

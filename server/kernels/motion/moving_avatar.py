@@ -1,4 +1,4 @@
-"""Avatar moving along one chord: both ends placed in float32, as placed_avatar.py places one pose."""
+"""Avatar moving along one chord, both ends placed in float32 as in placed_avatar.py."""
 
 import math
 from typing import NamedTuple
@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
+from ..collide.collide_poses import STACK
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.pose_transform import Avatar, largest_term, place
 from ..core.voxel_layout import LANES, SceneArrays
-from ..overlap.overlap import STACK
-from .screw_motion import Motion
+from .screw_motion import ScrewMotion
 
 # Error of float32 sums along a chord: w + t d, with t from two dot products and a quotient, is off
 # by less than 24 U32 of |w| + |d|.
@@ -20,30 +20,31 @@ ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
 
 
-class Moving(NamedTuple):
+class MovingAvatar(NamedTuple):
     """Avatar along one chord, float32 steps from `frame`, a lattice point; scratch of one call.
 
     nodes: (8, a): x[], y[], z[] at the beginning of the chord, radius[], the displacement to its
     end x[], y[], z[], and 1 / its square.
-    lanes: (b, 3, LANES), ways: (b, 4, LANES), the same of the points.
+    lanes: (b, 3, LANES), displacements: (b, 4, LANES), the same of the points.
     stamp: (b,) int64, the chord a block was placed for.  frame: (3,) int64.
     ends: (2, 4, 4), shifts: (2, 3), poses at the ends and t - O.
     pose, shift: (4, 4), (3,), the one pose that is tested with integers.
-    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points (placed_avatar.py).
+    pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points
+    (placed_avatar.py).
     best: (6,), that of the earliest contact found.
     first: (3,) float64, fractions of the chord, inf: never: when a contact is first possible; when
     `pair` certainly touches; the one of the two that prunes. On a chord worth halving, `pair` is
     the first that may touch; else it is the first that certainly touches.
-    limits: (2, c) float32, of the chord by radius class: reach plus error [steps], and `far`
-    (placed_avatar.py). It is one array because a job is passed on whole: with the four of `ByClass`, a
-    motion of the walk took a quarter longer.
+    thresholds: (2, c) float32, of the chord by radius class: reach plus error [steps], and `far`
+    (placed_avatar.py). It is one array because a sweep is passed on whole: with the four arrays of
+    `ClassThresholds`, a motion of the walk took a quarter longer.
     counters: (4,) int64, node visits, point tests, chords placed, largest number of visits.
-    gap, way, keep, off, stack: scratch.
+    gap, displacement, keep, off, stack: scratch.
     """
 
     nodes: NDArray[np.float32]
     lanes: NDArray[np.float32]
-    ways: NDArray[np.float32]
+    displacements: NDArray[np.float32]
     stamp: NDArray[np.int64]
     frame: NDArray[np.int64]
     ends: NDArray[np.float64]
@@ -53,29 +54,29 @@ class Moving(NamedTuple):
     pair: NDArray[np.int64]
     best: NDArray[np.int64]
     first: NDArray[np.float64]
-    limits: NDArray[np.float32]
+    thresholds: NDArray[np.float32]
     counters: NDArray[np.int64]
     gap: NDArray[np.float64]
-    way: NDArray[np.float64]
+    displacement: NDArray[np.float64]
     keep: NDArray[np.bool_]
     off: NDArray[np.float32]
     stack: NDArray[np.int64]
 
 
-class Job(NamedTuple):
+class AvatarSweep(NamedTuple):
     """One motion of one avatar in one scene.
 
-    motion: Motion.  avatar: Avatar.  scene: SceneArrays.  moving: Moving.
+    motion: ScrewMotion.  avatar: Avatar.  scene: SceneArrays.  moving: MovingAvatar.
     radius: of the avatar's points [m].  scale: of the poses.
     In exact units: other_units: the scan's largest radius plus the margin; units: these plus the
     avatar's radius at either end, the larger; loose: how much that may vary on the way. The reach
-    of a pair is less by its `SceneArrays.drop`.
+    of a pair is less by its `SceneArrays.radius_deficit`.
     """
 
-    motion: Motion
+    motion: ScrewMotion
     avatar: Avatar
     scene: SceneArrays
-    moving: Moving
+    moving: MovingAvatar
     radius: float
     scale: float
     other_units: int
@@ -83,7 +84,7 @@ class Job(NamedTuple):
     loose: float
 
 
-class Chord(NamedTuple):
+class AvatarChord(NamedTuple):
     """One interval.
 
     t0, t1: fractions.  inner, outer: U - band, U + band, exact units, with U of the scan's largest
@@ -99,10 +100,10 @@ class Chord(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_moving(avatar, drop):
-    """Allocate scratch for one avatar, not empty, and the radius classes of `SceneArrays.drop`."""
+def make_moving(avatar, deficit):
+    """Allocate scratch for one avatar, not empty, and as many classes as `deficit` has."""
     blocks = avatar.points.shape[0]
-    return Moving(
+    return MovingAvatar(
         np.empty((8, avatar.center.shape[0]), np.float32),
         np.empty((blocks, 3, LANES), np.float32),
         np.empty((blocks, 4, LANES), np.float32),
@@ -115,7 +116,7 @@ def make_moving(avatar, drop):
         np.zeros(6, np.int64),
         np.zeros(6, np.int64),
         np.empty(3),
-        np.empty((2, drop.shape[0]), np.float32),
+        np.empty((2, deficit.shape[0]), np.float32),
         np.zeros(4, np.int64),
         np.empty(3),
         np.empty(3),
@@ -125,7 +126,7 @@ def make_moving(avatar, drop):
     )
 
 
-@borrowing
+@njit_no_refcount
 def _inverse(x, y, z):
     """Return 1 / (x^2 + y^2 + z^2), or 0 for a vector too short to matter or to divide by.
 
@@ -135,12 +136,12 @@ def _inverse(x, y, z):
     return np.float32(ONE / square) if square > np.float32(1e-20) else ZERO
 
 
-@borrowing
+@njit_no_refcount
 def place_nodes(avatar, scale, speed, moving, scene):
     """Place an avatar's nodes at both ends of a chord; fill shifts, frame and nodes.
 
     speed: the farthest any point moves on the chord [m]. Returns (extent, farthest) for
-    `make_limits`.
+    `make_thresholds`.
     """
     per_step = 1.0 / scene.step
     nodes, frame = moving.nodes, moving.frame
@@ -168,17 +169,17 @@ def place_nodes(avatar, scale, speed, moving, scene):
     longest = math.sqrt(longest) * (1.0 + 1e-6)
     extent = avatar.radius[0] * scale * per_step + 1.0 + longest
     for i in range(count):
-        # The added 1e-6 is that of placed_avatar.py; it also covers a scale within 1e-9 of 1, or of the
-        # other end's.
+        # The added 1e-6 is that of placed_avatar.py; it also covers a scale within 1e-9 of 1, or of
+        # the other end's.
         nodes[3, i] = np.float32(avatar.radius[i] * scale * per_step * (1.0 + 1e-6) + extent * 1e-6)
     return extent + CHORD_ERROR * longest, farthest + extent
 
 
-@borrowing
+@njit_no_refcount
 def place_block(avatar, block, moving, scene):
     """Place the points of one leaf node of the avatar at both ends of a chord."""
     per_step = 1.0 / scene.step
-    lanes, ways, points = moving.lanes, moving.ways, avatar.points
+    lanes, displacements, points = moving.lanes, moving.displacements, avatar.points
     for r in range(3):
         base = np.float64(moving.frame[r]) * scene.step
         for j in range(LANES):
@@ -186,6 +187,8 @@ def place_block(avatar, block, moving, scene):
             world = place(moving.ends[0], moving.shifts[0], r, x, y, z)
             lanes[block, r, j] = np.float32((world - base) * per_step)
             end = place(moving.ends[1], moving.shifts[1], r, x, y, z)
-            ways[block, r, j] = np.float32((end - world) * per_step)
+            displacements[block, r, j] = np.float32((end - world) * per_step)
     for j in range(LANES):
-        ways[block, 3, j] = _inverse(ways[block, 0, j], ways[block, 1, j], ways[block, 2, j])
+        displacements[block, 3, j] = _inverse(
+            displacements[block, 0, j], displacements[block, 1, j], displacements[block, 2, j]
+        )

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 
 # Coefficients of sin(x) / x and cos(x), by powers of x^2, highest first. Up to pi/2, the omitted
 # terms are below 2^-58.
@@ -38,7 +38,7 @@ _COSINE = tuple((-1.0) ** n / math.factorial(2 * n) for n in range(11, -1, -1))
 _NO_TURN = 1e-30
 
 
-class Motion(NamedTuple):
+class ScrewMotion(NamedTuple):
     """One motion.
 
     first, last: (4, 4) poses.  axis: (3,) unit u.  half: A / 2, in [0, pi/2].  sine: sin(A / 2).
@@ -61,7 +61,7 @@ class Motion(NamedTuple):
     slip: float
 
 
-@borrowing
+@njit_no_refcount
 def sine_cosine(x):
     """Return sin(x) and cos(x) for 0 <= x <= pi/2.
 
@@ -76,7 +76,7 @@ def sine_cosine(x):
     return s * x, c
 
 
-@borrowing
+@njit_no_refcount
 def angle_of(s, c):
     """Return the angle in [0, pi/2] with the given sine and cosine; s^2 + c^2 is 1 to rounding.
 
@@ -89,7 +89,7 @@ def angle_of(s, c):
     return min(max(x, 0.0), 0.5 * math.pi)
 
 
-@borrowing
+@njit_no_refcount
 def _turn(axis, s, c, x, y, z):
     """Return (x, y, z) rotated about `axis` by the angle whose HALF has sine s and cosine c."""
     cx, cy, cz = axis[1] * z - axis[2] * y, axis[2] * x - axis[0] * z, axis[0] * y - axis[1] * x
@@ -195,10 +195,10 @@ def make_motion(first, last, box, origin):
     speed = speed * (1.0 + 1e-12) + loose + (angle + 1.0) * uneven * far
     bend = bend * (1.0 + 1e-12) + angle * loose + (angle * angle + 2.0 * angle) * uneven * far
     slip = 2.0**-47 * (moved + largest * far) + 2.0**-50 * place
-    return Motion(first, last, axis, half, sine, along, across, strain, speed, bend, slip)
+    return ScrewMotion(first, last, axis, half, sine, along, across, strain, speed, bend, slip)
 
 
-@borrowing
+@njit_no_refcount
 def _turn_back(axis, s, c, v):
     """Return v (3,), perpendicular to the axis, rotated back by the angle of sine s, cosine c."""
     return (
@@ -208,7 +208,7 @@ def _turn_back(axis, s, c, v):
     )
 
 
-@borrowing
+@njit_no_refcount
 def pose_at(motion, t, pose):
     """Write M(t), the pose at fraction t in [0, 1], into pose (4, 4), by the definition."""
     if t <= 0.0 or t >= 1.0:
@@ -235,7 +235,7 @@ def pose_at(motion, t, pose):
     pose[3, 3] = 1.0
 
 
-@borrowing
+@njit_no_refcount
 def poses_on(motion, fractions, poses):
     """Write M(t) for each of fractions (n,) into poses (n, 4, 4)."""
     for i in range(fractions.shape[0]):

@@ -13,28 +13,28 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.pose_transform import largest_term, place
 from ..core.stop_flag_checks import stopped
 from ..core.voxels_in_reach import find_key, grid_high, grid_low
 from .contact_times import INFINITE, scan_coordinate, touches_at
-from .moving_avatar import Job, make_moving
+from .moving_avatar import AvatarSweep, make_moving
 from .screw_motion import make_motion, pose_at
 from .sweep_interval import search
 
 # Extent of a segment, and thereby of what must be resident together: four avatars plus 8 m.
 _SEGMENT_SIZES, _SEGMENT_MORE = 4.0, 8.0
-# Limit of a segment in lattice steps: float32 is exact up to 2^24 (placed_avatar.py), and an avatar may
-# take 2^23.
+# Limit of a segment in lattice steps: float32 is exact up to 2^24 (placed_avatar.py), and an avatar
+# may take 2^23.
 _SEGMENT_STEPS = 2.0**21
 # Sagitta of a segment and of a first chord, in avatar sizes: boxes and spheres grow by it.
 _SEGMENT_BEND, _CHORD_BEND = 0.25, 1.0 / 16.0
 # Advances of one segment that settled nothing. Beyond this number, undecided parts stay undecided.
 # A full turn 1 um from a wall all the way takes some hundreds.
-MOST_REFUSED = 512
+MAX_REFUSED = 512
 
 
-class Progress(NamedTuple):
+class SweepProgress(NamedTuple):
     """Progress of each of k motions; all arrays (k,) unless stated.
 
     at, end: float64, the current segment.
@@ -69,7 +69,7 @@ def avatar_box(avatar):
     return box
 
 
-@borrowing
+@njit_no_refcount
 def _size_of(box, scale, units):
     """Return the size of an avatar with its reach, across [m].
 
@@ -81,7 +81,7 @@ def _size_of(box, scale, units):
     return math.sqrt(square) * scale + 2.0 * np.float64(units) / UNITS_PER_METRE + 1e-6
 
 
-@borrowing
+@njit_no_refcount
 def _longest(motion, most, sagitta):
     """Return the longest part of a motion within two limits.
 
@@ -95,7 +95,7 @@ def _longest(motion, most, sagitta):
     return length
 
 
-@borrowing
+@njit_no_refcount
 def _root_at(motion, t, avatar, scale, units, scene, pose, shift, center):
     """Place the avatar's root sphere under M(t): center (3,) [steps]; pose and shift are scratch.
 
@@ -112,8 +112,8 @@ def _root_at(motion, t, avatar, scale, units, scene, pose, shift, center):
     return span + largest_term(pose, shift, x, y, z) / scene.step * 2.0**-49
 
 
-@borrowing
-def _strays(motion, length, scene):
+@njit_no_refcount
+def _sagitta(motion, length, scene):
     """Return how far points stray from their chords on a part of the motion, at most [steps].
 
     0 for a motion that stands still.
@@ -123,22 +123,22 @@ def _strays(motion, length, scene):
     return (motion.bend * length * length / 8.0 + 4.0 * motion.slip + 2.0 / UNITS_PER_METRE) / scene.step
 
 
-@borrowing
-def _enters(begin, end, span, low, high):
+@njit_no_refcount
+def _entry_fraction(begin, end, span, low, high):
     """Return the fraction at which a moving cube (half edge span) first meets the box [low, high].
 
     begin, end: (3,), its centre. Rounded down; inf if it does not meet the box.
     """
     least, most = 0.0, 1.0
     for r in range(3):
-        way = end[r] - begin[r]
+        displacement = end[r] - begin[r]
         near, far = np.float64(low[r]) - span - begin[r], np.float64(high[r]) + span - begin[r]
-        if way == 0.0:
+        if displacement == 0.0:
             if near > 0.0 or far < 0.0:
                 return INFINITE
             continue
-        first, last = near / way, far / way
-        if way < 0.0:
+        first, last = near / displacement, far / displacement
+        if displacement < 0.0:
             first, last = last, first
         # near and far are rounded to 2^-52 of terms; `span` is wider than necessary by that much
         # (voxels_in_reach).
@@ -148,7 +148,7 @@ def _enters(begin, end, span, low, high):
     return max(0.0, least - 1e-9)
 
 
-@borrowing
+@njit_no_refcount
 def _still_near(center, span, low, high):
     """Return whether a ball touches a voxel's box, by the test of voxels_in_reach."""
     square = 0.0
@@ -192,7 +192,7 @@ def _list_rows(begin, end, span, still, scene, index, rows, count):
             if row < 0:
                 continue
         low, high = index.low[row], index.high[row]
-        if _enters(begin, end, span, low, high) == INFINITE or (
+        if _entry_fraction(begin, end, span, low, high) == INFINITE or (
             still and not _still_near(begin, span, low, high)
         ):
             continue
@@ -236,11 +236,11 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
             stop = 1.0 if t + length >= 1.0 - 1e-12 else t + length
             span = _root_at(motion, t, avatar, scales[i], units[i], scene, pose, shift, begin)
             span = max(span, _root_at(motion, stop, avatar, scales[i], units[i], scene, pose, shift, end))
-            span += _strays(motion, stop - t, scene)
+            span += _sagitta(motion, stop - t, scene)
             # Outside the scene's bounds there are only cells of voxels whose own bounds are not
             # proved.
             if (
-                _enters(begin, end, span, index.scene_low, index.scene_high) < INFINITE
+                _entry_fraction(begin, end, span, index.scene_low, index.scene_high) < INFINITE
                 or _list_rows(begin, end, span, motion.speed == 0.0, scene, index, rows, count) > count
             ):
                 if length > segment * (1.0 + 1e-9):
@@ -276,7 +276,7 @@ def sweep_segments(
     A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
     it. Once the scene's stop flag is set, a motion is unknown from its current position on.
     """
-    moving = make_moving(avatar, scene.drop)
+    moving = make_moving(avatar, scene.radius_deficit)
     begin, end = np.empty(3), np.empty(3)
     for number in range(which.shape[0]):
         i = which[number]
@@ -291,15 +291,15 @@ def sweep_segments(
         span = max(
             span, _root_at(motion, t1, avatar, scales[i], units[i], scene, moving.pose, moving.shift, end)
         )
-        span += _strays(motion, t1 - t0, scene)
+        span += _sagitta(motion, t1 - t0, scene)
         gap = INFINITE
         for at in range(starts[i], starts[i + 1]):
             row = rows[at]
             if scene.where[row, 0] < 0:
                 counts[0, i] += np.uint32(1)
-                gap = min(gap, _enters(begin, end, span, index.low[row], index.high[row]))
+                gap = min(gap, _entry_fraction(begin, end, span, index.low[row], index.high[row]))
         moving.counters[0], moving.counters[1], moving.counters[3] = 0, 0, progress.visits[i]
-        job = Job(
+        sweep = AvatarSweep(
             motion,
             avatar,
             scene,
@@ -311,28 +311,28 @@ def sweep_segments(
             np.float64(loose[i]),
         )
         size = _size_of(box, scales[i], units[i])
-        lower, upper, steps = _advance(job, t0, t1, rows[starts[i] : starts[i + 1]], size, tolerance)
+        lower, upper, steps = _advance(sweep, t0, t1, rows[starts[i] : starts[i + 1]], size, tolerance)
         if gap < INFINITE:
             lower = min(lower, max(t0, t0 + gap * (t1 - t0) - 2.0**-52))
         progress.lower[i] = min(progress.lower[i], lower)
         if upper < progress.upper[i]:
             progress.upper[i] = upper
-            _name_witness(job, upper, progress.witness[i])
+            _name_witness(sweep, upper, progress.witness[i])
         progress.visits[i] -= moving.counters[0]
         counts[1, i] += np.uint32(moving.counters[0])
         counts[2, i] += np.uint32(moving.counters[1])
         counts[3, i] += np.uint32(steps)
 
 
-@borrowing
-def _advance(job, start, stop, rows, size, tolerance):
+@njit_no_refcount
+def _advance(sweep, start, stop, rows, size, tolerance):
     """Advance one motion over [start, stop] through some voxels. Return (lower, upper, advances).
 
     Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
     was found. lower is `stop` when nothing touches in [start, stop]. A graze fixes lower; the part
     after it is still searched for contacts.
     """
-    motion, moving = job.motion, job.moving
+    motion, moving = sweep.motion, sweep.moving
     t, lower, upper, refused, steps = start, -1.0, INFINITE, 0, 0
     best = moving.best
     still, begun = motion.speed == 0.0, False
@@ -341,26 +341,26 @@ def _advance(job, start, stop, rows, size, tolerance):
     while True:
         after = stop if t + length >= stop else t + length
         steps += 1
-        whole, final = search(job, t, after, rows)
-        enters, certain = moving.first[0], moving.first[1]
-        if enters == 0.0 and not final and t == 0.0 and not begun:
+        whole, final = search(sweep, t, after, rows)
+        earliest_possible, earliest_certain = moving.first[0], moving.first[1]
+        if earliest_possible == 0.0 and not final and t == 0.0 and not begun:
             # It may touch at the start: the search ended at the first doubt.
             begun = True
-            search(job, 0.0, 0.0, rows)
-            certain = moving.first[1]
+            search(sweep, 0.0, 0.0, rows)
+            earliest_certain = moving.first[1]
         sure = INFINITE
-        if certain < INFINITE:
-            sure = after if certain >= 1.0 else min(after, t + certain * (after - t))
-            if touches_at(job, sure, moving.pair):
+        if earliest_certain < INFINITE:
+            sure = after if earliest_certain >= 1.0 else min(after, t + earliest_certain * (after - t))
+            if touches_at(sweep, sure, moving.pair):
                 upper, stop = sure, sure
                 for n in range(6):
                     best[n] = moving.pair[n]
             else:  # the proof requires contact; without it nothing is claimed
-                sure, enters = INFINITE, 0.0
+                sure, earliest_possible = INFINITE, 0.0
         since = t
-        if enters < INFINITE:
-            since = max(t, t + enters * (after - t) - 2.0**-52)
-        if not whole or refused > MOST_REFUSED:
+        if earliest_possible < INFINITE:
+            since = max(t, t + earliest_possible * (after - t) - 2.0**-52)
+        if not whole or refused > MAX_REFUSED:
             lower = t if lower < 0.0 else lower
             if not whole:
                 break
@@ -370,12 +370,12 @@ def _advance(job, start, stop, rows, size, tolerance):
                 break
             length = max(min(sure - since, 0.5 * (after - t)), 2.0**-52)
             t, refused = since, refused + 1
-        elif enters == INFINITE or still:
+        elif earliest_possible == INFINITE or still:
             t, length = after, 2.0 * length
-        elif final or refused > MOST_REFUSED:
+        elif final or refused > MAX_REFUSED:
             lower = since if lower < 0.0 else lower
             t, refused = after, refused + 1
-            length = 2.0 * length if refused <= MOST_REFUSED else longest
+            length = 2.0 * length if refused <= MAX_REFUSED else longest
         else:
             length = max(0.25 * (after - t), 2.0**-52)
             t, refused = since, refused + 1
@@ -386,15 +386,15 @@ def _advance(job, start, stop, rows, size, tolerance):
     return (t if lower < 0.0 else lower), upper, steps
 
 
-@borrowing
-def _name_witness(job, t, witness):
+@njit_no_refcount
+def _name_witness(sweep, t, witness):
     """Write the centres (2, 3) of moving.pair under M(t), world [m].
 
     The avatar's centre as placed comes first, then the scan's.
     """
-    scene, moving, points = job.scene, job.moving, job.avatar.points
+    scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
     pair = moving.pair
-    pose_at(job.motion, t, moving.pose)
+    pose_at(sweep.motion, t, moving.pose)
     x, y, z = points[pair[0], 0, pair[1]], points[pair[0], 1, pair[1]], points[pair[0], 2, pair[1]]
     for r in range(3):
         moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
@@ -403,7 +403,9 @@ def _name_witness(job, t, witness):
 
 
 @nb.njit(nogil=True, cache=True)
-def look_around(box, first, last, avatar, scales, units, scene, index, unknown, until, outside, lost):
+def find_unknown_regions(
+    box, first, last, avatar, scales, units, scene, index, unknown, until, outside, unknown_from
+):
     """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, until].
 
     Writes outside (k,) bool, the reach leaves the scene's bounds; lost (k,) float64, when it first
@@ -415,9 +417,9 @@ def look_around(box, first, last, avatar, scales, units, scene, index, unknown, 
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
     for i in range(first.shape[0]):
         motion = make_motion(first[i], last[i], box, scene.origin)
-        outside[i], lost[i] = False, INFINITE
+        outside[i], unknown_from[i] = False, INFINITE
         if stopped(scene.stop):
-            lost[i] = 0.0
+            unknown_from[i] = 0.0
             continue
         size = _size_of(box, scales[i], units[i])
         parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * until[i]))) + 1
@@ -426,11 +428,11 @@ def look_around(box, first, last, avatar, scales, units, scene, index, unknown, 
             t0, t1 = until[i] * part / parts, until[i] * (part + 1) / parts
             span = _root_at(motion, t0, avatar, scales[i], units[i], scene, pose, shift, begin)
             span = max(span, _root_at(motion, t1, avatar, scales[i], units[i], scene, pose, shift, end))
-            span += _strays(motion, t1 - t0, scene)
+            span += _sagitta(motion, t1 - t0, scene)
             for r in range(3):
                 outside[i] |= min(begin[r], end[r]) - span < index.scene_low[r]
                 outside[i] |= max(begin[r], end[r]) + span > index.scene_high[r]
             for u in range(unknown.shape[0]):
-                met = _enters(begin, end, span, unknown[u, 0], unknown[u, 1])
+                met = _entry_fraction(begin, end, span, unknown[u, 0], unknown[u, 1])
                 if met < INFINITE:
-                    lost[i] = min(lost[i], max(0.0, t0 + met * (t1 - t0) - 2.0**-52))
+                    unknown_from[i] = min(unknown_from[i], max(0.0, t0 + met * (t1 - t0) - 2.0**-52))

@@ -23,8 +23,8 @@ point on a line from a fixed point: both moments are roots of a quadratic. They 
 the point of closest approach, whose rounding is relative to the lengths and not to their squares. A
 node's sphere moves straight with its centre: |lerp(x) - lerp(c)| is convex in t and therefore never
 exceeds the radius. Node pairs are pruned by the least distance of the centre's chord, up to the
-earliest certain contact found so far, in float32 with the error bound of placed_avatar.py enlarged by 32
-half units in the last place of the chord.
+earliest certain contact found so far, in float32 with the error bound of placed_avatar.py enlarged
+by 32 half units in the last place of the chord.
 
 The resulting interval is halved and quartered until its ends are within the tolerance, or until B
 (t1 - t0)^2 / 8 is negligible beside rounding; what is undecided then is a graze. The pairs that are
@@ -37,12 +37,12 @@ import math
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ..core.borrowing_kernels import borrowing
-from ..core.placed_avatar import ONE_SLACK, SLACK, make_limits
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.placed_avatar import ONE_SLACK, SLACK, make_thresholds
 from ..core.stop_flag_checks import stopped
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
 from .contact_times import INFINITE, try_pair
-from .moving_avatar import ZERO, Chord, place_block, place_nodes
+from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
 from .screw_motion import pose_at
 
 # Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
@@ -50,15 +50,15 @@ from .screw_motion import pose_at
 LEAST_SAGITTA = 0.25
 
 
-@borrowing
-def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, room):
-    """Return whether a moving sphere comes within `room` of a node's points, by the node's bounds.
+@njit_no_refcount
+def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, threshold):
+    """Return whether a moving sphere may come within `threshold` of a node's points.
 
     The sphere moves from (x, y, z) by (dx, dy, dz); its way up to the fraction `latest` counts.
-    room: reach plus error. Tests the sphere, then the slab. All float32.
+    threshold: reach plus error. Tests the sphere, then the slab. All float32.
     """
     wx, wy, wz = x - words[row], y - words[row + 1], z - words[row + 2]
-    span = radius + room
+    span = radius + threshold
     both = words[row + 3] + span
     t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
     ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
@@ -71,36 +71,36 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, room):
     return min(begin, end) <= words[row + 9] + wide and max(begin, end) >= words[row + 8] - wide
 
 
-@borrowing
+@njit_no_refcount
 def _latest(moving):
     """Return the fraction of the chord that still matters, float32, rounded up."""
     return np.float32(min(moving.first[2] * (1.0 + 1e-6) + 1e-30, 1.0))
 
 
-@borrowing
-def _leaves(job, chord, voxel, block, row):
+@njit_no_refcount
+def _leaves(sweep, chord, voxel, block, row):
     """Update moving.first with all pairs of a leaf node of the avatar and one of the scene.
 
-    As in overlap.py: avatar points are tested against the node's bound, then against its points,
-    each in one vector loop.
+    As in collide_poses.py: avatar points are tested against the node's bound, then against its
+    points, each in one vector loop.
     """
-    scene, moving = job.scene, job.moving
+    scene, moving = sweep.scene, sweep.moving
     words, ints, halves = scene.words, scene.ints, scene.halves
-    lanes, ways, keep, off = moving.lanes, moving.ways, moving.keep, moving.off
-    limits, mask = moving.limits, np.uint64(scene.drop.shape[0] - 1)
+    lanes, displacements, keep, off = moving.lanes, moving.displacements, moving.keep, moving.off
+    thresholds, mask = moving.thresholds, np.uint64(scene.radius_deficit.shape[0] - 1)
     largest = node_class(ints, row, mask)  # class of the spheres in the scene's block
-    room, far = limits[0, largest], limits[1, largest]
+    threshold, far = thresholds[0, largest], thresholds[1, largest]
     latest = _latest(moving)
     cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
     nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
-    both = words[row + 3] + room
-    wide = words[row + 7] * (room + SLACK * both + SLACK * both)
+    both = words[row + 3] + threshold
+    wide = words[row + 7] * (threshold + SLACK * both + SLACK * both)
     least, most = words[row + 8] - wide, words[row + 9] + wide
     square = both * both * ONE_SLACK
     for j in range(LANES):
-        dx, dy, dz = ways[block, 0, j], ways[block, 1, j], ways[block, 2, j]
+        dx, dy, dz = displacements[block, 0, j], displacements[block, 1, j], displacements[block, 2, j]
         wx, wy, wz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
-        t = min(max(-(wx * dx + wy * dy + wz * dz) * ways[block, 3, j], ZERO), latest)
+        t = min(max(-(wx * dx + wy * dy + wz * dz) * displacements[block, 3, j], ZERO), latest)
         ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
         begin = nx * wx + ny * wy + nz * wz
         end = begin + latest * (nx * dx + ny * dy + nz * dz)
@@ -118,10 +118,10 @@ def _leaves(job, chord, voxel, block, row):
             continue
         x, y, z = lanes[block, 0, lane] - lx, lanes[block, 1, lane] - ly, lanes[block, 2, lane] - lz
         dx, dy, dz, inverse = (
-            ways[block, 0, lane],
-            ways[block, 1, lane],
-            ways[block, 2, lane],
-            ways[block, 3, lane],
+            displacements[block, 0, lane],
+            displacements[block, 1, lane],
+            displacements[block, 2, lane],
+            displacements[block, 3, lane],
         )
         moving.counters[1] += LANES
         touched = False
@@ -141,22 +141,22 @@ def _leaves(job, chord, voxel, block, row):
             t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
             ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
             square = ex * ex + ey * ey + ez * ez
-            if square <= far and square <= limits[1, point_class(ints, block_at, j, mask)]:
-                try_pair(job, chord, (block, lane, voxel, lane_at, block_at, j))
+            if square <= far and square <= thresholds[1, point_class(ints, block_at, j, mask)]:
+                try_pair(sweep, chord, (block, lane, voxel, lane_at, block_at, j))
                 latest = _latest(moving)
 
 
-@borrowing
-def _sweep_voxel(job, chord, voxel):
+@njit_no_refcount
+def _sweep_voxel(sweep, chord, voxel):
     """Update moving.first with one resident voxel by a joint descent, depth first.
 
     Returns whether to continue: not when nothing can be earlier, when the visits are spent, or when
     the scene's stop flag is set.
     """
-    avatar, scene, moving = job.avatar, job.scene, job.moving
+    avatar, scene, moving = sweep.avatar, sweep.scene, sweep.moving
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
-    rooms, mask = moving.limits[0], np.uint64(scene.drop.shape[0] - 1)
+    thresholds, mask = moving.thresholds[0], np.uint64(scene.radius_deficit.shape[0] - 1)
     nodes, off, stack, counters = moving.nodes, moving.off, moving.stack, moving.counters
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - moving.frame[r])
@@ -167,7 +167,7 @@ def _sweep_voxel(job, chord, voxel):
     if _nodes_meet(
         words, base, nodes[0, 0] - off[0], nodes[1, 0] - off[1], nodes[2, 0] - off[2],
         nodes[4, 0], nodes[5, 0], nodes[6, 0], nodes[7, 0], nodes[3, 0], latest,
-        rooms[node_class(ints, base, mask)],
+        thresholds[node_class(ints, base, mask)],
     ):  # fmt: skip
         depth = 1
     while depth > 0:
@@ -181,18 +181,18 @@ def _sweep_voxel(job, chord, voxel):
             if moving.stamp[block] != counters[2]:
                 place_block(avatar, block, moving, scene)
                 moving.stamp[block] = counters[2]
-            _leaves(job, chord, voxel, block, row)
+            _leaves(sweep, chord, voxel, block, row)
             if moving.first[2] <= 0.0:
                 return False
             latest = _latest(moving)
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
             counters[0] += avatar.count[a]
-            room = rooms[node_class(ints, row, mask)]
+            threshold = thresholds[node_class(ints, row, mask)]
             for child in range(a_first, a_first + avatar.count[a]):
                 if _nodes_meet(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
                     nodes[4, child], nodes[5, child], nodes[6, child], nodes[7, child], nodes[3, child],
-                    latest, room,
+                    latest, threshold,
                 ):  # fmt: skip
                     stack[depth, 0], stack[depth, 1] = child, row
                     depth += 1
@@ -202,40 +202,42 @@ def _sweep_voxel(job, chord, voxel):
             counters[0] += ints[row + COUNT] & COUNTED
             for i in range(ints[row + COUNT] & COUNTED):
                 child_row = base + (b_first + i) * ROW_WORDS
-                room = rooms[node_class(ints, child_row, mask)]
-                if _nodes_meet(words, child_row, x, y, z, dx, dy, dz, inverse, nodes[3, a], latest, room):
+                threshold = thresholds[node_class(ints, child_row, mask)]
+                if _nodes_meet(
+                    words, child_row, x, y, z, dx, dy, dz, inverse, nodes[3, a], latest, threshold
+                ):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
     return True
 
 
-@borrowing
-def search(job, t0, t1, rows):
+@njit_no_refcount
+def search(sweep, t0, t1, rows):
     """Descend once over the interval [t0, t1], through those voxels of `rows` that are resident.
 
     Fills moving.first and moving.pair. Returns (whether the search was complete, whether halving
     the interval is useless).
     """
-    motion, scene, moving = job.motion, job.scene, job.moving
+    motion, scene, moving = sweep.motion, sweep.scene, sweep.moving
     pose_at(motion, t0, moving.ends[0])
     pose_at(motion, t1, moving.ends[1])
     length = t1 - t0
     sagitta = motion.bend * length * length / 8.0 * UNITS_PER_METRE
-    band = (0.8661 + job.loose + sagitta + 2.0 * motion.slip * UNITS_PER_METRE) * (1.0 + 1e-9)
-    chord = Chord(
-        t0, t1, np.float64(job.units) - band, np.float64(job.units) + band, sagitta <= LEAST_SAGITTA
+    band = (0.8661 + sweep.loose + sagitta + 2.0 * motion.slip * UNITS_PER_METRE) * (1.0 + 1e-9)
+    chord = AvatarChord(
+        t0, t1, np.float64(sweep.units) - band, np.float64(sweep.units) + band, sagitta <= LEAST_SAGITTA
     )
-    extent, farthest = place_nodes(job.avatar, job.scale, motion.speed * length, moving, scene)
+    extent, farthest = place_nodes(sweep.avatar, sweep.scale, motion.speed * length, moving, scene)
     widest = np.int64(math.ceil(chord.outer)) + 1
-    for c in range(scene.drop.shape[0]):
-        limits = make_limits(
-            widest - scene.drop[c], scene.units_per_step, extent, farthest, scene.voxel_steps
+    for c in range(scene.radius_deficit.shape[0]):
+        thresholds = make_thresholds(
+            widest - scene.radius_deficit[c], scene.units_per_step, extent, farthest, scene.voxel_steps
         )
-        moving.limits[0, c], moving.limits[1, c] = limits.reach + limits.error, limits.far
+        moving.thresholds[0, c], moving.thresholds[1, c] = thresholds.reach + thresholds.error, thresholds.far
     moving.counters[2] += 1
     moving.first[0], moving.first[1], moving.first[2] = INFINITE, INFINITE, INFINITE
     for row in rows:
-        if scene.where[row, 0] >= 0 and not _sweep_voxel(job, chord, row):
+        if scene.where[row, 0] >= 0 and not _sweep_voxel(sweep, chord, row):
             break
     spent = moving.counters[0] > moving.counters[3] or stopped(scene.stop)
     return not (spent and moving.first[2] > 0.0), chord.final

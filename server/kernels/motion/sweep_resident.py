@@ -1,8 +1,8 @@
 """Sweep of one motion in one call, where all voxels in its reach are resident.
 
-The result is that of server/queries/sweep.py. The cost of a motion is then only its search: each array
-passed from Python to a kernel costs a tenth of a microsecond, and each inspection of its contents
-costs another call.
+The result is that of server/queries/sweep.py. The cost of a motion is then only its search: each
+array passed from Python to a kernel costs a tenth of a microsecond, and each inspection of its
+contents costs another call.
 """
 
 import numpy as np
@@ -10,16 +10,16 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
-from ..core.pose_transform import GOOD, SIMILARITY_TOLERANCE, check_poses
-from ..core.stop_flag_checks import MOST_QUICK_VISITS, stopped
+from ..core.pose_transform import SIMILARITY_TOLERANCE, VALID, check_poses
+from ..core.stop_flag_checks import MAX_RESIDENT_PATH_VISITS, stopped
 from ..core.voxel_layout import SceneArrays
 from .screw_motion import make_motion, pose_at
-from .sweep_advance import Progress, avatar_box, look_around, plan_segments, sweep_segments
+from .sweep_advance import SweepProgress, avatar_box, find_unknown_regions, plan_segments, sweep_segments
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
 # Result of `sweep_resident` for a motion that it does not answer.
-_LEFT = (-1, _UNKNOWN, 0, 0, 0)
+_NOT_ANSWERED = (-1, _UNKNOWN, 0, 0, 0)
 # Columns of the output: fractions, upper bound of the distance any point moves [m], the witness's
 # centres, world [m].
 LOWER, UPPER, SPEED, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 3, 6, 9
@@ -44,16 +44,16 @@ def _rigid(pose):
 @nb.njit(nogil=True, cache=True)
 def sweep_resident(
     pose_from, pose_to, avatar, radius, other_units, box, scene, index, unknown, unknown_everywhere, tolerance, rows,
-    said,
+    result,
 ):  # fmt: skip
     """Sweep one motion if it is short, of scale 1, and all voxels in its reach are resident.
 
     pose_from, pose_to: (4, 4) world, unchecked.  avatar: not empty.  box: `box_of` it.  radius,
-    other_units, tolerance: as in kernels/motion/sweep_advance.py.  scene: with the dataset's origin, which is
-    subtracted from the motion as in server/queries/sweep.py.  unknown: (u, 2, 3) int64, boxes [steps] of
-    excluded scans.
-    Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64; the witness is
-    written where the verdict is CONTACT.
+    other_units, tolerance: as in kernels/motion/sweep_advance.py.  scene: with the dataset's
+    origin, which is subtracted from the motion as in server/queries/sweep.py.  unknown: (u, 2, 3)
+    int64, boxes [steps] of excluded scans.
+    Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64; the witness
+    is written where the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
     this includes invalid poses.
     """
@@ -63,30 +63,30 @@ def sweep_resident(
     scales, units, others = np.empty(1), np.empty(1, np.int64), np.empty(1, np.int64)
     for poses, found_units in ((first, others), (last, units)):
         fault, _, _ = check_poses(poses, avatar.radius, radius, other_units, scene, scales, found_units)
-        if fault != GOOD or not _rigid(poses[0]):
-            return _LEFT
+        if fault != VALID or not _rigid(poses[0]):
+            return _NOT_ANSWERED
     units[0] = max(units[0], others[0])
     for r in range(3):
         first[0, r, 3] -= origin[r]
         last[0, r, 3] -= origin[r]
     from_zero = SceneArrays(
         scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, zero, scene.step, scene.units_per_step,
-        scene.voxel_steps, scene.block_words, scene.drop, scene.stop,
+        scene.voxel_steps, scene.block_words, scene.radius_deficit, scene.stop,
     )  # fmt: skip
-    progress = Progress(
+    progress = SweepProgress(
         np.zeros(1), np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1), np.full((1, 2, 3), np.nan),
-        np.full(1, MOST_QUICK_VISITS, np.int64),
+        np.full(1, MAX_RESIDENT_PATH_VISITS, np.int64),
     )  # fmt: skip
-    counts, outside, lost = np.zeros((4, 1), np.uint32), np.zeros(1, np.bool_), np.empty(1)
+    counts, outside, unknown_from = np.zeros((4, 1), np.uint32), np.zeros(1, np.bool_), np.empty(1)
     starts, which = np.zeros(2, np.int64), np.zeros(1, np.int64)
     needed = plan_segments(
         box, first, last, avatar, scales, units, from_zero, index, which, progress, starts, rows
     )
     if needed < 0 or needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
-        return _LEFT
+        return _NOT_ANSWERED
     for at in range(needed):
         if scene.where[rows[at], 0] < 0:
-            return _LEFT
+            return _NOT_ANSWERED
     proved = 1.0
     if needed > 0:
         progress.lower[0] = progress.end[0]
@@ -95,23 +95,25 @@ def sweep_resident(
             which, tolerance, progress, counts,
         )  # fmt: skip
         if progress.visits[0] < 0 or stopped(scene.stop):
-            return _LEFT
+            return _NOT_ANSWERED
         proved = progress.lower[0]
     upper = progress.upper[0]
     if unknown_everywhere:
         proved = 0.0
     elif unknown.shape[0] > 0:
         until = np.full(1, min(upper, 1.0))
-        look_around(box, first, last, avatar, scales, units, from_zero, index, unknown, until, outside, lost)
-        if lost[0] <= until[0]:
-            proved = min(proved, lost[0])
-    said[LOWER], said[UPPER], said[SPEED] = proved, upper, progress.speed[0]
+        find_unknown_regions(
+            box, first, last, avatar, scales, units, from_zero, index, unknown, until, outside, unknown_from
+        )
+        if unknown_from[0] <= until[0]:
+            proved = min(proved, unknown_from[0])
+    result[LOWER], result[UPPER], result[SPEED] = proved, upper, progress.speed[0]
     verdict = _CLEAR if proved >= 1.0 else _UNKNOWN
     if upper < np.inf:
         verdict = _CONTACT
         for r in range(3):
             own = np.rint(progress.witness[0, 0, r] * UNITS_PER_METRE) / UNITS_PER_METRE
-            said[AVATAR + r], said[CLOUD + r] = own + origin[r], progress.witness[0, 1, r] + origin[r]
+            result[AVATAR + r], result[CLOUD + r] = own + origin[r], progress.witness[0, 1, r] + origin[r]
     return needed, verdict, np.int64(counts[1, 0]), np.int64(counts[2, 0]), np.int64(counts[3, 0])
 
 

@@ -12,9 +12,9 @@ one began, and no bound gets worse (NUMERICS.md case 30). All state lies in arra
 be suspended and resumed. Pairs that do not fit the heap are searched depth first, to the end,
 before the heap continues: memory is bounded, and no pair is dropped.
 
-Where scan points have spheres of several sizes, all bounds are bounds of |a - b| + drop
-(nearest_pair.py). Below a node, no drop is less than that of its radius class, and the drop of some
-point is at most the class's `sure` drop.
+Where scan points have spheres of several sizes, all bounds are bounds of |a - b| + deficit
+(nearest_pair.py). Below a node, no deficit is less than that of its radius class, and the deficit
+of some point is at most the class's `sure` deficit.
 """
 
 import math
@@ -25,50 +25,50 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import RIM_BIT
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
-from ..core.placed_avatar import SLACK, Placed, make_placed, place_block, place_nodes
+from ..collide.collide_poses import STACK
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.placed_avatar import SLACK, PlacedAvatar, make_placed, place_block, place_nodes
 from ..core.pose_transform import MAX_REACH_UNITS
 from ..core.stop_flag_checks import NO_LIMIT, stopped
-from ..core.vector_lanes import any_near, keep_near
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
-from ..overlap.overlap import STACK
+from .block_distances import any_near, mark_near
 from .nearest_pair import (
-    Best,
+    BestPair,
     found_units,
     lower_bound,
-    make_best,
+    make_best_pair,
     search_lanes,
     set_cut,
 )
-from .nearest_search import box_gap
+from .nearest_search import box_distance
 
 # The search continues; no pair is open; the answer is known to the requested accuracy; the budget
 # of visits is spent.
-OPEN, DONE, ENOUGH, SPENT = range(4)
+OPEN, DONE, ENOUGH, BUDGET_SPENT = range(4)
 NO_VOXEL = -1  # in place of a row: the voxel has not been visited
 
 
-class Known(NamedTuple):
+class SearchResults(NamedTuple):
     """Results for k poses, accumulated over the pieces of a request.
 
-    square, pair, drop, gap: of `Nearest`.
-    lower: (k,) float64 [steps], a lower bound of |a - b| + drop of everything left open; inf:
+    square, pair, deficit, missing_bound: of `NearestPairs`.
+    lower: (k,) float64 [steps], a lower bound of |a - b| + deficit of everything left open; inf:
     nothing was.
-    upper: (k,) float64 [steps], an upper bound of |a - b| + drop of some pair.
+    upper: (k,) float64 [steps], an upper bound of |a - b| + deficit of some pair.
     spent: (k,) bool, the budget has ended a search. Further pieces then get no budget; otherwise a
     larger budget would see less of them.
     """
 
     square: NDArray[np.int64]
     pair: NDArray[np.int64]
-    drop: NDArray[np.int64]
-    gap: NDArray[np.float64]
+    deficit: NDArray[np.int64]
+    missing_bound: NDArray[np.float64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     spent: NDArray[np.bool_]
 
 
-class Search(NamedTuple):
+class BestFirstSearch(NamedTuple):
     """Search that can be resumed; scratch of one request.
 
     keys: (h + STACK, 2) float32, lower and upper bound of a pair [steps], without the error of
@@ -79,8 +79,8 @@ class Search(NamedTuple):
     bounds: (4,) float64 [steps]: lower and upper bound of the answer, lower bound of the stack,
     error of placing.
     status: (1,) int64.
-    drops: (2, n) float32 [steps], by radius class of a node: a lower bound of the drop of every
-    point below it, rounded down; an upper bound of the drop of some point, rounded up.
+    deficits: (2, n) float32 [steps], by radius class of a node: a lower bound of the deficit of
+    every point below it, rounded down; an upper bound of the deficit of some point, rounded up.
     """
 
     keys: NDArray[np.float32]
@@ -88,12 +88,12 @@ class Search(NamedTuple):
     sizes: NDArray[np.int64]
     bounds: NDArray[np.float64]
     status: NDArray[np.int64]
-    drops: NDArray[np.float32]
-    placed: Placed
-    best: Best
+    deficits: NDArray[np.float32]
+    placed: PlacedAvatar
+    best: BestPair
 
 
-class Goal(NamedTuple):
+class SearchGoal(NamedTuple):
     """Conditions that end a search.
 
     first: end at the first pair within reach plus `early` (`collide`).
@@ -114,22 +114,22 @@ class Goal(NamedTuple):
 @nb.njit(nogil=True, cache=True)
 def make_search(avatar, scene, heap):
     """Allocate scratch for one avatar (not empty) and a heap of `heap` pairs."""
-    drop = scene.drop
-    mask = drop.shape[0] - 1
-    drops = np.empty((2, drop.shape[0]), np.float32)
-    for c in range(drop.shape[0]):
+    deficit = scene.radius_deficit
+    mask = deficit.shape[0] - 1
+    deficits = np.empty((2, deficit.shape[0]), np.float32)
+    for c in range(deficit.shape[0]):
         # Some point has the node's local class, on a rim or not; where not all are on a rim, one
         # that is not on a rim may have any class.
-        sure = min(drop[(c | RIM_BIT) & mask], drop[c & RIM_BIT & mask])
-        drops[0, c] = np.float32(np.float64(drop[c]) / scene.units_per_step * (1.0 - 1e-6))
-        drops[1, c] = np.float32(np.float64(sure) / scene.units_per_step * (1.0 + 1e-6))
-    return Search(
+        sure = min(deficit[(c | RIM_BIT) & mask], deficit[c & RIM_BIT & mask])
+        deficits[0, c] = np.float32(np.float64(deficit[c]) / scene.units_per_step * (1.0 - 1e-6))
+        deficits[1, c] = np.float32(np.float64(sure) / scene.units_per_step * (1.0 + 1e-6))
+    return BestFirstSearch(
         np.empty((heap + STACK, 2), np.float32), np.empty((heap + STACK, 3), np.int64), np.zeros(2, np.int64),
-        np.zeros(4), np.zeros(1, np.int64), drops, make_placed(avatar), make_best(drop),
+        np.zeros(4), np.zeros(1, np.int64), deficits, make_placed(avatar), make_best_pair(deficit),
     )  # fmt: skip
 
 
-@borrowing
+@njit_no_refcount
 def _sift_up(keys, pairs, at):
     """Move the pair at the end of a heap up to its place."""
     key, tie, a, row, voxel = keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2]
@@ -143,8 +143,8 @@ def _sift_up(keys, pairs, at):
     keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
 
 
-@borrowing
-def _drop_top(keys, pairs, size):
+@njit_no_refcount
+def _pop_top(keys, pairs, size):
     """Remove the top of a heap of `size` pairs."""
     last = size - 1
     key, tie, a, row, voxel = keys[last, 0], keys[last, 1], pairs[last, 0], pairs[last, 1], pairs[last, 2]
@@ -165,13 +165,13 @@ def _drop_top(keys, pairs, size):
     keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
 
 
-@borrowing
-def _low(words, row, x, y, z, radius, drop):
-    """Return `lower_bound`, at least 0, plus the drop. No two centres are nearer than 0."""
-    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + drop
+@njit_no_refcount
+def _lower_bound_with_deficit(words, row, x, y, z, radius, deficit):
+    """Return `lower_bound`, at least 0, plus the deficit. No two centres are nearer than 0."""
+    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + deficit
 
 
-@borrowing
+@njit_no_refcount
 def _upper_bound(words, row, x, y, z, radius):
     """Return an upper bound of the distance of some sphere point from some node point.
 
@@ -183,41 +183,41 @@ def _upper_bound(words, row, x, y, z, radius):
 
 
 @nb.njit(nogil=True, cache=True)
-def _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts):
+def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, counts):
     """Start a search for pose i: all voxels in reach, with bounds from the index."""
     best, placed = search.best, search.placed
     best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
     best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
     best.units[0] = reach.units[i] + min(goal.early, MAX_REACH_UNITS - reach.units[i])
-    best.found[0], best.found[7] = known.square[i], known.drop[i]
-    best.found[1:7] = known.pair[i]
+    best.found[0], best.found[7] = results.square[i], results.deficit[i]
+    best.found[1:7] = results.pair[i]
     best.counters[:3] = 0
-    set_cut(best.cut, best.far, best.frame, best.drop, reach.units[i])
+    set_cut(best.cut, best.far, best.frame, best.deficit, reach.units[i])
     search.bounds[0], search.bounds[1], search.bounds[2], search.bounds[3] = 0.0, np.inf, 0.0, best.frame[4]
     within = best.units[0] if best.found[0] < 0 else found_units(best.found)
     # `collide` searches nodes for pairs within reach, and accepts a pair slightly beyond if it
     # meets one. `squares`, a scratch of LANES, holds a cut for each of at most RADIUS_CLASSES,
     # which are as many.
-    set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.drop, within)
+    set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.deficit, within)
     search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
     keys, pairs = search.keys, search.pairs
     for at in range(reach.starts[i], reach.starts[i + 1]):
         voxel = reach.rows[at]
         root = avatar.radius[0] * reach.scales[i]
-        gap = box_gap(root, placed, best.frame[1], scene, index, voxel)
+        gap = box_distance(root, placed, best.frame[1], scene, index, voxel)
         if scene.where[voxel, 0] < 0:
             counts[0, i] += np.uint32(1)
-            known.gap[i] = min(known.gap[i], gap)
+            results.missing_bound[i] = min(results.missing_bound[i], gap)
             continue
         size = search.sizes[0]
-        drop = search.drops[0, node_class(scene.ints, scene.where[voxel, 0], best.mask)]
-        keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)) + drop, np.float32(np.inf)
+        deficit = search.deficits[0, node_class(scene.ints, scene.where[voxel, 0], best.mask)]
+        keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)) + deficit, np.float32(np.inf)
         pairs[size, 0], pairs[size, 1], pairs[size, 2] = 0, NO_VOXEL, voxel
         _sift_up(keys, pairs, size)
         search.sizes[0] = size + 1
 
 
-@borrowing
+@njit_no_refcount
 def _enough(goal, enough, best, bounds):
     """Return whether the answer is known as accurately as requested."""
     if goal.first:
@@ -228,8 +228,8 @@ def _enough(goal, enough, best, bounds):
     return found / best.frame[2] - bounds[0] <= goal.tolerance
 
 
-@borrowing
-def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
+@njit_no_refcount
+def _push_pair(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, row, voxel):
     """Add a pair to the heap, or to the stack if spilling.
 
     low, high: its bounds.  parent: the lower bound of its parent.  cut: pairs above it are useless.
@@ -249,8 +249,8 @@ def _put(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, high, a, 
         _sift_up(keys, pairs, at)
 
 
-@borrowing
-def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
+@njit_no_refcount
+def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
     """Visit node pairs until the search ends, or `until` pairs are visited; set the status.
 
     budget: how many visits are allowed.
@@ -271,8 +271,14 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         placed.shift,
     )
     found, cut, far, frame, corner, keep = best.found, best.cut, best.far, best.frame, best.corner, best.keep
-    squares, counters, units, drop, mask = best.squares, best.counters, best.units[0], best.drop, best.mask
-    drops, largest = search.drops, np.argmin(drop)
+    squares, counters, units, deficit, mask = (
+        best.squares,
+        best.counters,
+        best.units[0],
+        best.deficit,
+        best.mask,
+    )
+    deficits, largest = search.deficits, np.argmin(deficit)
     keys, pairs, sizes, bounds = search.keys, search.pairs, search.sizes, search.bounds
     avatar_first, avatar_count, points = avatar.first, avatar.count, avatar.points
     heap = keys.shape[0] - STACK
@@ -289,7 +295,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         if counters[0] >= until:
             return
         if stopped(scene.stop):
-            search.status[0] = SPENT
+            search.status[0] = BUDGET_SPENT
             return
         at = 0 if sizes[1] == 0 else heap + sizes[1] - 1
         key, a, row, voxel = keys[at, 0], pairs[at, 0], pairs[at, 1], pairs[at, 2]
@@ -301,7 +307,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         if row != NO_VOXEL and not leaves:
             cost = np.int64(avatar_count[a]) if avatar_side else np.int64(ints[row + COUNT] & COUNTED)
         if counters[0] + cost > budget:
-            search.status[0] = SPENT
+            search.status[0] = BUDGET_SPENT
             return
         # A nearer pair may have overtaken a pair on the stack; visits are counted nevertheless.
         counters[0] += cost
@@ -310,7 +316,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
             sizes[1] -= 1
         else:
             bounds[2] = np.float64(key)
-            _drop_top(keys, pairs, sizes[0])
+            _pop_top(keys, pairs, sizes[0])
             sizes[0] -= 1
         if key > limit:
             continue
@@ -323,9 +329,9 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
         x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
         c = node_class(ints, base if row == NO_VOXEL else row, mask)
         if row == NO_VOXEL:
-            low = _low(words, base, x, y, z, nodes[3, a], drops[0, c])
-            high = _upper_bound(words, base, x, y, z, nodes[3, a]) + drops[1, c]
-            _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, base, voxel)
+            low = _lower_bound_with_deficit(words, base, x, y, z, nodes[3, a], deficits[0, c])
+            high = _upper_bound(words, base, x, y, z, nodes[3, a]) + deficits[1, c]
+            _push_pair(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, base, voxel)
         elif leaves:
             block, scene_block = ~a_first, ~b_first
             if stamp[block] != pose:
@@ -335,7 +341,7 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
             lane_at = where[voxel, 2] + scene_block * 3 * LANES
             lx, ly = off_x + np.float32(ints[block_at]), off_y + np.float32(ints[block_at + 1])
             lz = off_z + np.float32(ints[block_at + 2])
-            keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep)
+            mark_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep)
             for lane in range(avatar_count[a]):
                 if not keep[lane]:
                     continue
@@ -348,67 +354,69 @@ def _go_on(m, pose, avatar, scene, search, goal, enough, budget, until):
                 if any_near(halves, lane_at, px, py, pz, far[c]):
                     search_lanes(
                         points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, px, py, pz,
-                        frame, units, squares, found, cut, far, drop, mask,
+                        frame, units, squares, found, cut, far, deficit, mask,
                     )  # fmt: skip
         elif avatar_side:
             for child in range(a_first, a_first + cost):
                 x, y, z = nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z
-                low = _low(words, row, x, y, z, nodes[3, child], drops[0, c])
-                high = _upper_bound(words, row, x, y, z, nodes[3, child]) + drops[1, c]
-                _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, child, row, voxel)
+                low = _lower_bound_with_deficit(words, row, x, y, z, nodes[3, child], deficits[0, c])
+                high = _upper_bound(words, row, x, y, z, nodes[3, child]) + deficits[1, c]
+                _push_pair(
+                    keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, child, row, voxel
+                )
         else:
             for number in range(cost):
                 child = base + (b_first + number) * ROW_WORDS
                 c = node_class(ints, child, mask)
-                low = _low(words, child, x, y, z, nodes[3, a], drops[0, c])
-                high = _upper_bound(words, child, x, y, z, nodes[3, a]) + drops[1, c]
-                _put(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, child, voxel)
+                low = _lower_bound_with_deficit(words, child, x, y, z, nodes[3, a], deficits[0, c])
+                high = _upper_bound(words, child, x, y, z, nodes[3, a]) + deficits[1, c]
+                _push_pair(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, child, voxel)
 
 
 @nb.njit(nogil=True, cache=True)
-def end_search(search, i, known, counts):
+def end_search(search, i, results, counts):
     """Add the results of a search to what is known of pose i."""
     best = search.best
-    known.square[i], known.drop[i] = best.found[0], best.found[7]
-    known.pair[i] = best.found[1:7]
-    known.upper[i] = min(known.upper[i], search.bounds[1])
-    known.spent[i] |= search.status[0] == SPENT
+    results.square[i], results.deficit[i] = best.found[0], best.found[7]
+    results.pair[i] = best.found[1:7]
+    results.upper[i] = min(results.upper[i], search.bounds[1])
+    results.spent[i] |= search.status[0] == BUDGET_SPENT
     if search.status[0] != DONE:
-        known.lower[i] = min(known.lower[i], search.bounds[0])
+        results.lower[i] = min(results.lower[i], search.bounds[0])
     counts[1, i] += np.uint32(best.counters[0])
     counts[2, i] += np.uint32(best.counters[1])
 
 
 @nb.njit(nogil=True, cache=True)
-def go_on(poses, avatar, scene, index, reach, i, fresh, until, search, goal, known, counts):
+def resume_search(poses, avatar, scene, index, reach, i, fresh, until, search, goal, results, counts):
     """Search for the nearest pair of pose i: from the start if `fresh`, else from where it stopped.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of the poses; a voxel in it that is
-    not resident is counted as missing.  until: the number of visits, in this piece, at which to
-    suspend.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of the poses; a voxel in it
+    that is not resident is counted as missing.  until: the number of visits, in this piece, at
+    which to suspend.
     Once the search has ended, its results are added to known and counts (3, k) uint32; for a
     suspended search, `end_search` does that. Returns the status.
     """
     if fresh:
-        _begin(poses, avatar, scene, index, reach, i, search, goal, known, counts)
-    budget = np.int64(0) if known.spent[i] else goal.visits - np.int64(counts[1, i])
-    _go_on(poses[i], i, avatar, scene, search, goal, goal.enough[i], budget, until)
+        _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, counts)
+    budget = np.int64(0) if results.spent[i] else goal.visits - np.int64(counts[1, i])
+    _resume(poses[i], i, avatar, scene, search, goal, goal.enough[i], budget, until)
     if search.status[0] != OPEN:
-        end_search(search, i, known, counts)
+        end_search(search, i, results, counts)
     return search.status[0]
 
 
 @nb.njit(nogil=True, cache=True)
-def search_poses(poses, avatar, scene, index, reach, which, heap, goal, known, counts):
-    """Run `go_on` to the end for the poses numbered in `which`.
+def search_poses(poses, avatar, scene, index, reach, which, heap, goal, results, counts):
+    """Run `resume_search` to the end for the poses numbered in `which`.
 
     One call answers a request without a deadline.
     """
     search = make_search(avatar, scene, heap)
     for number in range(which.shape[0]):
         if stopped(scene.stop):
-            known.lower[which[number]] = 0.0
+            results.lower[which[number]] = 0.0
             continue
-        go_on(
-            poses, avatar, scene, index, reach, which[number], True, np.int64(NO_LIMIT), search, goal, known, counts
+        resume_search(
+            poses, avatar, scene, index, reach, which[number], True, np.int64(NO_LIMIT), search, goal, results, counts
         )  # fmt: skip

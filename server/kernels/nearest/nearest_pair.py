@@ -3,13 +3,13 @@
 `distance` and the bounded search share this module.
 
 The nearest pair is the one with the least separation of its spheres, |a - b| - (r_a + r_b). r_a is
-the same for all pairs, and the scan point's radius is the largest radius minus the `drop` of its
-class. The search therefore compares |a - b| + drop. A bound on it, minus the drop of a class, is a
-bound on |a - b| of the pairs of that class.
+the same for all pairs, and the scan point's radius is the largest radius minus the `deficit` of its
+class. The search therefore compares |a - b| + deficit. A bound on it, minus the deficit of a class,
+is a bound on |a - b| of the pairs of that class.
 
 Float32 separates nearly all pairs of points from the best one. The pairs it cannot separate are
-squared in integers (NUMERICS.md N5) and compared by gap_order.py. The least separation, and the pair
-that has it, are therefore those of the definition, for every tree and order.
+squared in integers (NUMERICS.md N5) and compared by separation_order.py. The least separation, and
+the pair that has it, are therefore those of the definition, for every tree and order.
 """
 
 import math
@@ -19,94 +19,94 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
-from ..core.gap_order import compare_gaps
-from ..core.placed_avatar import ONE_SLACK, SLACK, U32, make_limits
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.placed_avatar import ONE_SLACK, SLACK, U32, make_thresholds
 from ..core.pose_transform import lattice_to_units, place, to_units
+from ..core.separation_order import compare_separations
 from ..core.stop_flag_checks import NO_LIMIT
-from ..core.vector_lanes import list_squares
 from ..core.voxel_layout import LANES, point_class
+from .block_distances import write_squares
 
 U = np.uint64  # see avatar_front.py
 # Pairs that float32 cannot separate from the best. Coarse lattices have many ties; a full list is
 # settled.
-MOST_CANDIDATES = 64
+MAX_CANDIDATES = 64
 
 
-class Nearest(NamedTuple):
+class NearestPairs(NamedTuple):
     """Nearest pair of each of k poses, among the voxels searched.
 
     square: (k,) int64, |a - b|^2, exact units; -1: none within reach.
     pair: (k, 6) int64, the scan point's lattice x, y, z, then the avatar's placed centre [exact
     units].
-    drop: (k,) int64, the largest radius minus the scan point's radius, exact units.
-    gap: (k,) float64, a lower bound of the distance of the avatar's centres from what missing
-    voxels hold [steps]; inf: nothing is missing.
+    deficit: (k,) int64, the largest radius minus the scan point's radius, exact units.
+    missing_bound: (k,) float64, a lower bound of the distance of the avatar's centres from what
+    missing voxels hold [steps]; inf: nothing is missing.
     """
 
     square: NDArray[np.int64]
     pair: NDArray[np.int64]
-    drop: NDArray[np.int64]
-    gap: NDArray[np.float64]
+    deficit: NDArray[np.int64]
+    missing_bound: NDArray[np.float64]
 
 
-class Best(NamedTuple):
+class BestPair(NamedTuple):
     """Nearest pair of one pose so far, and what it rules out; scratch of one call.
 
-    found: (8,) int64, square or -1, a row of `Nearest.pair`, drop.
+    found: (8,) int64, square or -1, a row of `NearestPairs.pair`, deficit.
     cut, far: (n,) float32, by radius class: no node pair whose `lower_bound` is above cut[c]
     [steps] and no pair of points whose square is above far[c] can be nearer, or tie.
-    drop: (n,) int64, of SceneArrays.  mask: the number of classes minus one, uint64.
-    frame: (5,) float64, extent and farthest of `make_limits`, units per step, voxel steps; the
+    deficit: (n,) int64, of SceneArrays.  mask: the number of classes minus one, uint64.
+    frame: (5,) float64, extent and farthest of `make_thresholds`, units per step, voxel steps; the
     error of a distance [steps].
     corner: (3,) int64, low corner of the current voxel [steps].
     keep, squares: (LANES,), a mark and a square for each point of an avatar's block.
     keep8: the memory of keep as uint64, eight marks each.
-    listed: (LANES,) float32, a square for each point of a scene block.
-    units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + drop.
+    block_squares: (LANES,) float32, a square for each point of a scene block.
+    units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + deficit.
     counters: (4,) int64, node visits, point tests, candidates, and the largest number of visits of
     a pose.
     candidates: (MOST_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
     pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
-    nearly: (MOST_CANDIDATES,) float32, their least squares there.
+    candidate_squares: (MOST_CANDIDATES,) float32, their least squares there.
     """
 
     found: NDArray[np.int64]
     cut: NDArray[np.float32]
     far: NDArray[np.float32]
-    drop: NDArray[np.int64]
+    deficit: NDArray[np.int64]
     mask: np.uint64
     frame: NDArray[np.float64]
     corner: NDArray[np.int64]
     keep: NDArray[np.bool_]
     keep8: NDArray[np.uint64]
     squares: NDArray[np.float32]
-    listed: NDArray[np.float32]
+    block_squares: NDArray[np.float32]
     units: NDArray[np.int64]
     counters: NDArray[np.int64]
     candidates: NDArray[np.int64]
-    nearly: NDArray[np.float32]
+    candidate_squares: NDArray[np.float32]
 
 
 @nb.njit(nogil=True, cache=True)
-def make_best(drop):
-    """Allocate scratch for the radius classes of `SceneArrays.drop`; no pair is found yet."""
-    keep, n = np.zeros(LANES, np.bool_), drop.shape[0]
-    return Best(
-        np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), drop, np.uint64(n - 1), np.empty(5),
+def make_best_pair(deficit):
+    """Allocate scratch for as many classes as `deficit` has; no pair is found yet."""
+    keep, n = np.zeros(LANES, np.bool_), deficit.shape[0]
+    return BestPair(
+        np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), np.empty(5),
         np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
-        np.empty(2, np.int64), np.array([0, 0, 0, NO_LIMIT]), np.empty((MOST_CANDIDATES, 5), np.int64),
-        np.empty(MOST_CANDIDATES, np.float32),
+        np.empty(2, np.int64), np.array([0, 0, 0, NO_LIMIT]), np.empty((MAX_CANDIDATES, 5), np.int64),
+        np.empty(MAX_CANDIDATES, np.float32),
     )  # fmt: skip
 
 
-@borrowing
+@njit_no_refcount
 def lower_bound(words, row, x, y, z, radius):
     """Return a lower bound of the distance of a sphere's points from a node's points [steps].
 
     x, y, z: float32, relative to the voxel's low corner. The bound is the larger of the sphere's
     and the slab's, minus all float32 rounding of this function; a negative bound says nothing. It
-    does not include the errors of placed coordinates: `Best.cut` does.
+    does not include the errors of placed coordinates: `BestPair.cut` does.
     """
     at = U(row)  # not negative: saves a comparison for every index
     dx, dy, dz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
@@ -119,46 +119,46 @@ def lower_bound(words, row, x, y, z, radius):
     return bound - SLACK * (apart + both)
 
 
-@borrowing
-def set_cut(cut, far, frame, drop, units):
-    """Rule out pairs whose |a - b| + drop is above `units`; see `Best`."""
-    limits = make_limits(units, frame[2], frame[0], frame[1], frame[3])
-    error = np.float64(limits.error)
+@njit_no_refcount
+def set_cut(cut, far, frame, deficit, units):
+    """Rule out pairs whose |a - b| + deficit is above `units`; see `BestPair`."""
+    thresholds = make_thresholds(units, frame[2], frame[0], frame[1], frame[3])
+    error = np.float64(thresholds.error)
     frame[4] = error
-    for c in range(drop.shape[0]):
-        if drop[c] == 0:
-            cut[c] = (limits.reach + limits.error) * ONE_SLACK
-            far[c] = limits.far
+    for c in range(deficit.shape[0]):
+        if deficit[c] == 0:
+            cut[c] = (thresholds.reach + thresholds.error) * ONE_SLACK
+            far[c] = thresholds.far
         else:
-            # As in `make_limits`, with all slack in one factor: 45 ns for 32 classes instead of
+            # As in `make_thresholds`, with all slack in one factor: 45 ns for 32 classes instead of
             # 370.
-            above = (np.float64(max(units - drop[c], 0)) / frame[2] + error) * (1.0 + 2e-6)
+            above = (np.float64(max(units - deficit[c], 0)) / frame[2] + error) * (1.0 + 2e-6)
             cut[c] = np.float32(above)
             far[c] = np.float32(above * above)
 
 
-@borrowing
+@njit_no_refcount
 def found_units(found):
-    """Return an upper bound of |a - b| + drop of the pair found, exact units.
+    """Return an upper bound of |a - b| + deficit of the pair found, exact units.
 
     A bound at this value excludes no pair that ties.
     """
     return np.int64(math.sqrt(np.float64(found[0]))) + 2 + found[7]
 
 
-@borrowing
-def _consider(
-    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, units_per_step, units, drop, found
+@njit_no_refcount
+def _update_best(
+    points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, units_per_step, units, deficit, found
 ):  # fmt: skip
     """Replace the best pair by this pair if it is nearer, or as near and first in order.
 
     Ties go to the lesser scan point, then to the lesser avatar centre.
-    points, shift: of Avatar and Placed.  corner: (3,) int64, of the voxel [steps].  drop: of the
-    scan point's class.
+    points, shift: of Avatar and PlacedAvatar.  corner: (3,) int64, of the voxel [steps].  deficit:
+    of the scan point's class.
     The square is that of `pair_square`. Returns whether the pair is nearer.
     """
     square = np.int64(0)
-    units -= drop
+    units -= deficit
     for r in range(3):
         world = place(m, shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane])
         steps = corner[r] + np.int64(ints[block_at + r]) + np.int64(halves[lane_at + r * LANES + j])
@@ -170,12 +170,12 @@ def _consider(
         return False
     nearer = found[0] < 0
     if not nearer:
-        if drop == found[7]:
+        if deficit == found[7]:
             if square > found[0]:
                 return False
             nearer = square < found[0]
         else:
-            order = compare_gaps(square, -drop, found[0], -found[7])
+            order = compare_separations(square, -deficit, found[0], -found[7])
             if order > 0:
                 return False
             nearer = order < 0
@@ -194,22 +194,22 @@ def _consider(
             lesser = value < found[1 + r]
         # While all earlier values are equal, this writes the value already stored.
         found[1 + r] = value
-    found[0], found[7] = square, drop
+    found[0], found[7] = square, deficit
     return nearer
 
 
-@borrowing
+@njit_no_refcount
 def search_lanes(
     points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, c, x, y, z, frame, units, squares, found,
-    cut, far, drop, mask,
+    cut, far, deficit, mask,
 ):  # fmt: skip
     """Update the best pair with the pairs of one avatar point and a scene block.
 
     x, y, z: the avatar point, float32, relative to the block's low corner. The nearest pair comes
     first: it shrinks the cut, and few of the others then need integers.
-    c: class of the scene's leaf node.  Arguments from frame on: of `Best`.
+    c: class of the scene's leaf node.  Arguments from frame on: of `BestPair`.
     """
-    list_squares(halves, lane_at, x, y, z, squares)
+    write_squares(halves, lane_at, x, y, z, squares)
     first = 0
     for lane_j in range(1, LANES):
         if squares[lane_j] < squares[first]:
@@ -218,32 +218,38 @@ def search_lanes(
         j = first if number < 0 else number
         if squares[j] <= far[c] and (number < 0 or j != first):
             own = point_class(ints, block_at, j, mask)
-            nearer = squares[j] <= far[own] and _consider(
-                points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, frame[2], units, drop[own],
-                found,
+            nearer = squares[j] <= far[own] and _update_best(
+                points, m, shift, block, lane, ints, halves, corner, block_at, lane_at, j, frame[2], units,
+                deficit[own], found,
             )  # fmt: skip
             if nearer:
-                set_cut(cut, far, frame, drop, found_units(found))
+                set_cut(cut, far, frame, deficit, found_units(found))
 
 
-@borrowing
-def _no_farther(square, frame):
+@njit_no_refcount
+def _distance_bound(square, frame):
     """Return an upper bound of a distance whose square float32 holds [exact units, float64].
 
-    The error is that of `make_limits`.
+    The error is that of `make_thresholds`.
     """
     return (math.sqrt(np.float64(square)) * (1.0 + 8.0 * U32) + frame[4]) * frame[2]
 
 
-@borrowing
+@njit_no_refcount
 def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
     """Unmark the points of an avatar's block that are near no point of a scene block, by class.
 
     The radius class of each scene point decides.  c: class of the scene's leaf node.  Other
-    arguments as for `take_candidates`. Returns an upper bound of the least |a - b| + drop, exact
+    arguments as for `take_candidates`. Returns an upper bound of the least |a - b| + deficit, exact
     units, float64; inf: no point is near.
     """
-    keep, squares, listed, far, drop = best.keep, best.squares, best.listed, best.far, best.drop
+    keep, squares, block_squares, far, deficit = (
+        best.keep,
+        best.squares,
+        best.block_squares,
+        best.far,
+        best.deficit,
+    )
     low_x = off[0] + np.float32(ints[block_at])
     low_y = off[1] + np.float32(ints[block_at + 1])
     low_z = off[2] + np.float32(ints[block_at + 2])
@@ -255,27 +261,29 @@ def _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes):
         if not squares[lane] <= far[c]:
             continue
         x, y, z = lanes[block, 0, lane] - low_x, lanes[block, 1, lane] - low_y, lanes[block, 2, lane] - low_z
-        list_squares(halves, lane_at, x, y, z, listed)
+        write_squares(halves, lane_at, x, y, z, block_squares)
         for j in range(LANES):
             own = point_class(ints, block_at, j, best.mask)
-            if listed[j] <= far[own]:
+            if block_squares[j] <= far[own]:
                 keep[lane] = True
-                nearest = min(nearest, _no_farther(listed[j], best.frame) + np.float64(drop[own]))
+                nearest = min(
+                    nearest, _distance_bound(block_squares[j], best.frame) + np.float64(deficit[own])
+                )
     return nearest
 
 
-@borrowing
+@njit_no_refcount
 def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, shift, ints, halves, lanes):
-    """Add the points that `least_squares` found to the candidates, and shrink the cut.
+    """Add the points that `nearest_squares` found to the candidates, and shrink the cut.
 
     This uses no integers. As points arrive and the cut shrinks, ten or twenty of them are the
-    nearest in turn; `settle` does the integer work once, at the end.
+    nearest in turn; `settle_candidates` does the integer work once, at the end.
     least: the least square, within the cut.  c: class of the scene's leaf node.
     """
-    far, units, counters, nearly = best.far, best.units, best.counters, best.nearly
+    far, units, counters, candidate_squares = best.far, best.units, best.counters, best.candidate_squares
     candidates, keep, squares = best.candidates, best.keep, best.squares
     if best.mask == U(0):
-        within = _no_farther(least, best.frame)
+        within = _distance_bound(least, best.frame)
     else:
         within = _list_by_class(c, block, block_at, lane_at, off, best, ints, halves, lanes)
         if within == np.inf:
@@ -283,11 +291,11 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
     nearer = np.int64(within) + 2  # one unit for rounding up
     if nearer < units[1]:
         units[1] = nearer
-        set_cut(best.cut, far, best.frame, best.drop, nearer)
+        set_cut(best.cut, far, best.frame, best.deficit, nearer)
         left = 0
         for i in range(counters[2]):
-            if nearly[i] <= far[candidates[i, 4]]:
-                nearly[left] = nearly[i]
+            if candidate_squares[i] <= far[candidates[i, 4]]:
+                candidate_squares[left] = candidate_squares[i]
                 for r in range(5):
                     candidates[left, r] = candidates[i, r]
                 left += 1
@@ -295,42 +303,42 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
     for lane in range(LANES):
         if not keep[lane] or not squares[lane] <= far[c]:
             continue
-        if counters[2] == MOST_CANDIDATES:
-            settle(best, points, m, shift, ints, halves, lanes, off)
+        if counters[2] == MAX_CANDIDATES:
+            settle_candidates(best, points, m, shift, ints, halves, lanes, off)
         at = counters[2]
         candidates[at, 0], candidates[at, 1], candidates[at, 2] = block, lane, block_at
         candidates[at, 3], candidates[at, 4] = lane_at, np.int64(c)
-        nearly[at] = squares[lane]
+        candidate_squares[at] = squares[lane]
         counters[2] = at + 1
 
 
-@borrowing
-def settle(best, points, m, shift, ints, halves, lanes, off):
+@njit_no_refcount
+def settle_candidates(best, points, m, shift, ints, halves, lanes, off):
     """Square the candidates of one voxel in integers and keep the nearest pair; clear the list.
 
-    points: (b, 3, LANES) of Avatar.  lanes: of Placed.  off: (3,) float32, from the frame to the
-    voxel's low corner.
+    points: (b, 3, LANES) of Avatar.  lanes: of PlacedAvatar.  off: (3,) float32, from the frame to
+    the voxel's low corner.
     """
-    far, frame, found, squares, units = best.far, best.frame, best.found, best.listed, best.units
+    far, frame, found, squares, units = best.far, best.frame, best.found, best.block_squares, best.units
     for i in range(best.counters[2]):
-        if best.nearly[i] > far[best.candidates[i, 4]]:
+        if best.candidate_squares[i] > far[best.candidates[i, 4]]:
             continue
         block, lane = best.candidates[i, 0], best.candidates[i, 1]
         block_at, lane_at = best.candidates[i, 2], best.candidates[i, 3]
         x = lanes[block, 0, lane] - (off[0] + np.float32(ints[block_at]))
         y = lanes[block, 1, lane] - (off[1] + np.float32(ints[block_at + 1]))
         z = lanes[block, 2, lane] - (off[2] + np.float32(ints[block_at + 2]))
-        list_squares(halves, lane_at, x, y, z, squares)
+        write_squares(halves, lane_at, x, y, z, squares)
         for j in range(LANES):
             c = point_class(ints, block_at, j, best.mask)
             if squares[j] <= far[c]:
-                _consider(
+                _update_best(
                     points, m, shift, block, lane, ints, halves, best.corner, block_at, lane_at, j, frame[2],
-                    units[0], best.drop[c], found,
+                    units[0], best.deficit[c], found,
                 )  # fmt: skip
     best.counters[2] = 0
     if found[0] >= 0:
         nearest = found_units(found)
         if nearest < units[1]:
             units[1] = nearest
-            set_cut(best.cut, far, frame, best.drop, nearest)
+            set_cut(best.cut, far, frame, best.deficit, nearest)

@@ -1,9 +1,9 @@
 """Resident path of `distance`: one pose in one kernel call (`resident_fast_path.py`).
 
 It applies where all voxels in the pose's reach are resident. The kernel also converts the nearest
-pair to metres, with the formulas of `signed_distance.py` in the same order of operations; the bits are
-therefore the same. As numpy operations on columns of one element, this took four times as long as
-the search.
+pair to metres, with the formulas of `signed_distance.py` in the same order of operations; the bits
+are therefore the same. As numpy operations on columns of one element, this took four times as long
+as the search.
 """
 
 import math
@@ -12,73 +12,76 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
-from ..core.pose_transform import GOOD, lattice_to_units
-from ..core.stop_flag_checks import MOST_QUICK_VISITS
-from ..core.voxels_in_reach import Reach, find_reach
-from .nearest_pair import Nearest
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.pose_transform import VALID, lattice_to_units
+from ..core.stop_flag_checks import MAX_RESIDENT_PATH_VISITS
+from ..core.voxels_in_reach import VoxelsInReach, find_reach
+from .nearest_pair import NearestPairs
 from .nearest_search import nearest_poses
 
 # Columns of the output.
 SIGNED, LOWER, NORMAL, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 5, 8, 11
 
 
-@borrowing
-def _say(square, pair, drop, radii, reach, scene, said):
+@njit_no_refcount
+def _write_result(square, pair, deficit, radii, reach, scene, result):
     """Write the results for one pair, or for no pair (square -1); see `nearest_resident`."""
     if square < 0:
-        said[SIGNED], said[LOWER] = np.inf, reach
+        result[SIGNED], result[LOWER] = np.inf, reach
         for at in range(NORMAL, COLUMNS):
-            said[at] = np.nan
+            result[at] = np.nan
         return
-    own = radii - drop
+    own = radii - deficit
     above = np.float64(square - own * own)
     root = math.sqrt(np.float64(square))
     both = root + np.float64(own)
     signed = above / both / UNITS_PER_METRE if both > 0.0 else 0.0
-    said[SIGNED], said[LOWER] = signed, min(signed, reach)
+    result[SIGNED], result[LOWER] = signed, min(signed, reach)
     for r in range(3):
         apart = np.float64(pair[3 + r] - lattice_to_units(pair[r], scene.units_per_step))
-        said[NORMAL + r] = apart / root if root > 0.0 else 0.0
-        said[AVATAR + r] = np.float64(pair[3 + r]) / UNITS_PER_METRE + scene.origin[r]
-        said[CLOUD + r] = np.float64(pair[r]) * scene.step + scene.origin[r]
+        result[NORMAL + r] = apart / root if root > 0.0 else 0.0
+        result[AVATAR + r] = np.float64(pair[3 + r]) / UNITS_PER_METRE + scene.origin[r]
+        result[CLOUD + r] = np.float64(pair[r]) * scene.step + scene.origin[r]
 
 
 @nb.njit(nogil=True, cache=True)
-def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, scene, index, rows, said):
+def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, scene, index, rows, result):
     """Answer `distance` for one pose: `find_reach`, `nearest_poses`, then the values of the pair.
 
     poses: (1, 4, 4) float64, unchecked.  radius: of the avatar's points [m].  radius_units: radius
     of the scan's largest sphere, exact units.  reach_units: the reach, exact units.  reach: the
     same [m].
-    Writes rows (capacity,) int64, the voxels in reach, and said (COLUMNS,) float64: signed distance
-    and its lower bound [m], normal, witness of the avatar, witness of the cloud, world [m]; inf and
-    NaN where no pair is within reach.
+    Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64: signed
+    distance and its lower bound [m], normal, witness of the avatar, witness of the cloud, world
+    [m]; inf and NaN where no pair is within reach.
     Returns (fault, pose, value found), as `check_poses` does, then the number of rows, outside,
     node visits, point tests. -1 rows: not answered, because a voxel has to be loaded, the rows do
     not fit, or the search ended early (scene.stop, MOST_QUICK_VISITS).
     """
     outside = np.zeros(1, np.bool_)
     scales, units = np.empty(1), np.empty(1, np.int64)
-    around = Reach(scales, units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)
+    around = VoxelsInReach(scales, units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)
     fault, pose, found, needed = find_reach(
         poses, avatar, radius, radius_units + reach_units, scene, index, around
     )
-    ready = fault == GOOD and 0 <= needed <= rows.shape[0]
+    ready = fault == VALID and 0 <= needed <= rows.shape[0]
     if ready:
         for at in range(needed):
             ready &= scene.where[rows[at], 0] >= 0
     if not ready:
         return fault, pose, found, -1, False, 0, 0
-    nearest = Nearest(
+    nearest = NearestPairs(
         np.full(1, -1, np.int64), np.zeros((1, 6), np.int64), np.zeros(1, np.int64), np.full(1, np.inf)
     )
     counts = np.zeros((3, 1), np.uint32)
     if needed > 0:
         nearest_poses(
-            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), MOST_QUICK_VISITS, nearest, counts
+            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), MAX_RESIDENT_PATH_VISITS,
+            nearest, counts,
         )  # fmt: skip
-        if nearest.gap[0] < np.inf:  # all is resident: the search ended early
+        if nearest.missing_bound[0] < np.inf:  # all is resident: the search ended early
             return fault, pose, found, -1, False, 0, 0
-    _say(nearest.square[0], nearest.pair[0], nearest.drop[0], units[0] - reach_units, reach, scene, said)
+    _write_result(
+        nearest.square[0], nearest.pair[0], nearest.deficit[0], units[0] - reach_units, reach, scene, result
+    )
     return fault, pose, found, needed, outside[0], np.int64(counts[1, 0]), np.int64(counts[2, 0])

@@ -1,10 +1,10 @@
 """Nearest pair of two bounding sphere hierarchies under a pose, after [Fig12] figures 5 and 6.
 
 This is branch and bound, with the best pair so far as the bound. The scene's tree is descended with
-a list of those nodes of the avatar's front that may hold a nearer pair, as in overlap.py, where the
-reach is the bound. A node is pruned only if its lower bound, minus the largest float32 error,
-exceeds the best; the radius class of the largest sphere below a node sets its bound. nearest_pair.py
-defines nearest and handles the points.
+a list of those nodes of the avatar's front that may hold a nearer pair, as in collide_poses.py,
+where the reach is the bound. A node is pruned only if its lower bound, minus the largest float32
+error, exceeds the best; the radius class of the largest sphere below a node sets its bound.
+nearest_pair.py defines nearest and handles the points.
 
 The first bound is narrow and is widened while nothing is found within it. This costs a tenth more
 node visits than knowing the distance beforehand. Two alternatives are slower. A single descent of
@@ -21,21 +21,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.avatar_front import make_front, move_node, pad, place_front, sift, take_kept
-from ..core.borrowing_kernels import borrowing, inlined
+from ..collide.collide_poses import BROAD, FLAT, STACK
+from ..core.avatar_front import compact_marked, copy_node, make_front, mark_meeting, pad_list, place_front
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.placed_avatar import ONE_SLACK, SLACK, make_placed, node_reach, place_lanes, place_root
 from ..core.pose_transform import place
-from ..core.stop_flag_checks import is_over, stopped
-from ..core.vector_lanes import keep_in_box, keep_near, least_squares
+from ..core.stop_flag_checks import should_end, stopped
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
-from ..overlap.overlap import BROAD, FLAT, STACK
-from .nearest_pair import found_units, lower_bound, make_best, set_cut, settle, take_candidates
+from .block_distances import mark_near, nearest_squares, unmark_beyond_box
+from .nearest_pair import (
+    found_units,
+    lower_bound,
+    make_best_pair,
+    set_cut,
+    settle_candidates,
+    take_candidates,
+)
 
 U = np.uint64  # see avatar_front.py
 
 
-class Descent(NamedTuple):
-    """Scratch of one call, in addition to `Best`.
+class NearestScratch(NamedTuple):
+    """Scratch of one call, in addition to `BestPair`.
 
     stack: (STACK, 3) int64, scene nodes still to examine: row, start of the list of front nodes,
     length.
@@ -50,9 +57,9 @@ class Descent(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_descent():
+def make_nearest_scratch():
     """Allocate the scratch."""
-    return Descent(
+    return NearestScratch(
         np.empty((STACK, 3), np.int64),
         np.empty(STACK, np.int64),
         np.empty(STACK, np.float32),
@@ -60,12 +67,12 @@ def make_descent():
     )
 
 
-@borrowing
+@njit_no_refcount
 def place_all(avatar, m, scale, placed, scene, bounds):
     """Place an avatar: root and nodes below its front into placed.nodes, the front in `bounds`.
 
     The front becomes the first list of `bounds`. Fills placed.frame and shift. Returns (extent,
-    farthest) for `make_limits` and the length of the list.
+    farthest) for `make_thresholds` and the length of the list.
     """
     extent, farthest = place_root(avatar, m, scale, placed, scene)
     count = place_front(avatar, m, scale, placed, scene, extent, bounds)
@@ -81,21 +88,21 @@ def place_all(avatar, m, scale, placed, scene, bounds):
     return extent, farthest, count
 
 
-@inlined
-def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
+@njit_inlined
+def _search_leaves(m, a, row, avatar, placed, scene, location, best, off):
     """Update the best pair from an avatar's leaf node (its marked points) and a scene's."""
     ints, lanes, keep, block = scene.ints, placed.lanes, best.keep, ~np.int64(avatar.first[U(a)])
     for lane in range(avatar.count[U(a)], LANES):
         keep[U(lane)] = False  # repeats the last point
     number = ~np.int64(ints[U(row + FIRST)])
-    block_at = spot[1] + number * scene.block_words
-    lane_at = spot[2] + number * 3 * LANES
+    block_at = location[1] + number * scene.block_words
+    lane_at = location[2] + number * 3 * LANES
     low_x = off[0] + np.float32(ints[U(block_at)])
     low_y = off[1] + np.float32(ints[U(block_at + 1)])
     low_z = off[2] + np.float32(ints[U(block_at + 2)])
     halves, c = scene.halves, node_class(ints, row, best.mask)
-    keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.far[c], keep)
-    least, tested = least_squares(
+    unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.far[c], keep)
+    least, tested = nearest_squares(
         halves, lane_at, low_x, low_y, low_z, lanes, block, keep, best.keep8, best.squares
     )
     best.counters[1] += LANES * tested
@@ -105,7 +112,7 @@ def _search_leaves(m, a, row, avatar, placed, scene, spot, best, off):
         )  # fmt: skip
 
 
-@borrowing
+@njit_no_refcount
 def _push(below, keys, begin, depth, a, key):
     """Insert a node into below[begin:depth], sorted by descending key; the least key is on top."""
     at = depth
@@ -115,19 +122,19 @@ def _push(below, keys, begin, depth, a, key):
     below[at], keys[at] = a, key
 
 
-@borrowing
-def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
+@njit_no_refcount
+def _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratch):
     """Search a scene leaf node for a point nearer to a point below a node of the avatar's front.
 
     The avatar's node is descended depth first, the nearest child first. This is for avatars whose
     front is not their leaf nodes.
     """
     words, nodes, firsts, held = scene.words, placed.nodes, avatar.first, avatar.count
-    below, keys, off, cut = descent.below, descent.keys, descent.off, best.cut
+    below, keys, off, cut = scratch.below, scratch.keys, scratch.off, best.cut
     of_class = node_class(scene.ints, row, best.mask)
     below[0], keys[0] = a, np.float32(-1.0)
     depth = 1
-    while depth > 0 and not is_over(scene.stop, best.counters[0], best.counters[3]):
+    while depth > 0 and not should_end(scene.stop, best.counters[0], best.counters[3]):
         depth -= 1
         a, within = below[depth], cut[of_class]
         if keys[depth] > within:
@@ -138,8 +145,8 @@ def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
             if placed.stamp[block] != pose:
                 place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
                 placed.stamp[block] = pose
-            if keep_near(placed.lanes, block, words, row, off[0], off[1], off[2], within, best.keep):
-                _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
+            if mark_near(placed.lanes, block, words, row, off[0], off[1], off[2], within, best.keep):
+                _search_leaves(m, a, row, avatar, placed, scene, location, best, off)
             continue
         begin = depth
         best.counters[0] += held[a]
@@ -153,7 +160,7 @@ def _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent):
                 depth += 1
 
 
-@borrowing
+@njit_no_refcount
 def node_near(words, row, x, y, z, span):
     """Return whether a scene node may hold a point within `span` of a position.
 
@@ -164,28 +171,28 @@ def node_near(words, row, x, y, z, span):
     dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
     both = words[w + U(3)] + span
     along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
-    room = words[w + U(7)] * (span + SLACK * both + SLACK * both)
+    wide = words[w + U(7)] * (span + SLACK * both + SLACK * both)
     return (
         (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
-        & (along <= words[w + U(9)] + room)
-        & (along >= words[w + U(8)] - room)
+        & (along <= words[w + U(9)] + wide)
+        & (along >= words[w + U(8)] - wide)
     )
 
 
-@borrowing
-def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent, best):
+@njit_no_refcount
+def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch, best):
     """Search one resident voxel for a nearer pair.
 
-    The descent is that of overlap.py, and the function is long for the same reason.
+    The descent is that of collide_poses.py, and the function is long for the same reason.
     """
     words, ints = scene.words, scene.ints
     nodes, lanes, stamp = placed.nodes, placed.lanes, placed.stamp
-    cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, descent.off
+    cut, keep, counters, corner, off = best.cut, best.keep, best.counters, best.corner, scratch.off
     bounds, which, listed, listed8 = front.bounds, front.which, front.keep, front.keep8
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
-    stack, mask = descent.stack, best.mask
+    stack, mask = scratch.stack, best.mask
     shift, frame, step, stop, most = placed.shift, placed.frame, scene.step, scene.stop, counters[3]
-    spot = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
+    location = (scene.where[voxel, 0], scene.where[voxel, 1], scene.where[voxel, 2])
     for r in range(3):
         corner[r] = scene.coordinates[voxel, r] * scene.voxel_steps
         off[r] = np.float32(corner[r] - placed.frame[r])
@@ -193,11 +200,11 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
     counters[0] += 1
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     broad = BROAD * radius
-    if not node_near(words, spot[0], x, y, z, radius + cut[node_class(ints, spot[0], mask)]):
+    if not node_near(words, location[0], x, y, z, radius + cut[node_class(ints, location[0], mask)]):
         return
-    stack[0, 0], stack[0, 1], stack[0, 2] = spot[0], 0, count
+    stack[0, 0], stack[0, 1], stack[0, 2] = location[0], 0, count
     depth = 1
-    while depth > 0 and not is_over(stop, counters[0], most):
+    while depth > 0 and not should_end(stop, counters[0], most):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -205,10 +212,10 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
         if first < 0 or words[U(row + 3)] < broad:
             counters[0] += count
             steps = (count + LANES - 1) // LANES
-            if not sift(words, row, bounds, at, steps, off_x, off_y, off_z, cut[c], listed):
+            if not mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, cut[c], listed):
                 continue
             to = at + steps * LANES
-            count = take_kept(bounds, which, listed, listed8, at, steps, to)
+            count = compact_marked(bounds, which, listed, listed8, at, steps, to)
             at = to
             thick = words[U(row + 9)] - words[U(row + 8)]
             if first < 0 or thick < FLAT * words[U(row + 7)] * bounds[3, U(at)]:
@@ -222,33 +229,33 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, descent,
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
-                        if not keep_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep):
+                        if not mark_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep):
                             continue
                         if first < 0:
-                            _search_leaves(m, a, row, avatar, placed, scene, spot, best, off)
+                            _search_leaves(m, a, row, avatar, placed, scene, location, best, off)
                             continue
                     elif first < 0:
-                        _search_below(avatar, m, pose, a, row, placed, scene, spot, best, descent)
+                        _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratch)
                         continue
-                    move_node(bounds, which, U(i), U(left))
+                    copy_node(bounds, which, U(i), U(left))
                     left += 1
                 if left == at:  # always true at a leaf
                     continue
-                pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
+                pad_list(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
         children = np.int64(ints[U(row + COUNT)] & COUNTED)
-        child = spot[0] + first * ROW_WORDS
+        child = location[0] + first * ROW_WORDS
         counters[0] += children
         for _ in range(children):
             stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2] = child, at, count
             if node_near(words, child, x, y, z, radius + cut[node_class(ints, child, mask)]):
                 depth += 1
             child += ROW_WORDS
-    settle(best, points, m, placed.shift, ints, scene.halves, lanes, off)
+    settle_candidates(best, points, m, placed.shift, ints, scene.halves, lanes, off)
 
 
-@borrowing
-def box_gap(root, placed, farthest, scene, index, voxel):
+@njit_no_refcount
+def box_distance(root, placed, farthest, scene, index, voxel):
     """Return a lower bound of the distance of the avatar's centres from a voxel's points.
 
     In steps, at least 0, from the index alone.  root: radius of the avatar's root sphere, scaled
@@ -259,26 +266,26 @@ def box_gap(root, placed, farthest, scene, index, voxel):
         center = placed.frame[r]  # the root's centre, to half a step an axis
         gap = np.float64(max(index.low[voxel, r] - center, center - index.high[voxel, r], 0))
         square += gap * gap
-    # One step for the frame's rounding; for the other terms see `make_limits`.
+    # One step for the frame's rounding; for the other terms see `make_thresholds`.
     error = 1.0 + 2.0 / scene.units_per_step + farthest * 2.0**-46
     return max(math.sqrt(square) * (1.0 - 1e-9) - root / scene.step * (1.0 + 1e-9) - error, 0.0)
 
 
-@borrowing
-def _widen(
-    m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
+@njit_no_refcount
+def _search_widening(
+    m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, scratch, best, gaps, classes
 ):
     """Search the voxels reach.rows[first:last] for the nearest pair, within widening bounds.
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
     nodes are far.
-    gaps: for each voxel, see `box_gap`; inf: not resident.  classes: of their root nodes.
+    gaps: for each voxel, see `box_distance`; inf: not resident.  classes: of their root nodes.
     """
-    units, found, drop, cut = best.units, best.found, best.drop, best.cut
+    units, found, deficit, cut = best.units, best.found, best.deficit, best.cut
     # Under the radius model, no sphere here is larger than the largest minus this.
-    base = drop[classes[0]]
+    base = deficit[classes[0]]
     for other in range(1, last - first):
-        base = min(base, drop[classes[other]])
+        base = min(base, deficit[classes[other]])
     # Twice the radii: a distance of the size of the spheres. For spheres of radius 0, a share of
     # the reach.
     near = max(2 * (units[0] - base - beyond), (units[0] - base) >> 6, 1)
@@ -288,20 +295,20 @@ def _widen(
             limit = min(limit, found_units(found))
         bound = min(base + near, limit)
         units[1] = bound
-        set_cut(cut, best.far, best.frame, drop, bound)
+        set_cut(cut, best.far, best.frame, deficit, bound)
         while True:
             # The nearest voxel first. Few are searched, therefore they are not sorted.
             at, least = -1, np.inf
             for other in range(last - first):
                 if 0.0 <= gaps[other] <= min(least, np.float64(cut[classes[other]])):
                     at, least = other, gaps[other]
-            if at < 0 or is_over(scene.stop, best.counters[0], best.counters[3]):
+            if at < 0 or should_end(scene.stop, best.counters[0], best.counters[3]):
                 break
             gaps[at] = -1.0 - least
             _nearest_voxel(
-                avatar, m, pose, placed, scene, reach.rows[first + at], front, count, descent, best
+                avatar, m, pose, placed, scene, reach.rows[first + at], front, count, scratch, best
             )
-        if units[1] < bound or bound == limit or is_over(scene.stop, best.counters[0], best.counters[3]):
+        if units[1] < bound or bound == limit or should_end(scene.stop, best.counters[0], best.counters[3]):
             break
         near *= 4
         for at in range(last - first):
@@ -313,30 +320,30 @@ def _widen(
 def nearest_poses(poses, avatar, scene, index, reach, beyond, which, most_visits, nearest, counts):
     """Answer `distance` for the poses numbered in `which`: one call a request, with all voxels.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (voxels_in_reach.py), to the
-    largest distance requested; a voxel in it that is not resident is counted as missing.  beyond:
-    the part of the reach that is not the radii, exact units.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
+    (voxels_in_reach.py), to the largest distance requested; a voxel in it that is not resident is
+    counted as missing.  beyond: the part of the reach that is not the radii, exact units.
     Accumulates into `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests),
     whose initial values are -1, inf and 0. A pose may therefore be answered in pieces. Once the
     scene's stop flag is set, or a pose has cost more than `most_visits`, voxels that were not
-    searched count in `gap` as though they were missing.
+    searched count in `missing_bound` as though they were missing.
     """
-    placed, best = make_placed(avatar), make_best(scene.drop)
+    placed, best = make_placed(avatar), make_best_pair(scene.radius_deficit)
     best.counters[3] = most_visits
-    front, descent = make_front(avatar), make_descent()
+    front, scratch = make_front(avatar), make_nearest_scratch()
     most = 0
     for number in range(which.shape[0]):
         most = max(most, reach.starts[which[number] + 1] - reach.starts[which[number]])
     gaps, classes = np.empty(most), np.empty(most, np.uint64)
     _nearest_poses(
-        poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps,
+        poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, scratch, gaps,
         classes,
     )  # fmt: skip
 
 
-@borrowing
+@njit_no_refcount
 def _nearest_poses(
-    poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, descent, gaps, classes
+    poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, scratch, gaps, classes
 ):  # fmt: skip
     """Implement `nearest_poses` with its scratch passed in."""
     for number in range(which.shape[0]):
@@ -345,7 +352,7 @@ def _nearest_poses(
         if first == last:
             continue
         if stopped(scene.stop):
-            nearest.gap[i] = 0.0
+            nearest.missing_bound[i] = 0.0
             continue
         best.frame[0], best.frame[1], count = place_all(
             avatar, poses[i], reach.scales[i], placed, scene, front.bounds
@@ -354,28 +361,28 @@ def _nearest_poses(
         best.found[0] = nearest.square[i]
         for r in range(6):
             best.found[1 + r] = nearest.pair[i, r]
-        best.found[7] = nearest.drop[i]
+        best.found[7] = nearest.deficit[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
         root = avatar.radius[0] * reach.scales[i]
         for at in range(first, last):
-            gap = box_gap(root, placed, best.frame[1], scene, index, reach.rows[at])
+            gap = box_distance(root, placed, best.frame[1], scene, index, reach.rows[at])
             row = scene.where[reach.rows[at], 0]
             if row >= 0:
                 gaps[at - first], classes[at - first] = gap, node_class(scene.ints, row, best.mask)
             else:
                 gaps[at - first], classes[at - first] = np.inf, U(0)
                 counts[0, i] += np.uint32(1)
-                nearest.gap[i] = min(nearest.gap[i], gap)
-        _widen(
-            poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, descent, best, gaps, classes
+                nearest.missing_bound[i] = min(nearest.missing_bound[i], gap)
+        _search_widening(
+            poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, scratch, best, gaps, classes
         )  # fmt: skip
-        if is_over(scene.stop, best.counters[0], best.counters[3]):
+        if should_end(scene.stop, best.counters[0], best.counters[3]):
             # The gap of no voxel is below 0, and any of them may have been searched only in part.
-            nearest.gap[i] = 0.0
+            nearest.missing_bound[i] = 0.0
         nearest.square[i] = best.found[0]
         for r in range(6):
             nearest.pair[i, r] = best.found[1 + r]
-        nearest.drop[i] = best.found[7]
+        nearest.deficit[i] = best.found[7]
         counts[1, i] += np.uint32(best.counters[0])
         counts[2, i] += np.uint32(best.counters[1])

@@ -1,7 +1,7 @@
 """Prediction of a user's motion, and the voxels it brings within reach, from the index alone.
 
-A way is the path of the user's ball: m + 1 centres, beginning with the last pose [lattice steps], m
-straight pieces.
+A path is the path of the user's ball: m + 1 centres, beginning with the last pose [lattice steps],
+m straight pieces.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.voxels_in_reach import find_key, grid_high, grid_low
 
 # Typical values of poses that look like a walk: scatter of clock and position together [m], and
@@ -24,15 +24,15 @@ SCATTER, USUAL_SPEED, USUAL_ACCELERATION = 0.02, 3.0, 2.0
 NEAREST_HALVINGS, TOUCH_HALVINGS = 40, 12
 # Largest number of grid cells one call looks up: a few milliseconds, reached only with voxels far
 # smaller than the reach. The last cells are then omitted.
-MOST_CELLS = 1 << 14
+MAX_CELLS = 1 << 14
 
 
-class Motion(NamedTuple):
+class PredictionLimits(NamedTuple):
     """Limits of a prediction.
 
     history: poses older than this before the last are ignored [s].  speed: at most [m/s].
     acceleration: at most [m/s²].
-    fade: the acceleration falls to 1/e in this time [s], which makes the far part of the way
+    fade: the acceleration falls to 1/e in this time [s], which makes the far part of the path
     straight.
     """
 
@@ -42,7 +42,7 @@ class Motion(NamedTuple):
     fade: float
 
 
-@borrowing
+@njit_no_refcount
 def _limit(vector, most):
     """Shorten a vector (3,) to a length of at most `most`."""
     length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
@@ -52,11 +52,11 @@ def _limit(vector, most):
 
 
 @nb.njit(nogil=True, cache=True)
-def fit_motion(poses, motion):
+def fit_motion(poses, limits):
     """Fit velocity [m/s] and acceleration [m/s²], (3,) each, at the last of poses (h, 4).
 
     A pose: time [s], position [m]; h >= 1. Least squares of p + v t + a t²/2 over the last
-    `motion.history` seconds, with v and a drawn towards 0 by SCATTER over USUAL_*. For one pose, or
+    `limits.history` seconds, with v and a drawn towards 0 by SCATTER over USUAL_*. For one pose, or
     poses at one time, both are 0.
     """
     last = poses.shape[0] - 1
@@ -64,7 +64,7 @@ def fit_motion(poses, motion):
     right = np.zeros((3, 3))
     for i in range(last + 1):
         t = poses[i, 0] - poses[last, 0]
-        if t < -motion.history or t > 0.0:
+        if t < -limits.history or t > 0.0:
             continue
         h = t * t / 2
         s0, s1, s2, s3, s4 = s0 + 1.0, s1 + t, s2 + t * t, s3 + t * h, s4 + h * h
@@ -85,71 +85,71 @@ def fit_motion(poses, motion):
         r2 = right[2, k] - s2 / 2 / s0 * right[0, k]
         velocity[k] = (m22 * r1 - m12 * r2) / determinant
         acceleration[k] = (m11 * r2 - m12 * r1) / determinant
-    _limit(velocity, motion.speed)
-    _limit(acceleration, motion.acceleration)
+    _limit(velocity, limits.speed)
+    _limit(acceleration, limits.acceleration)
     return velocity, acceleration
 
 
 @nb.njit(nogil=True, cache=True)
-def predict_way(poses, motion, seconds, way):
-    """Write predicted positions from the last pose to `seconds` after it into way (m + 1, 3) [m].
+def predict_path(poses, limits, seconds, path):
+    """Write predicted positions from the last pose to `seconds` after it into path (m + 1, 3) [m].
 
-    The times are evenly spaced; m >= 1. The acceleration fades (`Motion`) and never makes the user
-    faster than `motion.speed`; the way is therefore at most speed * seconds long. With seconds of 0
-    or less, the user stands still.
+    The times are evenly spaced; m >= 1. The acceleration fades (`PredictionLimits`) and never makes
+    the user faster than `limits.speed`; the path is therefore at most speed * seconds long. With
+    seconds of 0 or less, the user stands still.
     """
-    last, pieces = poses.shape[0] - 1, way.shape[0] - 1
-    velocity, acceleration = fit_motion(poses, motion)
+    last, pieces = poses.shape[0] - 1, path.shape[0] - 1
+    velocity, acceleration = fit_motion(poses, limits)
     now = np.empty(3)
     for k in range(3):
-        way[0, k] = poses[last, 1 + k]
+        path[0, k] = poses[last, 1 + k]
     step = max(seconds, 0.0) / pieces
     for i in range(pieces):
         # The speed at the middle of a piece represents the whole piece.
-        gained = motion.fade * (1.0 - math.exp(-(i + 0.5) * step / motion.fade))
+        gained = limits.fade * (1.0 - math.exp(-(i + 0.5) * step / limits.fade))
         for k in range(3):
             now[k] = velocity[k] + acceleration[k] * gained
-        _limit(now, motion.speed)
+        _limit(now, limits.speed)
         for k in range(3):
-            way[i + 1, k] = way[i, k] + now[k] * step
+            path[i + 1, k] = path[i, k] + now[k] * step
 
 
-@borrowing
-def _square_gap(way, i, along, low, high):
+@njit_no_refcount
+def _square_gap(path, i, along, low, high):
     """Return the squared distance of a point of piece i from the box [low, high], and its slope.
 
     along: position on the piece, in [0, 1].  low, high: (3,).
     """
     square, slope = 0.0, 0.0
     for k in range(3):
-        step = way[i + 1, k] - way[i, k]
-        x = way[i, k] + along * step
+        step = path[i + 1, k] - path[i, k]
+        x = path[i, k] + along * step
         gap = min(x - low[k], 0.0) + max(x - high[k], 0.0)
         square += gap * gap
         slope += gap * step
     return square, slope
 
 
-@borrowing
-def first_touch(way, i, low, high, reach):
+@njit_no_refcount
+def first_touch(path, i, low, high, reach):
     """Return when a ball first touches a box as it moves along piece i: in [0, 1], or -1 if never.
 
     reach: of the ball. The moment is never late. The distance is convex along a piece; its minimum
     is where the slope changes sign.
     """
     most = reach * reach
-    square, slope = _square_gap(way, i, 0.0, low, high)
+    square, slope = _square_gap(path, i, 0.0, low, high)
     if square <= most:
         return 0.0
     if slope >= 0.0:
         return -1.0
-    least, slope = _square_gap(way, i, 1.0, low, high)
+    least, slope = _square_gap(path, i, 1.0, low, high)
     near = 1.0
     if slope > 0.0:
         before = 0.0
         for _ in range(NEAREST_HALVINGS):
             middle = (before + near) / 2
-            square, slope = _square_gap(way, i, middle, low, high)
+            square, slope = _square_gap(path, i, middle, low, high)
             least = min(least, square)
             if slope > 0.0:
                 near = middle
@@ -160,7 +160,7 @@ def first_touch(way, i, low, high, reach):
     before, touching = 0.0, near
     for _ in range(TOUCH_HALVINGS):
         middle = (before + touching) / 2
-        square, slope = _square_gap(way, i, middle, low, high)
+        square, slope = _square_gap(path, i, middle, low, high)
         if square > most:
             before = middle
         else:
@@ -168,7 +168,7 @@ def first_touch(way, i, low, high, reach):
     return before
 
 
-@borrowing
+@njit_no_refcount
 def _cells(low, high, index, voxel_steps, first, counts):
     """Find the grid cells of the scene that meet the box [low, high] (3,) [steps].
 
@@ -187,7 +187,7 @@ def _cells(low, high, index, voxel_steps, first, counts):
     return cells
 
 
-@borrowing
+@njit_no_refcount
 def _cell_row(keys, number, first, counts):
     """Return the row of cell `number` of those that `_cells` found, x slowest; -1: no voxel."""
     iz = first[2] + number % counts[2]
@@ -199,7 +199,7 @@ def _cell_row(keys, number, first, counts):
     )
 
 
-@borrowing
+@njit_no_refcount
 def _known(rows, count, row):
     """Return whether a row is among the first `count`."""
     at = 0
@@ -208,14 +208,14 @@ def _known(rows, count, row):
     return at < count
 
 
-@borrowing
+@njit_no_refcount
 def _box_of(index, row, low, high):
     """Fill low and high (3,) float64 with the box of a voxel's points [steps]."""
     for k in range(3):
         low[k], high[k] = np.float64(index.low[row, k]), np.float64(index.high[row, k])
 
 
-@borrowing
+@njit_no_refcount
 def _sort_by_need(rows, need, count):
     """Sort the first `count` entries, soonest first, ties by row; they arrive nearly in order."""
     for i in range(1, count):
@@ -228,18 +228,18 @@ def _sort_by_need(rows, need, count):
 
 
 @nb.njit(nogil=True, cache=True)
-def rows_ahead(way, reach, ring, index, voxel_steps, rows, need):
-    """Find the voxels a ball touches on its way, then those around its start.
+def rows_ahead(path, reach, ring, index, voxel_steps, rows, need):
+    """Find the voxels a ball touches on its path, then those around its start.
 
-    way: (m + 1, 3) float64.  reach: of the ball, inclusive.  ring: how far beyond the reach voxels
+    path: (m + 1, 3) float64.  reach: of the ball, inclusive.  ring: how far beyond the reach voxels
     count as around; all [steps].
     Fills rows (n,) int64, each once, and need (n,) float64, soonest first. need is the number of
-    pieces of the way until the ball touches, 0 to m. For voxels around the start that it does not
+    pieces of the path until the ball touches, 0 to m. For voxels around the start that it does not
     touch, need is m + 1 + (distance between ball and box) / ring.
     Returns how many, at most n; where there are more, the voxels on the last pieces, or around, are
     omitted.
     """
-    pieces, capacity, voxels = way.shape[0] - 1, rows.shape[0], index.keys.shape[0]
+    pieces, capacity, voxels = path.shape[0] - 1, rows.shape[0], index.keys.shape[0]
     low, high, box_low, box_high = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     first, counts = np.empty(3, np.int64), np.empty(3, np.int64)
     found, looked = 0, 0
@@ -250,25 +250,25 @@ def rows_ahead(way, reach, ring, index, voxel_steps, rows, need):
         wide = reach + ring if around else reach
         a, b = (0, 0) if around else (i, i + 1)
         for k in range(3):
-            low[k] = min(way[a, k], way[b, k]) - wide
-            high[k] = max(way[a, k], way[b, k]) + wide
+            low[k] = min(path[a, k], path[b, k]) - wide
+            high[k] = max(path[a, k], path[b, k]) + wide
         cells = _cells(low, high, index, voxel_steps, first, counts)
         listed = cells > voxels  # cheaper to test every voxel than every cell of the grid
         for number in range(int(min(cells, np.float64(voxels)))):
             looked += 1
-            if looked > MOST_CELLS or found == capacity:
+            if looked > MAX_CELLS or found == capacity:
                 break
             row = number if listed else _cell_row(index.keys, number, first, counts)
             if row < 0 or _known(rows, found, row):
                 continue
             _box_of(index, row, box_low, box_high)
             if around:
-                square, _ = _square_gap(way, 0, 0.0, box_low, box_high)
+                square, _ = _square_gap(path, 0, 0.0, box_low, box_high)
                 if square > wide * wide:
                     continue
                 need[found] = pieces + 1 + max(0.0, math.sqrt(square) - reach) / ring
             else:
-                touch = first_touch(way, i, box_low, box_high, reach)
+                touch = first_touch(path, i, box_low, box_high, reach)
                 if touch < 0.0:
                     continue
                 need[found] = i + touch
@@ -312,7 +312,7 @@ def rows_in_reach(centers, reaches, index, voxel_steps, starts, rows):
     return needed
 
 
-@borrowing
+@njit_no_refcount
 def _square_between(low, high, other_low, other_high):
     """Return the squared distance between two boxes of corners (3,)."""
     square = 0.0
@@ -323,20 +323,20 @@ def _square_between(low, high, other_low, other_high):
 
 
 @nb.njit(nogil=True, cache=True)
-def distance_to_ways(ways, rows, index, far):
-    """Write the least distance of each voxel's box to the centres of u ways [steps] to far (n,).
+def write_path_distances(paths, rows, index, far):
+    """Write the least distance of each voxel's box to the centres of u paths [steps] to far (n,).
 
-    rows: (n,), the voxels.  ways: (u, m, 3) float64. far is inf where u is 0.
+    rows: (n,), the voxels.  paths: (u, m, 3) float64. far is inf where u is 0.
     """
     low, high = np.empty(3), np.empty(3)
-    users = ways.shape[0]
+    users = paths.shape[0]
     boxes, apart = (
         np.empty((users, 2, 3)),
         np.empty(users),
-    )  # boxes of whole ways, and the squared distance to each: no centre is nearer
+    )  # boxes of whole paths, and the squared distance to each: no centre is nearer
     for u in range(users):
         for k in range(3):
-            boxes[u, 0, k], boxes[u, 1, k] = ways[u, :, k].min(), ways[u, :, k].max()
+            boxes[u, 0, k], boxes[u, 1, k] = paths[u, :, k].min(), paths[u, :, k].max()
     for j in range(rows.shape[0]):
         _box_of(index, rows[j], low, high)
         first = 0
@@ -348,6 +348,6 @@ def distance_to_ways(ways, rows, index, far):
         for turn in range(users):
             u = first if turn == 0 else turn - 1 if turn <= first else turn
             if apart[u] < nearest:
-                for i in range(ways.shape[1]):
-                    nearest = min(nearest, _square_between(low, high, ways[u, i], ways[u, i]))
+                for i in range(paths.shape[1]):
+                    nearest = min(nearest, _square_between(low, high, paths[u, i], paths[u, i]))
         far[j] = math.sqrt(nearest)

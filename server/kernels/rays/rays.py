@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import U32
 from ..core.pose_transform import lattice_to_units
 from ..core.stop_flag_checks import stopped
@@ -39,7 +39,7 @@ from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_cl
 STACK = MAX_LEVELS * 15 + 16
 
 
-class Rays(NamedTuple):
+class RayBatch(NamedTuple):
     """Batch of k rays.
 
     origin: (k, 3) int64.  direction: (k, 3) float64 unit vectors.  reach, radius: int64, radius of
@@ -52,7 +52,7 @@ class Rays(NamedTuple):
     radius: int
 
 
-class Nearest(NamedTuple):
+class ClosestHits(NamedTuple):
     """Best results so far of k rays or points, and their cost.
 
     value: (k,) float64, t of a ray, exact units, inf: none; unused for points.
@@ -69,7 +69,7 @@ class Nearest(NamedTuple):
     counts: NDArray[np.uint32]
 
 
-@borrowing
+@njit_no_refcount
 def first_meeting(dx, dy, dz, ux, uy, uz, radius):
     """Return t of one ray and one sphere by the definition above, inf when missed.
 
@@ -91,7 +91,7 @@ def first_meeting(dx, dy, dz, ux, uy, uz, radius):
     return max(along - math.sqrt((r - miss) * (r + miss)), 0.0)
 
 
-@borrowing
+@njit_no_refcount
 def _meet_node(words, row, ray, radius, limit):
     """Return a lower bound of t [steps] for the spheres of a node's points, inf if none is met.
 
@@ -116,8 +116,8 @@ def _meet_node(words, row, ray, radius, limit):
     nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
     slope = nx * ray[3] + ny * ray[4] + nz * ray[5]
     offset = nx * dx + ny * dy + nz * dz
-    room = words[row + 7] * radius
-    least, most = words[row + 8] - room, words[row + 9] + room
+    wide = words[row + 7] * radius
+    least, most = words[row + 8] - wide, words[row + 9] + wide
     begin, end = first * slope - offset, last * slope - offset
     if (begin > most and end > most) or (begin < least and end < least):
         return np.inf
@@ -128,7 +128,7 @@ def _meet_node(words, row, ray, radius, limit):
     return first if first <= limit else np.inf
 
 
-@borrowing
+@njit_no_refcount
 def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     """Test all points of a leaf node against ray i: 32 in float32, those within the band exactly.
 
@@ -140,8 +140,8 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + block * scene.block_words
     lane_at = scene.where[voxel, 2] + block * 3 * LANES
-    drop = scene.drop
-    mask = np.uint64(drop.shape[0] - 1)
+    deficit = scene.radius_deficit
+    mask = np.uint64(deficit.shape[0] - 1)
     dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
     along = dx * ray[3] + dy * ray[4] + dz * ray[5]
     qx = np.float32(ray[0] + along * ray[3] - ints[block_at])
@@ -180,7 +180,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
             lattice_to_units(sx, scene.units_per_step) - rays.origin[i, 0],
             lattice_to_units(sy, scene.units_per_step) - rays.origin[i, 1],
             lattice_to_units(sz, scene.units_per_step) - rays.origin[i, 2],
-            ux, uy, uz, rays.radius - drop[point_class(ints, block_at, j, mask)],
+            ux, uy, uz, rays.radius - deficit[point_class(ints, block_at, j, mask)],
         )  # fmt: skip
         first = t < best.value[i] or (t == best.value[i] and is_less(sx, sy, sz, best.lattice[i]))
         if first and t <= rays.reach:
@@ -188,7 +188,7 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
             best.lattice[i, 0], best.lattice[i, 1], best.lattice[i, 2] = sx, sy, sz
 
 
-@borrowing
+@njit_no_refcount
 def is_less(x, y, z, other):
     """Return whether a lattice point precedes another (3,), by x, then y, then z."""
     if x != other[0]:
@@ -198,7 +198,7 @@ def is_less(x, y, z, other):
     return z < other[2]
 
 
-@borrowing
+@njit_no_refcount
 def _set_frame(ray, direction):
     """Fill ray[3:12] with the direction and two perpendicular unit vectors.
 
@@ -219,7 +219,7 @@ def _set_frame(ray, direction):
     ray[9], ray[10], ray[11] = uy * az - uz * ay, uz * ax - ux * az, ux * ay - uy * ax
 
 
-@borrowing
+@njit_no_refcount
 def push_sorted(rows, bounds, begin, depth, row, bound):
     """Push a node onto a stack whose entries [begin, depth] are popped by ascending bound."""
     at = depth
@@ -229,12 +229,12 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
     rows[at], bounds[at] = row, bound
 
 
-@borrowing
-def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, drops):
+@njit_no_refcount
+def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, deficits):
     """Follow ray i through the tree of one resident voxel, front to back; update `best`.
 
-    drops: `scene.drop` in float64 [steps].  near: exact units, as in Lists. A bound of a node holds
-    for its children; no bound therefore gets worse with more visits.
+    deficits: `scene.radius_deficit` in float64 [steps].  near: exact units, as in VoxelLists. A
+    bound of a node holds for its children; no bound therefore gets worse with more visits.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -248,8 +248,8 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
     # wide margin.
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
     largest = np.float64(rays.radius) * per_unit + error
-    base, mask = scene.where[voxel, 0], np.uint64(drops.shape[0] - 1)
-    radius = largest - drops[node_class(ints, base, mask)]
+    base, mask = scene.where[voxel, 0], np.uint64(deficits.shape[0] - 1)
+    radius = largest - deficits[node_class(ints, base, mask)]
     reach = np.float64(rays.reach)
     spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
     rows[0], depth = base, 0
@@ -267,7 +267,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         first = ints[row + FIRST]
         if first < 0:
             tests += LANES
-            radius = largest - drops[node_class(ints, row, mask)]
+            radius = largest - deficits[node_class(ints, row, mask)]
             _test_block(scene, voxel, row, ray, radius, rays, i, best)
             continue
         spent += ints[row + COUNT] & COUNTED
@@ -275,7 +275,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         limit = min(best.value[i], reach) * per_unit + error
         for child in range(first, first + (ints[row + COUNT] & COUNTED)):
             child_row = base + child * ROW_WORDS
-            radius = largest - drops[node_class(ints, child_row, mask)]
+            radius = largest - deficits[node_class(ints, child_row, mask)]
             bound = _meet_node(words, child_row, ray, radius, limit)
             if bound < np.inf:
                 push_sorted(rows, bounds, begin, depth, child_row, max(bound, above))
@@ -288,14 +288,14 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
     """Follow each ray along its list, from its cursor up to the first voxel that is not held.
 
     One call serves one round. Once the scene's stop flag is set, no more visits are spent.
-    lists: Lists of these rays.  cursor: (k,) int64, entries processed; a ray whose cursor is at the
-    end of its list is finished.  held: (v,) bool, voxels that do not change during this call; a
-    held voxel that is not resident is counted as missing.  tolerance: exact units.  visits: node
-    visits a ray. Updates cursor and best.
+    lists: VoxelLists of these rays.  cursor: (k,) int64, entries processed; a ray whose cursor is
+    at the end of its list is finished.  held: (v,) bool, voxels that do not change during this
+    call; a held voxel that is not resident is counted as missing.  tolerance: exact units.  visits:
+    node visits a ray. Updates cursor and best.
     """
     ray = np.empty(12)
     rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
-    drops = scene.drop.astype(np.float64) / scene.units_per_step
+    deficits = scene.radius_deficit.astype(np.float64) / scene.units_per_step
     for i in range(cursor.shape[0]):
         end = lists.starts[i + 1]
         if cursor[i] == end:
@@ -315,5 +315,5 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, drops)
+                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, deficits)
             cursor[i] = at + 1

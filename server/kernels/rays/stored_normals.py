@@ -10,13 +10,13 @@ from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
 from ....schemas.kernels.normal_codes import NONE, normal_code
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
 from ..core.voxels_in_reach import find_key
 from .rays import STACK
 
 # A code that no normal has: both bytes of a normal's code are at least 1.
-UNASKED = np.uint16(1)
+NOT_ESTIMATED = np.uint16(1)
 SUMS = 10
 
 
@@ -32,7 +32,7 @@ def find_voxel(keys, voxel_steps, x, y, z):
     return find_key(keys, morton_code(np.uint64(ix), np.uint64(iy), np.uint64(iz)))
 
 
-@borrowing
+@njit_no_refcount
 def _find_point(scene, voxel, x, y, z, rows):
     """Return the lane of a point in a resident voxel, or -1, and the nodes visited.
 
@@ -71,7 +71,7 @@ def _find_point(scene, voxel, x, y, z, rows):
     return np.int64(-1), visits
 
 
-@borrowing
+@njit_no_refcount
 def _add_near(scene, voxel, x, y, z, square, rows, sums):
     """Accumulate the sums for `normal_code` over a resident voxel's points near a point.
 
@@ -140,7 +140,7 @@ def code_at(scene, voxel, x, y, z, square, codes):
     lane, visits = _find_point(scene, voxel, x, y, z, rows)
     if lane < 0:
         return NONE, visits, False
-    if codes.shape[0] > 0 and codes[lane] != UNASKED:
+    if codes.shape[0] > 0 and codes[lane] != NOT_ESTIMATED:
         return codes[lane], visits, False
     visits += _add_near(scene, voxel, x, y, z, square, rows, sums)
     code = normal_code(sums)

@@ -17,17 +17,17 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.pose_transform import MAX_REACH_UNITS
-from ...kernels.core.voxels_in_reach import Reach
+from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...kernels.nearest.best_first_search import (
     OPEN,
-    Goal,
-    Known,
+    SearchGoal,
+    SearchResults,
     end_search,
-    go_on,
     make_search,
+    resume_search,
     search_poses,
 )
-from ...kernels.nearest.nearest_pair import Nearest
+from ...kernels.nearest.nearest_pair import NearestPairs
 from ...runtime.stop_flag import StopFlag
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, as_held, find_proved_reach, in_unknown, kernel_poses, pieces, to_units
@@ -46,7 +46,7 @@ TOLERANCE_SLACK = 8.0
 class _Gathered(NamedTuple):
     """Results of a request: known, counts (3, k) uint32, and cost."""
 
-    known: Known
+    known: SearchResults
     counts: NDArray[np.uint32]
     cost: Cost
 
@@ -55,12 +55,12 @@ def _search_until(
     data: SceneData,
     avatar: AvatarModel,
     array: NDArray[np.float64],
-    part: Reach,
+    part: VoxelsInReach,
     which: NDArray[np.int64],
     heap: int,
-    goal: Goal,
+    goal: SearchGoal,
     budget: QueryBudget,
-    known: Known,
+    known: SearchResults,
     counts: NDArray[np.uint32],
 ) -> None:
     """Search for the poses `which`, each with its share of the remaining time.
@@ -77,7 +77,7 @@ def _search_until(
         share = now + (deadline - now) / (len(which) - done)
         fresh, until = True, SLICE_VISITS
         while True:
-            status = go_on(
+            status = resume_search(
                 array, avatar.arrays, data.arrays, data.broad, part, pose, fresh, until, search, goal, known, counts
             )  # fmt: skip
             if status != OPEN:
@@ -90,10 +90,10 @@ def _search_until(
 
 def _leave_open(
     data: SceneData,
-    part: Reach,
+    part: VoxelsInReach,
     left: NDArray[np.int64],
     stop: StopFlag,
-    known: Known,
+    known: SearchResults,
     counts: NDArray[np.uint32],
 ) -> None:
     """Abandon the poses `left` in one step and bound them by the index.
@@ -125,14 +125,14 @@ def _gather(
     data: SceneData,
     avatar: AvatarModel,
     array: NDArray[np.float64],
-    reach: Reach,
-    goal: Goal,
+    reach: VoxelsInReach,
+    goal: SearchGoal,
     budget: QueryBudget,
     spent: CostCounter,
 ) -> _Gathered:
     """Search for all poses, piece by piece. Add the cost to `spent`."""
     k = len(array)
-    known = Known(
+    known = SearchResults(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf),
         np.full(k, math.inf), np.full(k, math.inf), np.zeros(k, bool),
     )  # fmt: skip
@@ -161,12 +161,12 @@ def _fields(cost: Cost) -> dict[str, Any]:
     return {name: getattr(cost, name) for name in Cost.__struct_fields__}
 
 
-def _upper(data: SceneData, known: Known, radii: NDArray[np.int64]) -> NDArray[np.float64]:
+def _upper(data: SceneData, known: SearchResults, radii: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return upper bounds (k,) of the signed distances [m]; inf if no pair was bounded.
 
     radii: (k,) sum of the largest radii of avatar and scan, exact units.
     """
-    found = signed_from_square(np.maximum(known.square, 0), radii - known.drop)
+    found = signed_from_square(np.maximum(known.square, 0), radii - known.deficit)
     signed = np.where(known.square >= 0, found, np.inf)
     steps = known.upper * data.arrays.step * (1.0 + 1e-12)
     return np.minimum(signed, steps - radii / UNITS_PER_METRE + 2.0 / UNITS_PER_METRE)
@@ -186,14 +186,14 @@ def distance_bounded(
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
     around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, budget, spent)
     tolerance = max(0.0, budget.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
-    goal = Goal(False, 0, np.zeros(len(array)), tolerance, budget.visits)
+    goal = SearchGoal(False, 0, np.zeros(len(array)), tolerance, budget.visits)
     known, counts, cost = _gather(data, avatar, array, around, goal, budget, spent)
     if len(avatar.points):
-        np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
+        np.minimum(known.missing_bound, unknown_gaps(data, around), out=known.missing_bound)
     # Unfinished searches bound the distance like missing voxels.
-    np.minimum(known.gap, known.lower, out=known.gap)
+    np.minimum(known.missing_bound, known.lower, out=known.missing_bound)
     upper = _upper(data, known, around.units - reach_units)
-    nearest = Nearest(known.square, known.pair, known.drop, known.gap)
+    nearest = NearestPairs(known.square, known.pair, known.deficit, known.missing_bound)
     columns = distance_columns(data, around, float(reach), reach_units, nearest, counts, upper)
     return DistanceAnswers(**columns, **_fields(cost))
 
@@ -217,17 +217,17 @@ def collide_bounded(
     # values.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
     enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
-    goal = Goal(True, early, enough, 0.0, budget.visits)
+    goal = SearchGoal(True, early, enough, 0.0, budget.visits)
     known, counts, cost = _gather(data, avatar, array, around, goal, budget, spent)
     upper = _upper(data, known, radii)
     found = known.square >= 0
-    truly = (found & (known.square <= (around.units - known.drop) ** 2)) | (known.upper <= certain)
+    truly = (found & (known.square <= (around.units - known.deficit) ** 2)) | (known.upper <= certain)
     contact = truly | found | (known.upper <= enough)
     lost = (counts[0] > 0) | (known.lower < math.inf)
     if len(avatar.points):
         lost |= in_unknown(around.boxes, data.unknown, data.nothing_clear)
-        np.minimum(known.gap, unknown_gaps(data, around), out=known.gap)
-    floor = signed_bound(np.minimum(known.gap, known.lower), data, radii)
+        np.minimum(known.missing_bound, unknown_gaps(data, around), out=known.missing_bound)
+    floor = signed_bound(np.minimum(known.missing_bound, known.lower), data, radii)
     lower = np.minimum(np.maximum(floor, -radii / UNITS_PER_METRE), np.minimum(upper, margin))
     verdict = np.where(contact, Verdict.CONTACT, np.where(lost, Verdict.UNKNOWN, Verdict.CLEAR))
     return CollideAnswers(

@@ -17,8 +17,8 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.requests import make_vectors
-from ...kernels.core.voxel_tree import Lists, VoxelTree, list_voxels
-from ...kernels.rays.rays import Nearest
+from ...kernels.core.voxel_tree import VoxelLists, VoxelTree, list_voxels
+from ...kernels.rays.rays import ClosestHits
 from ...residency.index_proof import ENTRIES_AT_ONCE
 from ...runtime.stop_flag import StopFlag
 from .query_budget import CostCounter, QueryBudget
@@ -43,9 +43,9 @@ def make_origins(
     return array, np.rint((array - data.arrays.origin) * UNITS_PER_METRE).astype(np.int64)
 
 
-def make_best(k: int) -> Nearest:
+def make_best(k: int) -> ClosestHits:
     """Return the results of k searches that have found nothing."""
-    return Nearest(
+    return ClosestHits(
         np.full(k, np.inf),
         np.full(k, -1, np.int64),
         np.zeros((k, 3), np.int64),
@@ -54,10 +54,10 @@ def make_best(k: int) -> Nearest:
     )
 
 
-def _part(best: Nearest, begin: int, end: int) -> Nearest:
+def _part(best: ClosestHits, begin: int, end: int) -> ClosestHits:
     """Return views of rows [begin, end), and a contiguous copy of counts to be written back."""
     rows = slice(begin, end)
-    return Nearest(
+    return ClosestHits(
         best.value[rows],
         best.square[rows],
         best.lattice[rows],
@@ -66,7 +66,7 @@ def _part(best: Nearest, begin: int, end: int) -> Nearest:
     )
 
 
-def _forget(best: Nearest) -> None:
+def _forget(best: ClosestHits) -> None:
     """Reset results to those of `make_best`, except `unseen`."""
     best.value[:], best.square[:], best.lattice[:], best.counts[:] = np.inf, -1, 0, 0
 
@@ -80,7 +80,7 @@ def look(
     budget: QueryBudget,
     kernel: Callable[..., Any],
     spent: CostCounter,
-) -> Nearest:
+) -> ClosestHits:
     """Answer k rays (direction (k, 3)) or query points (direction None) in rounds.
 
     radius_units: of the scan's largest sphere; 0 if radii do not count. The index gives no other
@@ -147,14 +147,14 @@ def _list(
     direction: NDArray[np.float64] | None,
     reach_units: int,
     radius_units: int,
-    part: Nearest,
-) -> Lists:
+    part: ClosestHits,
+) -> VoxelLists:
     """List the voxels that k rays or points reach by a tree's boxes; share `unseen` with `part`."""
     k = len(at_units)
     directions = np.empty((0, 3)) if direction is None else direction
     capacity = max(64, 8 * k)
     while True:
-        lists = Lists(
+        lists = VoxelLists(
             np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), part.unseen
         )
         needed = list_voxels(
@@ -168,9 +168,9 @@ def _list(
 
 def _settle_doubts(
     data: SceneData,
-    doubts: Lists,
-    lists: Lists,
-    part: Nearest,
+    doubts: VoxelLists,
+    lists: VoxelLists,
+    part: ClosestHits,
     reach_units: int,
     budget: QueryBudget,
     spent: CostCounter,
@@ -208,7 +208,7 @@ def _settle_doubts(
 
 
 def _open_doubts(
-    doubts: Lists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: StopFlag
+    doubts: VoxelLists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: StopFlag
 ) -> NDArray[np.int64]:
     """Return the entries of `doubts`, ascending, with an unproved voxel no farther than `until`.
 
@@ -226,7 +226,7 @@ def _open_doubts(
 
 
 def _next_rows(
-    data: SceneData, lists: Lists, cursor: NDArray[np.int64], open_: NDArray[np.bool_]
+    data: SceneData, lists: VoxelLists, cursor: NDArray[np.int64], open_: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """Return the voxels to hold in the next round.
 

@@ -22,8 +22,8 @@ from ....schemas.wire.requests import QuestionOptions
 from ...kernels.core.stop_flag_checks import (
     NO_LIMIT as NO_LIMIT,  # no budget: more node visits than any request could make
 )
-from ...residency.held import Held
-from ...residency.voxel_cache import Residency
+from ...residency.held_voxels import HeldVoxels
+from ...residency.voxel_cache import VoxelCache
 from ...runtime.deadlines import stop_at
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 
@@ -124,7 +124,7 @@ class CostCounter:
 
     __slots__ = ("_keys", "_residency", "begin", "faults", "hits", "late", "loaded", "misses", "waited")
 
-    def __init__(self, begin: float, residency: Residency, keys: NDArray[np.uint64]) -> None:
+    def __init__(self, begin: float, residency: VoxelCache, keys: NDArray[np.uint64]) -> None:
         """Begin with zero cost.
 
         begin: start time on time.perf_counter()'s clock [s].  keys: (v,) of the voxels, by their row
@@ -137,7 +137,7 @@ class CostCounter:
         self.faults: dict[str, None] = {}
         self.late: dict[int, None] = {}
 
-    def add(self, held: Held, again: int = 0) -> None:
+    def add(self, held: HeldVoxels, again: int = 0) -> None:
         """Add a hold. again: number of its hits on voxels that the request has held before."""
         found = held.hits - again - self.loaded
         self.hits, self.loaded = self.hits + max(0, found), max(0, -found)
@@ -149,7 +149,7 @@ class CostCounter:
     def add_cost(self, cost: Cost) -> None:
         """Add the cost of another query of the same data."""
         rows = [int(self._keys.searchsorted(key)) for key in cost.late]
-        self.add(Held(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
+        self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
 
     def fields(self) -> dict[str, Any]:
         """Return the fields of `Cost`; call it when the answer is complete."""

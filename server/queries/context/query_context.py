@@ -22,11 +22,11 @@ from ....schemas.wire.requests import make_poses
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core import pose_transform as placing
 from ...kernels.core.voxel_layout import SceneArrays, block_words
-from ...kernels.core.voxels_in_reach import Reach, SceneIndex, find_reach
-from ...residency.coarse_bounds import Coarse
-from ...residency.held import Held
-from ...residency.index_proof import Bounds
-from ...residency.voxel_cache import Residency
+from ...kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
+from ...residency.coarse_bounds import CoarseBounds
+from ...residency.held_voxels import HeldVoxels
+from ...residency.index_proof import ProvedBounds
+from ...residency.voxel_cache import VoxelCache
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .query_budget import CostCounter, QueryBudget
 
@@ -73,15 +73,15 @@ class SceneData(NamedTuple):
     coarse: coarse bounds of voxels that are not in memory; None if there are none.
     """
 
-    residency: Residency
+    residency: VoxelCache
     arrays: SceneArrays
-    bounds: Bounds
+    bounds: ProvedBounds
     broad: SceneIndex
     radius_units: int
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
     keeps_scan: bool
-    coarse: Coarse | None = None
+    coarse: CoarseBounds | None = None
 
     @property
     def nothing_clear(self) -> bool:
@@ -112,14 +112,17 @@ def to_units(metres: float, what: str) -> int:
 
 
 def make_scene_data(
-    archive: Archive, residency: Residency, bounds: Bounds | None = None, coarse: Coarse | None = None
+    archive: Archive,
+    residency: VoxelCache,
+    bounds: ProvedBounds | None = None,
+    coarse: CoarseBounds | None = None,
 ) -> SceneData:
     """Make the data of an archive whose voxels `residency` holds, with the archive's single radius.
 
     bounds: those of its voxels if they are shared; None: new ones. Loads prove them from now on.
     """
-    bounds = Bounds(archive) if bounds is None else bounds
-    residency.proved = bounds.prove
+    bounds = ProvedBounds(archive) if bounds is None else bounds
+    residency.on_proved = bounds.prove
     header = archive.header
     lattice = header.lattice
     arrays = SceneArrays(
@@ -158,8 +161,8 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
     # Only classes that occur count: on a dense scan all are small, which keeps the reach small. A
     # node may have a class that no point has, but no sphere of its points is larger than these.
     largest = int(radii[header.radius_counts > 0].max()) if len(radii) > 1 else int(radii[0])
-    drop = np.maximum(largest - radii, 0)
-    return data._replace(arrays=data.arrays._replace(drop=drop), radius_units=largest)
+    radius_deficit = np.maximum(largest - radii, 0)
+    return data._replace(arrays=data.arrays._replace(radius_deficit=radius_deficit), radius_units=largest)
 
 
 def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
@@ -169,9 +172,9 @@ def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
     )
 
 
-def _empty_reach(k: int, rows: int) -> Reach:
-    """Return an empty `Reach` for k poses with capacity for `rows` voxel rows."""
-    return Reach(
+def _empty_reach(k: int, rows: int) -> VoxelsInReach:
+    """Return an empty `VoxelsInReach` for k poses with capacity for `rows` voxel rows."""
+    return VoxelsInReach(
         np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
         np.zeros(k, bool),
     )  # fmt: skip
@@ -179,14 +182,14 @@ def _empty_reach(k: int, rows: int) -> Reach:
 
 def refuse(fault: int, pose: int, found: float) -> None:
     """Raise the error for a fault reported by `find_reach`; do nothing if there is none."""
-    if fault != placing.GOOD:
+    if fault != placing.VALID:
         error, text = _POSE_FAULTS[fault]
         raise error(f"pose {pose} {text.format(found)}")
 
 
 def check_request(
     data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], other_units: int
-) -> Reach:
+) -> VoxelsInReach:
     """Check poses (k, 4, 4) and return the voxels in reach of each; none for an empty avatar.
 
     Raise BadRequestError, BadTransformError or TooLargeError naming the pose, TooLargeError for
@@ -232,8 +235,8 @@ def find_proved_reach(
     other_units: int,
     budget: QueryBudget,
     spent: CostCounter,
-    settled: Callable[[Reach], Reach] = lambda reach: reach,
-) -> Reach:
+    settled: Callable[[VoxelsInReach], VoxelsInReach] = lambda reach: reach,
+) -> VoxelsInReach:
     """Return the reach of poses (k, 4, 4) with only voxels that are proved or unreadable.
 
     Otherwise the same as `check_request`, errors included.
@@ -254,7 +257,7 @@ def find_proved_reach(
     return reach
 
 
-def _likely(data: SceneData, reach: Reach, doubted: list[int], budget: QueryBudget) -> list[int]:
+def _likely(data: SceneData, reach: VoxelsInReach, doubted: list[int], budget: QueryBudget) -> list[int]:
     """Return the rows to load before doubted ones: with a deadline, those in reach by the index.
 
     Proofs may take half of the time, and voxels that are likely to be touched matter more. If the
@@ -271,8 +274,8 @@ def _likely(data: SceneData, reach: Reach, doubted: list[int], budget: QueryBudg
 
 
 def pieces(
-    reach: Reach, residency: Residency, share: float = 1.0, stop: StopFlag = NO_STOP
-) -> Iterator[tuple[NDArray[np.int64], list[int], Reach]]:
+    reach: VoxelsInReach, residency: VoxelCache, share: float = 1.0, stop: StopFlag = NO_STOP
+) -> Iterator[tuple[NDArray[np.int64], list[int], VoxelsInReach]]:
     """Split a request into pieces whose voxels fit in the budget: (pose numbers, rows, reach) each.
 
     share: of the budget, for each piece; a single larger voxel is allowed.
@@ -323,14 +326,14 @@ def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: StopFlag) -> NDArr
     return np.flatnonzero(met)
 
 
-def _only(reach: Reach, pose: int, rows: list[int]) -> Reach:
+def _only(reach: VoxelsInReach, pose: int, rows: list[int]) -> VoxelsInReach:
     """Return the reach with the voxels of one pose replaced by some of them."""
     starts = np.zeros_like(reach.starts)
     starts[pose + 1 :] = len(rows)
     return reach._replace(starts=starts, rows=np.array(rows, np.int64))
 
 
-def as_held(data: SceneData, held: Held) -> SceneData:
+def as_held(data: SceneData, held: HeldVoxels) -> SceneData:
     """Return what a kernel may read during a hold: late voxels appear as not resident.
 
     They may become resident during the hold.

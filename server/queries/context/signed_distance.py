@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
-from ...kernels.core.voxels_in_reach import Reach
-from ...kernels.nearest.nearest_pair import Nearest
+from ...kernels.core.voxels_in_reach import VoxelsInReach
+from ...kernels.nearest.nearest_pair import NearestPairs
 from .query_context import SceneData
 
 
@@ -47,7 +47,7 @@ def signed_bound(
     return metres - radii / UNITS_PER_METRE - 2.0 / UNITS_PER_METRE
 
 
-def unknown_gaps(data: SceneData, reach: Reach) -> NDArray[np.float64]:
+def unknown_gaps(data: SceneData, reach: VoxelsInReach) -> NDArray[np.float64]:
     """Return lower bounds (k,) of the distance of centres from regions left out [steps].
 
     The bound is inf without regions of scans that were left out.
@@ -67,10 +67,10 @@ def unknown_gaps(data: SceneData, reach: Reach) -> NDArray[np.float64]:
 
 def distance_columns(
     data: SceneData,
-    reach: Reach,
+    reach: VoxelsInReach,
     farthest: float,
     reach_units: int,
-    nearest: Nearest,
+    nearest: NearestPairs,
     counts: NDArray[np.uint32],
     upper: NDArray[np.float64] | None = None,
 ) -> dict[str, Any]:
@@ -83,8 +83,10 @@ def distance_columns(
     """
     radii = reach.units - reach_units  # of the largest spheres
     found = nearest.square >= 0
-    signed = np.where(found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.drop), np.inf)
-    floor = np.maximum(signed_bound(nearest.gap, data, radii), -radii / UNITS_PER_METRE)
+    signed = np.where(
+        found, signed_from_square(np.maximum(nearest.square, 0), radii - nearest.deficit), np.inf
+    )
+    floor = np.maximum(signed_bound(nearest.missing_bound, data, radii), -radii / UNITS_PER_METRE)
     # `farthest` may exceed the reach in exact units by a rounding.
     exact = floor >= np.where(found, signed, farthest)
     upper = signed if upper is None else np.where(exact, signed, np.where(upper <= farthest, upper, np.inf))

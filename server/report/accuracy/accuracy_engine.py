@@ -17,7 +17,7 @@ from ....builder.pipeline import build_archive
 from ....schemas.errors import InternalError
 from ....schemas.wire.answers import Verdict
 from ...residency.arena import ArenaBuffer
-from ...residency.voxel_store import Store
+from ...residency.voxel_store import VoxelStore
 from ...scene import Scene
 from .accuracy_case import AVATAR, REACH, Ground
 from .accuracy_plan import Plan
@@ -172,7 +172,7 @@ class Archives:
             # The archive usually has one shard: more processes would only load numba several times.
             summary = build_archive([self._ground.scan], target, replace(config, jobs=1))
             self._figures[key] = (summary.bytes, decode_seconds(target))
-            store = Store(target)
+            store = VoxelStore(target)
             budget = sum(ArenaBuffer.rounded(int(size)) for size in store.sizes)
             store.close()
             scene = self._open.enter_context(Scene.open(target, budget_bytes=budget))
@@ -198,7 +198,7 @@ def _key(config: BuildConfig) -> tuple[Any, ...]:
 
 def decode_seconds(folder: Path) -> float:
     """Return the least of DECODE_LOOPS times to read, check and lay out all voxels [s]."""
-    store = Store(folder)
+    store = VoxelStore(folder)
     try:
         best = math.inf
         for _ in range(DECODE_LOOPS):

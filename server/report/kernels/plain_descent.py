@@ -1,7 +1,7 @@
 """Plain descent of two hierarchies with exchangeable node and leaf tests, for fair comparisons.
 
 The descent is scalar and depth-first, as in figures 5 and 6 of [Fig12], with the correction
-described in server/kernels/overlap/overlap.py: a leaf is never opened, and of two inner nodes the
+described in server/kernels/collide/collide_poses.py: a leaf is never opened, and of two inner nodes the
 one with the larger sphere is. Node tests are in float64, inclusive and widened by SLACK. Therefore
 no test loses a contact, and a bounding volume only changes the number of node pairs that are not
 excluded.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
-from ...kernels.core.borrowing_kernels import borrowing
+from ...kernels.core.kernel_decorators import njit_no_refcount
 from ...kernels.core.pose_transform import place
 from ...kernels.core.voxel_layout import LANES
 from .plain_pairs import (
@@ -110,7 +110,7 @@ def make_scratch(body):
     )  # fmt: skip
 
 
-@borrowing
+@njit_no_refcount
 def bounds_meet(kind, body_radius, center, middle, half, a, forest, b, reach):
     """Return whether points below avatar node a may be within `reach` of points below scene node b.
 
@@ -145,7 +145,7 @@ def bounds_meet(kind, body_radius, center, middle, half, a, forest, b, reach):
     return (along <= forest.slab[b, 1] + room) & (along >= forest.slab[b, 0] - room)
 
 
-@borrowing
+@njit_no_refcount
 def keep_points(kind, points, block, count, m, shift, forest, b, reach, keep):
     """Mark the points of an avatar block that may be within `reach` of points below scene node b.
 
@@ -176,7 +176,7 @@ def keep_points(kind, points, block, count, m, shift, forest, b, reach, keep):
     return kept
 
 
-@borrowing
+@njit_no_refcount
 def _lower_bound(body_radius, center, a, forest, b):
     """Return a lower bound of the distance of points below two nodes [m], by their spheres.
 
@@ -189,7 +189,7 @@ def _lower_bound(body_radius, center, a, forest, b):
     return math.sqrt(square) - body_radius[a] - forest.radius[b]
 
 
-@borrowing
+@njit_no_refcount
 def _place_nodes(kind, m, shift, body, center, middle, half):
     """Transform the avatar's nodes to the pose.
 
@@ -209,7 +209,7 @@ def _place_nodes(kind, m, shift, body, center, middle, half):
                 )
 
 
-@borrowing
+@njit_no_refcount
 def _begin(leaf, m, body, units, reach, lattice, shift, frame):
     """Choose the coordinate frame of one pose. Writes shift and frame, returns the Limits."""
     farthest = 0.0
@@ -237,7 +237,7 @@ def descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdic
     _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts, work)
 
 
-@borrowing
+@njit_no_refcount
 def _descend(poses, body, forest, lattice, units, reach, node, leaf, sift, verdict, counts, work):
     """Do the work of `descend`, with given working memory."""
     center, middle, half, placed, taken, shift, frame, stack, keep = work
@@ -304,7 +304,7 @@ def nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found):
     _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, work)
 
 
-@borrowing
+@njit_no_refcount
 def _nearest(poses, body, forest, lattice, units, reach, farthest, leaf, found, work):
     """Do the work of `nearest`, with given working memory."""
     center, middle, half, placed, taken, shift, frame, stack, _ = work

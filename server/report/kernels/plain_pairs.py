@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
-from ...kernels.core.borrowing_kernels import borrowing
+from ...kernels.core.kernel_decorators import njit_no_refcount
 from ...kernels.core.pose_transform import lattice_to_units, place, to_units
 from ...kernels.core.voxel_layout import LANES
 
@@ -72,7 +72,7 @@ def make_lanes(blocks):
     )
 
 
-@borrowing
+@njit_no_refcount
 def make_limits(kind, units, reach, extent, farthest, lattice):
     """Return the thresholds of one pose.
 
@@ -94,7 +94,7 @@ def make_limits(kind, units, reach, extent, farthest, lattice):
     return Limits(units, reach, np.float32(plain) * np.float32(plain), near, far)
 
 
-@borrowing
+@njit_no_refcount
 def place_points(kind, points, m, shift, frame, block, lattice, lanes):
     """Transform a block of the avatar to the pose, in the coordinates of `kind`.
 
@@ -115,7 +115,7 @@ def place_points(kind, points, m, shift, frame, block, lattice, lanes):
                 lanes.units[block, r, j] = to_units(world)
 
 
-@borrowing
+@njit_no_refcount
 def take_points(kind, low, steps, frame, block, lattice, lanes):
     """Convert a scene's block to the coordinates of `kind`, in block 0 of `lanes`.
 
@@ -135,7 +135,7 @@ def take_points(kind, low, steps, frame, block, lattice, lanes):
                 lanes.units[0, r, j] = lattice_to_units(step, lattice.units_per_step)
 
 
-@borrowing
+@njit_no_refcount
 def _any_within(one, i, other, square):
     """Return whether point i of `one` is within sqrt(square) of a point of `other`, (3, LANES)."""
     x, y, z = one[0, i], one[1, i], one[2, i]
@@ -146,7 +146,7 @@ def _any_within(one, i, other, square):
     return touched
 
 
-@borrowing
+@njit_no_refcount
 def _within(one, keep, other, square):
     """Return whether `_any_within` holds for a point marked in keep (LANES,), float or integer."""
     for i in range(LANES):
@@ -157,7 +157,7 @@ def _within(one, keep, other, square):
     return False
 
 
-@borrowing
+@njit_no_refcount
 def _cubes_meet(one, keep, other, reach):
     """Return whether a cube of `one` marked in keep meets a cube of `other` [exact units].
 
@@ -176,7 +176,7 @@ def _cubes_meet(one, keep, other, reach):
     return False
 
 
-@borrowing
+@njit_no_refcount
 def _settle(m, shift, points, block, i, low, steps, at, lattice, body, scene, limits):
     """Decide whether point i is in contact with a point of the scene's block.
 
@@ -200,7 +200,7 @@ def _settle(m, shift, points, block, i, low, steps, at, lattice, body, scene, li
     return False
 
 
-@borrowing
+@njit_no_refcount
 def blocks_touch(kind, m, shift, points, block, keep, low, steps, at, lattice, placed, taken, limits):
     """Return whether a marked point of an avatar block is in contact with the scene's block `at`.
 
@@ -226,7 +226,7 @@ def blocks_touch(kind, m, shift, points, block, keep, low, steps, at, lattice, p
     return False
 
 
-@borrowing
+@njit_no_refcount
 def _least_square(one, i, other):
     """Return the least squared distance of point i of `one` to points of `other`, (3, LANES)."""
     x, y, z = one[0, i], one[1, i], one[2, i]
@@ -238,7 +238,7 @@ def _least_square(one, i, other):
     return least
 
 
-@borrowing
+@njit_no_refcount
 def _cube_gap(one, i, other, reach):
     """Return the least distance of cube i of `one` to the cubes of `other` [exact units].
 
@@ -256,7 +256,7 @@ def _cube_gap(one, i, other, reach):
     return least
 
 
-@borrowing
+@njit_no_refcount
 def blocks_gap(kind, block, count, lattice, placed, taken, limits):
     """Return the least signed distance [m] of spheres, or for CUBES of cubes, in two blocks.
 

@@ -24,7 +24,7 @@ from ....builder.pipeline import build_archive
 from ....schemas.errors import InternalError, SolidcloudError
 from ....schemas.wire.answers import Verdict
 from ...residency.arena import ArenaBuffer
-from ...residency.voxel_store import Store
+from ...residency.voxel_store import VoxelStore
 from ...scene import Scene
 from ..common.paper_case import Case
 from ..common.sphere_pictures import draw_spheres, level_spheres, load_pyplot
@@ -119,7 +119,7 @@ def time_frames(scene: Scene, avatar: str, poses: NDArray[np.float64]) -> NDArra
 
 def open_whole(folder: Path) -> Scene:
     """Open an archive with a cache for all its voxels: the walk is timed, not the loading."""
-    store = Store(folder)
+    store = VoxelStore(folder)
     try:
         budget = sum(ArenaBuffer.rounded(int(size)) for size in store.sizes)
     finally:

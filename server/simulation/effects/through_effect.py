@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ....schemas.scene.effect_options import Through
 from ...archives.masked_archive import LeftOut
-from ...residency.voxel_store import OpenStore, Store
+from ...residency.voxel_store import OpenStore, VoxelStore
 
 
 def store_without(effect: Through, pose: ArrayLike | None = None, normals: float | None = None) -> OpenStore:
@@ -19,7 +19,7 @@ def store_without(effect: Through, pose: ArrayLike | None = None, normals: float
 
     It is for `Scene.open(..., open_store=...)`.
     pose: (4, 4), the archive's pose in the world, because boxes are in world coordinates; None: the
-    identity.  normals: as for `Store`.
+    identity.  normals: as for `VoxelStore`.
     """
     boxes = [(box.low, box.high) for box in effect.boxes]
-    return partial(Store, open_archive=partial(LeftOut, boxes=boxes, pose=pose), normals=normals)
+    return partial(VoxelStore, open_archive=partial(LeftOut, boxes=boxes, pose=pose), normals=normals)

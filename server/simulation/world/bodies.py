@@ -17,7 +17,7 @@ from ....schemas.errors import BadRequestError, BadTransformError
 from ....schemas.kernels.normal_codes import NONE, decode_normal, normal_code
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies.body_pairs import CONTACT, touch_pairs
-from ...kernels.bodies.moving_bodies import make_scratch
+from ...kernels.bodies.moving_bodies import make_body_scratch
 from ...kernels.bodies.near_bodies import bound_body
 from ...kernels.core.pose_transform import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
 from ...kernels.core.stop_flag_checks import NO_LIMIT
@@ -90,7 +90,7 @@ class Bodies:
         self._begin = begin
         self.origin, self.up = np.array(origin, np.float64), np.array(up, np.float64)
         self.lock = threading.RLock()
-        self.scratch = make_scratch(1, 1)
+        self.scratch = make_body_scratch(1, 1)
         self.names: list[str] = []
         self.kinds = np.empty(0, np.uint8)
         self.poses = np.empty((0, 4, 4))
@@ -127,7 +127,7 @@ class Bodies:
         blocks = max(len(model.arrays.points), len(self.scratch.lanes))
         if nodes > self.scratch.moving.shape[1] or blocks > len(self.scratch.lanes):
             counters = self.scratch.counters
-            self.scratch = make_scratch(nodes, blocks)
+            self.scratch = make_body_scratch(nodes, blocks)
             self.scratch.counters[:] = counters
         shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered, {})
         self._numbered += 1

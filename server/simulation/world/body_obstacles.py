@@ -19,7 +19,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel, make_avatar
 from ...kernels.bodies.body_sweep import sweep_bodies
-from ...kernels.bodies.near_bodies import find_near
+from ...kernels.bodies.near_bodies import find_near_bodies
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec
@@ -140,7 +140,9 @@ class BodyObstacle:
             return rows[:0]
         own = bodies.row_of(self._mover, user=self._user)
         more = shape.model.radius + self._margin_units / UNITS_PER_METRE
-        count = find_near(shape.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows)
+        count = find_near_bodies(
+            shape.box, first, last, more, bodies.bounds, bodies.kinds, self._wanted, own, rows
+        )
         return rows[:count]
 
     def _near(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:

@@ -28,7 +28,7 @@ from project_scripts import load_script
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
 from solidcloud.server.residency.eviction import POLICIES
-from solidcloud.server.residency.motion_prediction import AHEAD
+from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS
 
 SCRIPTS = Path(__file__).parents[3] / "scripts"
 STEP, VOXEL_STEPS, EDGE = 0.01, 200, 2.0
@@ -159,7 +159,7 @@ def test_bytes_take_their_time() -> None:
 def test_who_walks_straight_on_waits_no_more_after_the_first_second(name: str) -> None:
     asked = walks([along(3.0, 20.0), along(3.0, 20.0, y=5.0)])
     _, without = replay("lru", asked)
-    _, found = replay(name, asked, budget=3000, ahead=AHEAD._replace(ring=0.0))
+    _, found = replay(name, asked, budget=3000, ahead=PREFETCH_OPTIONS._replace(ring=0.0))
     assert without.misses_later >= 40
     assert found.misses_later == found.frames_missed_later == 0 < found.misses < 10
     assert found.prefetched >= 40 and found.evictions > 20
@@ -182,8 +182,8 @@ def test_every_load_is_demanded_or_in_vain(name: str, budget: int) -> None:
 
 def test_a_ring_that_nobody_goes_to_is_in_vain() -> None:
     asked = walks([along(0.0, 3.0, y=4.0)])
-    _, small = replay("lru+prefetch", asked, ahead=AHEAD._replace(ring=0.0))
-    _, large = replay("lru+prefetch", asked, ahead=AHEAD._replace(ring=6.0))
+    _, small = replay("lru+prefetch", asked, ahead=PREFETCH_OPTIONS._replace(ring=0.0))
+    _, large = replay("lru+prefetch", asked, ahead=PREFETCH_OPTIONS._replace(ring=6.0))
     assert small.prefetched == 0 < large.prefetched == large.vain
     assert large.row()["vain_share"] == 1.0 and small.row()["vain_share"] == 0.0
 
@@ -194,7 +194,7 @@ def test_what_comes_too_late_is_a_miss_once_and_waits_the_less() -> None:
     slow = Loading(0.35, 0.0)
     _, without = replay("lru", asked, loading=slow)
     run, found = replay(
-        "lru+prefetch", asked, loading=slow, ahead=AHEAD._replace(loads=0.0, least=0.1, ring=0.0)
+        "lru+prefetch", asked, loading=slow, ahead=PREFETCH_OPTIONS._replace(loads=0.0, least=0.1, ring=0.0)
     )
     assert found.late > 5 and found.misses >= found.late
     assert found.vain <= 1 and found.row()["wait_p50_ms"] < without.row()["wait_p50_ms"]
@@ -245,7 +245,7 @@ def test_sweeps_that_are_told_hurt_less_and_are_counted_apart(name: str) -> None
 
 def test_what_a_sweep_asks_for_was_not_loaded_ahead_for_it() -> None:
     asked = walks([along(0.0, 30.0, y=4.0)])
-    options = {"ahead": AHEAD._replace(ring=3.0)}
+    options = {"ahead": PREFETCH_OPTIONS._replace(ring=3.0)}
     _, plain = replay("lru+prefetch", asked, **options)
     _, swept = replay("lru+prefetch", with_sweeps(TOWN, asked, 1), **options)
     assert swept.prefetched == plain.prefetched == plain.vain == swept.vain > 0
@@ -278,7 +278,7 @@ def test_the_optimum_is_of_the_same_references_and_never_worse(script: ModuleTyp
     units = script.cases(TOWN, 1500, QUICK)[1]
     best = script.run_belady(units, requests)
     for name in POLICIES:
-        row = script.run(units, requests, name, False, AHEAD)
+        row = script.run(units, requests, name, False, PREFETCH_OPTIONS)
         assert row["references"] == best["references"] and row["budget"] == best["budget"]
         assert row["misses"] >= best["misses"] and row["misses_later"] >= best["misses_later"] > 0
 
@@ -300,11 +300,11 @@ def test_goals_are_of_voxels_and_after_the_first_second(script: ModuleType) -> N
 
 def test_ahead_is_read_by_name(script: ModuleType) -> None:
     read = script.read_ahead("ring=1.5,most_wanted=32")
-    assert read == AHEAD._replace(ring=1.5, most_wanted=32) and type(read.most_wanted) is int
+    assert read == PREFETCH_OPTIONS._replace(ring=1.5, most_wanted=32) and type(read.most_wanted) is int
     assert script.changed(read) == "ring 1.5, most_wanted 32"
     moved = script.read_ahead("history=0.25")
-    assert moved == AHEAD._replace(motion=AHEAD.motion._replace(history=0.25))
-    assert script.changed(moved) == "history 0.25" and script.changed(AHEAD) == ""
+    assert moved == PREFETCH_OPTIONS._replace(motion=PREFETCH_OPTIONS.motion._replace(history=0.25))
+    assert script.changed(moved) == "history 0.25" and script.changed(PREFETCH_OPTIONS) == ""
     for text in ("width=3", "ring=x", "ring", "motion=1"):
         with pytest.raises(
             argparse.ArgumentTypeError, match="expected NAME=NUMBER, of loads, least, most, ring, settled"

@@ -17,7 +17,7 @@ from solidcloud.schemas.kernels.kernel_sources import source_digest
 print(*[source_digest(name).hex() for name in sys.argv[2:]])
 """
 MODULES = [
-    "server.kernels.overlap.overlap",
+    "server.kernels.collide.collide_poses",
     "server.kernels.motion.contact_times",
     "schemas.kernels.morton",
     "builder.kernels.trees.pack_tree",
@@ -53,16 +53,16 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
         before.update(after)
         return found
 
-    assert changed("server/kernels/overlap/overlap.py") == {"server.kernels.overlap.overlap"}
+    assert changed("server/kernels/collide/collide_poses.py") == {"server.kernels.collide.collide_poses"}
     assert changed("server/kernels/core/pose_transform.py") == {
-        "server.kernels.overlap.overlap",
+        "server.kernels.collide.collide_poses",
         "server.kernels.motion.contact_times",
     }
     assert changed("schemas/kernels/compiling.py") == set(MODULES)
     assert changed("builder/kernels/trees/pack_tree.py") == {"builder.kernels.trees.pack_tree"}
     # A constant of a module that holds no kernel.
     assert changed("schemas/archive/voxel_grid.py") == {
-        "server.kernels.overlap.overlap",
+        "server.kernels.collide.collide_poses",
         "server.kernels.motion.contact_times",
     }
     assert changed("server/scene.py") == set()
@@ -73,8 +73,8 @@ def test_the_place_of_the_package_does_not_count(copy: Path) -> None:
 
 
 def test_imports_over_several_lines_are_found() -> None:
-    """server/kernels/overlap/overlap.py imports server/kernels/core/placed_avatar.py in parentheses."""
-    reached = kernel_sources._reached(("server", "kernels", "overlap", "overlap"))
+    """server/kernels/collide/collide_poses.py imports server/kernels/core/placed_avatar.py in parentheses."""
+    reached = kernel_sources._reached(("server", "kernels", "collide", "collide_poses"))
     assert {("server", "kernels", "core", "placed_avatar"), ("schemas", "kernels", "compiling")} <= reached
 
 

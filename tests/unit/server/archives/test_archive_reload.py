@@ -239,7 +239,7 @@ def test_a_closed_scene_says_so(place: Path) -> None:
 
 def test_warming_calls_the_kernel_of_coarse_bounds(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is called only once a load has made coarse bounds; the first request waited for its compilation."""
-    calls, kernel = [], coarse_bounds.settle_pairs
+    calls, kernel = [], coarse_bounds.copy_unproved_pairs
 
     def counted(*arguments: object) -> int:
         calls.append(len(arguments))

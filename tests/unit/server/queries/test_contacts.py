@@ -24,8 +24,8 @@ from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 from solidcloud.server.queries.context.query_context import make_scene_data
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 COST = (
@@ -102,7 +102,7 @@ def test_points_farther_apart_than_two_cells_are_two_clusters(row: ScanCase) -> 
     assert nothing.avatar_point.shape == (0, 3) and nothing.cluster_count.tolist() == [1, 2]
 
 
-def two_scans(folder: Path, **options: Any) -> tuple[Store, list[str]]:
+def two_scans(folder: Path, **options: Any) -> tuple[VoxelStore, list[str]]:
     """An archive of two scans, whose middle points coincide, and a third that cannot be read; the sources' names."""
     points = row_of_points(10)
     synthetic_scans.write_ply(folder / "left.ply", points[:6])
@@ -112,14 +112,14 @@ def two_scans(folder: Path, **options: Any) -> tuple[Store, list[str]]:
     build_archive(
         [folder / name for name in ("a broken one.las", "left.ply", "right.ply")], folder / "archive", config
     )
-    store = Store(folder / "archive")
+    store = VoxelStore(folder / "archive")
     return store, [Path(source.path).name for source in describe(store, "").sources]
 
 
 def test_a_pair_names_the_scan_it_came_from(tmp_path: Path) -> None:
     store, names = two_scans(tmp_path, keep=frozenset({"scan", "intensity"}))
     assert sorted(names) == ["left.ply", "right.ply"]
-    data = make_scene_data(store.archive, Residency(store, 1 << 20))
+    data = make_scene_data(store.archive, VoxelCache(store, 1 << 20))
     answers = contacts(data, BALL, at((0.1, 0, 0), (0.4, 0, 0), (0.9, 0, 0)))
     assert answers.pairs_found.tolist() == [1, 2, 1]
     left, right = names.index("left.ply"), names.index("right.ply")
@@ -134,7 +134,7 @@ def test_without_keep_scan_there_is_no_scan_and_no_room_for_it(tmp_path: Path) -
         folder = tmp_path / f"{len(keep)}"
         folder.mkdir()
         store, _ = two_scans(folder, keep=keep)
-        data = make_scene_data(store.archive, Residency(store, 1 << 20))
+        data = make_scene_data(store.archive, VoxelCache(store, 1 << 20))
         answers = contacts(data, BALL, at((0.4, 0, 0)))
         assert answers.scan_index.tolist() == ([0, 1] if keep else [-1, -1])
         assert answers.cluster_scan.tolist() == ([0] if keep else [-1])
@@ -143,7 +143,7 @@ def test_without_keep_scan_there_is_no_scan_and_no_room_for_it(tmp_path: Path) -
     assert (sizes[1] - sizes[0] == 64 * leaves).all()
 
 
-def flip_a_byte(store: Store, voxel: tuple[int, int, int]) -> None:
+def flip_a_byte(store: VoxelStore, voxel: tuple[int, int, int]) -> None:
     """Damage the points of one voxel's record."""
     row = int(np.flatnonzero((store.archive.coordinates == voxel).all(axis=1))[0])
     entry = store.archive.voxels[row]

@@ -20,8 +20,8 @@ from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.queries.context.query_context import make_scene_data
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, distance_fast
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 
 BALL = np.zeros((1, 3))
@@ -182,9 +182,9 @@ def test_one_hidden_voxel_among_others_is_not_clear(name: str, tmp_path: Path) -
 def test_a_box_that_is_passed_through_takes_no_voxel_whole_that_the_index_places_in_it(every: Hidden) -> None:
     for place, said in list(zip(every.hidden, every.said, strict=True))[:8]:
         boxes = [np.stack([said - 0.001, said + 0.001])]
-        store = Store(every.folder, partial(LeftOut, boxes=boxes))
+        store = VoxelStore(every.folder, partial(LeftOut, boxes=boxes))
         try:
-            data = make_scene_data(store.archive, Residency(store, 1 << 26))
+            data = make_scene_data(store.archive, VoxelCache(store, 1 << 26))
             answers = collide(data, make_avatar(BALL, RADIUS), poses_at(place[None]))
             assert answers.verdict.tolist() == [Verdict.UNKNOWN] and data.residency.misled
         finally:

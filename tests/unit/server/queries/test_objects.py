@@ -14,8 +14,8 @@ from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import StopFlag
 
 CLEAR, CONTACT, UNKNOWN = Verdict
@@ -26,8 +26,8 @@ BALL = make_avatar([[0.0, 0, 0]], 0.5)
 def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneData]:
     """A plane of 50 points."""
     case = archive_cases.build(tmp_path_factory.mktemp("objects"), synthetic_scans.make_scan("plane", 1, 50))
-    store = Store(case.archive)
-    yield make_scene_data(store.archive, Residency(store, 64 << 20))
+    store = VoxelStore(case.archive)
+    yield make_scene_data(store.archive, VoxelCache(store, 64 << 20))
     store.close()
 
 

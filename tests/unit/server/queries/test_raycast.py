@@ -22,8 +22,8 @@ from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, make_scene_data
 from solidcloud.server.queries.raycast import raycast
 from solidcloud.server.queries.within import within
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
@@ -32,9 +32,9 @@ X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
 @contextmanager
 def opened(archive: Path, budget: int = 64 << 20) -> Iterator[SceneData]:
     """What the questions read of an archive."""
-    store = Store(archive)
+    store = VoxelStore(archive)
     try:
-        yield make_scene_data(store.archive, Residency(store, budget))
+        yield make_scene_data(store.archive, VoxelCache(store, budget))
     finally:
         store.close()
 
@@ -198,13 +198,13 @@ def test_a_deadline_that_has_passed_leaves_all_unknown_and_loads_nothing(noise: 
 
 
 def test_what_is_loaded_too_late_is_unknown(beads: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    load = Store.load
+    load = VoxelStore.load
 
     def slow(self, *arguments):  # type: ignore[no-untyped-def]
         time.sleep(0.4)
         return load(self, *arguments)
 
-    monkeypatch.setattr(Store, "load", slow)
+    monkeypatch.setattr(VoxelStore, "load", slow)
     with opened(beads) as data:
         origins = [(x, -1.0, 0.0) for x in (0.0, 1.0, 2.0, 3.0)]
         answers = raycast(data, origins, [Y] * 4, 5, QueryBudget(deadline=time.perf_counter() + 0.2))

@@ -15,13 +15,13 @@ import pytest
 import stopped_queries
 import synthetic_scans
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.collide import collide_poses
 from solidcloud.server.kernels.core import stop_flag_checks as stopping
-from solidcloud.server.kernels.overlap import overlap
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.objects import find_pairs
 from solidcloud.server.queries.sweep import sweep
-from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from stopped_queries import CLEAR, CONTACT, UNKNOWN, Asked
 
@@ -39,9 +39,9 @@ def stopped_already(reason: str) -> StopFlag:
     return stop
 
 
-def assert_nothing_held(residency: Residency) -> None:
+def assert_nothing_held(residency: VoxelCache) -> None:
     residency.check()
-    assert not residency._pins and not residency._demands and not residency._loading
+    assert not residency._pins and not residency._waiting_requests and not residency._loading
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_whichever_look_finds_the_flag_set_nothing_is_wrong(
     for name, module in list(sys.modules.items()):
         if name.startswith("solidcloud.server.kernels.") and getattr(module, "stopped", None) is usual:
             monkeypatch.setattr(module, "stopped", look)
-    assert look is overlap.stopped
+    assert look is collide_poses.stopped
     ended = False
     while not ended:
         at = at + 1 if at < 12 else int(at * 1.3)

@@ -23,7 +23,7 @@ from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.surface_normals import Normals, warm
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import StopFlag, StoppedError
 
 pytestmark = pytest.mark.interpreted
@@ -39,7 +39,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @contextmanager
 def serving(archive: Path, budget_bytes: int = 1 << 24) -> Iterator[ArchiveGeneration]:
     """An archive, open."""
-    opened = ArchiveGeneration(Store(archive), budget_bytes)
+    opened = ArchiveGeneration(VoxelStore(archive), budget_bytes)
     try:
         yield opened
     finally:
@@ -63,7 +63,7 @@ def build(tmp_path: Path, kind: str, count: int = COUNT, **options: object) -> a
 
 def largest(archive: Path) -> int:
     """Bytes of the largest voxel once decoded."""
-    store = Store(archive)
+    store = VoxelStore(archive)
     store.close()
     return int(store.sizes.max())
 
@@ -236,7 +236,7 @@ def test_normals_of_a_voxel_that_cannot_be_read_are_unknown(tmp_path: Path) -> N
         places = [place for place, *_ in judged(opened, case.points)]
     for shard in (case.archive / "shards").iterdir():
         data = bytearray(shard.read_bytes())
-        with Store(case.archive).archive as archive:
+        with VoxelStore(case.archive).archive as archive:
             for row in range(len(archive.voxels)):
                 data[int(archive.voxels["frame_offset"][row][2]) + 9] ^= 0xFF
         shard.write_bytes(data)
@@ -286,7 +286,7 @@ def test_what_is_stored_is_what_is_found_at_first_use(
         first = [normals.code(place, REACH) for place in places]
         own = opened.store.sizes
         assert normals.estimated == len(places) and len(set(first)) > 20
-    opened = ArchiveGeneration(Store(case.archive, normals=REACH), 2 * int(own.max()))
+    opened = ArchiveGeneration(VoxelStore(case.archive, normals=REACH), 2 * int(own.max()))
     try:
         normals = Normals(opened.store, opened.data)
         leaves = opened.store.archive.voxels["leaves"]
@@ -305,7 +305,7 @@ def test_what_is_stored_is_what_is_found_at_first_use(
 def test_of_normals_that_nobody_asks_for_nothing_is_in_memory(tmp_path: Path, normals: float | None) -> None:
     case = build(tmp_path, "plane", COUNT // 3, keep=frozenset({"normal"}), normal_reach=REACH)
     plain = build(tmp_path, "plane", COUNT // 3)
-    kept, other = Store(case.archive, normals=normals), Store(plain.archive)
+    kept, other = VoxelStore(case.archive, normals=normals), VoxelStore(plain.archive)
     assert (kept.sizes == other.sizes).all() and not kept.with_normals
     kept.close()
     other.close()
@@ -323,7 +323,7 @@ def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path:
         whole = [normals.code(place, REACH) for place in left]
     found = []
     for reach in (None, REACH):
-        opened = ArchiveGeneration(Store(case.archive, without, normals=reach), 1 << 24)
+        opened = ArchiveGeneration(VoxelStore(case.archive, without, normals=reach), 1 << 24)
         try:
             assert opened.store.with_normals == (reach is not None)
             normals = Normals(opened.store, opened.data)

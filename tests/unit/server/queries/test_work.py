@@ -1,7 +1,7 @@
 """Answers about small fixed scenes, bit for bit, and the work done for them: both are what they were.
 
 A kernel that prunes less, visits in another order or looks at more points than it did answers the same, so no judge of
-answers sees it. Where such a change is meant, `scripts/make_work` writes the numbers anew, and the change of
+answers sees it. Where such a change is meant, `scripts/make_collide_scratch` writes the numbers anew, and the change of
 tests/golden/work.json shows what it costs.
 """
 

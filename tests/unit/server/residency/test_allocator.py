@@ -1,10 +1,10 @@
-"""Room: voxels moved together rather than evicted, and nothing lost on the way."""
+"""VoxelAllocator: voxels moved together rather than evicted, and nothing lost on the way."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solidcloud.server.residency.allocator import AROUND, Room
+from solidcloud.server.residency.allocator import AROUND, VoxelAllocator
 from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.eviction import make_policy
@@ -18,7 +18,7 @@ class Filled:
     def __init__(self, sizes: list[int], budget: int) -> None:
         self.buffer = ArenaBuffer(budget * BLOCK)
         self.where = np.full((len(sizes), 3), -1, np.int64)
-        self.room = Room(
+        self.room = VoxelAllocator(
             self.buffer, [s * BLOCK for s in sizes], self.where, make_policy("lru", budget * BLOCK)
         )
         self.gone: list[int] = []
@@ -79,7 +79,7 @@ def test_nothing_goes_where_all_that_may_is_too_little() -> None:
 def test_only_some_are_left_and_stand_together() -> None:
     filled = Filled([2, 1, 2, 1, 3], 6)
     assert all(filled.make(row) for row in range(4))
-    filled.room.leave_only({1, 3}, filled.gone.append)
+    filled.room.evict_all_but({1, 3}, filled.gone.append)
     assert sorted(filled.gone) == [0, 2]
     filled.check()
     assert filled.buffer.free_runs() == [(2 * BLOCK, 4 * BLOCK)]

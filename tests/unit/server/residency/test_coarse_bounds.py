@@ -17,10 +17,10 @@ from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, class_radii
 from solidcloud.schemas.errors import CorruptError
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.collide.coarse_clearance import MAX_SLOT_NODES
 from solidcloud.server.kernels.core.voxel_layout import CLASS_SHIFT, COUNT, COUNTED, FIRST
-from solidcloud.server.kernels.overlap.coarse_overlap import MOST_NODES
-from solidcloud.server.residency.coarse_bounds import SLOT_BYTES, Coarse, settle
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.coarse_bounds import SLOT_BYTES, CoarseBounds, drop_clear_pairs
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def enclosing(top: NDArray[np.int32], points: NDArray[np.int64]) -> NDArray[np.b
     return ((apart**2).sum(axis=2) <= words[:, 3] ** 2) & (along >= words[:, 8]) & (along <= words[:, 9])
 
 
-def damage(store: Store, row: int, dataset: int) -> None:
+def damage(store: VoxelStore, row: int, dataset: int) -> None:
     """Turn a bit of a frame over, in the middle of it."""
     entry = store.archive.voxels[row]
     offset = int(entry["frame_offset"][dataset]) + int(entry["frame_bytes"][dataset]) // 2
@@ -68,14 +68,14 @@ def test_the_nodes_of_a_top_enclose_all_points(
     )
     degree, leaves = options.get("degree", 16), made.store.archive.voxels["leaves"]
     for row in range(made.voxels):
-        made.coarse.fill(made.store, row)
+        made.coarse.store_from_archive(made.store, row)
         top = made.top(row)
         points = voxel_points(*made.store.archive.read_voxel(row)).astype(np.int64)
         held = enclosing(top, points)
         assert held.any(axis=1).all()
         assert held.any(axis=0).all()  # no node is there in vain
         # All leaf nodes, or so many nodes that no inner one could be opened further, were it of the least degree.
-        assert len(top) == leaves[row] or MOST_NODES - degree + 1 < len(top) <= MOST_NODES
+        assert len(top) == leaves[row] or MAX_SLOT_NODES - degree + 1 < len(top) <= MAX_SLOT_NODES
         assert len(top) <= leaves[row]
         assert (top[:, FIRST] == -1).all() and not (top[:, COUNT] & COUNTED).any()
 
@@ -88,22 +88,22 @@ def test_the_widest_nodes_are_opened(tmp_path: Path) -> None:
     made = open_made(
         archive_cases.build(tmp_path, scan, voxel=8.0, leaf=1, degree=2, cell_points=4096).archive
     )
-    made.coarse.fill(made.store, 0)
+    made.coarse.store_from_archive(made.store, 0)
     widest = made.top(0).view(np.float32)[:, 3].max()
     assert widest * 1e-4 < 0.01
 
 
 @pytest.mark.interpreted
 def test_filled_and_remembered_are_the_same_rows(made: Made) -> None:
-    filled = Coarse(made.voxels, ROOM)
+    filled = CoarseBounds(made.voxels, ROOM)
     for row in range(made.voxels):
-        filled.fill(made.store, row)
+        filled.store_from_archive(made.store, row)
     for row in reversed(range(made.voxels)):  # other slots, other places in the arena
         made.remember(row)
         assert made.top(row).tolist() == made.top(row, filled).tolist()
-    assert filled.known == made.coarse.known == made.voxels > 1
+    assert filled.stored == made.coarse.stored == made.voxels > 1
     sizes = made.coarse.arrays.count
-    assert sizes.min() < MOST_NODES - 3 < sizes.max()
+    assert sizes.min() < MAX_SLOT_NODES - 3 < sizes.max()
 
 
 @pytest.mark.interpreted
@@ -119,11 +119,11 @@ def test_no_point_has_a_larger_sphere_than_its_node_says(tmp_path: Path, voxel: 
             models=radius_class_archives.STORED,
         )
     made = open_made(case.archive)
-    header, filled = made.store.archive.header, Coarse(made.voxels, ROOM)
+    header, filled = made.store.archive.header, CoarseBounds(made.voxels, ROOM)
     tables = [class_radii(model, header.radius, header.models) for model in radius_class_archives.MODELS]
     for row in range(made.voxels):
         made.remember(row)
-        filled.fill(made.store, row)
+        filled.store_from_archive(made.store, row)
         top, plain = made.top(row), made.top(row, filled)
         data, links = made.store.archive.read_voxel(row)
         held = enclosing(top, voxel_points(data, links).astype(np.int64))
@@ -146,16 +146,16 @@ def test_no_point_has_a_larger_sphere_than_its_node_says(tmp_path: Path, voxel: 
 def test_slots_go_to_those_who_come_first_and_stay_theirs(made: Made) -> None:
     table = 4 * made.voxels
     assert made.voxels > 3
-    coarse = Coarse(made.voxels, table + 3 * SLOT_BYTES - 1)
+    coarse = CoarseBounds(made.voxels, table + 3 * SLOT_BYTES - 1)
     assert coarse.bytes == table + 2 * SLOT_BYTES
-    assert list(coarse.missing()) == list(range(made.voxels))
+    assert list(coarse.rows_without_bounds()) == list(range(made.voxels))
     for row in (3, 1):
-        coarse.fill(made.store, row)
+        coarse.store_from_archive(made.store, row)
     before = [made.top(row, coarse).tolist() for row in (3, 1)]
-    assert coarse.known == 2 and list(coarse.missing()) == []
+    assert coarse.stored == 2 and list(coarse.rows_without_bounds()) == []
     for row in range(made.voxels):
-        coarse.fill(made.store, row)
-        coarse.remember(row, made.arena, made.loaded[row])
+        coarse.store_from_archive(made.store, row)
+        coarse.store_from_arena(row, made.arena, made.loaded[row])
     assert np.flatnonzero(coarse.arrays.slot >= 0).tolist() == [1, 3]
     assert [made.top(row, coarse).tolist() for row in (3, 1)] == before
 
@@ -163,23 +163,25 @@ def test_slots_go_to_those_who_come_first_and_stay_theirs(made: Made) -> None:
 @pytest.mark.interpreted
 @pytest.mark.parametrize("short", [0, 1, 40])
 def test_a_budget_for_no_slot_is_none(made: Made, short: int) -> None:
-    coarse = Coarse(made.voxels, max(0, 4 * made.voxels + SLOT_BYTES - 1 - short * SLOT_BYTES))
-    assert coarse.bytes == 0 and coarse.known == 0
-    assert list(coarse.missing()) == []
-    coarse.fill(made.store, 0)
-    coarse.remember(0, made.arena, made.loaded[0])
+    coarse = CoarseBounds(made.voxels, max(0, 4 * made.voxels + SLOT_BYTES - 1 - short * SLOT_BYTES))
+    assert coarse.bytes == 0 and coarse.stored == 0
+    assert list(coarse.rows_without_bounds()) == []
+    coarse.store_from_archive(made.store, 0)
+    coarse.store_from_arena(0, made.arena, made.loaded[0])
     avatar, poses = make_avatar([[0.0, 0, 0]], 0.01), np.eye(4)[None]
     reach = made.reach(avatar, poses, 1 << 26)
-    found, settled = settle(made.arrays, coarse.arrays, avatar.arrays, poses, reach)
+    found, settled = drop_clear_pairs(made.arrays, coarse.arrays, avatar.arrays, poses, reach)
     assert found is reach and settled == 0 and reach.starts[1] > 0
 
 
 @pytest.mark.interpreted
 def test_a_slot_that_is_taken_is_not_written_again(made: Made) -> None:
-    made.coarse.fill(made.store, 0)
+    made.coarse.store_from_archive(made.store, 0)
     before = made.coarse.arrays.ints.tobytes()
-    made.coarse.remember(0, made.arena, made.loaded[1])  # what another voxel's rows say must not get in
-    assert made.coarse.arrays.ints.tobytes() == before and made.coarse.known == 1
+    made.coarse.store_from_arena(
+        0, made.arena, made.loaded[1]
+    )  # what another voxel's rows say must not get in
+    assert made.coarse.arrays.ints.tobytes() == before and made.coarse.stored == 1
 
 
 @pytest.mark.interpreted
@@ -187,16 +189,16 @@ def test_missing_names_each_once_while_they_are_filled(made: Made) -> None:
     made.remember(2)
     damage(made.store, 4, 1)
     named = []
-    for row in made.coarse.missing():
+    for row in made.coarse.rows_without_bounds():
         named.append(row)
         if row == 4:
             with pytest.raises(CorruptError):
-                made.coarse.fill(made.store, row)
+                made.coarse.store_from_archive(made.store, row)
         else:
-            made.coarse.fill(made.store, row)
+            made.coarse.store_from_archive(made.store, row)
     assert named == [row for row in range(made.voxels) if row != 2]
-    assert list(made.coarse.missing()) == [4]
-    assert made.coarse.known == made.voxels - 1
+    assert list(made.coarse.rows_without_bounds()) == [4]
+    assert made.coarse.stored == made.voxels - 1
 
 
 # --- what cannot be read --------------------------------------------------------------------------------
@@ -208,9 +210,9 @@ def test_points_are_not_read(made: Made, monkeypatch: pytest.MonkeyPatch) -> Non
     asked: list[int] = []
     read = os.pread
     monkeypatch.setattr(os, "pread", lambda file, size, at: asked.append(at) or read(file, size, at))
-    made.coarse.fill(made.store, 0)
+    made.coarse.store_from_archive(made.store, 0)
     assert asked == made.store.archive.voxels["frame_offset"][0][:2].tolist()
-    assert made.coarse.known == 1
+    assert made.coarse.stored == 1
     with pytest.raises(CorruptError):
         made.store.load(0, made.arena, 0)
 
@@ -218,15 +220,15 @@ def test_points_are_not_read(made: Made, monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.interpreted
 @pytest.mark.parametrize("dataset", [0, 1])
 def test_a_damaged_record_has_no_slot_and_takes_no_room(made: Made, dataset: int) -> None:
-    coarse = Coarse(made.voxels, 4 * made.voxels + SLOT_BYTES)
+    coarse = CoarseBounds(made.voxels, 4 * made.voxels + SLOT_BYTES)
     damage(made.store, 1, dataset)
     for _ in range(2):
         with pytest.raises(CorruptError, match=("voxel .*, cells", "voxel .*, nodes")[dataset]) as caught:
-            coarse.fill(made.store, 1)
+            coarse.store_from_archive(made.store, 1)
     assert made.store.archive.where(1) in str(caught.value)
-    assert coarse.known == 0 and (coarse.arrays.slot == -1).all()
+    assert coarse.stored == 0 and (coarse.arrays.slot == -1).all()
     damage(made.store, 1, dataset)  # the bit as it was
-    coarse.fill(made.store, 1)
+    coarse.store_from_archive(made.store, 1)
     assert made.top(1, coarse).tolist() == _remembered(made, 1)
 
 
@@ -238,11 +240,11 @@ def _remembered(made: Made, row: int) -> list:
 def test_a_record_of_another_shape_than_the_index_says_has_no_slot(made: Made) -> None:
     made.store.archive.voxels["leaves"][1] += 1
     with pytest.raises(CorruptError, match=r"leaf nodes, the index says \d+"):
-        made.coarse.fill(made.store, 1)
+        made.coarse.store_from_archive(made.store, 1)
     made.store.archive.voxels["rows"][2][2] += 1
     with pytest.raises(CorruptError, match="points"):
-        made.coarse.fill(made.store, 2)
-    assert made.coarse.known == 0
+        made.coarse.store_from_archive(made.store, 2)
+    assert made.coarse.stored == 0
 
 
 def test_a_disk_that_fails_is_an_error_and_may_be_tried_again(
@@ -254,10 +256,10 @@ def test_a_disk_that_fails_is_an_error_and_may_be_tried_again(
     with monkeypatch.context() as patch:
         patch.setattr(os, "pread", fail)
         with pytest.raises(OSError, match="Input/output"):
-            made.coarse.fill(made.store, 0)
-    assert made.coarse.known == 0
-    made.coarse.fill(made.store, 0)
-    assert made.coarse.known == 1
+            made.coarse.store_from_archive(made.store, 0)
+    assert made.coarse.stored == 0
+    made.coarse.store_from_archive(made.store, 0)
+    assert made.coarse.stored == 1
 
 
 # --- threads --------------------------------------------------------------------------------------------
@@ -284,7 +286,7 @@ def test_readers_see_whole_slots_or_none(made: Made, rng: np.random.Generator) -
     made.fill()
     everything, most = made.settled(avatar, poses)
     assert 0 < sum(map(len, most)) < sum(map(len, everything))
-    rounds = [made._replace(coarse=Coarse(made.voxels, ROOM)) for _ in range(20)]
+    rounds = [made._replace(coarse=CoarseBounds(made.voxels, ROOM)) for _ in range(20)]
     wrong: list[object] = []
     done = threading.Event()
 
@@ -305,9 +307,9 @@ def test_readers_see_whole_slots_or_none(made: Made, rng: np.random.Generator) -
         for coarse in rounds:
             for row in order:
                 if number % 2:
-                    coarse.coarse.fill(coarse.store, row)
+                    coarse.coarse.store_from_archive(coarse.store, row)
                 else:
-                    coarse.remember(row)
+                    coarse.store_from_arena(row)
 
     with running([threading.Thread(target=read) for _ in range(2)]):
         try:
@@ -317,7 +319,7 @@ def test_readers_see_whole_slots_or_none(made: Made, rng: np.random.Generator) -
             done.set()
     assert wrong == []
     for coarse in rounds:
-        assert coarse.coarse.known == made.voxels
+        assert coarse.coarse.stored == made.voxels
         assert sorted(coarse.coarse.arrays.slot.tolist()) == list(range(made.voxels))
         for row in range(made.voxels):
             assert coarse.top(row).tobytes() == made.top(row).tobytes()

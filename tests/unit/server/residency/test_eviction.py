@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.residency.eviction import POLICIES, Policy, make_policy, prefetches
+from solidcloud.server.residency.eviction import POLICIES, EvictionPolicy, make_policy, prefetches
 
 pytestmark = pytest.mark.interpreted
 
@@ -129,7 +129,7 @@ NAIVE: dict[str, type[Naive]] = {
 }
 
 
-def named(policy: Policy, naive: Naive, most: int) -> list[int]:
+def named(policy: EvictionPolicy, naive: Naive, most: int) -> list[int]:
     """The first victims of a policy, which are the naive one's."""
     found = list(islice(policy.victims(), most))
     expected: list[int] = []
@@ -261,7 +261,7 @@ def test_to_look_at_all_victims_changes_nothing(name: str) -> None:
 @pytest.mark.parametrize("some", [1, 3, 39, 40, 41])
 def test_distance_puts_some_in_order_before_the_rest(some: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In whatever parts, the order is the model's; and rows that go leave the others as they were."""
-    monkeypatch.setattr("solidcloud.server.residency.eviction.SOME_ROWS", some)
+    monkeypatch.setattr("solidcloud.server.residency.eviction.SORTED_ROWS", some)
     rng = np.random.default_rng(some)
     policy, naive = make_policy("distance", BUDGET, near), NaiveDistance()
     for row in rng.permutation(200)[:100].tolist():  # more than there is room for at first

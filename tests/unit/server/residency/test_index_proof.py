@@ -11,12 +11,12 @@ import pytest
 import synthetic_scans
 from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core.voxels_in_reach import Reach
+from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context import front_to_back as rounds
 from solidcloud.server.queries.context.query_budget import make_budget
-from solidcloud.server.residency.index_proof import Bounds
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.index_proof import ProvedBounds
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import StopFlag
 
 pytestmark = pytest.mark.interpreted
@@ -34,17 +34,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def opened(folder: Path) -> Iterator[ArchiveGeneration]:
     """The archive, nothing of it loaded."""
-    opened = ArchiveGeneration(Store(folder), 1 << 24)
+    opened = ArchiveGeneration(VoxelStore(folder), 1 << 24)
     yield opened
     opened.release()
 
 
-def reach_of(bounds: Bounds, poses: int, rng: np.random.Generator) -> Reach:
+def reach_of(bounds: ProvedBounds, poses: int, rng: np.random.Generator) -> VoxelsInReach:
     """Poses at random, each with every voxel in reach."""
     v = len(bounds.proved)
     center = rng.uniform(bounds.index.low.min(), bounds.index.high.max(), (poses, 1, 3))
     span = rng.uniform(1.0, 5000.0, (poses, 1, 1))
-    return Reach(
+    return VoxelsInReach(
         np.ones(poses), np.zeros(poses, np.int64), np.arange(poses + 1) * v, np.tile(np.arange(v), poses),
         np.concatenate([center - span, center + span], axis=1), np.zeros(poses, bool),
     )  # fmt: skip

@@ -5,14 +5,14 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
-from solidcloud.server.kernels.prediction.user_tracks import MOST_POSES, STALE, merge_wanted
+from solidcloud.server.kernels.prediction.user_tracks import MAX_POSES, STALE, merge_wanted
 from solidcloud.server.residency.motion_prediction import (
-    AHEAD,
     EXPIRY,
-    FEW_USERS,
-    MOST_USERS,
-    Neighbourhood,
-    Wanted,
+    INITIAL_USERS,
+    MAX_USERS,
+    PREFETCH_OPTIONS,
+    PredictedVoxels,
+    UserTracks,
 )
 
 pytestmark = pytest.mark.interpreted
@@ -22,7 +22,7 @@ EDGE = STEP * VOXEL_STEPS
 ORIGIN = np.array([1000.0, -500.0, 20.0])
 ME, YOU = ("client", "me"), ("client", "you")
 REACH = 0.5
-NO_RING = AHEAD._replace(ring=0.0)
+NO_RING = PREFETCH_OPTIONS._replace(ring=0.0)
 
 
 def floor(side: int = 20) -> tuple[SceneIndex, NDArray[np.int64]]:
@@ -39,9 +39,9 @@ def floor(side: int = 20) -> tuple[SceneIndex, NDArray[np.int64]]:
 INDEX, COORDINATES = floor()
 
 
-def make(ahead: object = AHEAD) -> Neighbourhood:
+def make(ahead: object = PREFETCH_OPTIONS) -> UserTracks:
     """Nobody there yet."""
-    return Neighbourhood(INDEX, VOXEL_STEPS, ORIGIN, STEP, ahead)  # type: ignore[arg-type]
+    return UserTracks(INDEX, VOXEL_STEPS, ORIGIN, STEP, ahead)  # type: ignore[arg-type]
 
 
 def at(x: float, y: float) -> tuple[float, float, float]:
@@ -62,11 +62,11 @@ def touched(x: float, y: float, reach: float) -> set[tuple[int, int]]:
 
 
 def walk(
-    around: Neighbourhood, places: NDArray[np.float64], start: float = 0.0, user: tuple[str, str] = ME
+    around: UserTracks, places: NDArray[np.float64], start: float = 0.0, user: tuple[str, str] = ME
 ) -> float:
     """See a user at places (k, 2), 30 a second. Returns the time of the last."""
     for number, (x, y) in enumerate(places):
-        assert not around.saw(user, start + number / 30, at(x, y), REACH)
+        assert not around.record_pose(user, start + number / 30, at(x, y), REACH)
     return start + (len(places) - 1) / 30
 
 
@@ -90,7 +90,10 @@ def test_straight_on_the_next_voxels_come_in_their_order_and_time() -> None:
 
 
 def test_the_horizon_follows_the_time_of_loading() -> None:
-    assert AHEAD.horizon(0.0) == AHEAD.least and AHEAD.horizon(99.0) == AHEAD.most
+    assert (
+        PREFETCH_OPTIONS.horizon(0.0) == PREFETCH_OPTIONS.least
+        and PREFETCH_OPTIONS.horizon(99.0) == PREFETCH_OPTIONS.most
+    )
     around = make(NO_RING)
     now = walk(around, straight(3.0))
     counts = [len(around.plan(now, seconds).rows) for seconds in (0.0, 0.25, 99.0)]
@@ -101,13 +104,13 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
     around = make()
     now = walk(around, np.tile([1.9, 1.0], (70, 1)))
     wanted = around.plan(now, 0.25)
-    assert cells(wanted.rows) == touched(1.9, 1.0, REACH + AHEAD.ring)
+    assert cells(wanted.rows) == touched(1.9, 1.0, REACH + PREFETCH_OPTIONS.ring)
     here = touched(1.9, 1.0, REACH)
     assert cells(wanted.rows[: len(here)]) == here and (wanted.need[: len(here)] == 0).all()
     low, high = INDEX.low[wanted.rows] * STEP, INDEX.high[wanted.rows] * STEP
     gap = np.maximum(np.maximum(low - [1.9, 1.0, 1.0], [1.9, 1.0, 1.0] - high), 0)
-    beyond = (np.sqrt((gap**2).sum(axis=1)) - REACH) / AHEAD.ring
-    expected = AHEAD.horizon(0.25) * (1 + beyond[len(here) :])
+    beyond = (np.sqrt((gap**2).sum(axis=1)) - REACH) / PREFETCH_OPTIONS.ring
+    expected = PREFETCH_OPTIONS.horizon(0.25) * (1 + beyond[len(here) :])
     for later in (0.0, STALE + 0.1):  # not heard of for a while: the same
         need = around.plan(now + later, 0.25).need
         assert np.allclose(need[len(here) :], expected, rtol=0.02) and (np.diff(need) >= 0).all()
@@ -117,13 +120,17 @@ def test_who_stands_wants_what_is_around_and_what_it_touches_first() -> None:
 def test_who_has_just_come_wants_nothing_around_yet() -> None:
     """Nor who teleports every second: what is around would be loaded in vain each time."""
     around = make()
-    here, around_here = touched(1.9, 1.0, REACH), touched(1.9, 1.0, REACH + AHEAD.ring)
+    here, around_here = touched(1.9, 1.0, REACH), touched(1.9, 1.0, REACH + PREFETCH_OPTIONS.ring)
     for now, teleports in ((0.0, False), (10.0, True)):
         if teleports:
-            around.saw(ME, now - 0.1, at(-30.0, -30.0), REACH)
-        assert around.saw(ME, now, at(1.9, 1.0), REACH) is teleports
-        for later, wanted in ((0.0, here), (AHEAD.settled - 0.1, here), (AHEAD.settled + 0.1, around_here)):
-            assert not around.saw(ME, now + later, at(1.9, 1.0), REACH)
+            around.record_pose(ME, now - 0.1, at(-30.0, -30.0), REACH)
+        assert around.record_pose(ME, now, at(1.9, 1.0), REACH) is teleports
+        for later, wanted in (
+            (0.0, here),
+            (PREFETCH_OPTIONS.settled - 0.1, here),
+            (PREFETCH_OPTIONS.settled + 0.1, around_here),
+        ):
+            assert not around.record_pose(ME, now + later, at(1.9, 1.0), REACH)
             assert cells(around.plan(now + later, 0.25).rows) == wanted
 
 
@@ -131,13 +138,13 @@ def test_what_is_ahead_comes_before_what_is_around() -> None:
     around = make()
     now = walk(around, straight(3.0, 70))
     wanted = around.plan(now, 0.25)
-    ahead = wanted.need <= AHEAD.horizon(0.25)
+    ahead = wanted.need <= PREFETCH_OPTIONS.horizon(0.25)
     assert cells(wanted.rows[ahead]) == cells(make_plan(NO_RING, straight(3.0, 70)).rows)
     assert ahead.any() and not ahead.all() and np.array_equal(ahead, np.sort(ahead)[::-1])
     assert len(set(wanted.rows.tolist())) == len(wanted.rows)
 
 
-def make_plan(ahead: object, places: NDArray[np.float64]) -> Wanted:
+def make_plan(ahead: object, places: NDArray[np.float64]) -> PredictedVoxels:
     """What a user who went along places wants."""
     around = make(ahead)
     return around.plan(walk(around, places), 0.25)
@@ -184,7 +191,7 @@ def test_jitter_changes_little(seed: int) -> None:
     places = straight(1.5, 60) + rng.normal(0, 0.01, (60, 2))
     times = np.maximum.accumulate(np.arange(60) / 30 + rng.uniform(0, 0.01, 60))
     for now, (x, y) in zip(times.tolist(), places.tolist(), strict=True):
-        assert not around.saw(ME, now, at(x, y), REACH)
+        assert not around.record_pose(ME, now, at(x, y), REACH)
     wanted = around.plan(float(times[-1]), 0.25)
     soon = wanted.rows[wanted.need <= 2.0]
     end = straight(1.5, 60)[-1, 0]
@@ -195,11 +202,11 @@ def test_jitter_changes_little(seed: int) -> None:
 def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
     around = make(NO_RING)
     now = walk(around, straight(5.0))
-    assert around.saw(ME, now + 1 / 30, at(-30.0, -30.0), REACH)
+    assert around.record_pose(ME, now + 1 / 30, at(-30.0, -30.0), REACH)
     wanted = around.plan(now + 1 / 30, 0.5)
     assert cells(wanted.rows) == touched(-30.0, -30.0, REACH) and (wanted.need == 0).all()
     assert cells(around.kept(now + 1 / 30)) == touched(-30.0, -30.0, REACH)
-    assert not around.saw(ME, now + 2 / 30, at(-29.9, -30.0), REACH)
+    assert not around.record_pose(ME, now + 2 / 30, at(-29.9, -30.0), REACH)
 
 
 @pytest.mark.parametrize(
@@ -215,15 +222,15 @@ def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
 )
 def test_how_far_is_too_far(passed: float, metres: float, teleport: bool) -> None:
     around = make()
-    assert not around.saw(ME, 7.0, at(0, 0), REACH), "the first pose is none"
-    assert around.saw(ME, 7.0 + passed, at(metres, 0), REACH) is teleport
+    assert not around.record_pose(ME, 7.0, at(0, 0), REACH), "the first pose is none"
+    assert around.record_pose(ME, 7.0 + passed, at(metres, 0), REACH) is teleport
 
 
 def test_poses_out_of_order_are_passed_over() -> None:
     around = make(NO_RING)
     now = walk(around, straight(3.0))
     before = around.plan(now, 0.25)
-    assert not around.saw(ME, now - 0.01, at(-20, -20), REACH)
+    assert not around.record_pose(ME, now - 0.01, at(-20, -20), REACH)
     after = around.plan(now, 0.25)
     assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
 
@@ -231,7 +238,7 @@ def test_poses_out_of_order_are_passed_over() -> None:
 def test_a_clock_that_starts_again_starts_afresh() -> None:
     around = make(NO_RING)
     walk(around, straight(3.0), start=1e6)
-    assert not around.saw(ME, 0.0, at(-20, -20), REACH)
+    assert not around.record_pose(ME, 0.0, at(-20, -20), REACH)
     assert cells(around.plan(0.0, 0.25).rows) == touched(-20, -20, REACH)
 
 
@@ -239,14 +246,14 @@ def test_poses_asked_as_fast_as_they_are_answered_span_the_history_all_the_same(
     """10,000 a second: the direction is seen as well as at 30 a second."""
     around = make(NO_RING)
     for number in range(8000):
-        around.saw(ME, number * 1e-4, at(1.0 + 3.0 * number * 1e-4, 1.0), REACH)
+        around.record_pose(ME, number * 1e-4, at(1.0 + 3.0 * number * 1e-4, 1.0), REACH)
     wanted = around.plan(0.8, 0.25)
     assert max(x for x, _ in cells(wanted.rows)) == int((1.0 + 2.4 + 6.0 + REACH) // EDGE)
 
 
 def test_a_user_wants_no_more_than_so_many_and_the_soonest() -> None:
-    few = make_plan(AHEAD._replace(most_wanted=4), straight(3.0, 70))
-    many = make_plan(AHEAD, straight(3.0, 70))
+    few = make_plan(PREFETCH_OPTIONS._replace(most_wanted=4), straight(3.0, 70))
+    many = make_plan(PREFETCH_OPTIONS, straight(3.0, 70))
     assert len(few.rows) == 4 < len(many.rows)
     assert few.rows.tolist() == many.rows[:4].tolist()
 
@@ -270,39 +277,39 @@ def test_who_leaves_is_forgotten() -> None:
 
 def test_what_users_can_touch_is_kept_each_once() -> None:
     around = make()
-    around.saw(ME, 0.0, at(2.0, 2.0), REACH)
-    around.saw(YOU, 5.0, at(3.0, 3.0), 1.2)
+    around.record_pose(ME, 0.0, at(2.0, 2.0), REACH)
+    around.record_pose(YOU, 5.0, at(3.0, 3.0), 1.2)
     kept = around.kept(5.0)
     assert cells(kept) == touched(2.0, 2.0, REACH) | touched(3.0, 3.0, 1.2)
     assert len(set(kept.tolist())) == len(kept)
-    around.saw(YOU, 5.1, at(3.0, 3.0), REACH)
+    around.record_pose(YOU, 5.1, at(3.0, 3.0), REACH)
     assert cells(around.kept(5.1)) == touched(2.0, 2.0, REACH) | touched(3.0, 3.0, REACH), (
         "its reach is the last one's"
     )
-    around.saw(YOU, 5.2, at(3.0, 3.0), 1.2)
+    around.record_pose(YOU, 5.2, at(3.0, 3.0), 1.2)
     assert cells(around.kept(EXPIRY + 1.0)) == touched(3.0, 3.0, 1.2), "not what is not heard of any more"
 
 
 def test_nearness_is_the_distance_to_the_nearest_way() -> None:
     around = make()
     rows = np.arange(len(COORDINATES))
-    assert np.isinf(around.nearness(rows)).all()
+    assert np.isinf(around.path_distances(rows)).all()
     now = walk(around, straight(3.0))
     walk(around, np.tile([-31.0, -31.0], (3, 1)), start=now, user=YOU)
     around.plan(now, 0.25)
-    near = around.nearness(rows)
+    near = around.path_distances(rows)
     assert cells(rows[near == 0]) >= {(1, 0), (2, 0), (3, 0), (-16, -16)}
     at_end = {tuple(c[:2]): float(d) for c, d in zip(COORDINATES.tolist(), near, strict=True)}
     assert at_end[(15, 0)] == pytest.approx(30.0 - straight(3.0)[-1, 0] - 6.0, abs=0.3)
     assert at_end[(-16, -10)] == pytest.approx(31.0 - 20.0, abs=0.01)
-    assert np.array_equal(around.nearness(rows[::-1]), near[::-1]), "asked again"
+    assert np.array_equal(around.path_distances(rows[::-1]), near[::-1]), "asked again"
     around.leave(YOU)
     around.plan(now, 0.25)
-    alone = around.nearness(rows)
+    alone = around.path_distances(rows)
     assert (alone >= near).all() and (alone > near).any(), "the ways of the last plan alone count"
     around.leave_client("client")
     around.plan(now, 0.25)
-    assert np.isinf(around.nearness(rows)).all()
+    assert np.isinf(around.path_distances(rows)).all()
 
 
 def test_who_stays_is_known_as_before_when_others_leave() -> None:
@@ -316,15 +323,15 @@ def test_who_stays_is_known_as_before_when_others_leave() -> None:
     after, before = around.plan(now, 0.25), alone.plan(now, 0.25)
     assert after.rows.tolist() == before.rows.tolist() and after.need.tolist() == before.need.tolist()
     again = ("client", "0")
-    assert not around.saw(again, now, at(-30.0, -30.0), REACH), "what it was before is forgotten"
+    assert not around.record_pose(again, now, at(-30.0, -30.0), REACH), "what it was before is forgotten"
 
 
 def test_there_is_room_for_more_users_than_at_first() -> None:
     around = make(NO_RING)
-    users = [("client", str(number)) for number in range(3 * FEW_USERS)]
+    users = [("client", str(number)) for number in range(3 * INITIAL_USERS)]
     places = np.random.default_rng(5).uniform(-35, 35, (len(users), 2))
     for user, (x, y) in zip(users, places.tolist(), strict=True):
-        around.saw(user, 1.0, at(x, y), REACH)
+        around.record_pose(user, 1.0, at(x, y), REACH)
     least, most = (
         set().union(*(touched(x, y, reach) for x, y in places.tolist())) for reach in (REACH, 0.52)
     )
@@ -335,12 +342,12 @@ def test_there_is_room_for_more_users_than_at_first() -> None:
 def test_of_too_many_users_the_one_not_heard_of_for_longest_is_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert MOST_USERS >= FEW_USERS
-    monkeypatch.setattr("solidcloud.server.residency.motion_prediction.MOST_USERS", 3)
+    assert MAX_USERS >= INITIAL_USERS
+    monkeypatch.setattr("solidcloud.server.residency.motion_prediction.MAX_USERS", 3)
     around = make()
     users = [("client", str(number)) for number in range(5)]
     for when, number in enumerate((0, 1, 2, 0, 3, 4)):
-        around.saw(users[number], float(when), at(2.0 * number, 0.0), REACH)
+        around.record_pose(users[number], float(when), at(2.0 * number, 0.0), REACH)
     assert around.users == [users[0], users[3], users[4]]
     assert cells(around.kept(5.0)) == set().union(*(touched(x, 0.0, REACH) for x in (0.0, 6.0, 8.0)))
 
@@ -353,12 +360,12 @@ def test_many_poses_at_once_are_as_many_one_by_one() -> None:
     places = ORIGIN + np.cumsum(rng.normal(0, 0.3, (400, 3)), axis=0)
     reaches = rng.choice([0.4, 1.0], 400)
     jumped = [
-        one.saw(user, time, (x, y, z), reach)
+        one.record_pose(user, time, (x, y, z), reach)
         for user, time, (x, y, z), reach in zip(
             users, times.tolist(), places.tolist(), reaches.tolist(), strict=True
         )
     ]
-    assert many.saw_each(users, times, places, reaches).tolist() == jumped and 0 < sum(jumped) < 400
+    assert many.record_poses(users, times, places, reaches).tolist() == jumped and 0 < sum(jumped) < 400
     assert many.users == one.users
     now = float(times[-1])
     before, after = one.plan(now, 0.25), many.plan(now, 0.25)
@@ -368,10 +375,10 @@ def test_many_poses_at_once_are_as_many_one_by_one() -> None:
 def test_of_more_poses_than_are_remembered_the_last_are() -> None:
     """At 150 a second half a second is more than that: round the ring several times, back and then on."""
     around = make(NO_RING)
-    turn = 3 * MOST_POSES
-    places = 1.0 + 3.0 / 150 * np.concatenate([np.arange(turn)[::-1], np.arange(MOST_POSES)])
+    turn = 3 * MAX_POSES
+    places = 1.0 + 3.0 / 150 * np.concatenate([np.arange(turn)[::-1], np.arange(MAX_POSES)])
     for number, x in enumerate(places.tolist()):
-        assert not around.saw(ME, number / 150, at(x, 1.0), REACH)
+        assert not around.record_pose(ME, number / 150, at(x, 1.0), REACH)
     wanted = around.plan((len(places) - 1) / 150, 0.25)
     assert max(x for x, _ in cells(wanted.rows)) == int((places[-1] + 6.0 + REACH) // EDGE)
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from fake_store import BLOCK, FakeStore
-from solidcloud.server.residency.motion_prediction import User, Wanted
+from solidcloud.server.residency.motion_prediction import PredictedVoxels, User
 from solidcloud.server.residency.prefetch import Prefetcher
-from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_cache import VoxelCache
 
 pytestmark = pytest.mark.interpreted
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right
@@ -36,12 +36,12 @@ class Wishes:
     def expire(self, now: float, after: float) -> None:
         """Nobody is."""
 
-    def plan(self, now: float, load_seconds: float) -> Wanted:
+    def plan(self, now: float, load_seconds: float) -> PredictedVoxels:
         """What is wanted, soonest first."""
         self.plans += 1
         rows = sorted(self.wanted, key=lambda row: self.wanted[row])
         need = np.array([self.wanted[row] for row in rows])
-        return Wanted(np.array(rows, np.int64), need)
+        return PredictedVoxels(np.array(rows, np.int64), need)
 
     def kept(self, now: float, after: float) -> np.ndarray:
         """What users stand in."""
@@ -53,13 +53,13 @@ class Table:
 
     def __init__(self, sizes: list[int], blocks: int, **options: object) -> None:
         self.store = FakeStore(sizes)
-        self.residency = Residency(self.store, blocks * BLOCK)  # type: ignore[arg-type]
+        self.residency = VoxelCache(self.store, blocks * BLOCK)  # type: ignore[arg-type]
         self.wishes = Wishes()
         self.prefetcher = Prefetcher(self.residency, self.wishes, **options)  # type: ignore[arg-type]
 
     def see(self) -> None:
         """A user moves."""
-        self.prefetcher.saw(ANNA, (0.0, 0.0, 0.0), 1.0)
+        self.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1.0)
 
     def resident(self) -> list[int]:
         """The rows that are there."""
@@ -77,7 +77,7 @@ def until(condition: Callable[[], bool]) -> bool:
 def test_what_is_wanted_is_loaded_soonest_first_and_counted() -> None:
     table = Table([1] * 5, 5)
     order: list[int] = []
-    table.residency.loaded = lambda row, where: order.append(row)
+    table.residency.on_loaded = lambda row, where: order.append(row)
     table.wishes.wanted = {3: 0.5, 1: 0.1, 4: 2.0}
     with table.prefetcher:
         table.see()
@@ -191,8 +191,8 @@ def test_who_comes_from_nowhere_is_told_so_and_idle_time_is_used() -> None:
     calls: list[bool] = []
     table = Table([1] * 3, 3, idle=lambda: calls.append(True) or next(left))
     with table.prefetcher:
-        assert table.prefetcher.saw(ANNA, (0.0, 0.0, 0.0), 1e3)
-        assert not table.prefetcher.saw(ANNA, (0.0, 0.0, 0.0), 1.0)
+        assert table.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1e3)
+        assert not table.prefetcher.record_pose(ANNA, (0.0, 0.0, 0.0), 1.0)
         assert until(lambda: len(calls) == 3)
 
 

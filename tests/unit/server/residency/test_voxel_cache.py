@@ -16,9 +16,9 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
 from solidcloud.server.kernels.core.voxel_layout import Arena
 from solidcloud.server.residency.eviction import POLICIES
-from solidcloud.server.residency.held import Held
+from solidcloud.server.residency.held_voxels import HeldVoxels
 from solidcloud.server.residency.load_turns import LOADS_WITHOUT_TURN
-from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0  # [s], for what takes microseconds when it is right
 
 
-def take(residency: Residency, rows: list[int]) -> Held:
+def take(residency: VoxelCache, rows: list[int]) -> HeldVoxels:
     """Hold rows for a moment."""
     with residency.hold(rows) as held:
         for row in rows:
@@ -35,32 +35,32 @@ def take(residency: Residency, rows: list[int]) -> Held:
         return held._replace(waited=0.0)
 
 
-def resident(residency: Residency) -> list[int]:
+def resident(residency: VoxelCache) -> list[int]:
     """The rows whose voxels are resident."""
     return np.flatnonzero(residency.where[:, 0] >= 0).tolist()
 
 
 def test_a_budget_below_the_largest_voxel_is_refused() -> None:
     with pytest.raises(BadRequestError, match="the largest voxel takes 192"):
-        Residency(FakeStore([1, 3]), 3 * BLOCK - 1)
-    assert Residency(FakeStore([]), 0).resident == 0
+        VoxelCache(FakeStore([1, 3]), 3 * BLOCK - 1)
+    assert VoxelCache(FakeStore([]), 0).resident == 0
 
 
 def test_the_least_recently_used_goes_first() -> None:
     store = FakeStore([1] * 5)
-    residency = Residency(store, 3 * BLOCK)
+    residency = VoxelCache(store, 3 * BLOCK)
     for row in (0, 1, 2, 0, 3):
         take(residency, [row])
     assert resident(residency) == [0, 2, 3]
     assert (residency.hits, residency.misses, residency.evictions) == (1, 4, 1)
-    assert take(residency, [2, 4]) == Held(1, 1, ())
+    assert take(residency, [2, 4]) == HeldVoxels(1, 1, ())
     assert resident(residency) == [2, 3, 4] and store.loads == {0: 1, 1: 1, 2: 1, 3: 1, 4: 1}
     assert residency.resident_bytes == 3 * BLOCK
     residency.check()
 
 
 def test_more_than_the_budget_at_once_is_refused() -> None:
-    residency = Residency(FakeStore([2, 2]), 3 * BLOCK)
+    residency = VoxelCache(FakeStore([2, 2]), 3 * BLOCK)
     with pytest.raises(ValueError, match="ask in pieces"), residency.hold([0, 1]):
         pass
     residency.check()
@@ -68,7 +68,7 @@ def test_more_than_the_budget_at_once_is_refused() -> None:
 
 def test_room_in_pieces_between_own_voxels_is_made_whole() -> None:
     store = FakeStore([1, 1, 1, 1, 3])
-    residency = Residency(store, 4 * BLOCK)
+    residency = VoxelCache(store, 4 * BLOCK)
     take(residency, [0, 1, 2, 3])
     # Row 1 lies in the middle: what is free beside it is enough for row 4, but not in one run.
     with residency.hold([1, 4]) as held:
@@ -82,18 +82,18 @@ def test_room_in_pieces_between_own_voxels_is_made_whole() -> None:
 
 def test_a_request_waits_for_pinned_room_and_then_goes_on() -> None:
     store = FakeStore([2, 2])
-    residency = Residency(store, 3 * BLOCK)
+    residency = VoxelCache(store, 3 * BLOCK)
     with ThreadPoolExecutor(1) as pool:
         with residency.hold([0]):
             other = pool.submit(take, residency, [1])
             assert not store.wait_for_load(1, 0.05), "there is no room while row 0 is held"
             assert resident(residency) == [0]
-        assert other.result(DEADLINE) == Held(0, 1, ())
+        assert other.result(DEADLINE) == HeldVoxels(0, 1, ())
     assert resident(residency) == [1]
 
 
 def test_requests_that_need_each_others_room_both_end() -> None:
-    residency = Residency(FakeStore([1] * 8), 4 * BLOCK)
+    residency = VoxelCache(FakeStore([1] * 8), 4 * BLOCK)
     left, right = [0, 1, 2, 3], [2, 3, 4, 5]
     with ThreadPoolExecutor(8) as pool:
         jobs = [pool.submit(take, residency, (left, right)[i % 2]) for i in range(400)]
@@ -104,7 +104,7 @@ def test_requests_that_need_each_others_room_both_end() -> None:
 def test_one_load_however_many_wait() -> None:
     store = FakeStore([1])
     store.gate.clear()
-    residency = Residency(store, BLOCK)
+    residency = VoxelCache(store, BLOCK)
     with ThreadPoolExecutor(8) as pool:
         jobs = [pool.submit(take, residency, [0]) for _ in range(8)]
         assert store.wait_for_load(0, DEADLINE)
@@ -120,10 +120,10 @@ def test_every_waiter_hears_of_a_load_that_fails(fault: str) -> None:
     store = FakeStore([1, 1])
     store.faults[0] = fault
     store.gate.clear()
-    residency = Residency(store, 2 * BLOCK)
+    residency = VoxelCache(store, 2 * BLOCK)
     ready = threading.Barrier(8)
 
-    def wait_and_leave(_: int) -> Held:
+    def wait_and_leave(_: int) -> HeldVoxels:
         with residency.hold([0, 1]) as held:
             assert residency.where[0, 0] == -1 and residency.where[1, 0] >= 0
             ready.wait(DEADLINE)  # all inside at once
@@ -148,7 +148,7 @@ def test_every_waiter_hears_of_a_load_that_fails(fault: str) -> None:
 def test_a_failed_voxel_does_not_appear_under_who_began_without_it() -> None:
     store = FakeStore([1])
     store.faults[0] = "unreadable"
-    residency = Residency(store, BLOCK)
+    residency = VoxelCache(store, BLOCK)
     with residency.hold([0]) as first:
         del store.faults[0]
         with residency.hold([0]) as second:
@@ -160,20 +160,20 @@ def test_a_failed_voxel_does_not_appear_under_who_began_without_it() -> None:
 def test_a_load_that_raises_anything_else_leaves_nothing_behind() -> None:
     store = FakeStore([1, 1, 1])
     store.faults[1] = "out of memory"
-    residency = Residency(store, 3 * BLOCK)
+    residency = VoxelCache(store, 3 * BLOCK)
     with pytest.raises(MemoryError), residency.hold([0, 1, 2]):
         pass
     residency.check()
     assert resident(residency) == [0] and residency.resident_bytes == BLOCK
     del store.faults[1]
-    assert take(residency, [0, 1, 2]) == Held(1, 2, ())
+    assert take(residency, [0, 1, 2]) == HeldVoxels(1, 2, ())
 
 
 def test_who_waits_for_a_load_that_raises_is_answered() -> None:
     store = FakeStore([1])
     store.faults[0] = "out of memory"
     store.gate.clear()
-    residency = Residency(store, BLOCK)
+    residency = VoxelCache(store, BLOCK)
     with ThreadPoolExecutor(2) as pool:
         first = pool.submit(take, residency, [0])
         assert store.wait_for_load(0, DEADLINE)
@@ -189,13 +189,13 @@ def test_who_waits_for_a_load_that_raises_is_answered() -> None:
 
 @pytest.mark.parametrize("broken", ["bytes", "overlap", "lost run", "where", "pin"])
 def test_check_finds_what_is_broken(broken: str) -> None:
-    residency = Residency(FakeStore([1, 1, 1]), 3 * BLOCK)
+    residency = VoxelCache(FakeStore([1, 1, 1]), 3 * BLOCK)
     take(residency, [0, 1])
     residency.check()
     if broken == "bytes":
-        residency._room.used_bytes += BLOCK
+        residency._allocator.used_bytes += BLOCK
     elif broken == "overlap":
-        residency._room.offsets[1] = residency._room.offsets[0]
+        residency._allocator.offsets[1] = residency._allocator.offsets[0]
     elif broken == "lost run":
         residency.buffer.allocate(BLOCK)
     elif broken == "where":
@@ -243,7 +243,7 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
         assert stats.requests == len(parts) and stats.unknown == sum(unknown)
         assert sum(user.requests for user in stats.users) == stats.requests
         assert sum(user.misses for user in stats.users) <= stats.misses
-        assert stats.prefetched == stats.used + stats.wasted + len(scene.residency._accounts.fresh)
+        assert stats.prefetched == stats.used + stats.wasted + len(scene.residency._stats.fresh)
         assert policy != "lru" or stats.prefetched == 0
     for part, verdict in zip(parts, verdicts, strict=True):
         assert verdict == expected[part].tolist()
@@ -251,9 +251,9 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
 
 def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.MonkeyPatch) -> None:
     store = FakeStore([1, 1, 1, 1, 2, 2])
-    residency = Residency(store, 4 * BLOCK)
+    residency = VoxelCache(store, 4 * BLOCK)
     take(residency, [0, 1, 2, 3])
-    made = residency._room.make
+    made = residency._allocator.make
 
     def make(row: int, *what: object, **more: object) -> bool:
         """Room for the first, and no memory for the second."""
@@ -262,18 +262,18 @@ def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.M
         return made(row, *what, **more)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patched:
-        patched.setattr(residency._room, "make", make)
+        patched.setattr(residency._allocator, "allocate", make)
         with pytest.raises(MemoryError), residency.hold([4, 5]):
             pass
-    assert not residency._pins and not residency._loading and residency._demands == 0
+    assert not residency._pins and not residency._loading and residency._waiting_requests == 0
     residency.check()
-    assert take(residency, [4, 5]) == Held(0, 2, ()) and store.loads[4] == 1
+    assert take(residency, [4, 5]) == HeldVoxels(0, 2, ()) and store.loads[4] == 1
 
 
 def test_a_voxel_known_to_be_corrupt_is_not_waited_for() -> None:
     store = FakeStore([1, 1])
     store.faults[0] = "corrupt"
-    residency = Residency(store, 2 * BLOCK)
+    residency = VoxelCache(store, 2 * BLOCK)
     take(residency, [0, 1])
     with residency.hold([0, 1]) as held:
         assert held.faults and (held.hits, held.misses, held.waited) == (1, 0, 0.0)
@@ -289,7 +289,7 @@ def test_parts_that_fit_look_at_each_row_once() -> None:
             return super().__getitem__(row)
 
     blocks = [1, 2, 1, 4, 9, 1, 1, 1, 1, 1] * 100
-    residency = Residency(FakeStore(blocks), 9 * BLOCK)
+    residency = VoxelCache(FakeStore(blocks), 9 * BLOCK)
     residency._sizes = Counting(residency._sizes)
     parts = list(residency.parts_that_fit(range(len(blocks)), 4 * BLOCK))
     assert [row for part in parts for row in part] == list(range(len(blocks)))
@@ -301,9 +301,9 @@ def test_parts_that_fit_look_at_each_row_once() -> None:
 def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     """One leaves it to the other, who leaves too: it is still to be loaded."""
     store = FakeStore([1, 1])
-    residency = Residency(store, 2 * BLOCK)
+    residency = VoxelCache(store, 2 * BLOCK)
     told: list[None] = []
-    residency.owed = lambda: told.append(None)
+    residency.on_owed = lambda: told.append(None)
     # Reserved by one whose deadline comes before the load begins.
     residency._reserve([1], float("inf"), False, NO_STOP)
     residency._pin([1])  # another waits for it
@@ -312,7 +312,7 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     assert residency.take_owed() is None, "who waits may load it"
     residency.release([1])
     residency.release([1])
-    residency._demands -= 1
+    residency._waiting_requests -= 1
     assert told and residency.take_owed() == 1
     residency.check()
 
@@ -320,7 +320,7 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
 def test_a_disk_that_is_stuck_keeps_no_other_request_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("solidcloud.server.residency.voxel_cache.LOADS_WITHOUT_TURN", 0)
     store, go = FakeStore([1, 1, 1]), threading.Event()
-    residency, load = Residency(store, 3 * BLOCK), store.load
+    residency, load = VoxelCache(store, 3 * BLOCK), store.load
 
     def stuck(row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         assert row or go.wait(DEADLINE)
@@ -331,7 +331,7 @@ def test_a_disk_that_is_stuck_keeps_no_other_request_waiting(monkeypatch: pytest
         first = pool.submit(take, residency, [0])
         while not residency.is_resident(0):
             assert not first.done()
-        assert take(residency, [1]) == Held(0, 1, ()) and not first.done()
+        assert take(residency, [1]) == HeldVoxels(0, 1, ()) and not first.done()
         go.set()
         assert first.result(DEADLINE).misses == 1
     residency.check()
@@ -340,10 +340,10 @@ def test_a_disk_that_is_stuck_keeps_no_other_request_waiting(monkeypatch: pytest
 def test_who_misses_few_voxels_needs_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("solidcloud.server.residency.load_turns.MAX_TURN_SECONDS", 60.0)
     store = FakeStore([1] * 20)
-    residency = Residency(store, 20 * BLOCK)
+    residency = VoxelCache(store, 20 * BLOCK)
     turn = residency._turns.take(math.inf, NO_STOP)
-    assert take(residency, list(range(LOADS_WITHOUT_TURN))) == Held(0, LOADS_WITHOUT_TURN, ())
-    assert take(residency, list(range(LOADS_WITHOUT_TURN))) == Held(LOADS_WITHOUT_TURN, 0, ())
+    assert take(residency, list(range(LOADS_WITHOUT_TURN))) == HeldVoxels(0, LOADS_WITHOUT_TURN, ())
+    assert take(residency, list(range(LOADS_WITHOUT_TURN))) == HeldVoxels(LOADS_WITHOUT_TURN, 0, ())
     with ThreadPoolExecutor(1) as pool:
         many = pool.submit(take, residency, list(range(LOADS_WITHOUT_TURN, 20)))
         while not residency._turns._queue:

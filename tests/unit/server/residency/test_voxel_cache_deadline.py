@@ -10,8 +10,8 @@ import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
-from solidcloud.server.residency.held import Held
-from solidcloud.server.residency.voxel_cache import Residency
+from solidcloud.server.residency.held_voxels import HeldVoxels
+from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, StopFlag
 from solidcloud.server.scene import Scene
 
@@ -24,7 +24,7 @@ def soon(seconds: float = 0.05) -> float:
     return time.perf_counter() + seconds
 
 
-def take(residency: Residency, rows: list[int], deadline: float = float("inf")) -> Held:
+def take(residency: VoxelCache, rows: list[int], deadline: float = float("inf")) -> HeldVoxels:
     """Hold rows for a moment; what is not late is there, and whole."""
     with residency.hold(rows, deadline) as held:
         for row in set(rows) - set(held.late):
@@ -37,19 +37,19 @@ def take(residency: Residency, rows: list[int], deadline: float = float("inf")) 
 
 def test_after_the_deadline_no_load_is_begun() -> None:
     store = FakeStore([1] * 4)
-    residency = Residency(store, 4 * BLOCK)
+    residency = VoxelCache(store, 4 * BLOCK)
     take(residency, [1])
-    assert take(residency, [0, 1, 2], deadline=0.0) == Held(1, 2, (), (0, 2))
+    assert take(residency, [0, 1, 2], deadline=0.0) == HeldVoxels(1, 2, (), (0, 2))
     assert store.loads == {1: 1} and residency.resident == 1
     residency.check()
-    assert take(residency, [0, 1, 2]) == Held(1, 2, ()), "and who has time gets them"
-    assert take(residency, [0, 1, 2], deadline=0.0) == Held(3, 0, ()), "what is there is not late"
+    assert take(residency, [0, 1, 2]) == HeldVoxels(1, 2, ()), "and who has time gets them"
+    assert take(residency, [0, 1, 2], deadline=0.0) == HeldVoxels(3, 0, ()), "what is there is not late"
 
 
 def test_a_deadline_of_ages_is_waited_for() -> None:
     """Longer than a lock can be waited for: `budget_ms` has no upper end."""
     store = FakeStore([1])
-    residency = Residency(store, BLOCK)
+    residency = VoxelCache(store, BLOCK)
     store.gate.clear()
     with ThreadPoolExecutor(2) as pool:
         loader = pool.submit(take, residency, [0])
@@ -58,13 +58,13 @@ def test_a_deadline_of_ages_is_waited_for() -> None:
         while not other.done() and not residency._changed._waiters:  # type: ignore[attr-defined]
             time.sleep(0.001)
         store.gate.set()
-        assert loader.result(PATIENCE) == Held(0, 1, ())
+        assert loader.result(PATIENCE) == HeldVoxels(0, 1, ())
         assert other.result(PATIENCE).late == ()
 
 
 def test_a_load_of_another_is_waited_for_until_the_deadline_and_goes_on() -> None:
     store = FakeStore([1])
-    residency = Residency(store, BLOCK)
+    residency = VoxelCache(store, BLOCK)
     store.gate.clear()
     with ThreadPoolExecutor(1) as pool:
         loader = pool.submit(take, residency, [0])
@@ -73,7 +73,7 @@ def test_a_load_of_another_is_waited_for_until_the_deadline_and_goes_on() -> Non
             assert held.late == (0,) and held.faults == ()
             assert residency.where[0, 0] == -1
             store.gate.set()
-            assert loader.result(PATIENCE) == Held(0, 1, ())
+            assert loader.result(PATIENCE) == HeldVoxels(0, 1, ())
             assert residency.where[0, 0] >= 0, "it became resident while one holds it as late"
             residency.check()
     assert store.loads == {0: 1}
@@ -81,7 +81,7 @@ def test_a_load_of_another_is_waited_for_until_the_deadline_and_goes_on() -> Non
 
 def test_a_load_that_was_not_begun_is_taken_over_by_who_waits_for_it() -> None:
     store = FakeStore([1, 1])
-    residency = Residency(store, 2 * BLOCK)
+    residency = VoxelCache(store, 2 * BLOCK)
     store.gate.clear()
     with ThreadPoolExecutor(2) as pool:
         deadline = soon(0.2)
@@ -99,9 +99,9 @@ def test_a_load_that_was_not_begun_is_taken_over_by_who_waits_for_it() -> None:
 
 def test_who_waits_for_room_waits_until_the_deadline() -> None:
     store = FakeStore([1, 1, 1])
-    residency = Residency(store, 2 * BLOCK)
+    residency = VoxelCache(store, 2 * BLOCK)
     with residency.hold([0, 1]):
-        assert take(residency, [1, 2], soon()) == Held(1, 0, (), (2,))
+        assert take(residency, [1, 2], soon()) == HeldVoxels(1, 0, (), (2,))
         residency.check()
     assert store.loads == {0: 1, 1: 1}
     assert take(residency, [1, 2], soon(PATIENCE)).late == ()
@@ -109,9 +109,9 @@ def test_who_waits_for_room_waits_until_the_deadline() -> None:
 
 def test_a_stopped_request_is_owed_nothing() -> None:
     """Its client is gone, or the server stops: only a deadline leaves loads to the prefetcher."""
-    residency = Residency(FakeStore([1] * 4), 4 * BLOCK)
+    residency = VoxelCache(FakeStore([1] * 4), 4 * BLOCK)
     told: list[str] = []
-    residency.owed = lambda: told.append("owed")
+    residency.on_owed = lambda: told.append("owed")
     stop = StopFlag()
     stop.set("the client is gone")
     with residency.hold([0, 1], stop=stop) as held:
@@ -124,7 +124,7 @@ def test_a_stopped_request_is_owed_nothing() -> None:
 
 
 def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    residency = Residency(FakeStore([1, 1, 1]), 2 * BLOCK)
+    residency = VoxelCache(FakeStore([1, 1, 1]), 2 * BLOCK)
     tries: list[list[int]] = []
     allocate = residency._allocate_all
     monkeypatch.setattr(
@@ -151,7 +151,7 @@ def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch:
 def test_what_is_corrupt_is_a_fault_and_not_late() -> None:
     store = FakeStore([1, 1])
     store.faults[0] = "corrupt"
-    residency = Residency(store, 2 * BLOCK)
+    residency = VoxelCache(store, 2 * BLOCK)
     with residency.hold([0]) as held:
         assert held.late == () and len(held.faults) == 1
     with residency.hold([0, 1], 0.0) as held:
@@ -160,9 +160,9 @@ def test_what_is_corrupt_is_a_fault_and_not_late() -> None:
 
 def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:
     store = FakeStore([1, 2, 1, 1, 3, 1, 2, 1])
-    residency = Residency(store, 5 * BLOCK)
+    residency = VoxelCache(store, 5 * BLOCK)
 
-    def one(seed: int) -> tuple[Held, bool]:
+    def one(seed: int) -> tuple[HeldVoxels, bool]:
         rng = np.random.default_rng(seed)
         rows = rng.permutation(8)[: rng.integers(1, 3)].tolist()
         hurried = bool(rng.integers(2))
@@ -174,7 +174,7 @@ def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:
         for held, hurried in pool.map(one, range(600), timeout=10 * PATIENCE):
             assert hurried or not held.late
     residency.check()
-    assert not residency._pins and not residency._loading and not residency._left
+    assert not residency._pins and not residency._loading and not residency._abandoned
 
 
 def test_a_kernel_does_not_see_what_comes_late(tmp_path: Path) -> None:

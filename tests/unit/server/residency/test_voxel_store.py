@@ -11,21 +11,21 @@ from solidcloud.schemas.archive import voxel as voxel_module
 from solidcloud.schemas.archive.codec import encode_voxel
 from solidcloud.schemas.errors import CorruptError, FormatError, MisleadingIndexError
 from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> VoxelStore:
     """A store of a few voxels."""
-    return Store(archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 3, 300)).archive)
+    return VoxelStore(archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 3, 300)).archive)
 
 
 def test_a_folder_without_an_archive_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no archive here"):
-        Store(tmp_path)
+        VoxelStore(tmp_path)
 
 
-def test_a_load_reads_the_same_at_any_offset(store: Store) -> None:
+def test_a_load_reads_the_same_at_any_offset(store: VoxelStore) -> None:
     size = int(store.sizes[0])
     low, high = ArenaBuffer(size + 64), ArenaBuffer(size + 4096)
     first = store.load(0, low.arena, 0)
@@ -34,7 +34,7 @@ def test_a_load_reads_the_same_at_any_offset(store: Store) -> None:
     assert low.arena.halves[: size // 2].tobytes() == high.arena.halves[2048 : 2048 + size // 2].tobytes()
 
 
-def test_a_flipped_byte_is_corrupt_and_named(store: Store) -> None:
+def test_a_flipped_byte_is_corrupt_and_named(store: VoxelStore) -> None:
     row = 2
     entry = store.archive.voxels[row]
     path = store.archive.shard_path(int(entry["shard"]))
@@ -50,7 +50,9 @@ def test_a_flipped_byte_is_corrupt_and_named(store: Store) -> None:
     assert store.load(row + 1, arena, 0)[0] == 0
 
 
-def test_a_point_outside_its_cell_is_corrupt_and_named(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_point_outside_its_cell_is_corrupt_and_named(
+    store: VoxelStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     voxel, _ = store.archive.read_voxel(1)
     points = voxel.points.copy()
     points[-1] = 65535
@@ -61,13 +63,13 @@ def test_a_point_outside_its_cell_is_corrupt_and_named(store: Store, monkeypatch
         store.load(1, ArenaBuffer(1 << 20).arena, 0)
 
 
-def test_leaf_nodes_that_the_index_does_not_count_are_corrupt(store: Store) -> None:
+def test_leaf_nodes_that_the_index_does_not_count_are_corrupt(store: VoxelStore) -> None:
     store.archive.voxels["leaves"][1] += 1
     with pytest.raises(CorruptError, match=r"leaf nodes, the index says \d+"):
         store.load(1, ArenaBuffer(1 << 20).arena, 0)
 
 
-def test_a_tree_too_high_for_the_stack_is_corrupt(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tree_too_high_for_the_stack_is_corrupt(store: VoxelStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voxel_module, "MAX_LEVELS", 0)
     with pytest.raises(CorruptError, match="levels of nodes, expected at most 0"):
         store.load(int(np.argmax(store.sizes)), ArenaBuffer(1 << 20).arena, 0)
@@ -77,7 +79,7 @@ def test_a_radius_class_that_there_is_none_of_is_corrupt_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     models = frozenset({"mean", "local"})
-    store = Store(
+    store = VoxelStore(
         archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 3, 300), models=models).archive
     )
     voxel, _ = store.archive.read_voxel(1)

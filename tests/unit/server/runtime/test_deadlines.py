@@ -62,7 +62,7 @@ def test_what_is_left_when_the_time_is_up_takes_no_kernel(
     def kernel(*_: Any) -> int:
         raise AssertionError("searched")
 
-    monkeypatch.setattr(bounded, "go_on", kernel)
+    monkeypatch.setattr(bounded, "resume_search", kernel)
     late = QUESTIONS[question](case.data, avatar, poses, QueryBudget(deadline=0.0))
     assert late.verdict.tolist() == [UNKNOWN] * 5 + [CLEAR]
     assert (late.lower <= truth).all() and np.isinf(late.upper).all()

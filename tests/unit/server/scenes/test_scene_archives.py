@@ -32,7 +32,7 @@ from solidcloud.server import scene as scene_module
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files.scene_check import check_scene_file
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 from solidcloud.server.scenes import scene_archives
 from solidcloud.server.scenes.scene_archives import (
@@ -162,7 +162,7 @@ def test_a_scene_file_is_opened_with_the_readers_of_scans(write: Write) -> None:
         info = scene.info()
         scene.reload()
         assert scene.info() == info
-    for option in ({"radius_model": "mean"}, {"open_store": Store}):
+    for option in ({"radius_model": "mean"}, {"open_store": VoxelStore}):
         with pytest.raises(BadRequestError, match=r"hall.toml: a scene file: expected no open_store"):
             Scene.open(write(TOP), **option)
 

@@ -11,7 +11,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.archive_writer import write_index
 from solidcloud.server.cli.main import run
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 from synthetic_scans import make_scan, write_xyz
 
 WKT = 'PROJCS["UTM",\n  UNIT["metre",1]]'
@@ -45,7 +45,7 @@ def test_info_says_it_in_json(archive: Path, capsys: pytest.CaptureFixture[str])
         {"number": 0, "scanner": [1.5, -2.25, 100.0], "crs": WKT},
         {"number": 1, "units": "ft", "up": "y"},
     ]
-    store = Store(archive)
+    store = VoxelStore(archive)
     rows = store.archive.voxels["rows"][:, 2]
     densest = int(np.argmax(rows))
     assert found["densest"] == {

@@ -46,15 +46,17 @@ def units_of(model: AvatarModel) -> int:
     return int(np.rint(model.radius * naive.UNITS))
 
 
-def scratch_of(*models: AvatarModel) -> placed.Scratch:
+def scratch_of(*models: AvatarModel) -> placed.BodyScratch:
     """Scratch that just holds these."""
-    return placed.make_scratch(max(len(m.arrays.radius) for m in models), max(len(m.rows) for m in models))
+    return placed.make_body_scratch(
+        max(len(m.arrays.radius) for m in models), max(len(m.rows) for m in models)
+    )
 
 
 def ask(
     a: AvatarModel, first: NDArray[np.float64], last: NDArray[np.float64],
     b: AvatarModel, poses: NDArray[np.float64], margin: float = 0.0, until: float = np.inf,
-    scratch: placed.Scratch | None = None,
+    scratch: placed.BodyScratch | None = None,
 ) -> Asked:  # fmt: skip
     """Ask for all bodies at once."""
     ends = [pose.copy() for pose in (first, last)]
@@ -217,7 +219,9 @@ def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float)
             end[:3, 3] -= ORIGIN
         rows = np.empty(n, np.int64)
         for wanted, skip in ((7, -1), (4, 2)):
-            count = near_bodies.find_near(box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows)
+            count = near_bodies.find_near_bodies(
+                box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows
+            )
             named = rows[:count].tolist()
             assert named == sorted(named) and skip not in named
             assert all(kinds[row] & wanted for row in named)
@@ -273,10 +277,10 @@ def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> Non
             bounds[:, 0, axis] = [-9.0, -9.0, edges[2], edges[3]]
             bounds[:, 1, axis] = [edges[0], edges[1], 9.0, 9.0]
             rows = np.full(5, -7)
-            assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 6, -1, rows) == 2
+            assert near_bodies.find_near_bodies(box, first, last, 0.07, bounds, kinds, 6, -1, rows) == 2
             assert rows.tolist() == [1, 2, -7, -7, -7]
-            assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
-            assert near_bodies.find_near(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
+            assert near_bodies.find_near_bodies(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
+            assert near_bodies.find_near_bodies(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
             assert rows[0] == 2
 
 

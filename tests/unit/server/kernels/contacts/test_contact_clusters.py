@@ -6,7 +6,7 @@ from naive_contacts import Pair, clusters_of, gap_key
 from solidcloud.server.kernels.contacts.contact_clusters import (
     CELLS,
     CLUSTER,
-    DROP,
+    DEFICIT,
     HIGH,
     KEPT,
     LOW,
@@ -16,7 +16,7 @@ from solidcloud.server.kernels.contacts.contact_clusters import (
     RECORD,
     SQUARE,
     TAG,
-    Memory,
+    ContactState,
     empty_cells,
     enter_cell,
     find_slot,
@@ -35,13 +35,13 @@ def random_records(rng: np.random.Generator, count: int) -> np.ndarray:
     """Records with many ties in their first columns, also of gaps of unlike pairs: 2 less 1 is 1 less 0."""
     records = rng.integers(-2, 3, (count, RECORD))
     records[:, SQUARE] = rng.choice([0, 1, 2, 4, 9], count)
-    records[:, DROP] = rng.integers(0, 3, count)
+    records[:, DEFICIT] = rng.integers(0, 3, count)
     return records
 
 
 def place_of(record: list[int]) -> tuple[int, ...]:
     """What a record is sorted by."""
-    return gap_key(record[SQUARE], -record[DROP]), *record[DROP + 1 : ORDER]
+    return gap_key(record[SQUARE], -record[DEFICIT]), *record[DEFICIT + 1 : ORDER]
 
 
 @pytest.mark.parametrize("limit", [1, 2, 7, 64])
@@ -100,7 +100,7 @@ def test_a_cell_is_found_again_through_growth_and_after_emptying(rng: np.random.
 @pytest.mark.parametrize("spread", [2, 4, 8])
 def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: int) -> None:
     """One pair a cell; three poses in turn, so that nothing of one is left for the next."""
-    memory = Memory(
+    memory = ContactState(
         make_cells(64, NO_STOP.flag), np.empty((10, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
         np.zeros(3, np.int64), np.empty((1, 2), np.int64), np.empty((0, RECORD), np.int64),
         np.empty((0, CLUSTER), np.int64),
@@ -127,7 +127,7 @@ def test_neighbouring_cells_are_one_cluster(rng: np.random.Generator, spread: in
         own = memory.clusters[runs[2] : runs[2] + runs[3]]
         assert own[:, PAIRS].tolist() == [cluster.count for cluster in clusters]
         assert own[:, SQUARE].tolist() == [cluster.deepest.square for cluster in clusters]
-        assert own[:, DROP].tolist() == [-cluster.deepest.reach for cluster in clusters]
+        assert own[:, DEFICIT].tolist() == [-cluster.deepest.reach for cluster in clusters]
         boxes = [tuple(row) for row in own[:, LOW : HIGH + 3].tolist()]
         assert boxes == [(*c.low, *c.high) for c in clusters]
         assert memory.pairs[runs[0] : runs[0] + runs[1], TAG].tolist() == of_pair[:10]

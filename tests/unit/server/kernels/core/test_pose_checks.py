@@ -45,7 +45,7 @@ def test_a_mirrored_pose_is_told_whatever_its_axes(rng: np.random.Generator) -> 
         pose = archive_cases.pose_of(
             archive_cases.random_rotation(rng) * rng.uniform(0.1, 9), rng.uniform(-1, 1, 3)
         )
-        assert check(pose[None])[0] == placing.GOOD
+        assert check(pose[None])[0] == placing.VALID
         pose[:3, rng.integers(3)] *= -1
         fault, index, volume = check(pose[None])
         assert (fault, index) == (placing.MIRRORED, 0)
@@ -62,7 +62,7 @@ def test_every_entry_is_looked_at_and_the_figure_is_what_was_found(row: int, col
         assert check(entry(row, column, given)) == (placing.BAD_LAST_ROW, 1, given if column == 3 else 1.0)
     elif column == 3:
         for sign in (1.0, -1.0):
-            assert check(entry(row, column, sign * 1e9))[0] == placing.GOOD
+            assert check(entry(row, column, sign * 1e9))[0] == placing.VALID
             beyond = sign * np.nextafter(1e9, np.inf)
             assert check(entry(row, column, beyond)) == (placing.TOO_FAR, 1, beyond)
     else:
@@ -86,14 +86,14 @@ def test_a_shear_is_told_by_its_size(row: int, column: int) -> None:
             assert (fault, index) == (placing.SHEARED, 1)
             assert found == pytest.approx(np.abs(gram - np.eye(3) * square).max() / square, rel=1e-6)
     least, most = 0.95e-9 * (1.5 if row == column else 2), 1.05e-9 * (1.5 if row == column else 2)
-    assert check(entry(row, column, value + least))[0] == placing.GOOD
+    assert check(entry(row, column, value + least))[0] == placing.VALID
     assert check(entry(row, column, value + most))[0] == placing.SHEARED
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_a_scale_at_the_border_is_admitted_rounding_included(scale: float) -> None:
     sign = 1 if scale > 1 else -1
-    for by, fault in ((0.0, placing.GOOD), (0.9e-9, placing.GOOD), (1.1e-9, placing.BAD_SCALE)):
+    for by, fault in ((0.0, placing.VALID), (0.9e-9, placing.VALID), (1.1e-9, placing.BAD_SCALE)):
         given = scale * (1 + sign * by)
         pose = np.diag([given] * 3 + [1.0])[None]
         assert check(pose, 1e-3)[0] == fault
@@ -105,31 +105,31 @@ def test_radii_scale_and_are_rounded_once() -> None:
     poses = np.stack([np.diag([s, s, s, 1.0]) for s in (1.0, 0.5, 3.0)])
     radius = (2**20 + 0.75) / UNITS
     said = placing.check_poses(poses, np.ones(1), radius, 7, LATTICE, scales, units)
-    assert said == (placing.GOOD, 0, 0.0)
+    assert said == (placing.VALID, 0, 0.0)
     assert scales.tolist() == [1.0, 0.5, 3.0]
     assert units.tolist() == [round(s * (2**20 + 0.75)) + 7 for s in (1.0, 0.5, 3.0)]
 
 
 def test_the_reach_ends_at_sixteen_metres_to_the_unit() -> None:
-    assert check(np.eye(4)[None], radius=15.0, others=1 << 26)[0] == placing.GOOD
+    assert check(np.eye(4)[None], radius=15.0, others=1 << 26)[0] == placing.VALID
     said = check(np.eye(4)[None], radius=15.0, others=(1 << 26) + 1)
     assert said == (placing.LONG_REACH, 0, 16 + 1 / UNITS)
     doubled = np.diag([2.0, 2, 2, 1])[None]
-    assert check(doubled, radius=8.0)[0] == placing.GOOD
+    assert check(doubled, radius=8.0)[0] == placing.VALID
     assert check(doubled, radius=8.0, others=1)[0] == placing.LONG_REACH
 
 
 def test_an_avatar_ends_where_float32_does_to_the_step() -> None:
     """2^23 steps of 2^-13 m, less a voxel of 8 m, less a reach of 1 m: 1,015 m."""
-    assert check(np.eye(4)[None], 1015.0, 1.0)[0] == placing.GOOD
+    assert check(np.eye(4)[None], 1015.0, 1.0)[0] == placing.VALID
     said = check(np.eye(4)[None], 1015.0 + 2.0**-13, 1.0)
     assert said == (placing.LARGE_AVATAR, 0, 1016.0 + 2.0**-13)
     doubled = np.diag([2.0, 2, 2, 1])[None]
-    assert check(doubled, 507.5, 0.5)[0] == placing.GOOD
+    assert check(doubled, 507.5, 0.5)[0] == placing.VALID
     assert check(doubled, 507.5 + 2.0**-13, 0.5)[0] == placing.LARGE_AVATAR
     scales, units = np.empty(1), np.empty(1, np.int64)
     said = placing.check_poses(np.eye(4)[None], np.empty(0), 1.0, 0, LATTICE, scales, units)
-    assert said == (placing.GOOD, 0, 0.0), "an avatar without nodes has no extent but its reach"
+    assert said == (placing.VALID, 0, 0.0), "an avatar without nodes has no extent but its reach"
 
 
 def test_the_largest_term_is_that_of_the_row_with_the_largest_sum(rng: np.random.Generator) -> None:

@@ -44,7 +44,7 @@ def test_a_rotation_is_rigid_whatever_its_rounding(rng: np.random.Generator) -> 
     for _ in range(50):
         pose = archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1e6, 1e6, 3))
         fault, scale, units = check(pose)
-        assert (fault, scale) == (placing.GOOD, 1.0)
+        assert (fault, scale) == (placing.VALID, 1.0)
         assert units == naive.reach_units(pose, 0.01, 0.0, 0.0) + 5
 
 
@@ -52,7 +52,7 @@ def test_a_rotation_is_rigid_whatever_its_rounding(rng: np.random.Generator) -> 
 def test_a_uniform_scale_scales_the_radius(rng: np.random.Generator, factor: float) -> None:
     pose = archive_cases.pose_of(factor * archive_cases.random_rotation(rng), np.zeros(3))
     fault, scale, units = check(pose, node_radius=0.01, radius=0.003)
-    assert fault == placing.GOOD and scale == pytest.approx(factor, rel=1e-12)
+    assert fault == placing.VALID and scale == pytest.approx(factor, rel=1e-12)
     assert units == naive.reach_units(pose, 0.003, 0.0, 0.0) + 5
 
 
@@ -88,18 +88,18 @@ def test_what_is_no_similarity_is_refused(pose: NDArray[np.float64], fault: int)
 
 
 def test_a_departure_within_the_tolerance_is_admitted() -> None:
-    assert check(entry(0, 1, 0.9e-9))[:2] == (placing.GOOD, 1.0)
-    assert check(np.diag([1 + 0.9e-9] * 3 + [1.0]))[:2] == (placing.GOOD, 1.0)
+    assert check(entry(0, 1, 0.9e-9))[:2] == (placing.VALID, 1.0)
+    assert check(np.diag([1 + 0.9e-9] * 3 + [1.0]))[:2] == (placing.VALID, 1.0)
     # Beyond it a scale is a scale.
     assert check(np.diag([1 + 2e-9] * 3 + [1.0]))[1] == pytest.approx(1 + 2e-9, abs=1e-12)
 
 
 def test_reach_and_extent_are_bounded() -> None:
-    assert check(np.eye(4), radius=15.99)[0] == placing.GOOD
+    assert check(np.eye(4), radius=15.99)[0] == placing.VALID
     assert check(np.eye(4), radius=16.01)[0] == placing.LONG_REACH
     assert check(np.eye(4), radius=1e300)[0] == placing.LONG_REACH
     # 2^23 steps of 0.1 mm are 838.9 m, of which the voxel takes 8.
-    assert check(np.eye(4), node_radius=830.0)[0] == placing.GOOD
+    assert check(np.eye(4), node_radius=830.0)[0] == placing.VALID
     assert check(np.eye(4), node_radius=831.0)[0] == placing.LARGE_AVATAR
 
 

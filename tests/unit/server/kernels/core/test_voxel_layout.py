@@ -19,7 +19,7 @@ from solidcloud.server.kernels.core.voxel_layout import (
     scan_run,
 )
 from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_store import VoxelStore
 
 pytestmark = pytest.mark.interpreted
 
@@ -40,7 +40,7 @@ def test_the_arena_holds_what_the_archive_does(
     case = archive_cases.build(
         tmp_path, synthetic_scans.make_scan(kind, 7, 120), voxel=voxel, resolution=resolution, **options
     )
-    store = Store(case.archive)
+    store = VoxelStore(case.archive)
     buffer = ArenaBuffer(int(store.sizes.max()) + 128)
     with Archive(case.archive) as archive:
         for row in range(len(archive.voxels)):
@@ -111,7 +111,7 @@ def test_a_node_without_a_normal_is_cut_by_no_slab(tmp_path: Path, monkeypatch: 
     case = archive_cases.build(
         tmp_path, synthetic_scans.make_scan("duplicates", 7, 120), voxel=0.5, resolution=1e-3, with_slab=False
     )
-    store = Store(case.archive)
+    store = VoxelStore(case.archive)
     buffer = ArenaBuffer(int(store.sizes.max()) + 128)
     opened = Archive.open_voxel
 

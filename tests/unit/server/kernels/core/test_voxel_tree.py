@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core.voxel_tree import FAN, Lists, list_voxels, make_voxel_tree
+from solidcloud.server.kernels.core.voxel_tree import FAN, VoxelLists, list_voxels, make_voxel_tree
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
@@ -41,12 +41,14 @@ def apart(at: NDArray[np.float64], low: NDArray, high: NDArray, slack: float) ->
     return np.maximum(np.sqrt((gap**2).sum(axis=1)) - slack, 0)
 
 
-def listed(tree: tuple, at: NDArray, direction: NDArray, along: bool, reach: float, radius: float) -> Lists:
+def listed(
+    tree: tuple, at: NDArray, direction: NDArray, along: bool, reach: float, radius: float
+) -> VoxelLists:
     """The kernel's lists, asked with too little room first."""
     k = len(at)
     room = 0
     while True:
-        lists = Lists(np.zeros(k + 1, np.int64), np.full(room, -1), np.full(room, np.nan), np.zeros(k))
+        lists = VoxelLists(np.zeros(k + 1, np.int64), np.full(room, -1), np.full(room, np.nan), np.zeros(k))
         units = np.rint(at * UNITS).astype(np.int64)
         needed = list_voxels(
             tree,
@@ -115,7 +117,7 @@ def test_boxes_far_away_are_grown_by_what_rounding_takes(along: bool, sign: floa
         if along:
             at[0] = [(1 << 50) + 0.0, -5.0, sign * away]
         units = np.rint(at * 4).astype(np.int64)
-        lists = Lists(np.zeros(2, np.int64), np.full(4, -1), np.zeros(4), np.zeros(1))
+        lists = VoxelLists(np.zeros(2, np.int64), np.full(4, -1), np.zeros(4), np.zeros(1))
         reach = 40 if along else 0
         assert list_voxels(tree, units, direction, along, reach, 0, 4.0, NO_STOP.flag, lists) == found
 

@@ -10,30 +10,30 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.kernels.core.voxels_in_reach import Reach, find_key
+from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach, find_key
 from solidcloud.server.queries.context.query_context import (
     SceneData,
     check_request,
     make_scene_data,
     to_units,
 )
-from solidcloud.server.residency.voxel_cache import Residency
-from solidcloud.server.residency.voxel_store import Store
+from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 
 
-def find(data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], margin: float) -> Reach:
+def find(data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], margin: float) -> VoxelsInReach:
     """The voxels in reach of a request."""
     return check_request(data, avatar, poses, data.radius_units + to_units(margin, "margin"))
 
 
 def open_data(case: archive_cases.Case) -> SceneData:
     """What `collide` reads of an archive."""
-    store = Store(case.archive)
-    return make_scene_data(store.archive, Residency(store, 1 << 24))
+    store = VoxelStore(case.archive)
+    return make_scene_data(store.archive, VoxelCache(store, 1 << 24))
 
 
-def listed(reach: Reach, pose: int) -> list[int]:
+def listed(reach: VoxelsInReach, pose: int) -> list[int]:
     """The voxel rows of one pose."""
     return reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
 

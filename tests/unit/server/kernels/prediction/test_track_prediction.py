@@ -7,20 +7,20 @@ from solidcloud.schemas.archive.voxel_grid import KEY_BIAS
 from solidcloud.schemas.kernels.morton import morton_encode
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
 from solidcloud.server.kernels.prediction.track_prediction import (
-    MOST_CELLS,
-    Motion,
-    distance_to_ways,
+    MAX_CELLS,
+    PredictionLimits,
     first_touch,
     fit_motion,
-    predict_way,
+    predict_path,
     rows_ahead,
     rows_in_reach,
+    write_path_distances,
 )
 
 pytestmark = pytest.mark.interpreted
 
 VOXEL_STEPS = 100
-MOTION = Motion(history=0.5, speed=15.0, acceleration=6.0, fade=0.5)
+MOTION = PredictionLimits(history=0.5, speed=15.0, acceleration=6.0, fade=0.5)
 
 
 def scattered(rng: np.random.Generator, side: int, count: int) -> SceneIndex:
@@ -121,7 +121,7 @@ def test_far_outside_the_scene_nothing_is_wanted() -> None:
 @pytest.mark.parametrize(("beyond", "found"), [(-1, 1), (0, 0)])
 def test_no_more_cells_are_looked_at_than_are_said(beyond: int, found: int) -> None:
     """A row of voxels that a ball comes down to at its end, which is looked at last."""
-    count = MOST_CELLS + 1 + beyond
+    count = MAX_CELLS + 1 + beyond
     coordinates = np.column_stack([np.arange(count), np.zeros((count, 2), np.int64)])
     base = coordinates * VOXEL_STEPS
     keys = morton_encode((coordinates + KEY_BIAS).astype(np.uint64))
@@ -170,9 +170,9 @@ def test_distance_to_ways_is_the_least_of_all(rng: np.random.Generator) -> None:
     index = scattered(rng, 5, 90)
     ways = rng.uniform(-600, 600, (4, 6, 3))
     rows, far = rng.integers(0, len(index.keys), 30), np.empty(30)
-    distance_to_ways(ways, rows, index, far)
+    write_path_distances(ways, rows, index, far)
     assert np.allclose(far, gaps(index, ways.reshape(-1, 3)).min(axis=0)[rows])
-    distance_to_ways(ways[:0], rows, index, far)
+    write_path_distances(ways[:0], rows, index, far)
     assert np.isinf(far).all()
 
 
@@ -216,7 +216,7 @@ def test_jitter_of_clock_and_place_moves_a_prediction_little(seed: int) -> None:
     places = t[:, None] * [1.5, 0.0, 0.0] + rng.normal(0, 0.01, (16, 3))
     late = np.maximum.accumulate(t + rng.uniform(0, 0.01, 16))
     way = np.empty((17, 3))
-    predict_way(np.column_stack([late, places]), MOTION, 1.0, way)
+    predict_path(np.column_stack([late, places]), MOTION, 1.0, way)
     assert np.linalg.norm(way[-1] - [2.0, 0, 0]) < 0.5
 
 
@@ -225,7 +225,7 @@ def test_turning_is_followed() -> None:
     angle = np.arange(16) / 30
     poses = walked(1.5 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]))
     way = np.empty((17, 3))
-    predict_way(poses, MOTION, 0.5, way)
+    predict_path(poses, MOTION, 0.5, way)
     end = angle[-1] + 0.5
     truth = 1.5 * np.array([np.cos(end), np.sin(end), 0])
     straight = poses[-1, 1:] + 0.75 * np.array([-np.sin(angle[-1]), np.cos(angle[-1]), 0])
@@ -247,7 +247,7 @@ def test_acceleration_fades_so_that_what_is_far_ahead_goes_straight() -> None:
     """At 1 m/s, gaining 2 m/s a second: after half a second some 60 % of a second's worth, then hardly more."""
     t = np.arange(16)[:, None] / 30
     way = np.empty((17, 3))
-    predict_way(walked((0.5 * t + t**2) * [1.0, 0.0, 0.0]), MOTION, 4.0, way)
+    predict_path(walked((0.5 * t + t**2) * [1.0, 0.0, 0.0]), MOTION, 4.0, way)
     velocity, gained = 1.5, 2.0 * MOTION.fade
     expected = velocity * 4.0 + gained * (4.0 - MOTION.fade * (1 - np.exp(-4.0 / MOTION.fade)))
     assert way[-1, 0] - way[0, 0] == pytest.approx(expected, rel=0.05)
@@ -259,7 +259,7 @@ def test_acceleration_fades_so_that_what_is_far_ahead_goes_straight() -> None:
 def test_no_way_is_longer_than_people_go(power: int) -> None:
     t = np.arange(16)[:, None] / 30
     way = np.empty((17, 3))
-    predict_way(walked(1e3 * t**power * [1.0, -1.0, 0.5]), MOTION, 2.0, way)
+    predict_path(walked(1e3 * t**power * [1.0, -1.0, 0.5]), MOTION, 2.0, way)
     assert np.isfinite(way).all()
     lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
     assert (lengths <= MOTION.speed * 2.0 / 16 + 1e-9).all() and lengths.sum() > 10
@@ -268,5 +268,5 @@ def test_no_way_is_longer_than_people_go(power: int) -> None:
 def test_of_no_time_ahead_the_user_stands() -> None:
     way = np.empty((5, 3))
     for seconds in (0.0, -3.0):
-        predict_way(walked(np.arange(48.0).reshape(16, 3)), MOTION, seconds, way)
+        predict_path(walked(np.arange(48.0).reshape(16, 3)), MOTION, seconds, way)
         assert (way == [45.0, 46.0, 47.0]).all()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_options import AnyEffect, Crowd, Slide, Stop, Sweep
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.bodies.moving_bodies import Scratch
+from solidcloud.server.kernels.bodies.moving_bodies import BodyScratch
 from solidcloud.server.simulation.effects import crowd_effect as crowd
 from solidcloud.server.simulation.world.frame import Body
 
@@ -127,7 +127,7 @@ def test_nobody_near_asks_nothing_of_trees(tmp_path: Path) -> None:
     with staged(tmp_path, [*CONTINUOUS, Crowd()]) as stage:
         for number, place in enumerate(around(8, 5.0)):
             stage.enter(f"c/{number}", SMALL, at(*place, heading=number))
-        scratch: Scratch = stage.bodies.scratch
+        scratch: BodyScratch = stage.bodies.scratch
         for name in stage.users:
             moved = stage.step(name, (0.1, 0.1, 0))
             assert moved.crowd is not None and moved.crowd.met == 0

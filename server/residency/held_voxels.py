@@ -4,7 +4,7 @@ from enum import Enum
 from typing import NamedTuple
 
 
-class Held(NamedTuple):
+class HeldVoxels(NamedTuple):
     """Result of a hold on voxels.
 
     hits: voxels that were resident or being loaded.  misses: voxels that were not.
@@ -21,9 +21,9 @@ class Held(NamedTuple):
     waited: float = 0.0
 
 
-class Ahead(Enum):
+class BackgroundLoad(Enum):
     """Result of a load that no request waits for."""
 
-    THERE = "the voxel is resident, or was"
+    RESIDENT = "the voxel is resident, or was"
     NO_ROOM = "no voxel may be evicted for it"
     FAILED = "the voxel cannot be read"

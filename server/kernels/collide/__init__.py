@@ -1,5 +1,5 @@
 """Contact or not: two hierarchies descended together.
 
 May import server.kernels.core, schemas.
-Begin with overlap.py.
+Begin with collide_poses.py.
 """

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from .borrowing_kernels import borrowing
+from .kernel_decorators import njit_no_refcount
 
 # Two separations whose float64 values differ by more than this are in that order. Squares are below
 # 2^62, so a root is off by at most half of 2^-22 for its rounding and 2^-54 of itself for that of
@@ -21,7 +21,7 @@ _LOW = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
 
 
-@borrowing
+@njit_no_refcount
 def _product(a, b):
     """Return the product of two uint64 as its high and low 64 bits."""
     a_high, a_low, b_high, b_low = a >> _HALF, a & _LOW, b >> _HALF, b & _LOW
@@ -32,18 +32,19 @@ def _product(a, b):
     return a_high * b_high + (middle >> _HALF) + (other >> _HALF), ((other & _LOW) << _HALF) | (low & _LOW)
 
 
-@borrowing
-def _compare_roots(square, other, more):
+@njit_no_refcount
+def _compare_roots(square, other, radius_difference):
     """Return the sign of sqrt(square) - (sqrt(other) + more), int64.
 
-    more: >= 0. The difference is within 1. Squaring both sides leaves the sign of s - 2 more
-    sqrt(other), with s = square - other - more^2; where s is not negative, both sides are squared
-    again. All terms fit, because `more` is at most slightly larger than the root of `square`.
+    radius_difference: >= 0. The difference is within 1. Squaring both sides leaves the sign of s -
+    2 more sqrt(other), with s = square - other - more^2; where s is not negative, both sides are
+    squared again. All terms fit, because `radius_difference` is at most slightly larger than the
+    root of `square`.
     """
-    s = square - other - more * more
+    s = square - other - radius_difference * radius_difference
     if s < 0:
         return -1
-    size, twice = np.uint64(s), np.uint64(2 * more)
+    size, twice = np.uint64(s), np.uint64(2 * radius_difference)
     high, low = _product(size, size)
     other_high, other_low = _product(twice * twice, np.uint64(other))
     if high != other_high:
@@ -53,21 +54,23 @@ def _compare_roots(square, other, more):
     return 0
 
 
-@borrowing
-def compare_gaps(square, radius, other_square, other_radius):
+@njit_no_refcount
+def compare_separations(square, radius, other_square, other_radius):
     """Compare the gaps sqrt(square) - radius of two pairs exactly.
 
     Returns -1, 0 or 1: the first gap is less than, equal to or greater than the other.
     square, other_square: int64, 0 to 3 * 2^60, from `pair_square`.  radius, other_radius: int64,
-    -2^31 to 2^31, exact units. Terms common to both radii may be omitted: `-drop` serves as well as
-    the radius.
+    -2^31 to 2^31, exact units. Terms common to both radii may be omitted: `-deficit` serves as well
+    as the radius.
     """
-    more = radius - other_radius
-    apart = (math.sqrt(np.float64(square)) - math.sqrt(np.float64(other_square))) - np.float64(more)
+    radius_difference = radius - other_radius
+    apart = (math.sqrt(np.float64(square)) - math.sqrt(np.float64(other_square))) - np.float64(
+        radius_difference
+    )
     if apart < -CERTAIN:
         return -1
     if apart > CERTAIN:
         return 1
-    if more >= 0:
-        return _compare_roots(square, other_square, more)
-    return -_compare_roots(other_square, square, -more)
+    if radius_difference >= 0:
+        return _compare_roots(square, other_square, radius_difference)
+    return -_compare_roots(other_square, square, -radius_difference)

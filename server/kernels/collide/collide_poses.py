@@ -4,10 +4,10 @@ As printed, figures 5 and 6 descend into "all children A[i] and B[j]" when A is 
 a leaf has no children, the loop runs zero times, and the contact is lost. Here inner nodes are
 descended, whichever side they are on, and leaves never are.
 
-The scene's tree is descended with the whole front of the avatar's tree (avatar_front.py). Where a scene
-node is a leaf, or flat compared with the avatar's leaf nodes, the avatar's points themselves are
-tested against its bound, LANES in a vector step. The slab of a floor then clears a foot that stands
-a centimetre above it, while the foot's sphere would not.
+The scene's tree is descended with the whole front of the avatar's tree (avatar_front.py). Where a
+scene node is a leaf, or flat compared with the avatar's leaf nodes, the avatar's points themselves
+are tested against its bound, LANES in a vector step. The slab of a floor then clears a foot that
+stands a centimetre above it, while the foot's sphere would not.
 
 An inequality of integers decides (NUMERICS.md N5). A float32 pass settles nearly all pairs. Its
 distances are in lattice steps from a lattice point near the avatar; relative to it, scene
@@ -22,28 +22,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.avatar_front import MOST_LEVELS, make_front, move_node, pad, place_front, sift, take_kept
-from ..core.borrowing_kernels import borrowing, inlined
+from ..core.avatar_front import (
+    MAX_LEVELS,
+    compact_marked,
+    copy_node,
+    make_front,
+    mark_meeting,
+    pad_list,
+    place_front,
+)
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.placed_avatar import (
     ONE_SLACK,
     SLACK,
-    make_by_class,
+    make_class_thresholds,
     make_placed,
     node_reach,
     pair_in_reach,
     place_block,
     place_lanes,
     place_root,
-    set_by_class,
+    set_class_thresholds,
 )
-from ..core.pose_transform import GOOD, place
-from ..core.stop_flag_checks import MOST_QUICK_VISITS, NO_LIMIT, is_over, stopped
+from ..core.pose_transform import VALID, place
+from ..core.stop_flag_checks import MAX_RESIDENT_PATH_VISITS, NO_LIMIT, should_end, stopped
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
-from ..core.voxels_in_reach import Reach, find_reach
+from ..core.voxels_in_reach import VoxelsInReach, find_reach
 
 # A pair is pushed for each child of one of its nodes: at most 15 a level stay behind on the stack.
 # This size holds two trees of MOST_LEVELS.
-STACK = 2 * MOST_LEVELS * 15 + 16
+STACK = 2 * MAX_LEVELS * 15 + 16
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
 
 U = np.uint64  # see avatar_front.py
@@ -56,7 +64,7 @@ FLAT = np.float32(1.0)
 BROAD = np.float32(2.0)
 
 
-class Work(NamedTuple):
+class CollideScratch(NamedTuple):
     """Scratch of one call.
 
     stack: (STACK, 3) int64: scene row, start of its list, length.
@@ -73,7 +81,7 @@ class Work(NamedTuple):
     counters: NDArray[np.int64]
 
 
-class Spot(NamedTuple):
+class VoxelLocation(NamedTuple):
     """Location of one voxel.
 
     rows, blocks, lanes: its first row, block and lane in the arena.
@@ -89,25 +97,25 @@ class Spot(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def make_work(avatar):
+def make_collide_scratch(avatar):
     """Allocate scratch for one avatar (not empty)."""
     below = STACK if avatar.first[avatar.front_first] >= 0 else 1
     keep = np.zeros(LANES, np.bool_)
     stack, counters = np.empty((STACK, 3), np.int64), np.zeros(3, np.int64)
     counters[2] = NO_LIMIT
-    return Work(stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters)
+    return CollideScratch(stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters)
 
 
-@borrowing
-def nodes_meet(words, row, x, y, z, radius, room):
-    """Return whether a sphere may come within `room` of a node's points, by the node's bounds.
+@njit_no_refcount
+def nodes_meet(words, row, x, y, z, radius, threshold):
+    """Return whether a sphere may come within `threshold` of a node's points, by the node's bounds.
 
-    x, y, z: float32, relative to the voxel's low corner.  room: reach plus error. Tests the sphere
-    as in [Fig12] line 2, then the slab.
+    x, y, z: float32, relative to the voxel's low corner.  threshold: reach plus error. Tests the
+    sphere as in [Fig12] line 2, then the slab.
     """
     w = U(row)
     dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
-    span = radius + room
+    span = radius + threshold
     both = words[w + U(3)] + span
     along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
     # The sphere test decides beyond `both`; the rounding of `along` is therefore at most SLACK of
@@ -121,18 +129,18 @@ def nodes_meet(words, row, x, y, z, radius, room):
     )
 
 
-@inlined
-def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
-    """Mark in `keep` the points of an avatar's block that come within `room` of a node's bounds.
+@njit_inlined
+def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
+    """Mark in `keep` the points of an avatar's block within `threshold` of a node's bounds.
 
-    lanes: relative to the frame.  room: reach plus error.  row: a scene node. Returns whether any
-    point is marked.
+    lanes: relative to the frame.  threshold: reach plus error.  row: a scene node. Returns whether
+    any point is marked.
     """
     w = U(row)
     cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
     nx, ny, nz = words[w + U(4)], words[w + U(5)], words[w + U(6)]
-    both = words[w + U(3)] + room
-    wide = words[w + U(7)] * (room + SLACK * both + SLACK * both)
+    both = words[w + U(3)] + threshold
+    wide = words[w + U(7)] * (threshold + SLACK * both + SLACK * both)
     low, high = words[w + U(8)] - wide, words[w + U(9)] + wide
     square = both * both * ONE_SLACK
     b = U(block)
@@ -146,12 +154,12 @@ def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
     return any_meets
 
 
-@borrowing
+@njit_no_refcount
 def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin):
     """Find the first marked point, from `begin` on, that may be near a point of a scene block.
 
     The points are those of an avatar's block.  lane_at: the scene block in `halves`.  low: its
-    corner, relative to the frame.  far: a square, see `Limits`. Returns (lane or -1, number of
+    corner, relative to the frame.  far: a square, see `Thresholds`. Returns (lane or -1, number of
     points tested against the block).
     """
     h, b = U(lane_at), U(block)
@@ -176,23 +184,23 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
     return -1, tested
 
 
-@borrowing
-def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
+@njit_no_refcount
+def leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
     """Return whether a marked point of an avatar's block touches a point of leaf node `row`."""
     halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
     number = ~np.int64(ints[U(row + FIRST)])
-    block_at = spot.blocks + number * scene.block_words
-    lane_at = spot.lanes + number * 3 * LANES
-    low_x = spot.x + np.float32(ints[U(block_at)])
-    low_y = spot.y + np.float32(ints[U(block_at + 1)])
-    low_z = spot.z + np.float32(ints[U(block_at + 2)])
+    block_at = location.blocks + number * scene.block_words
+    lane_at = location.lanes + number * 3 * LANES
+    low_x = location.x + np.float32(ints[U(block_at)])
+    low_y = location.y + np.float32(ints[U(block_at + 1)])
+    low_z = location.z + np.float32(ints[U(block_at + 2)])
     far = by_class.far[node_class(ints, row, mask)]  # for the largest sphere in the block
     begin = 0
     while begin < LANES:
         lane, tested = next_near(
-            halves, lane_at, low_x, low_y, low_z, lanes, block, far, work.keep, work.keep8, begin
+            halves, lane_at, low_x, low_y, low_z, lanes, block, far, scratch.keep, scratch.keep8, begin
         )
-        work.counters[1] += LANES * tested
+        scratch.counters[1] += LANES * tested
         if lane < 0:
             return False
         x, y, z = lanes[block, 0, lane] - low_x, lanes[block, 1, lane] - low_y, lanes[block, 2, lane] - low_z
@@ -215,7 +223,7 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, wo
     return False
 
 
-@borrowing
+@njit_no_refcount
 def _block_placed(avatar, m, pose, block, placed, scene):
     """Place a block of the avatar unless it is already placed for this pose."""
     if placed.stamp[U(block)] != pose:
@@ -223,41 +231,41 @@ def _block_placed(avatar, m, pose, block, placed, scene):
         placed.stamp[U(block)] = pose
 
 
-@borrowing
-def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work):
+@njit_no_refcount
+def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch):
     """Return whether a point of a scene leaf node touches a point below an avatar's front node.
 
     The avatar's node is descended depth first. This is for avatars whose front is not their leaf
     nodes.
     """
-    words, below = scene.words, work.below
-    room = by_class.room[node_class(scene.ints, row, by_class.mask)]
+    words, below = scene.words, scratch.below
+    threshold = by_class.threshold[node_class(scene.ints, row, by_class.mask)]
     steps = scale / scene.step
     below[0] = a
     depth = 1
-    while depth > 0 and not is_over(scene.stop, work.counters[0], work.counters[2]):
+    while depth > 0 and not should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
         depth -= 1
         a = below[depth]
         a_first = avatar.first[a]
-        work.counters[0] += 1
+        scratch.counters[0] += 1
         if a_first < 0:
             block = np.int64(~a_first)
             _block_placed(avatar, m, pose, block, placed, scene)
             if lanes_meet(
-                words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, work.keep
-            ) and leaves_touch(avatar, m, block, placed, scene, voxel, spot, row, by_class, work):
+                words, row, placed.lanes, block, location.x, location.y, location.z, threshold, scratch.keep
+            ) and leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
                 return True
             continue
         x, y, z = _place_node(avatar, m, a, placed, scene)
         radius = node_reach(avatar.radius[a], steps, extent)
-        if nodes_meet(words, row, x - spot.x, y - spot.y, z - spot.z, radius, room):
+        if nodes_meet(words, row, x - location.x, y - location.y, z - location.z, radius, threshold):
             for i in range(avatar.count[a]):
                 below[depth] = a_first + i
                 depth += 1
     return False
 
 
-@borrowing
+@njit_no_refcount
 def _place_node(avatar, m, a, placed, scene):
     """Place one node of the avatar: return x, y, z from the frame [steps], float32."""
     per_step = 1.0 / scene.step
@@ -275,8 +283,10 @@ def _place_node(avatar, m, a, placed, scene):
     )
 
 
-@borrowing
-def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, by_class, front, count, work):
+@njit_no_refcount
+def _collide_voxel(
+    avatar, m, scale, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch
+):
     """Return whether the placed avatar touches one resident voxel, whose root it meets.
 
     The scene's tree is descended depth first, each node with a list of those front nodes that met
@@ -284,30 +294,30 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
     call that passes tuples of arrays, or takes arrays out of them, costs the same again (11 us a
     pose instead of 4 with each step in a function).
     """
-    words, ints, stack, counters = scene.words, scene.ints, work.stack, work.counters
+    words, ints, stack, counters = scene.words, scene.ints, scratch.stack, scratch.counters
     bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
-    listed, listed8, keep = front.keep, front.keep8, work.keep
+    listed, listed8, keep = front.keep, front.keep8, scratch.keep
     firsts, front_first, points = avatar.first, avatar.front_first, avatar.points
     shift, frame, step = placed.shift, placed.frame, scene.step
-    off_x, off_y, off_z = spot.x, spot.y, spot.z
-    rooms, mask = by_class.room, by_class.mask
-    some_smaller, room, stop, most = mask > U(0), rooms[0], scene.stop, counters[2]
+    off_x, off_y, off_z = location.x, location.y, location.z
+    thresholds, mask = by_class.threshold, by_class.mask
+    by_size, threshold, stop, most = mask > U(0), thresholds[0], scene.stop, counters[2]
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
-    stack[0, 0], stack[0, 1], stack[0, 2] = spot.rows, 0, count
+    stack[0, 0], stack[0, 1], stack[0, 2] = location.rows, 0, count
     depth = 1
-    while depth > 0 and not is_over(stop, counters[0], most):
+    while depth > 0 and not should_end(stop, counters[0], most):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
-        if some_smaller:
-            room = rooms[node_class(ints, row, mask)]
+        if by_size:
+            threshold = thresholds[node_class(ints, row, mask)]
         if first < 0 or words[U(row + 3)] < BROAD * radius:
             counters[0] += count
             steps = (count + LANES - 1) // LANES
-            if not sift(words, row, bounds, at, steps, off_x, off_y, off_z, room, listed):
+            if not mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, threshold, listed):
                 continue
             to = at + steps * LANES
-            count = take_kept(bounds, which, listed, listed8, at, steps, to)
+            count = compact_marked(bounds, which, listed, listed8, at, steps, to)
             at = to
             thick = words[U(row + 9)] - words[U(row + 8)]
             if first < 0 or thick < FLAT * words[U(row + 7)] * bounds[3, U(at)]:
@@ -321,11 +331,11 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
-                        if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, room, keep):
+                        if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
                             continue
                         if first < 0:
                             if leaves_touch(
-                                avatar, m, block, placed, scene, voxel, spot, row, by_class, work
+                                avatar, m, block, placed, scene, voxel, location, row, by_class, scratch
                             ):
                                 return True
                             if stopped(stop):  # the blocks of a whole front may take milliseconds
@@ -333,35 +343,47 @@ def _overlap_voxel(avatar, m, scale, extent, pose, placed, scene, voxel, spot, b
                             continue
                     elif first < 0:
                         if _below_touches(
-                            avatar, m, scale, extent, pose, placed, scene, voxel, spot, a, row, by_class, work
+                            avatar,
+                            m,
+                            scale,
+                            extent,
+                            pose,
+                            placed,
+                            scene,
+                            voxel,
+                            location,
+                            a,
+                            row,
+                            by_class,
+                            scratch,
                         ):
                             return True
                         continue
-                    move_node(bounds, which, U(i), U(left))
+                    copy_node(bounds, which, U(i), U(left))
                     left += 1
                 if left == at:  # always true at a leaf
                     continue
-                pad(bounds, left, at + (count + LANES - 1) // LANES * LANES)
+                pad_list(bounds, left, at + (count + LANES - 1) // LANES * LANES)
                 count = left - at
         children = np.int64(ints[U(row + COUNT)] & COUNTED)
-        child = spot.rows + first * ROW_WORDS
+        child = location.rows + first * ROW_WORDS
         counters[0] += children
         for _ in range(children):
             u = U(depth)
             stack[u, 0], stack[u, 1], stack[u, 2] = child, at, count
-            if some_smaller:
-                room = rooms[node_class(ints, child, mask)]
-            if nodes_meet(words, child, x, y, z, radius, room):
+            if by_size:
+                threshold = thresholds[node_class(ints, child, mask)]
+            if nodes_meet(words, child, x, y, z, radius, threshold):
                 depth += 1
             child += ROW_WORDS
     return False
 
 
-@borrowing
-def make_spot(scene, voxel, placed):
+@njit_no_refcount
+def locate_voxel(scene, voxel, placed):
     """Locate a resident voxel in the arena and relative to the frame."""
     coordinates, where, frame = scene.coordinates, scene.where, placed.frame
-    return Spot(
+    return VoxelLocation(
         where[voxel, 0],
         where[voxel, 1],
         where[voxel, 2],
@@ -372,27 +394,27 @@ def make_spot(scene, voxel, placed):
 
 
 @nb.njit(nogil=True, cache=True)
-def overlap_poses(poses, avatar, scene, reach, which, most, verdict, counts):
+def collide_poses(poses, avatar, scene, reach, which, most, verdict, counts):
     """Answer `collide` for the poses numbered in `which`: one call a request, with all voxels.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (voxels_in_reach.py); a voxel
-    in it that is not resident is counted as missing.  most: node visits of a pose, beyond which its
-    search ends.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
+    (voxels_in_reach.py); a voxel in it that is not resident is counted as missing.  most: node
+    visits of a pose, beyond which its search ends.
     Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
     tests), whose initial values are CLEAR and 0. A pose may therefore be answered in pieces: a
     contact overrides a missing voxel, and a missing voxel overrides CLEAR. Once the scene's stop
     flag is set, poses without a contact so far become UNKNOWN; a pose whose search ends early does
     too.
     """
-    placed, front, work = make_placed(avatar), make_front(avatar), make_work(avatar)
-    by_class = make_by_class(scene.drop)
-    work.counters[2] = most
-    _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, work)
+    placed, front, scratch = make_placed(avatar), make_front(avatar), make_collide_scratch(avatar)
+    by_class = make_class_thresholds(scene.radius_deficit)
+    scratch.counters[2] = most
+    _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, scratch)
 
 
-@borrowing
-def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, work):
-    """Implement `overlap_poses` with its scratch passed in."""
+@njit_no_refcount
+def _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, scratch):
+    """Implement `collide_poses` with its scratch passed in."""
     nodes, ints = placed.nodes, scene.ints
     for number in range(which.shape[0]):
         i = which[number]
@@ -402,10 +424,16 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
             verdict[i] = UNKNOWN
             continue
         m, scale = poses[i], reach.scales[i]
-        work.counters[0], work.counters[1] = 0, 0
+        scratch.counters[0], scratch.counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, scale, placed, scene)
-        set_by_class(
-            by_class, scene.drop, reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps
+        set_class_thresholds(
+            by_class,
+            scene.radius_deficit,
+            reach.units[i],
+            scene.units_per_step,
+            extent,
+            farthest,
+            scene.voxel_steps,
         )
         count = 0  # length of the front; not placed yet, as most far poses never need it
         for at in range(reach.starts[i], reach.starts[i + 1]):
@@ -414,28 +442,28 @@ def _overlap_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
                 counts[0, i] += np.uint32(1)
                 verdict[i] = UNKNOWN
                 continue
-            spot = make_spot(scene, voxel, placed)
-            x, y, z = nodes[0, 0] - spot.x, nodes[1, 0] - spot.y, nodes[2, 0] - spot.z
-            work.counters[0] += 1
-            room = by_class.room[node_class(ints, spot.rows, by_class.mask)]
-            if not nodes_meet(scene.words, spot.rows, x, y, z, nodes[3, 0], room):
+            location = locate_voxel(scene, voxel, placed)
+            x, y, z = nodes[0, 0] - location.x, nodes[1, 0] - location.y, nodes[2, 0] - location.z
+            scratch.counters[0] += 1
+            threshold = by_class.threshold[node_class(ints, location.rows, by_class.mask)]
+            if not nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
                 continue
             if count == 0:
                 count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
-            if _overlap_voxel(
-                avatar, m, scale, extent, i, placed, scene, voxel, spot, by_class, front, count, work
+            if _collide_voxel(
+                avatar, m, scale, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
             ):
                 verdict[i] = CONTACT
                 break
-            if is_over(scene.stop, work.counters[0], work.counters[2]):
+            if should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
                 verdict[i] = UNKNOWN
                 break
-        counts[1, i] += np.uint32(work.counters[0])
-        counts[2, i] += np.uint32(work.counters[1])
+        counts[1, i] += np.uint32(scratch.counters[0])
+        counts[2, i] += np.uint32(scratch.counters[1])
 
 
 @nb.njit(nogil=True, cache=True)
-def rows_or_undone(needed, verdict, counts):
+def rows_or_reset(needed, verdict, counts):
     """Return `needed`, or undo the request and return -1 where a search ended early.
 
     needed: the rows of a request all of whose voxels are resident. Undoing resets verdict (k,) to
@@ -450,26 +478,26 @@ def rows_or_undone(needed, verdict, counts):
 
 
 @nb.njit(nogil=True, cache=True)
-def answer_resident(poses, avatar, radius, other_units, scene, index, rows, outside, verdict, counts):
+def collide_resident(poses, avatar, radius, other_units, scene, index, rows, outside, verdict, counts):
     """Answer a whole request in one call, where all voxels in its reach are resident.
 
-    This is `find_reach`, then `overlap_poses`. Writes rows (capacity,) int64, the voxels in reach,
-    pose by pose; outside (k,) bool; and verdict and counts, as `overlap_poses` does. The remaining
-    arrays of `Reach` are local: arrays created here cost a tenth of arrays passed in.
+    This is `find_reach`, then `collide_poses`. Writes rows (capacity,) int64, the voxels in reach,
+    pose by pose; outside (k,) bool; and verdict and counts, as `collide_poses` does. The remaining
+    arrays of `VoxelsInReach` are local: arrays created here cost a tenth of arrays passed in.
     Returns (fault, pose, value found), as `check_poses` does, and the number of rows. -1 rows: not
     answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
     (scene.stop, MOST_QUICK_VISITS); verdict and counts are then unchanged.
     """
     k = poses.shape[0]
-    reach = Reach(
+    reach = VoxelsInReach(
         np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside
     )
     fault, pose, found, needed = find_reach(poses, avatar, radius, other_units, scene, index, reach)
-    if fault != GOOD or needed < 0 or needed > rows.shape[0]:
+    if fault != VALID or needed < 0 or needed > rows.shape[0]:
         return fault, pose, found, -1
     for at in range(needed):
         if scene.where[rows[at], 0] < 0:
             return fault, pose, found, -1
     if avatar.radius.shape[0] > 0:
-        overlap_poses(poses, avatar, scene, reach, np.arange(k), MOST_QUICK_VISITS, verdict, counts)
-    return fault, pose, found, rows_or_undone(needed, verdict, counts)
+        collide_poses(poses, avatar, scene, reach, np.arange(k), MAX_RESIDENT_PATH_VISITS, verdict, counts)
+    return fault, pose, found, rows_or_reset(needed, verdict, counts)

@@ -5,9 +5,9 @@ counter for each array that is taken out of a tuple or passed on, inside the ker
 although the caller holds the arrays for the whole call. In the descents this took between a fifth
 and a half of the time (scripts/bench_engine: collide 5.0 us a pose with counting, 4.1 without).
 
-`borrowing` disables the counting. It is for functions that create no array. Such a function may use
-elements and slices; the compiler refuses np.empty and similar calls, and assignments of whole
-arrays.
+`njit_no_refcount` disables the counting. It is for functions that create no array. Such a function
+may use elements and slices; the compiler refuses np.empty and similar calls, and assignments of
+whole arrays.
 """
 
 from typing import Any
@@ -18,10 +18,10 @@ from ....schemas.kernels import compiling as nb
 # change. Without it, kernels are slower and equally correct.
 _NO_COUNTING: dict[str, Any] = {"_nrt": False}
 
-borrowing = nb.njit(nogil=True, cache=True, **_NO_COUNTING)
+njit_no_refcount = nb.njit(nogil=True, cache=True, **_NO_COUNTING)
 
 # For functions that take arrays, have one or two callers and run ten or more times a pose: a call
 # passes six words for each array on the stack. With keep_near and three more inlined, distance took
-# 8.0 us a pose instead of 8.8; with sift, take_kept and lanes_meet inlined, collide took 3.5
-# instead of 4.0.
-inlined = nb.njit(nogil=True, cache=True, forceinline=True, **_NO_COUNTING)
+# 8.0 us a pose instead of 8.8; with mark_meeting, compact_marked and lanes_meet inlined, collide
+# took 3.5 instead of 4.0.
+njit_inlined = nb.njit(nogil=True, cache=True, forceinline=True, **_NO_COUNTING)

@@ -5,7 +5,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.core.gap_order import CERTAIN, compare_gaps
+from solidcloud.server.kernels.core.separation_order import CERTAIN, compare_separations
 
 pytestmark = pytest.mark.interpreted
 
@@ -26,8 +26,8 @@ def check(square: int, radius: int, other: int, other_radius: int) -> int:
     """Assert that both orders of the two pairs are told as they are; returns the sign."""
     right = judged(square, radius, other, other_radius)
     numbers = [np.int64(n) for n in (square, radius, other, other_radius)]
-    assert compare_gaps(*numbers) == right, numbers
-    assert compare_gaps(*numbers[2:], *numbers[:2]) == -right, numbers
+    assert compare_separations(*numbers) == right, numbers
+    assert compare_separations(*numbers[2:], *numbers[:2]) == -right, numbers
     return right
 
 

@@ -1,20 +1,21 @@
 """Distances between the points of two leaf nodes, all LANES of a block in one vector step; float32.
 
-nearest_pair.py uses these functions. Avatar points are placed: their coordinates are relative to the
-frame or to the block's low corner. Scene points are whole steps from the low corner of their block.
+nearest_pair.py uses these functions. Avatar points are placed: their coordinates are relative to
+the frame or to the block's low corner. Scene points are whole steps from the low corner of their
+block.
 """
 
 import numpy as np
 
-from .borrowing_kernels import borrowing, inlined
-from .placed_avatar import ONE_SLACK, SLACK
-from .voxel_layout import LANES
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
+from ..core.placed_avatar import ONE_SLACK, SLACK
+from ..core.voxel_layout import LANES
 
 U = np.uint64  # see avatar_front.py
 
 
-@inlined
-def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
+@njit_inlined
+def mark_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
     """Mark the points of an avatar's block that may be within `cut` [steps] of a scene node.
 
     Writes keep (LANES,). Returns whether any point is marked.
@@ -23,8 +24,8 @@ def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
     cx, cy, cz = words[at] + off_x, words[at + U(1)] + off_y, words[at + U(2)] + off_z
     nx, ny, nz = words[at + U(4)], words[at + U(5)], words[at + U(6)]
     both = words[at + U(3)] + cut
-    room = words[at + U(7)] * (cut + SLACK * both + SLACK * both)
-    least, most = words[at + U(8)] - room, words[at + U(9)] + room
+    wide = words[at + U(7)] * (cut + SLACK * both + SLACK * both)
+    least, most = words[at + U(8)] - wide, words[at + U(9)] + wide
     limit = both * both * ONE_SLACK
     b, any_near = U(block), False
     for lane in range(LANES):
@@ -37,7 +38,7 @@ def keep_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
     return any_near
 
 
-@borrowing
+@njit_no_refcount
 def any_near(halves, lane_at, x, y, z, far):
     """Return whether any point of a scene block has a squared distance of at most `far` to a point.
 
@@ -56,8 +57,8 @@ def any_near(halves, lane_at, x, y, z, far):
     return near
 
 
-@borrowing
-def list_squares(halves, lane_at, x, y, z, squares):
+@njit_no_refcount
+def write_squares(halves, lane_at, x, y, z, squares):
     """Write the squared distances (LANES,) of a scene block's points to a point."""
     at_x = U(lane_at)
     at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
@@ -68,11 +69,11 @@ def list_squares(halves, lane_at, x, y, z, squares):
         squares[j] = dx * dx + dy * dy + dz * dz
 
 
-@inlined
-def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
+@njit_inlined
+def unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
     """Unmark the points of an avatar's block that are beyond `far` from a scene block's box.
 
-    far: a squared distance. Other arguments as for `least_squares`.
+    far: a squared distance. Other arguments as for `nearest_squares`.
     No slack is added for rounding: rounding is monotonic, therefore each difference computed here
     is no larger than those of the points.
     """
@@ -93,8 +94,8 @@ def keep_in_box(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep):
         keep[u] = keep[u] & (dx * dx + dy * dy + dz * dz <= far)
 
 
-@inlined
-def least_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep8, squares):
+@njit_inlined
+def nearest_squares(halves, lane_at, low_x, low_y, low_z, lanes, block, keep, keep8, squares):
     """Compute the least squared distance of each marked point of an avatar to a scene block.
 
     lane_at: the scene block in `halves`.  low: its corner, relative to the frame. Writes squares.

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ..core.borrowing_kernels import borrowing
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import U32
 from ..core.pose_transform import MAX_REACH_UNITS, lattice_to_units
 from ..core.stop_flag_checks import stopped
@@ -23,7 +23,7 @@ from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .rays import STACK, is_less
 
 
-@borrowing
+@njit_no_refcount
 def _below_node(words, row, x, y, z, limit):
     """Return a lower bound of the distance [steps] from a point to a node's points.
 
@@ -55,7 +55,7 @@ def _below_node(words, row, x, y, z, limit):
     return max(below - slack, 0.0), middle
 
 
-@borrowing
+@njit_no_refcount
 def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     """Test all points of a leaf node against point i: 32 in float32, those in the band in integers.
 
@@ -120,12 +120,12 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     return limit
 
 
-@borrowing
+@njit_no_refcount
 def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
-    near: exact units, as in Lists. A bound of a node holds for its children; no bound therefore
-    gets worse with more visits.
+    near: exact units, as in VoxelLists. A bound of a node holds for its children; no bound
+    therefore gets worse with more visits.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step

@@ -11,10 +11,10 @@ from coarse_tops import ROOM, Made, open_made, rows_of, scattered
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.overlap.coarse_overlap import any_to_settle
-from solidcloud.server.kernels.overlap.overlap import CLEAR, CONTACT, overlap_poses
+from solidcloud.server.kernels.collide.coarse_clearance import any_with_coarse_bounds
+from solidcloud.server.kernels.collide.collide_poses import CLEAR, CONTACT, collide_poses
 from solidcloud.server.queries.context.query_budget import NO_LIMIT
-from solidcloud.server.residency.coarse_bounds import Coarse, settle
+from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs
 
 
 @pytest.fixture
@@ -45,15 +45,15 @@ def test_a_pose_between_walls_is_settled_and_one_at_a_wall_is_not(tmp_path: Path
     poses = shifted((2, 2, 2), (2, 2, -0.1), (0.1, 2, 2), (1.5, 2.5, 1.5))
     reach = made.reach(BODY, poses)
     assert rows_of(reach) == [[0]] * 4
-    found, settled = settle(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    found, settled = drop_clear_pairs(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
     assert found is reach and settled == 0  # no voxel has a slot
     made.fill()
-    found, settled = settle(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    found, settled = drop_clear_pairs(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
     assert (rows_of(found), settled) == ([[], [0], [0], []], 2)
     for name in ("scales", "units", "boxes", "outside"):
         assert getattr(found, name) is getattr(reach, name)
     resident = made.resident(0)
-    found, settled = settle(resident.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    found, settled = drop_clear_pairs(resident.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
     assert found is reach and settled == 0
 
 
@@ -67,7 +67,7 @@ def test_feet_above_a_floor_are_settled_by_their_points(tmp_path: Path) -> None:
     assert made.settled(BODY, poses) == ([[0], [0]], [[0], []])
     verdict, counts = np.zeros(2, np.uint8), np.zeros((3, 2), np.uint32)
     reach = made.reach(BODY, poses)
-    overlap_poses(poses, BODY.arrays, made.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts)
+    collide_poses(poses, BODY.arrays, made.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts)
     assert verdict.tolist() == [CLEAR, CONTACT]
 
 
@@ -85,7 +85,7 @@ def test_an_avatar_without_points_has_nothing_to_settle(made: Made) -> None:
     made.fill()
     avatar, poses = make_avatar(np.empty((0, 3))), np.eye(4)[None]
     reach = made.reach(make_avatar([[0.0, 0, 0]], 0.01), poses)._replace(starts=np.zeros(2, np.int64))
-    found, settled = settle(made.arrays, made.coarse.arrays, avatar.arrays, poses, reach)
+    found, settled = drop_clear_pairs(made.arrays, made.coarse.arrays, avatar.arrays, poses, reach)
     assert found is reach and settled == 0
 
 
@@ -117,7 +117,7 @@ def test_what_is_settled_of_a_long_avatar_is_clear(made: Made, rng: np.random.Ge
         starts = np.cumsum([0, *map(len, gone)])
         reach = made.reach(rod, poses)._replace(starts=starts, rows=np.array(list(chain(*gone)), np.int64))
         verdict, counts = np.zeros(30, np.uint8), np.zeros((3, 30), np.uint32)
-        overlap_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), NO_LIMIT, verdict, counts)
+        collide_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), NO_LIMIT, verdict, counts)
         assert (verdict == CLEAR).all()
 
 
@@ -127,8 +127,8 @@ def test_only_what_is_not_resident_and_has_a_slot_is_worth_asking() -> None:
     where = np.array([[-1, -1, -1], [0, 0, 0], [-1, -1, -1]])
     slot = np.array([0, 1, -1], np.int32)
     for rows, worth in (([0], True), ([1], False), ([2], False), ([1, 2], False), ([2, 1, 0], True)):
-        assert any_to_settle(where, slot, np.array(rows), len(rows)) is worth
-    assert not any_to_settle(where, slot, np.array([1, 0]), 1), "of the first alone"
+        assert any_with_coarse_bounds(where, slot, np.array(rows), len(rows)) is worth
+    assert not any_with_coarse_bounds(where, slot, np.array([1, 0]), 1), "of the first alone"
 
 
 @pytest.mark.interpreted
@@ -144,8 +144,8 @@ def test_radii_of_a_model_are_those_of_the_nodes(tmp_path: Path) -> None:
     # 20 mm below either plate: clear of spheres of 1 mm, not of such of 32.
     poses = shifted((0.5, 0.5, 0.1 - 0.02), (0.5, 0.5, 1.0 - 0.02))
     assert made.settled(avatar, poses) == ([[0], [0]], [[0], []])
-    filled = made._replace(coarse=Coarse(made.voxels, ROOM))  # knows no better than that all are large
-    filled.fill()
+    filled = made._replace(coarse=CoarseBounds(made.voxels, ROOM))  # knows no better than that all are large
+    filled.store_from_archive()
     assert filled.settled(avatar, poses) == ([[0], [0]], [[], []])
     poses[:, 2, 3] -= 0.02
     assert filled.settled(avatar, poses[1:]) == ([[0]], [[0]])

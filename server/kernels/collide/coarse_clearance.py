@@ -1,9 +1,9 @@
 """Coarse bounds: the top nodes of a voxel's hierarchy, and the pairs they prove clear.
 
 A slot holds nodes that together enclose all points of one voxel. They have the layout of the
-arena's rows (voxel_layout.py) and no children. They prove what a descent would have found: the bounds,
-the float32 tests, their slack and the thresholds by radius class are those of overlap.py. A pair
-settled here is therefore clear by the definition.
+arena's rows (voxel_layout.py) and no children. They prove what a descent would have found: the
+bounds, the float32 tests, their slack and the thresholds by radius class are those of
+collide_poses.py. A pair found clear here is therefore clear by the definition.
 """
 
 from typing import NamedTuple
@@ -12,12 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.avatar_front import MAX_FRONT, place_front, sift
-from ..core.borrowing_kernels import borrowing
-from ..core.placed_avatar import make_by_class, make_placed, place_block, place_root, set_by_class
+from ..core.avatar_front import MAX_FRONT, mark_meeting, place_front
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.placed_avatar import (
+    make_class_thresholds,
+    make_placed,
+    place_block,
+    place_root,
+    set_class_thresholds,
+)
 from ..core.stop_flag_checks import stopped
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
-from .overlap import lanes_meet, make_spot, nodes_meet
+from .collide_poses import lanes_meet, locate_voxel, nodes_meet
 
 # Nodes of a slot, 48 bytes each. Share of the clear pairs of pose and voxel that this many nodes
 # settle, on the walk through a generated town of 10^7 points (voxels of 8 m, mean 282 KB decoded):
@@ -26,14 +32,14 @@ from .overlap import lanes_meet, make_spot, nodes_meet
 # and 20 % if the avatar's points are not tested against the bounds. Opening the thickest node, or
 # that of the largest volume, instead of that of the largest radius changes the share by about a
 # tenth.
-MOST_NODES = 128
-SLOT_WORDS = MOST_NODES * ROW_WORDS
+MAX_SLOT_NODES = 128
+SLOT_WORDS = MAX_SLOT_NODES * ROW_WORDS
 
 
 class CoarseArrays(NamedTuple):
     """Coarse bounds of a scene's v voxels in s slots.
 
-    words, ints: (s * SLOT_WORDS,) float32 and int32, two views of one buffer: MOST_NODES rows a
+    words, ints: (s * SLOT_WORDS,) float32 and int32, two views of one buffer: MAX_SLOT_NODES rows a
     slot, voxel_layout.py. COUNT holds the radius class only, and FIRST is -1.
     slot: (v,) int32, the slot of a voxel, -1: none.  count: (s,) int32, rows in a slot.
     A thread that finds a slot in `slot` may read it without a lock: the slot was written before and
@@ -47,16 +53,16 @@ class CoarseArrays(NamedTuple):
 
 
 @nb.njit(nogil=True, cache=True)
-def take_top(words, ints, root, assumed, out, number):
+def write_coarse_bounds(words, ints, root, assumed, out, number):
     """Write the coarse bounds of a voxel that `lay_out` wrote into slot `number` of `out`.
 
     words, ints: of the arena.  root: the voxel's first row.  out: the ints of CoarseArrays.
     assumed: radius class, shifted as in COUNT, for rows without a class so far; 0: take their own.
     Beginning with the root, the node of the largest radius (the first of equals) is replaced by its
-    children as long as all of them fit. Where there are MOST_NODES leaf nodes or fewer, the result
-    is therefore the leaf nodes. Returns the number of rows.
+    children as long as all of them fit. Where there are MAX_SLOT_NODES leaf nodes or fewer, the
+    result is therefore the leaf nodes. Returns the number of rows.
     """
-    taken, radius = np.empty(MOST_NODES, np.int64), np.empty(MOST_NODES, np.float32)
+    taken, radius = np.empty(MAX_SLOT_NODES, np.int64), np.empty(MAX_SLOT_NODES, np.float32)
     taken[0], radius[0] = root, words[root + 3]
     count = 1
     while True:
@@ -68,7 +74,7 @@ def take_top(words, ints, root, assumed, out, number):
             break
         row = taken[widest]
         first, children = int(ints[row + FIRST]), int(ints[row + COUNT] & COUNTED)
-        if first < 0 or count + children - 1 > MOST_NODES:
+        if first < 0 or count + children - 1 > MAX_SLOT_NODES:
             radius[widest] = np.float32(-1.0)
             continue
         child = root + first * ROW_WORDS
@@ -88,7 +94,7 @@ def take_top(words, ints, root, assumed, out, number):
 
 
 @nb.njit(nogil=True, cache=True)
-def any_to_settle(where, slot, rows, count):
+def any_with_coarse_bounds(where, slot, rows, count):
     """Return whether one of the first `count` voxel rows is not resident and has a slot."""
     for row in rows[:count]:  # noqa: SIM110  `any` of a generator is not compiled
         if where[row, 0] < 0 and slot[row] >= 0:
@@ -97,25 +103,27 @@ def any_to_settle(where, slot, rows, count):
 
 
 @nb.njit(nogil=True, cache=True)
-def settle_pairs(poses, avatar, scene, coarse, reach, starts, rows):
+def copy_unproved_pairs(poses, avatar, scene, coarse, reach, starts, rows):
     """Copy starts and rows of `reach` without the pairs that coarse bounds prove clear.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: Reach of these poses (voxels_in_reach.py).
-    A pair is a pose and a voxel. Writes starts (k + 1,) and rows, which are as long as those in
-    `reach` and in the same order. It omits a voxel that is not resident, has a slot, and has no
-    node there whose bound comes within reach. Returns how many were omitted.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
+    (voxels_in_reach.py). A pair is a pose and a voxel. Writes starts (k + 1,) and rows, which are
+    as long as those in `reach` and in the same order. It omits a voxel that is not resident, has a
+    slot, and has no node there whose bound comes within reach. Returns how many were omitted.
     """
-    placed, by_class = make_placed(avatar), make_by_class(scene.drop)
+    placed, by_class = make_placed(avatar), make_class_thresholds(scene.radius_deficit)
     bounds = np.empty((4, MAX_FRONT), np.float32)
     met, keep = np.zeros(MAX_FRONT, np.bool_), np.zeros(LANES, np.bool_)
-    return _settle_pairs(
+    return _copy_unproved_pairs(
         poses, avatar, scene, coarse, reach, starts, rows, placed, by_class, bounds, met, keep
     )
 
 
-@borrowing
-def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_class, bounds, met, keep):
-    """Implement `settle_pairs` with its scratch passed in."""
+@njit_no_refcount
+def _copy_unproved_pairs(
+    poses, avatar, scene, coarse, reach, starts, rows, placed, by_class, bounds, met, keep
+):
+    """Implement `copy_unproved_pairs` with its scratch passed in."""
     left = 0
     for i in range(poses.shape[0]):
         m, scale = poses[i], reach.scales[i]
@@ -127,9 +135,9 @@ def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_
             if number >= 0 and scene.where[voxel, 0] < 0 and not stopped(scene.stop):
                 if front == 0:
                     extent, farthest = place_root(avatar, m, scale, placed, scene)
-                    set_by_class(
+                    set_class_thresholds(
                         by_class,
-                        scene.drop,
+                        scene.radius_deficit,
                         reach.units[i],
                         scene.units_per_step,
                         extent,
@@ -137,7 +145,7 @@ def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_
                         scene.voxel_steps,
                     )
                     front = place_front(avatar, m, scale, placed, scene, extent, bounds)
-                if _apart(
+                if _is_clear(
                     avatar, m, i, scene, coarse, voxel, number, placed, by_class, bounds, front, met, keep
                 ):
                     continue
@@ -147,22 +155,27 @@ def _settle_pairs(poses, avatar, scene, coarse, reach, starts, rows, placed, by_
     return reach.starts[poses.shape[0]] - left
 
 
-@borrowing
-def _apart(avatar, m, pose, scene, coarse, voxel, number, placed, by_class, bounds, front, met, keep):
+@njit_no_refcount
+def _is_clear(avatar, m, pose, scene, coarse, voxel, number, placed, by_class, bounds, front, met, keep):
     """Return whether no point of the avatar comes within reach of any node of slot `number`.
 
     placed, by_class, bounds: of this pose.  front: the number of nodes in `bounds`.  pose: its
     number, for the blocks' stamps.  met: (MAX_FRONT,) and keep: (LANES,) bool, scratch.
     """
     words, nodes = coarse.words, placed.nodes
-    spot = make_spot(scene, voxel, placed)
-    x, y, z, radius = nodes[0, 0] - spot.x, nodes[1, 0] - spot.y, nodes[2, 0] - spot.z, nodes[3, 0]
+    location = locate_voxel(scene, voxel, placed)
+    x, y, z, radius = (
+        nodes[0, 0] - location.x,
+        nodes[1, 0] - location.y,
+        nodes[2, 0] - location.z,
+        nodes[3, 0],
+    )
     steps = (front + LANES - 1) // LANES
     row = number * SLOT_WORDS
     for _ in range(coarse.count[number]):
-        room = by_class.room[node_class(coarse.ints, row, by_class.mask)]
-        if nodes_meet(words, row, x, y, z, radius, room) and sift(
-            words, row, bounds, 0, steps, spot.x, spot.y, spot.z, room, met
+        threshold = by_class.threshold[node_class(coarse.ints, row, by_class.mask)]
+        if nodes_meet(words, row, x, y, z, radius, threshold) and mark_meeting(
+            words, row, bounds, 0, steps, location.x, location.y, location.z, threshold, met
         ):
             for i in range(front):
                 if not met[i]:
@@ -174,7 +187,9 @@ def _apart(avatar, m, pose, scene, coarse, voxel, number, placed, by_class, boun
                 if placed.stamp[block] != pose:
                     place_block(avatar, m, block, placed, scene)
                     placed.stamp[block] = pose
-                if lanes_meet(words, row, placed.lanes, block, spot.x, spot.y, spot.z, room, keep):
+                if lanes_meet(
+                    words, row, placed.lanes, block, location.x, location.y, location.z, threshold, keep
+                ):
                     return False
         row += ROW_WORDS
     return True

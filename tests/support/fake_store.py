@@ -12,7 +12,7 @@ from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 
 
 class FakeStore:
-    """What Residency asks of a Store.
+    """Stand-in for a `VoxelStore`: what `VoxelCache` calls.
 
     sizes: (v,) int64 [bytes].  loads: row -> times it was loaded.  faults: row -> how its loading fails.
     gate: loads wait until it is set.

@@ -486,7 +486,7 @@ def collide_resident(poses, avatar, radius, other_units, scene, index, rows, out
     arrays of `VoxelsInReach` are local: arrays created here cost a tenth of arrays passed in.
     Returns (fault, pose, value found), as `check_poses` does, and the number of rows. -1 rows: not
     answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
-    (scene.stop, MOST_QUICK_VISITS); verdict and counts are then unchanged.
+    (scene.stop, MAX_RESIDENT_PATH_VISITS); verdict and counts are then unchanged.
     """
     k = poses.shape[0]
     reach = VoxelsInReach(

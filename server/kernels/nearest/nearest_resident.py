@@ -56,7 +56,7 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     [m]; inf and NaN where no pair is within reach.
     Returns (fault, pose, value found), as `check_poses` does, then the number of rows, outside,
     node visits, point tests. -1 rows: not answered, because a voxel has to be loaded, the rows do
-    not fit, or the search ended early (scene.stop, MOST_QUICK_VISITS).
+    not fit, or the search ended early (scene.stop, MAX_RESIDENT_PATH_VISITS).
     """
     outside = np.zeros(1, np.bool_)
     scales, units = np.empty(1), np.empty(1, np.int64)

@@ -163,7 +163,7 @@ def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
     with judged_sweeps.opened(case) as data:
         looked = [each.visits for each in same(probe, data, first, last)]
         # Compiled, a kernel has taken the figure up already.
-        monkeypatch.setattr(kernel, "MOST_QUICK_VISITS", 3)
+        monkeypatch.setattr(kernel, "MAX_RESIDENT_PATH_VISITS", 3)
         monkeypatch.setattr(module, "sweep", counted)
         same(probe, data, first, last)
         assert max(looked) > 3 and (len(left) > 0) == INTERPRETED

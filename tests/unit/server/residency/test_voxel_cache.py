@@ -1,4 +1,4 @@
-"""Residency: one load a voxel, every waiter answered, pins respected, never a byte over the budget."""
+"""Test the voxel cache: one load a voxel, all waiting requests answered, pins and budget respected."""
 
 import math
 import threading

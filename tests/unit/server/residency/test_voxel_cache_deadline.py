@@ -1,4 +1,4 @@
-"""Residency with deadlines: what is late is missing for who asked and nobody else; every load is begun by someone."""
+"""Test the cache with deadlines: a late voxel is missing for its own request only; every load is begun."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor

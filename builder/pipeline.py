@@ -24,7 +24,7 @@ from ..schemas.archive.index import SHARD_FOLDER, Header
 from ..schemas.archive.voxel_grid import Lattice
 from ..schemas.archive.vtkhdf import PREVIEW_NAME
 from ..schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
-from ..schemas.process.interrupts import check
+from ..schemas.process.interrupts import check_interrupt
 from ..schemas.process.os_errors import os_error_words
 from .config import RADIUS_SAMPLE, BuildConfig
 from .passes.build_shards import Shard
@@ -142,7 +142,7 @@ def build_archive(
         with workplace(target, what, fresh=config.fresh) as place:
             header, built = _build(inputs, what, place, target, config, stages)
             _check_unchanged(inputs, what, place, config)
-            check()
+            check_interrupt()
             with stages.timed("publish"):
                 publish_folder(place.archive, target, config.overwrite)
     return _summary(target, header, sum(len(s.rows) for s in built), len(built), begin, stages)

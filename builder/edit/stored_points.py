@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.codec import OpenRecord
+from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from ...schemas.kernels.morton import morton_decode
 from ..config import BuildConfig
@@ -99,7 +99,7 @@ class FewUnit(NamedTuple):
     most_near: int
 
 
-def stored_column(record: OpenRecord, name: str, rows: NDArray[np.int64]) -> NDArray:
+def stored_column(record: DecompressedRecord, name: str, rows: NDArray[np.int64]) -> NDArray:
     """Return a column (m,) of some points of a record, whose dtype must have it."""
     kind, at = record.dtype.fields[name][:2]  # type: ignore[index]  # its dtype has fields
     planes = record.planes[at : at + kind.itemsize]
@@ -116,7 +116,7 @@ class _Points(NamedTuple):
     columns: dict[str, NDArray]
 
 
-def record_points(record: OpenRecord, dtype: np.dtype) -> Iterator[_Points]:
+def record_points(record: DecompressedRecord, dtype: np.dtype) -> Iterator[_Points]:
     """Yield the points of a record, with the columns of a spool row, a block at a time."""
     columns = [name for name in dtype.names or () if name != "local"]
     for block in taken(record, _FROM_CORNER):
@@ -268,7 +268,7 @@ def find_scans(unit: FindUnit) -> list[Found]:
     return found
 
 
-def _holds_scans(record: OpenRecord, scans: NDArray[np.int64]) -> bool:
+def _holds_scans(record: DecompressedRecord, scans: NDArray[np.int64]) -> bool:
     """Return whether a record has points of some scans; reads only the column of scan numbers."""
     kind, at = record.dtype.fields["scan_index"][:2]  # type: ignore[index]  # its dtype has fields
     planes = record.planes[at : at + kind.itemsize]

@@ -17,7 +17,7 @@ from ...schemas.archive.index import shard_name
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel_grid import Lattice
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ..config import BuildConfig, shard_points
 from ..spool.spool import Spool
 from ..voxel.dense_voxel import BuiltVoxel, build_dense, is_dense
@@ -122,7 +122,7 @@ def build_shard(unit: ShardUnit) -> Shard:
 def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxel]:
     """Yield each voxel of a unit, built, with its record and the bounds of its points."""
     for key in unit.keys:
-        check()
+        check_interrupt()
         if is_dense(unit.spool.count(key), unit.config):
             classify = None if classes is None else partial(classes.find, key)
             yield build_dense(key, unit.spool, unit.config, unit.archive_id, unit.folder, classify)

@@ -11,7 +11,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import Header
 from ...schemas.archive.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
 from ...schemas.errors import CorruptError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ...schemas.process.new_file import new_file, publish
 from ..kernels.points.voxel_records import first_of_each, point_hashes
 from ..run.executor import Executor
@@ -91,7 +91,7 @@ def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
         found = read_points(path)
         stamp = found.attributes["archive_id"].tobytes(), int(found.attributes["generation"])
     except (CorruptError, OSError) as error:
-        check()
+        check_interrupt()
         return [str(error)], []
     except KeyError:
         return [f"{path}: does not name its archive and generation: delete it"], []

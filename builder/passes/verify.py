@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.codec import OpenRecord
+from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.index import SHARD_FOLDER
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.errors import BadRequestError, CorruptError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import last_loose_node, measure_points, sum_places
 from ..run.executor import Executor, worker_count
@@ -175,7 +175,7 @@ def _verify_rows(unit: _Unit) -> _Found:
     with Archive(unit.folder) as archive:
         for i, row in enumerate(unit.rows):
             known = len(faults)
-            check()
+            check_interrupt()
             try:
                 record = archive.open_voxel(row, columns=("radius_class", "normal"))
                 with archive.locating(row):
@@ -194,7 +194,7 @@ def _verify_rows(unit: _Unit) -> _Found:
                     faults += [_loose(archive, row, node) for node in loose]
                     proved += len(unit.asked[i]) - len(loose)
             except (CorruptError, OSError) as error:
-                check()
+                check_interrupt()
                 faults.append(str(error))
             else:
                 points += int(archive.voxels["rows"][row, 2])
@@ -209,7 +209,7 @@ def _loose(archive: Archive, row: int, node: int) -> str:
     return f"{archive.where(row)}: node {node} does not enclose its points: rebuild the archive"
 
 
-def voxel_faults(archive: Archive, row: int, record: OpenRecord, deep: bool) -> list[str]:
+def voxel_faults(archive: Archive, row: int, record: DecompressedRecord, deep: bool) -> list[str]:
     """Return the faults of one voxel that opening it does not detect.
 
     Raise CorruptError for a point outside its cell.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.codec import encode_voxel
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ..config import BuildConfig
 from ..kernels.points.occupied_cubes import FREE, insert_all, take_cubes
 from ..sources.common.scan import Scan, ScanBlock
@@ -273,7 +273,7 @@ def _bytes_a_point(
 
 def _packed_bytes(block: _Gathered, lattice: Lattice, config: BuildConfig) -> int:
     """Return the bytes of the record of points of one voxel."""
-    check()
+    check_interrupt()
     points = VoxelPoints(
         np.ascontiguousarray(block.local),
         block.scan if "scan" in config.keep else None,

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ...schemas.process.new_file import sync_folder
 from ..run.executor import Executor
 from ..run.progress import Progress
@@ -129,7 +129,7 @@ class _Noting(Generic[Unit, Result]):
     def __call__(self, named: tuple[str, Unit]) -> Result:
         name, unit = named
         result = self.run(unit)
-        check()  # results made while a signal arrived are not trusted
+        check_interrupt()  # results made while a signal arrived are not trusted
         self.journal.note(name, self.dump(result))
         return result
 

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.process.interrupts import check, children_ignore
+from ...schemas.process.interrupts import blocking_sigint, check_interrupt
 from .executor import ASK_SECONDS, Result, Unit, results_in_order
 from .memory_shares import CLUSTER_WORKER_KILLED, cluster_worker_limit
 from .progress import Progress
@@ -280,11 +280,11 @@ class ClusterExecutor:
         alone_since: float | None = None
         looked = time.monotonic()
         while True:
-            check()
+            check_interrupt()
             try:
                 return ask()
             except (FutureCancelledError, FuturesCancelledError):
-                check()  # the cluster's processes may have received the signal too
+                check_interrupt()  # the cluster's processes may have received the signal too
                 raise SolidcloudError(
                     f"{self._address}: the scheduler was lost, expected it to last as long as the build: start it, "
                     "then give the same command again to resume"
@@ -356,7 +356,7 @@ def _start_local(number: int, memory_bytes: int, watch: _Watch) -> LocalCluster:
             "distributed.worker.memory.terminate": CLUSTER_WORKER_KILLED,
         }
     )
-    with settings, children_ignore():
+    with settings, blocking_sigint():
         return LocalCluster(
             n_workers=number,
             threads_per_worker=1,

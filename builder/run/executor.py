@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.process.interrupts import check, children_ignore
+from ...schemas.process.interrupts import blocking_sigint, check_interrupt
 from .progress import Progress
 
 Unit = TypeVar("Unit")
@@ -192,9 +192,9 @@ class ProcessExecutor:
         """Yield the results, as `Executor` and `results_in_order` describe."""
         if self._pool is None:
             for unit in units:
-                check()
+                check_interrupt()
                 result = function(unit)
-                check()
+                check_interrupt()
                 yield result
                 progress.advance(size(unit))
             return
@@ -203,13 +203,13 @@ class ProcessExecutor:
     def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
         """Submit a unit, as `Hands` describes."""
         assert self._pool is not None
-        with _worker_deaths(), children_ignore():
+        with _worker_deaths(), blocking_sigint():
             return self._pool.submit(function, unit)
 
     def done(self, tickets: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
         """Wait until units are done, as `Hands` describes."""
         while True:
-            check()
+            check_interrupt()
             if done := wait(tickets, ASK_SECONDS, FIRST_COMPLETED).done:
                 return done
 
@@ -225,7 +225,7 @@ def _worker_deaths() -> Iterator[None]:
     try:
         yield
     except BrokenProcessPool:
-        check()  # a signal to the whole process group also ends the workers
+        check_interrupt()  # a signal to the whole process group also ends the workers
         raise SolidcloudError(
             "a worker process ended abruptly: out of memory, or an error that cannot be sent here? give fewer "
             "--jobs or a smaller --memory; the same command resumes the build"

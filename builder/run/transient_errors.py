@@ -7,7 +7,7 @@ import errno
 from pathlib import Path
 
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 
 # Errors of a disk, a network or an overloaded machine.
 TRANSIENT = frozenset(
@@ -21,7 +21,7 @@ def raise_transient(error: ScanError, path: Path) -> None:
 
     Lack of memory is detected where it occurs, in every pass (sources/common/scan.py `library_errors`).
     """
-    check()
+    check_interrupt()
     cause = error.__cause__
     if isinstance(cause, OSError) and cause.errno in TRANSIENT:
         raise OSError(cause.errno, cause.strerror, str(path)) from None

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, ScanError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ..run.progress import Progress, Silent
 from ..run.transient_errors import raise_transient
 from .coincident_scans import coincident_scan
@@ -129,7 +129,7 @@ def header_bounds(path: Path) -> NDArray[np.float64] | None:
         bounds: NDArray[np.float64] | None = _reader(form.bounds)(Path(path))
         return bounds
     except Exception:
-        check()
+        check_interrupt()
         # Best effort on a file known to be broken; open_scans() or blocks() has already raised its
         # error.
         return None

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive_writer import file_checksum
 from ...schemas.archive.voxel_grid import Lattice, voxel_coordinates
 from ...schemas.errors import CorruptError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS, content_sum
 from ..kernels.points.octree_cells import voxel_codes
@@ -373,7 +373,7 @@ class Spool:
 
         Raise CorruptError if the run is shorter than its directory says.
         """
-        check()
+        check_interrupt()
         path = self._merged().paths[part.run]
         rows = np.fromfile(path, self.dtype, part.size, offset=part.start * self.dtype.itemsize)
         if len(rows) != part.size:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.voxel_grid import KEY_BIAS, MAX_COORDINATE, Lattice, voxel_keys
 from ...schemas.errors import ScanError
-from ...schemas.process.interrupts import check
+from ...schemas.process.interrupts import check_interrupt
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.spool_rows import (
@@ -247,11 +247,11 @@ class _Held:
             scatter(numbers, self.bits[:size], place.copy(), bits)
         scatter(numbers, self.codes[:size], place, codes)
         for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
-            check()
+            check_interrupt()
             sort_voxel(codes[begin:end], None if bits is None else bits[begin:end])
         with new_run(path) as file:
             for rows in self._rows(codes, bits):
-                check()
+                check_interrupt()
                 file.write(rows.view(np.uint8).data)
         directory = write_directory(path, self.keys[:voxels][order], starts)
         self.size = 0

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.voxel import CELL_BITS, Cells, Nodes
+from ...schemas.archive.voxel import CELL_BITS, LeafCells, Nodes
 from ..config import BuildConfig
 from ..kernels.trees.bounding_sphere import SPREAD
 from ..kernels.trees.build_tree import EXTREMES, build_cells, leaf_rows, take_runs
@@ -118,9 +118,9 @@ def _leaves(trees: CellTrees, leaf: int) -> NDArray[np.int64]:
     return np.asarray(-(-np.diff(trees.starts) // leaf))
 
 
-def stored_cells(trees: CellTrees) -> Cells:
+def stored_cells(trees: CellTrees) -> LeafCells:
     """Return the cells in their stored form."""
-    return Cells(
+    return LeafCells(
         trees.low.astype(np.int32),
         trees.log2_size,
         np.diff(trees.rows).astype(np.uint32),

@@ -37,7 +37,7 @@ from ...schemas.archive.codec import (
     point_dtype,
     point_rows,
 )
-from ...schemas.archive.voxel import CELL_BITS, Cells, Nodes, VoxelData, top_shift
+from ...schemas.archive.voxel import CELL_BITS, LeafCells, Nodes, VoxelData, top_shift
 from ...schemas.archive.zstd_frame import RowStream, pwrite_all
 from ...schemas.errors import BadRequestError, CorruptError
 from ..config import BuildConfig
@@ -268,10 +268,10 @@ class _Spill:
             )
         )
 
-    def cells(self) -> Cells:
+    def cells(self) -> LeafCells:
         """Return the cells in their stored form, in Morton order."""
         low, log2_size, points, nodes = (np.concatenate(column) for column in zip(*self._cells, strict=True))
-        return Cells(low, log2_size, nodes, points)
+        return LeafCells(low, log2_size, nodes, points)
 
     def stats(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         """Return the spreads and extremes of all cells, in Morton order."""
@@ -327,7 +327,7 @@ class _Layout:
             order = self.top.order
         points, nodes = (np.cumsum(np.append(0, c), dtype=np.int64) for c in (cells.points, cells.nodes))
         self.first_point, self.first_node = points[order], nodes[order]
-        self.cells = Cells._make(column[order] for column in cells)
+        self.cells = LeafCells._make(column[order] for column in cells)
 
     def write(self) -> BuiltVoxel:
         """Read the cells in order and compress their rows."""
@@ -371,7 +371,7 @@ class _Layout:
         stored: node rows of these cells.
         """
         of = slice(first, past)
-        cells = Cells._make(column[of] for column in self.cells)
+        cells = LeafCells._make(column[of] for column in self.cells)
         held = cells.points.astype(np.int64)
         starts, rows = (
             np.concatenate([[0], np.cumsum(count, dtype=np.int64)]) for count in (held, cells.nodes)
@@ -416,7 +416,7 @@ class _Layout:
         return VoxelData(
             self.key,
             self.shift,
-            Cells._make(column[:0] for column in self.cells),
+            LeafCells._make(column[:0] for column in self.cells),
             Nodes._make(nodes[name] for name in Nodes._fields),
             np.empty((0, 3), np.uint16),
             **{name: np.empty(0, self.spill.dtype[name]) for name in self.spill.names},

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.codec import OpenRecord
+from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.index import Header
 from ...schemas.archive.voxel import top_shift
-from ..kernels.neighbours.nearest_points import Spheres
+from ..kernels.neighbours.nearest_points import NodeSpheres
 from ..kernels.points.voxel_records import Leaves, take_points
 
 BLOCK_POINTS = 1 << 16
@@ -34,7 +34,7 @@ class Taken(NamedTuple):
     nodes: NDArray[np.int32]
 
 
-def leaves_of(record: OpenRecord) -> Leaves:
+def leaves_of(record: DecompressedRecord) -> Leaves:
     """Return a record in the form that kernels take."""
     first, is_leaf, cell = record.tree
     nodes, cells = record.nodes, record.cells
@@ -51,9 +51,9 @@ def leaves_of(record: OpenRecord) -> Leaves:
     )
 
 
-def spheres_of(record: OpenRecord) -> Spheres:
+def spheres_of(record: DecompressedRecord) -> NodeSpheres:
     """Return the bounds of a record in the form that kernels take."""
-    return Spheres(record.nodes.center, record.nodes.radius, np.int64(1 << top_shift(record.voxel_steps)))
+    return NodeSpheres(record.nodes.center, record.nodes.radius, np.int64(1 << top_shift(record.voxel_steps)))
 
 
 def stored_columns(header: Header) -> dict[str, np.dtype]:
@@ -67,7 +67,9 @@ def record_columns(columns: Iterable[str]) -> list[str]:
     return [_COLUMNS[name][0] for name in columns]
 
 
-def read_columns(record: OpenRecord, columns: Iterable[str], rows: NDArray[np.int64]) -> dict[str, NDArray]:
+def read_columns(
+    record: DecompressedRecord, columns: Iterable[str], rows: NDArray[np.int64]
+) -> dict[str, NDArray]:
     """Return columns of some points of a record, by name. rows: (m,), see `Taken`.
 
     The record must have these columns.
@@ -92,7 +94,7 @@ def hash_limit(share: float) -> np.uint64:
 
 
 def taken(
-    record: OpenRecord,
+    record: DecompressedRecord,
     base: NDArray[np.int64],
     *,
     box: NDArray[np.int64] | None = None,

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError, FormatError
-from ..process.interrupts import check
+from ..process.interrupts import check_interrupt
 from .codec import (
     OPTIONAL_COLUMNS,
-    OpenRecord,
-    OpenTree,
+    DecompressedRecord,
+    DecompressedTree,
     RecordShape,
-    open_record,
-    open_tree,
+    decompress_record,
+    decompress_tree,
     point_dtype,
 )
 from .index import (
@@ -175,7 +175,7 @@ class Archive:
         """Read the frame of dataset `i` of a voxel, as `read_frames` does."""
         if not self._descriptors:
             raise ValueError(f"{self.folder}: the archive is closed")
-        check()
+        check_interrupt()
         entry = self.voxels[row]
         size, offset = int(entry["frame_bytes"][i]), int(entry["frame_offset"][i])
         frame = os.pread(self._descriptors[int(entry["shard"])], size, offset)
@@ -208,7 +208,7 @@ class Archive:
         row: int,
         frames: tuple[bytes, bytes, bytes] | None = None,
         columns: Collection[str] = OPTIONAL_COLUMNS,
-    ) -> OpenRecord:
+    ) -> DecompressedRecord:
         """Decompress the voxel in index row `row`; its points stay unread.
 
         frames: the voxel's frames if they have been read already.
@@ -217,7 +217,7 @@ class Archive:
         """
         frames = frames or self.read_frames(row)
         with self.locating(row):
-            return open_record(
+            return decompress_record(
                 *frames,
                 self._shape(row),
                 int(self.voxels["key"][row]),
@@ -226,14 +226,14 @@ class Archive:
                 columns,
             )
 
-    def open_tree(self, row: int) -> OpenTree:
+    def open_tree(self, row: int) -> DecompressedTree:
         """Read the hierarchy of the voxel in index row `row`, without its points.
 
         Raises CorruptError naming the location.
         """
         cells, nodes = self._read_frame(row, 0), self._read_frame(row, 1)
         with self.locating(row):
-            return open_tree(
+            return decompress_tree(
                 cells,
                 nodes,
                 self._shape(row),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError
-from ..process.interrupts import check
+from ..process.interrupts import check_interrupt
 from ..process.new_file import new_file, publish, temporary_path
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .index import DATASETS, INDEX_NAME, VOXEL_DTYPE, Header, index_columns, index_digest
@@ -118,7 +118,7 @@ def file_checksum(path: Path) -> int:
     checksum, buffer = 0, memoryview(bytearray(READ_BYTES))
     with open(path, "rb", buffering=0) as file:
         while got := file.readinto(buffer):
-            check()
+            check_interrupt()
             checksum = zlib.crc32(buffer[:got], checksum)
     return checksum
 

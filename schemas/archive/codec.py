@@ -15,18 +15,18 @@ from ..kernels.record_rows import delta_along, lanes_to_points, leaf_bytes, leaf
 from .radius_model import RADIUS_CLASSES
 from .voxel import (
     MAX_LEAF,
-    Cells,
+    LeafCells,
     Links,
     Nodes,
     VoxelData,
     check_cell_nodes,
     check_cell_points,
     check_tree,
+    decode_points,
     link_nodes,
     link_tree,
-    read_lanes,
     top_shift,
-    transposed,
+    transpose_columns,
 )
 from .zstd_frame import Expansion, Frame, column_of, pack, unpack
 
@@ -127,12 +127,12 @@ def encode_voxel(voxel: VoxelData, archive_id: bytes) -> Record:
     return Record(*frames, len(cells), len(nodes), len(points), leaves)
 
 
-def cell_rows(key: int, archive_id: bytes, cells: Cells) -> NDArray:
+def cell_rows(key: int, archive_id: bytes, cells: LeafCells) -> NDArray:
     """Return the rows (c,) of the cells dataset."""
     rows = np.zeros(len(cells.nodes), CELL_DTYPE)
     rows["archive"] = np.frombuffer(archive_id, "<u8")
     rows["voxel"] = key
-    for name, column in zip(Cells._fields, cells, strict=True):
+    for name, column in zip(LeafCells._fields, cells, strict=True):
         rows[name] = column
     return rows
 
@@ -165,16 +165,16 @@ def point_rows(
     return rows
 
 
-class OpenTree(NamedTuple):
-    """Content of a record besides its points, decompressed and checked. Fields as in OpenRecord."""
+class DecompressedTree(NamedTuple):
+    """Content of a record besides its points, decompressed and checked. Fields as in DecompressedRecord."""
 
-    cells: Cells
+    cells: LeafCells
     nodes: Nodes
     links: Links
     leaves: int
 
 
-class OpenRecord(NamedTuple):
+class DecompressedRecord(NamedTuple):
     """Decompressed record with a checked tree.
 
     Its points stay as byte planes, to be read once, in place.
@@ -186,7 +186,7 @@ class OpenRecord(NamedTuple):
 
     key: int
     voxel_steps: int
-    cells: Cells
+    cells: LeafCells
     nodes: Nodes
     links: Links
     leaves: int
@@ -208,7 +208,7 @@ class OpenRecord(NamedTuple):
         """
         name = f"voxel {self.key:#x}"
         self.check_bounds(
-            read_lanes(name, self.planes[:6], self.cells, self.nodes, self.links, self.voxel_steps, lanes)
+            decode_points(name, self.planes[:6], self.cells, self.nodes, self.links, self.voxel_steps, lanes)
         )
 
     def check_bounds(self, found: NDArray[np.int64]) -> None:
@@ -311,12 +311,12 @@ class OpenRecord(NamedTuple):
             self.class_counts()
         if "normal" in kept:
             self.check_normals()
-        cells, nodes = transposed(self.cells), transposed(self.nodes)
+        cells, nodes = transpose_columns(self.cells), transpose_columns(self.nodes)
         voxel = VoxelData(self.key, top_shift(self.voxel_steps), cells, nodes, points, **kept)
         return voxel, self.links
 
 
-def open_record(
+def decompress_record(
     cells: bytes,
     nodes: bytes,
     points: bytes,
@@ -325,10 +325,10 @@ def open_record(
     archive_id: bytes,
     voxel_steps: int,
     columns: Collection[str] = OPTIONAL_COLUMNS,
-) -> OpenRecord:
+) -> DecompressedRecord:
     """Decompress a record and check everything but the points.
 
-    `OpenRecord.read_points` checks the points as it reads them.
+    `DecompressedRecord.read_points` checks the points as it reads them.
     columns: optional columns wanted; the result holds no others.
     Raises CorruptError if a frame is damaged, has another size than `shape`, belongs to another
     voxel or archive, or contains what `check_voxel` refuses.
@@ -336,15 +336,15 @@ def open_record(
     names = [n for n in shape.point_dtype.names or () if n == "xyz" or n in columns]
     kept = np.dtype([(n, shape.point_dtype[n]) for n in names])
     # In this order, so that no frame is decompressed before the earlier ones confirm its row count.
-    tree = open_tree(cells, nodes, shape, key, archive_id, voxel_steps)
+    tree = decompress_tree(cells, nodes, shape, key, archive_id, voxel_steps)
     planes = unpack(points, shape.point_dtype, shape.point_rows, f"voxel {key:#x}, points", kept)
-    return OpenRecord(key, voxel_steps, *tree, planes, kept, shape)
+    return DecompressedRecord(key, voxel_steps, *tree, planes, kept, shape)
 
 
-def open_tree(
+def decompress_tree(
     cells: bytes, nodes: bytes, shape: RecordShape, key: int, archive_id: bytes, voxel_steps: int
-) -> OpenTree:
-    """Decompress and check a record without its points, as `open_record` does.
+) -> DecompressedTree:
+    """Decompress and check a record without its points, as `decompress_record` does.
 
     The frame of the points need not have been read.
     """
@@ -354,7 +354,7 @@ def open_tree(
     # Archive and voxel are the first fields of a row.
     if (cell_planes[: len(identity)] != identity[:, None]).any():
         raise MisleadingIndexError(f"{name}: the record belongs to another voxel or archive")
-    cell_columns = Cells(*(column_of(cell_planes, CELL_DTYPE, field) for field in Cells._fields))
+    cell_columns = LeafCells(*(column_of(cell_planes, CELL_DTYPE, field) for field in LeafCells._fields))
     check_cell_nodes(name, cell_columns, shape.node_rows)
     check_cell_points(name, cell_columns, shape.point_rows)
     node_planes = unpack(nodes, NODE_DTYPE, shape.node_rows, f"{name}, nodes")
@@ -364,7 +364,7 @@ def open_tree(
     leaves = int(np.count_nonzero(links.is_leaf))
     if shape.leaves is not None and leaves != shape.leaves:
         raise CorruptError(f"{name}: {leaves} leaf nodes, the index says {shape.leaves}")
-    return OpenTree(cell_columns, node_columns, links, leaves)
+    return DecompressedTree(cell_columns, node_columns, links, leaves)
 
 
 def decode_voxel(
@@ -378,9 +378,9 @@ def decode_voxel(
 ) -> tuple[VoxelData, Links]:
     """Decompress and check a record, points included. Inverse of `encode_voxel`.
 
-    Raises as `open_record` does.
+    Raises as `decompress_record` does.
     """
-    return open_record(cells, nodes, points, shape, key, archive_id, voxel_steps).decode()
+    return decompress_record(cells, nodes, points, shape, key, archive_id, voxel_steps).decode()
 
 
 def _leaf_runs(

@@ -1,6 +1,6 @@
 """Data of one voxel as flat arrays, and the checks that every decoded voxel passes.
 
-The checks are `link_tree`, `check_tree` and, as the points are read, `read_lanes` (codec.py);
+The checks are `link_tree`, `check_tree` and, as the points are read, `decode_points` (codec.py);
 `check_voxel` runs all three.
 
 A voxel is an octree whose leaf cells each hold a bounding sphere hierarchy (BSH), with one more BSH
@@ -34,7 +34,7 @@ MAX_LEVELS = 80
 CELL_BITS = 16
 
 
-class Cells(NamedTuple):
+class LeafCells(NamedTuple):
     """Leaf cells of a voxel's octree, c of them.
 
     Cell `i` covers `low[i] + [0, 2**log2_size[i])` on each axis.
@@ -75,7 +75,7 @@ class Nodes(NamedTuple):
 class VoxelData(NamedTuple):
     """Complete data of one voxel.
 
-    key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see Cells and Nodes.
+    key: voxel key.  top_shift: see Nodes.center.  cells, nodes: see LeafCells and Nodes.
     points: (p, 3) uint16 x, y, z from their leaf node's block_low, in leaf-node order [steps].
     scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.
     radius_class: (p,) uint8 below RADIUS_CLASSES, or None.
@@ -84,7 +84,7 @@ class VoxelData(NamedTuple):
 
     key: int
     top_shift: int
-    cells: Cells
+    cells: LeafCells
     nodes: Nodes
     points: NDArray[np.uint16]
     scan_index: NDArray[np.uint16] | None = None
@@ -123,7 +123,7 @@ def link_nodes(voxel: VoxelData) -> Links:
     return link_tree(f"voxel {voxel.key:#x}", voxel.cells, voxel.nodes.count)
 
 
-def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
+def link_tree(name: str, cells: LeafCells, count: NDArray[np.uint8]) -> Links:
     """Derive the links from cells and the nodes' counts (n,), as `link_nodes` does.
 
     name: of the voxel, for messages.
@@ -139,7 +139,7 @@ def link_tree(name: str, cells: Cells, count: NDArray[np.uint8]) -> Links:
     return Links(first, is_leaf, cell_of, height)
 
 
-def check_cell_nodes(name: str, cells: Cells, nodes: int) -> None:
+def check_cell_nodes(name: str, cells: LeafCells, nodes: int) -> None:
     """Check the cells' node counts against the number of nodes in the voxel.
 
     Raises CorruptError.
@@ -150,7 +150,7 @@ def check_cell_nodes(name: str, cells: Cells, nodes: int) -> None:
         raise CorruptError(f"{name}: {nodes} nodes for {c} cells are inconsistent")
 
 
-def check_cell_points(name: str, cells: Cells, points: int) -> None:
+def check_cell_points(name: str, cells: LeafCells, points: int) -> None:
     """Check the cells' point counts against the number of points in the voxel.
 
     Raises CorruptError.
@@ -160,16 +160,18 @@ def check_cell_points(name: str, cells: Cells, points: int) -> None:
         raise CorruptError(f"{name}: cells claim {claimed} points, found {points}")
 
 
-Columns = TypeVar("Columns", Cells, Nodes)
+Columns = TypeVar("Columns", LeafCells, Nodes)
 
 
-def transposed(columns: Columns) -> Columns:
+def transpose_columns(columns: Columns) -> Columns:
     """Transpose the columns of several components, (n, 3) to (3, n) or back, contiguous."""
     turned = (np.ascontiguousarray(column.T) for column in columns)
     return type(columns)(*turned)  # type: ignore[arg-type]  # each keeps its type
 
 
-def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int, voxel_steps: int) -> None:
+def check_tree(
+    name: str, cells: LeafCells, nodes: Nodes, links: Links, points: int, voxel_steps: int
+) -> None:
     """Check everything but the points that a kernel relies on, in a voxel whose counts form trees.
 
     name: of the voxel, for messages.  cells, nodes: transposed.  points: number of points.
@@ -188,10 +190,10 @@ def check_tree(name: str, cells: Cells, nodes: Nodes, links: Links, points: int,
         raise CorruptError(f"{name}: sort axis {int(nodes.axis.max())}, expected 0, 1 or 2")
 
 
-def read_lanes(
+def decode_points(
     name: str,
     planes: NDArray[np.uint8],
-    cells: Cells,
+    cells: LeafCells,
     nodes: Nodes,
     links: Links,
     voxel_steps: int,
@@ -234,10 +236,10 @@ def check_voxel(voxel: VoxelData, voxel_steps: int) -> Links:
     if voxel.top_shift != top_shift(voxel_steps):
         raise CorruptError(f"{name}: top unit 2^{voxel.top_shift} steps, expected 2^{top_shift(voxel_steps)}")
     links = link_nodes(voxel)
-    cells, nodes = transposed(cells), transposed(nodes)
+    cells, nodes = transpose_columns(cells), transpose_columns(nodes)
     check_tree(name, cells, nodes, links, p, voxel_steps)
     planes = np.ascontiguousarray(np.ascontiguousarray(voxel.points).view(np.uint8).T)
     planes.flags.writeable = False  # like a record's: the kernel is compiled once for both
     lanes = np.empty((int(np.count_nonzero(links.is_leaf)), 3, MAX_LEAF), np.uint16)
-    read_lanes(name, planes, cells, nodes, links, voxel_steps, lanes, deltas=False)
+    decode_points(name, planes, cells, nodes, links, voxel_steps, lanes, deltas=False)
     return links

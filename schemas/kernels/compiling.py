@@ -35,7 +35,7 @@ config: Any = numba_config
 # numba settings that do not affect machine code and differ between processes.
 _UNRELATED = frozenset({"CACHE_DIR", "COLOR_SCHEME", "NUMBA_DEFAULT_NUM_THREADS", "NUMBA_NUM_THREADS"})
 # A file name holds 255 bytes; the digest takes 64.
-_MOST_LABEL = 150
+_MAX_LABEL = 150
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -48,7 +48,7 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = compiled(function)
         if cache and kernel is not function:  # interpreted, with NUMBA_DISABLE_JIT=1
-            kernel._cache = _Kept(function)
+            kernel._cache = _KernelCache(function)
         return kernel
 
     return decorate
@@ -60,7 +60,7 @@ def kernel_files() -> KernelFiles:
     return KernelFiles(default_folder(config.CACHE_DIR))
 
 
-class _Kept(_Cache):  # type: ignore[misc]
+class _KernelCache(_Cache):  # type: ignore[misc]
     """Cache of one function's machine code, with numba's cache interface."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -84,9 +84,9 @@ class _Kept(_Cache):  # type: ignore[misc]
         if payload is None:
             return None
         try:
-            kept, reduced = pickle.loads(payload)
-            if kept != sig:
-                raise ValueError(f"it is for {kept}, expected {sig}")
+            stored, reduced = pickle.loads(payload)
+            if stored != sig:
+                raise ValueError(f"it is for {stored}, expected {sig}")
             return CompileResult._rebuild(target_context, *reduced)
         except Exception as error:
             kernel_files().discard(name, f"{type(error).__name__}: {error}")
@@ -122,7 +122,7 @@ class _Kept(_Cache):  # type: ignore[misc]
             sig,
         )
         digest = hashlib.sha256(repr(decides).encode()).hexdigest()
-        return f"{module.partition('.')[2]}.{qualname}"[:_MOST_LABEL] + f"-{digest}.kernel"
+        return f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL] + f"-{digest}.kernel"
 
 
 @functools.cache

@@ -28,8 +28,8 @@ _TEMPORARY = ".tmp"
 _STARTING = ".starting"
 _DAY = 86_400.0
 # Limits of the folder. All kernels of one version of this package take 37 MB.
-MOST_BYTES = 1 << 29
-MOST_DAYS = 60.0
+MAX_BYTES = 1 << 29
+MAX_DAYS = 60.0
 
 
 def default_folder(cache: str) -> Path:
@@ -51,7 +51,7 @@ class KernelFiles:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
         self._pruned = False
         self._descriptor = self._open()
 
@@ -94,25 +94,25 @@ class KernelFiles:
                     os.unlink(temporary, dir_fd=self._descriptor)
                 raise
         except OSError as error:
-            self._not_kept(error.strerror or str(error))
+            self._warn_not_stored(error.strerror or str(error))
 
     def discard(self, name: str, fault: str) -> None:
         """Remove a damaged file, and log that on the first occurrence."""
         removed = self._remove(name)
         outcome = "removed" if removed else "it cannot be removed: remove the folder"
-        self._say(
+        self._warn_once(
             "damaged",
             f"compiled kernels in {self.folder}: {name} is damaged ({fault}): {outcome}; "
             "damaged kernels are compiled again",
         )
 
-    def wipe(self) -> None:
+    def remove_all(self) -> None:
         """Remove every compiled kernel."""
         for name in self._names(_SUFFIX):
             self._remove(name)
 
-    def prune(self, most_bytes: int = MOST_BYTES, most_days: float = MOST_DAYS) -> None:
-        """Remove files not used for `most_days`, then the least recently used beyond `most_bytes`."""
+    def prune(self, max_bytes: int = MAX_BYTES, max_days: float = MAX_DAYS) -> None:
+        """Remove files not used for `max_days`, then the least recently used beyond `max_bytes`."""
         now, kept = time.time(), 0
         for name, found in self._files(_TEMPORARY):
             if now - found.st_mtime > _DAY:
@@ -120,7 +120,7 @@ class KernelFiles:
         listed = [(found.st_mtime, found.st_size, name) for name, found in self._files(_SUFFIX)]
         for used, size, name in sorted(listed, reverse=True):
             kept += size
-            if kept > most_bytes or now - used > most_days * _DAY:
+            if kept > max_bytes or now - used > max_days * _DAY:
                 self._remove(name)
 
     @contextlib.contextmanager
@@ -130,7 +130,7 @@ class KernelFiles:
         A mark is a file that its process holds locked. The system unlocks it however the process
         ends.
         """
-        unfinished = any([self._left_behind(name) for name in self._names(_STARTING)])
+        unfinished = any([self._remove_stale_mark(name) for name in self._names(_STARTING)])
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(OSError):
                 if self._descriptor is not None:
@@ -141,7 +141,7 @@ class KernelFiles:
                     fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield unfinished
 
-    def _left_behind(self, name: str) -> bool:
+    def _remove_stale_mark(self, name: str) -> bool:
         """Remove a mark that no process holds; return True if it was removed."""
         try:
             mark = os.open(name, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=self._descriptor)
@@ -163,14 +163,14 @@ class KernelFiles:
                 self.folder.mkdir(mode=0o700)
             descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         except OSError as error:
-            self._not_kept(error.strerror or str(error))
+            self._warn_not_stored(error.strerror or str(error))
             return None
         found = os.fstat(descriptor)
         if found.st_uid in (os.geteuid(), 0) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
             return descriptor
         os.close(descriptor)
         mode = stat.S_IMODE(found.st_mode)
-        self._not_kept(f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700")
+        self._warn_not_stored(f"owner {found.st_uid}, mode {mode:o}: expected owner {os.geteuid()}, mode 700")
         return None
 
     def _content(self, name: str) -> bytes:
@@ -228,17 +228,17 @@ class KernelFiles:
             return False
         return self._stat(name) is None
 
-    def _not_kept(self, fault: str) -> None:
-        self._say(
+    def _warn_not_stored(self, fault: str) -> None:
+        self._warn_once(
             "not kept",
             f"compiled kernels are not kept in {self.folder} ({fault}), so each start compiles for a minute or more: "
             "set NUMBA_CACHE_DIR to a folder that you alone may write",
         )
 
-    def _say(self, kind: str, message: str) -> None:
+    def _warn_once(self, kind: str, message: str) -> None:
         """Log a message, but only the first of its kind."""
-        if kind not in self._said:
-            self._said.add(kind)
+        if kind not in self._warned:
+            self._warned.add(kind)
             log.warning(message)
 
 

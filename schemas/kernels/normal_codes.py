@@ -56,7 +56,7 @@ def _rotation(a_pp, a_qq, a_pq):
 
 
 @nb.njit(nogil=True, cache=True)
-def _turn(c, s, a, b):
+def _rotate_pair(c, s, a, b):
     """Rotate the pair (a, b)."""
     return c * a - s * b, s * a + c * b
 
@@ -73,22 +73,22 @@ def least_direction(xx, yy, zz, yz, zx, xy):
     for _ in range(SWEEPS):
         t, c, s = _rotation(xx, yy, xy)
         xx, yy, xy = xx - t * xy, yy + t * xy, 0.0
-        zx, yz = _turn(c, s, zx, yz)
-        ax, bx = _turn(c, s, ax, bx)
-        ay, by = _turn(c, s, ay, by)
-        az, bz = _turn(c, s, az, bz)
+        zx, yz = _rotate_pair(c, s, zx, yz)
+        ax, bx = _rotate_pair(c, s, ax, bx)
+        ay, by = _rotate_pair(c, s, ay, by)
+        az, bz = _rotate_pair(c, s, az, bz)
         t, c, s = _rotation(xx, zz, zx)
         xx, zz, zx = xx - t * zx, zz + t * zx, 0.0
-        xy, yz = _turn(c, s, xy, yz)
-        ax, cx = _turn(c, s, ax, cx)
-        ay, cy = _turn(c, s, ay, cy)
-        az, cz = _turn(c, s, az, cz)
+        xy, yz = _rotate_pair(c, s, xy, yz)
+        ax, cx = _rotate_pair(c, s, ax, cx)
+        ay, cy = _rotate_pair(c, s, ay, cy)
+        az, cz = _rotate_pair(c, s, az, cz)
         t, c, s = _rotation(yy, zz, yz)
         yy, zz, yz = yy - t * yz, zz + t * yz, 0.0
-        xy, zx = _turn(c, s, xy, zx)
-        bx, cx = _turn(c, s, bx, cx)
-        by, cy = _turn(c, s, by, cy)
-        bz, cz = _turn(c, s, bz, cz)
+        xy, zx = _rotate_pair(c, s, xy, zx)
+        bx, cx = _rotate_pair(c, s, bx, cx)
+        by, cy = _rotate_pair(c, s, by, cy)
+        bz, cz = _rotate_pair(c, s, bz, cz)
     least, greatest = min(xx, yy, zz), max(xx, yy, zz)
     second = max(min(xx, yy), min(max(xx, yy), zz))
     if least == zz:  # if equal, prefer z: ambiguous points count as horizontal

@@ -2,10 +2,10 @@
 
 Python raises KeyboardInterrupt at any instruction. Inside a library's callback it comes out as that
 library's error (lazrs: 11 of 16 times), inside an error handler it hides the error, inside a
-`finally` it leaves cleanup incomplete. In a block of `taken` a signal sets a flag instead. Long
-work calls `check` between blocks, voxels, files and units, and `check` raises Interrupted. Once the
-flag is set, any other exception that ends the block counts as an interrupt too, never as a fault of
-a file.
+`finally` it leaves cleanup incomplete. In a block of `deferring_interrupts` a signal sets a flag
+instead. Long work calls `check_interrupt` between blocks, voxels, files and units, which raises
+Interrupted. Once the flag is set, any other exception that ends the block counts as an interrupt
+too, never as a fault of a file.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-# Code that calls no `check` for GRACE_SECONDS is interrupted at its current instruction:
+# Code that calls no `check_interrupt` for GRACE_SECONDS is interrupted at its current instruction:
 # compilation, or a library that reads a whole file in one call. The interrupt is repeated every
 # AGAIN_SECONDS, in case a library swallowed the exception, and after SOON_SECONDS if Python dropped
 # it.
@@ -34,50 +34,51 @@ class Interrupted(KeyboardInterrupt):
 class _State:
     """State of the interrupt in this process.
 
-    taken: in a block of `taken`.  held: number of active `kept_back` blocks in it.
+    deferring: in a block of `deferring_interrupts`.
+    blocked: number of active `blocking_interrupts` blocks in it.
     since: time of the first signal (time.monotonic); None before.
     """
 
-    taken = False
-    held = 0
+    deferring = False
+    blocked = 0
     since: float | None = None
 
 
-def came() -> bool:
-    """Return True if a signal has arrived in the block of `taken`."""
+def interrupt_pending() -> bool:
+    """Return True if a signal has arrived in the block of `deferring_interrupts`."""
     return _State.since is not None
 
 
-def check() -> None:
+def check_interrupt() -> None:
     """Raise Interrupted once a signal has arrived.
 
-    The call is cheap, allowed in any thread, and harmless outside `taken`.
+    The call is cheap, allowed in any thread, and harmless outside `deferring_interrupts`.
     """
     if _State.since is not None:
-        leave()
+        stop_insisting()
         raise Interrupted
 
 
-def leave() -> None:
+def stop_insisting() -> None:
     """Stop the timer of `_insist`, so that cleanup is not interrupted while the stack unwinds."""
     signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 @contextlib.contextmanager
-def taken() -> Iterator[None]:
-    """Note SIGINT and SIGTERM in this block, for `check`.
+def deferring_interrupts() -> Iterator[None]:
+    """Note SIGINT and SIGTERM in this block, for `check_interrupt`.
 
     If a signal arrived, the block ends with Interrupted, whatever else ends it. A signal that is
     ignored stays ignored, as under nohup. A further signal after GRACE_SECONDS raises at once. A
     nested block has no effect, and neither has a block outside the main thread, where Python runs
     no handlers.
     """
-    if _State.taken or threading.current_thread() is not threading.main_thread():
+    if _State.deferring or threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     alarm, unraisable = signal.getsignal(signal.SIGALRM), sys.unraisablehook
-    _State.taken = True
+    _State.deferring = True
     try:
         for number, handler in before.items():
             if handler not in (signal.SIG_IGN, None):
@@ -85,19 +86,19 @@ def taken() -> Iterator[None]:
         try:
             yield
         except Exception as error:
-            if came():
+            if interrupt_pending():
                 raise Interrupted from error
             raise
-        check()
+        check_interrupt()
     finally:
-        if came():
-            leave()
+        if interrupt_pending():
+            stop_insisting()
             signal.signal(signal.SIGALRM, alarm)
             sys.unraisablehook = unraisable
         for number, handler in before.items():
             if handler is not None:
                 signal.signal(number, handler)
-        _State.taken, _State.since = False, None
+        _State.deferring, _State.since = False, None
 
 
 def _note(number: int, frame: object) -> None:
@@ -108,13 +109,13 @@ def _note(number: int, frame: object) -> None:
         signal.signal(signal.SIGALRM, _insist)
         sys.unraisablehook = _swallowed
         signal.setitimer(signal.ITIMER_REAL, GRACE_SECONDS, AGAIN_SECONDS)
-    elif now - _State.since >= GRACE_SECONDS and not _State.held:
+    elif now - _State.since >= GRACE_SECONDS and not _State.blocked:
         raise Interrupted
 
 
 def _insist(number: int, frame: object) -> None:
-    """Handle the timer that a signal starts: raise, because nothing has called `check` for long."""
-    if not _State.held:
+    """Handle the timer that a signal starts: raise, because nothing has called `check_interrupt` for long."""
+    if not _State.blocked:
         raise Interrupted
 
 
@@ -130,24 +131,25 @@ def _swallowed(what: "sys.UnraisableHookArgs") -> None:
 
 
 @contextlib.contextmanager
-def kept_back() -> Iterator[Callable[[], None]]:
+def blocking_interrupts() -> Iterator[Callable[[], None]]:
     """Hold back SIGINT and SIGTERM until the block ends or the yielded function is called.
 
     For calls of libraries that call Python back: raised in a callback of HDF5, a KeyboardInterrupt
-    came out as a SystemError, or not at all. In a block of `taken`, `check` still raises here where
-    our own Python code calls it. Outside `taken`, the original handlers run at that time. Outside
-    the main thread, where Python runs no handlers, this has no effect.
+    came out as a SystemError, or not at all. In a block of `deferring_interrupts`,
+    `check_interrupt` still raises here where our own Python code calls it. Outside
+    `deferring_interrupts`, the original handlers run at that time. Outside the main thread, where
+    Python runs no handlers, this has no effect.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
-    if _State.taken:
-        _State.held += 1
+    if _State.deferring:
+        _State.blocked += 1
         try:
-            yield check
+            yield check_interrupt
         finally:
-            _State.held -= 1
-            check()
+            _State.blocked -= 1
+            check_interrupt()
         return
     waiting: list[int] = []
     before = {number: signal.getsignal(number) for number in _SIGNALS}
@@ -173,7 +175,7 @@ def kept_back() -> Iterator[Callable[[], None]]:
 
 
 @contextlib.contextmanager
-def children_ignore() -> Iterator[None]:
+def blocking_sigint() -> Iterator[None]:
     """Start the processes of this block with SIGINT blocked.
 
     Ctrl-C reaches a terminal's whole process group, and a worker that is still loading Python would

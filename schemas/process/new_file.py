@@ -1,7 +1,7 @@
 """Atomic writing of HDF5 files: under a temporary name, closed, synced, renamed, the folder synced.
 
 The sequence survived kills at every system call. HDF5 is shielded from full disks (`_Disk`) and
-from interrupts (`kept_back`).
+from interrupts (`blocking_interrupts`).
 """
 
 import contextlib
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import h5py
 
-from .interrupts import kept_back
+from .interrupts import blocking_interrupts
 
 # Random id of this process, or of the one that it was forked from: several hosts use the same
 # process ids.
@@ -131,10 +131,10 @@ def new_file(path: Path) -> Iterator[NewFile]:
     """Open an HDF5 file under a temporary name; `publish` gives it its own name.
 
     A failed write raises an OSError that names the file, and no file is left. Interrupts wait until
-    the file is closed, or until `check`.
+    the file is closed, or until `check_interrupt`.
     """
     temporary = temporary_path(path)
-    with kept_back() as deliver, contextlib.ExitStack() as stack:
+    with blocking_interrupts() as deliver, contextlib.ExitStack() as stack:
         disk = _Disk(temporary)
         stack.callback(disk.close)
         try:

@@ -52,7 +52,7 @@ def os_error_line(error: OSError) -> str:
 
 
 @contextmanager
-def writing(output: Path) -> Iterator[None]:
+def naming_write_errors(output: Path) -> Iterator[None]:
     """Convert an OSError about writing `output` to a SolidcloudError that names it.
 
     Errors about other files pass unchanged. Errors count as about the output if they name the

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.process.interrupts import taken
+from ...schemas.process.interrupts import deferring_interrupts
 from ...schemas.process.os_errors import os_error_line
 from .commands import accuracy_command as accuracy
 from .commands import archive_command as archive
@@ -90,7 +90,7 @@ def run(arguments: Sequence[str]) -> int:
     """
     try:
         command, name, rest = _find_verb(arguments or ["--help"])
-        with contextlib.nullcontext() if name.split()[-1] in WAITING else taken():
+        with contextlib.nullcontext() if name.split()[-1] in WAITING else deferring_interrupts():
             return _run(command, name, rest)
     except SolidcloudError as error:
         return complain(str(error), error.exit_code)

@@ -6,12 +6,12 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
 from solidcloud.schemas.archive.codec import (
     OPTIONAL_COLUMNS,
-    OpenRecord,
+    DecompressedRecord,
     Record,
     RecordShape,
     decode_voxel,
+    decompress_record,
     encode_voxel,
-    open_record,
     voxel_point_dtype,
 )
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
@@ -69,20 +69,20 @@ def kept(n: int, seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def open_points(points: VoxelPoints, steps: int, **options: object) -> OpenRecord:
+def open_points(points: VoxelPoints, steps: int, **options: object) -> DecompressedRecord:
     """The record of some points, in small cells and leaf nodes unless the options say otherwise."""
     config = BuildConfig(**{"cell_points": 40, "leaf": 8, "degree": 3, **options})
     voxel = build_voxel(KEY, points, steps, config)
     record = encode_voxel(voxel, ARCHIVE_ID)
-    return open_record(*record[:3], shape_of(voxel), KEY, ARCHIVE_ID, steps)
+    return decompress_record(*record[:3], shape_of(voxel), KEY, ARCHIVE_ID, steps)
 
 
-def open_scan(kind: str, seed: int, count: int, steps: int, **options: object) -> OpenRecord:
+def open_scan(kind: str, seed: int, count: int, steps: int, **options: object) -> DecompressedRecord:
     """The record of a made scan."""
     return open_points(VoxelPoints(make_steps(kind, seed, count, steps)), steps, **options)
 
 
-def points_of(record: OpenRecord) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def points_of(record: DecompressedRecord) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """All points of a record (p, 3) int64 [voxel steps] in stored order, and the leaf node of each (p,)."""
     return points_below(*record.decode())
 

@@ -88,7 +88,7 @@ def closest_other(tree, queries, best):
         best[q] = found
 
 
-class Spheres(NamedTuple):
+class NodeSpheres(NamedTuple):
     """Bounds of an opened record (schemas/archive/voxel.py Nodes).
 
     center: (3, n) uint16.

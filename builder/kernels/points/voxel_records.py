@@ -19,7 +19,7 @@ U = np.uint64
 
 
 class Leaves(NamedTuple):
-    """Opened record (schemas/archive/codec.py OpenRecord) as kernels take it; its tree has been checked.
+    """Opened record (schemas/archive/codec.py DecompressedRecord) as kernels take it; its tree has been checked.
 
     planes: (6 or more, p) uint8, low and high bytes of x, y, z.
     first, is_leaf, cell: (n,), the links.

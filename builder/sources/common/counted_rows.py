@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check
+from ....schemas.process.interrupts import check_interrupt
 from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
 from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, split_row
 
@@ -103,7 +103,7 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
         )
     wanted, last = count - 1, NEWLINE
     while wanted:
-        check()
+        check_interrupt()
         data = file.read(CHUNK_BYTES)
         if not data:
             # A last row without a line end counts too.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import ScanError, SolidcloudError
-from ....schemas.process.interrupts import check
+from ....schemas.process.interrupts import check_interrupt
 
 # A block of 2^18 points is 6 MiB of float64: large enough to hide the cost of one round of the
 # Python loop, small enough that a few blocks are negligible beside any --memory.
@@ -138,7 +138,7 @@ class Scan(ABC):
         blocks = self._read_range(block_points, start, stop)
         with library_errors(self.path):
             for block in blocks:
-                check()
+                check_interrupt()
                 yield block
 
     def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
@@ -225,9 +225,9 @@ def library_errors(path: Path) -> Iterator[None]:
     """
     try:
         yield
-        check()
+        check_interrupt()
     except SolidcloudError:
-        check()
+        check_interrupt()
         raise
     except BaseException as error:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
@@ -238,7 +238,7 @@ def library_errors(path: Path) -> Iterator[None]:
         # A Rust panic inside lazrs is a BaseException subclass, not an Exception.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        check()
+        check_interrupt()
         # libe57 appends a page of debugging text to its message; the first line is sufficient.
         first_line = next(iter(str(error).strip().splitlines()), "")
         raise scan_error(
@@ -342,6 +342,6 @@ def sha256_of(path: Path) -> str:
     with library_errors(path), path.open("rb", buffering=0) as file:
         digest, buffer = hashlib.sha256(), memoryview(bytearray(HASHED_BYTES))
         while size := file.readinto(buffer):
-            check()
+            check_interrupt()
             digest.update(buffer[:size])
     return digest.hexdigest()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import ScanError
-from ....schemas.process.interrupts import check
+from ....schemas.process.interrupts import check_interrupt
 from .scan import scan_error
 
 # 4 MiB of text is about 130,000 rows of three numbers. In the worst case ("1 1 1 ...") it is 2 M
@@ -35,7 +35,7 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
     rest = b""
     line = first_line
     while data := file.read(CHUNK_BYTES):
-        check()  # an OBJ may hold gigabytes of faces only, and yield no block meanwhile
+        check_interrupt()  # an OBJ may hold gigabytes of faces only, and yield no block meanwhile
         data = rest + data
         # A file system that lost part of a file returns zeros in its place; OBJ would skip them as
         # a line without a vertex.

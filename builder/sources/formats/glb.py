@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check
+from ....schemas.process.interrupts import check_interrupt
 from ..common.scan import (
     BLOCK_BYTES,
     Scan,
@@ -153,7 +153,7 @@ def _rows(file: BufferedReader, path: Path, accessor: _Accessor, block_rows: int
         # The last row, and the file with it, may end before the row's full stride.
         wanted = (count - 1) * accessor.stride + accessor.width * item
         file.seek(accessor.start + begin * accessor.stride)
-        check()
+        check_interrupt()
         data = file.read(wanted)
         if len(data) < wanted:
             raise _damaged(path, "a file that ends within its vertices", "all its vertices")

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import kept_back
+from ....schemas.process.interrupts import blocking_interrupts
 from ..common.scan import (
     BLOCK_BYTES,
     Scan,
@@ -122,7 +122,7 @@ class LasScan(SeekableScan):
             | lazrs.SELECTIVE_DECOMPRESS_Z
             | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
         )
-        with kept_back():
+        with blocking_interrupts():
             source: Any = LazTail(lazrs, file, self._start, self._laszip, start) if start else file
             # Decompress serially: the builder already runs one process per core.
             decompressor = lazrs.LasZipDecompressor(source, self._laszip, wanted)
@@ -133,12 +133,12 @@ class LasScan(SeekableScan):
         before = source.skip if start else 0
         while before:
             count = min(step, before)
-            with kept_back():  # lazrs calls back into Python to read
+            with blocking_interrupts():  # lazrs calls back into Python to read
                 decompressor.decompress_many(raw[: count * self._record.itemsize])
             before -= count
         for seen in range(start, stop, step):
             count = min(step, stop - seen)
-            with kept_back():
+            with blocking_interrupts():
                 decompressor.decompress_many(raw[: count * self._record.itemsize])
             yield buffer[:count]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.process.interrupts import check
+from ....schemas.process.interrupts import check_interrupt
 from ...kernels.points.lzf_decoder import FARTHEST_BACK, LONGEST_CODE, LONGEST_COPY, decode
 from ..common.scan import scan_error
 
@@ -63,7 +63,7 @@ class LzfStream:
 
     def _decode(self, file: BufferedReader) -> None:
         """Decode the next piece, keeping the bytes that a back-reference can reach before it."""
-        check()
+        check_interrupt()
         kept = min(self._have, FARTHEST_BACK)
         self._out[:kept] = self._out[self._have - kept : self._have]
         if len(self._source) < LONGEST_CODE and self._at < self._past:

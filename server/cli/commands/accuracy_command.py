@@ -25,7 +25,7 @@ def accuracy(
     """
     import tempfile
 
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
 
     with needs_extra("made"):
         from ...report.accuracy.accuracy import run as measure
@@ -35,7 +35,7 @@ def accuracy(
 
     with (
         interruptible(),
-        writing(output),
+        naming_write_errors(output),
         tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch,
         progress_listener() as bars,
     ):

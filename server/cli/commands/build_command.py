@@ -140,7 +140,7 @@ def build(
 def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: bool, as_json: bool) -> None:
     """Build the archive and print its summary."""
     from ....builder.pipeline import build_archive
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.console import print_build
     from ..output.progress_display import progress_listener
 
@@ -148,7 +148,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     whole = f"{output} is complete: the build had finished"
     with (
         interruptible(lambda: whole if built else _kept(output)),
-        writing(output),
+        naming_write_errors(output),
         progress_listener(log_json) as listener,
     ):
         built.append(build_archive(scans, output, config, listener))

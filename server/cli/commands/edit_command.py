@@ -40,10 +40,10 @@ def add(
     The result is a new generation, which a running server serves after solidcloud reload.
     """
     from ....builder.edit.edit_archive import add_scans
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
-    with interruptible(lambda: _as_it_is(archive)), writing(archive), progress_listener() as bars:
+    with interruptible(lambda: _as_it_is(archive)), naming_write_errors(archive), progress_listener() as bars:
         summary = add_scans(
             archive,
             scans,
@@ -72,10 +72,10 @@ def remove(
     running server serves after solidcloud reload.
     """
     from ....builder.edit.edit_archive import remove_scans
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
-    with interruptible(lambda: _as_it_is(archive)), writing(archive), progress_listener() as bars:
+    with interruptible(lambda: _as_it_is(archive)), naming_write_errors(archive), progress_listener() as bars:
         summary = remove_scans(
             archive, scans, jobs=jobs, memory_bytes=parse_bytes(memory, "--memory"), progress=bars
         )

@@ -33,11 +33,11 @@ def export(
     stored.
     """
     from ....builder.export.export_archive import export_archive
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.archive_facts import print_export
     from ..output.progress_display import progress_listener
 
-    with interruptible(), needs_extra("readers"), writing(output), progress_listener() as bars:
+    with interruptible(), needs_extra("readers"), naming_write_errors(output), progress_listener() as bars:
         done = export_archive(archive, output, box=box, form=form, overwrite=overwrite, progress=bars)
     if as_json:
         print_json({**done._asdict(), "file": str(done.file)})

@@ -34,7 +34,7 @@ def inspect(
     from ....builder.sources.scan_files import inspect_scans
     from ....builder.sources.scan_list import write_scan_list
     from ....schemas.errors import BadRequestError
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
     if output and output.exists() and not overwrite:
@@ -52,7 +52,7 @@ def inspect(
             file=sys.stderr,
         )
     elif output or not as_json:
-        with interruptible(), writing(output or DEFAULT_LIST):
+        with interruptible(), naming_write_errors(output or DEFAULT_LIST):
             write_scan_list(output or DEFAULT_LIST, entries)
         print(f"{output or DEFAULT_LIST}: {len(entries)} scans", file=sys.stderr)
     for entry in entries:

@@ -3,7 +3,13 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ....schemas.process.interrupts import Interrupted, came, check, leave, taken
+from ....schemas.process.interrupts import (
+    Interrupted,
+    check_interrupt,
+    deferring_interrupts,
+    interrupt_pending,
+    stop_insisting,
+)
 
 
 @contextmanager
@@ -13,12 +19,14 @@ def interruptible(left: Callable[[], str] | None = None) -> Iterator[None]:
     left: returns a sentence about what the work has left behind; None: it leaves nothing.
     Raises Interrupted with that sentence as its text.
     """
-    with taken():
+    with deferring_interrupts():
         try:
             yield
-            check()
+            check_interrupt()
         except BaseException as error:
-            if not isinstance(error, KeyboardInterrupt) and not (came() and isinstance(error, Exception)):
+            if not isinstance(error, KeyboardInterrupt) and not (
+                interrupt_pending() and isinstance(error, Exception)
+            ):
                 raise
-            leave()
+            stop_insisting()
             raise Interrupted(left() if left else "") from None

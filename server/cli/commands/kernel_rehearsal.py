@@ -46,7 +46,7 @@ def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
         if code == 0:
             return
         fault = f"ended with {signal.Signals(-code).name if code < 0 else f'exit code {code}'}"
-    files.wipe()
+    files.remove_all()
     log.warning(
         "compiled kernels in %s: the last server start did not complete, and a trial of the kernels %s: "
         "all were removed and are compiled again",

@@ -29,10 +29,10 @@ def make_facade(
     """
     with needs_extra("made"):
         from ....builder.synthetic.scenes import make_facade as make_it
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
-    with interruptible(), writing(output), progress_listener() as bars:
+    with interruptible(), naming_write_errors(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
     print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
 
@@ -50,10 +50,10 @@ def make_town(
     """
     with needs_extra("made"):
         from ....builder.synthetic.scenes import make_town as make_it
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
-    with interruptible(), writing(output), progress_listener() as bars:
+    with interruptible(), naming_write_errors(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, progress=bars.made)
     print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
 
@@ -66,9 +66,9 @@ def make_figure(
 ) -> None:
     """Make an avatar: a human figure in mid-stride."""
     from ....builder.synthetic.figure import figure_points, write_figure
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
 
-    with interruptible(), writing(output):
+    with interruptible(), naming_write_errors(output):
         write_figure(output, figure_points(points, seed, height))
     print(f"{points:,} points in {output}")
 
@@ -84,9 +84,9 @@ def make_walk(
     """
     from ....builder.synthetic.truth import read_truth
     from ....builder.synthetic.walk import walk_poses
-    from ....schemas.process.os_errors import writing
+    from ....schemas.process.os_errors import naming_write_errors
     from ..input.pose_file import write_poses
 
-    with interruptible(), writing(output):
+    with interruptible(), naming_write_errors(output):
         write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))
     print(f"{frames} poses in {output}")

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID
 from rich.table import Column
 from rich.text import Text
 
-from ....schemas.process.interrupts import check
+from ....schemas.process.interrupts import check_interrupt
 
 # Rates average over this window: work completes in chunks of a second or two, and disk speed
 # varies.
@@ -107,13 +107,13 @@ class Listener:
 
     def start(self, stage: str, total: int, unit: str) -> None:
         """Begin a stage. Raises Interrupted if a signal has arrived."""
-        check()
+        check_interrupt()
         self._pace = Pace(stage, total, unit, self._clock)
         self._began(self._pace)
 
     def advance(self, amount: int) -> None:
         """Add to the amount done of the stage. Raises Interrupted if a signal has arrived."""
-        check()
+        check_interrupt()
         if self._pace is not None:
             self._pace.advance(amount)
             self._moved(self._pace)

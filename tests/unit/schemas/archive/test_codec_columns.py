@@ -5,7 +5,7 @@ import pytest
 from opened_records import ARCHIVE_ID, KEY, assert_same_bits, decode, kept, shape_of
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
-from solidcloud.schemas.archive.codec import OPTIONAL_COLUMNS, encode_voxel, open_record
+from solidcloud.schemas.archive.codec import OPTIONAL_COLUMNS, decompress_record, encode_voxel
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
 from solidcloud.schemas.archive.voxel import MAX_LEAF, VoxelData, link_nodes
 from solidcloud.schemas.errors import CorruptError
@@ -21,7 +21,7 @@ def test_classes_are_read_into_lanes_and_those_there_are_none_of_refused() -> No
 
     def lanes_of(voxel: VoxelData) -> np.ndarray:
         record = encode_voxel(voxel, ARCHIVE_ID)
-        opened = open_record(*record[:3], shape_of(voxel), KEY, ARCHIVE_ID, 1000)
+        opened = decompress_record(*record[:3], shape_of(voxel), KEY, ARCHIVE_ID, 1000)
         lanes = np.empty((opened.leaves, MAX_LEAF), np.uint8)
         opened.read_classes(lanes)
         return lanes
@@ -51,7 +51,7 @@ def test_columns_that_are_not_wanted_are_not_held(stored: tuple[str, ...], wante
     voxel = build_voxel(KEY, VoxelPoints(points, **columns), 1000, BuildConfig(leaf=8, cell_points=50))
     record = encode_voxel(voxel, ARCHIVE_ID)
     arguments = (record.cells, record.nodes, record.points, shape_of(voxel), KEY, ARCHIVE_ID, 1000)
-    opened = open_record(*arguments, columns=wanted)
+    opened = decompress_record(*arguments, columns=wanted)
     assert opened.planes.shape == (opened.dtype.itemsize, 200) and not opened.planes.flags.writeable
     left_out = {name: None for name in stored if name not in wanted}
     assert_same_bits(opened.decode()[0], voxel._replace(**left_out))
@@ -72,7 +72,7 @@ def test_a_flipped_bit_of_a_column_that_is_not_wanted_is_found(wanted: tuple[str
             broken[at] ^= flip
             arguments = (record.cells, record.nodes, bytes(broken), shape_of(voxel), KEY, ARCHIVE_ID, 1000)
             try:
-                found = open_record(*arguments, columns=wanted)
+                found = decompress_record(*arguments, columns=wanted)
             except CorruptError as error:
                 assert f"voxel {KEY:#x}, points: " in str(error)
             else:  # a bit that decoders must ignore
@@ -90,7 +90,7 @@ def test_more_or_less_than_is_declared_is_refused_where_columns_are_not_wanted()
     shape = shape_of(voxel)
     for frame in (record.points + record.points, record.points[:-5], record.points[:20]):
         with pytest.raises(CorruptError, match="points: damaged frame"):
-            open_record(record.cells, record.nodes, frame, shape, KEY, ARCHIVE_ID, 1000, columns=())
+            decompress_record(record.cells, record.nodes, frame, shape, KEY, ARCHIVE_ID, 1000, columns=())
 
 
 @pytest.mark.interpreted
@@ -99,7 +99,7 @@ def test_counting_refuses_a_class_there_is_none_of() -> None:
     points = VoxelPoints(np.arange(12, dtype=np.int32).reshape(4, 3), radius_class=classes)
     voxel = build_voxel(KEY, points, 1000, BuildConfig())
     record = encode_voxel(voxel, ARCHIVE_ID)
-    opened = open_record(
+    opened = decompress_record(
         record.cells,
         record.nodes,
         record.points,

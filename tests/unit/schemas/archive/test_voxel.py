@@ -10,7 +10,7 @@ from solidcloud.schemas.archive.voxel import (
     CELL_BITS,
     MAX_DEGREE,
     MAX_LEAF,
-    Cells,
+    LeafCells,
     Nodes,
     VoxelData,
     check_voxel,
@@ -42,7 +42,7 @@ def by_hand(counts: list[int], cell_nodes: list[int], cell_points: list[int]) ->
         np.array(counts, np.uint8), np.zeros(n, np.uint8), np.zeros((n, 3), np.uint16),
     )  # fmt: skip
     low = np.zeros((c, 3), np.int32)
-    cells = Cells(
+    cells = LeafCells(
         low, np.zeros(c, np.uint8), np.array(cell_nodes, np.uint32), np.array(cell_points, np.uint32)
     )
     return VoxelData(5, 0, cells, nodes, np.zeros((p, 3), np.uint16))
@@ -132,7 +132,7 @@ def shorten(part: str, field: str) -> Callable[[VoxelData], VoxelData]:
 
 def no_cells(voxel: VoxelData) -> VoxelData:
     """No cells, though nodes and points are there."""
-    return voxel._replace(cells=Cells(*(column[:0] for column in voxel.cells)))
+    return voxel._replace(cells=LeafCells(*(column[:0] for column in voxel.cells)))
 
 
 def fewer_nodes(voxel: VoxelData) -> VoxelData:
@@ -199,7 +199,7 @@ def beyond_the_edge(voxel: VoxelData) -> VoxelData:
 
 
 FAULTS: dict[str, tuple[Callable[[], VoxelData], Callable[[VoxelData], VoxelData], str]] = {
-    **{f"short cells.{f}": (built, shorten("cells", f), "columns of unequal length") for f in Cells._fields},
+    **{f"short cells.{f}": (built, shorten("cells", f), "columns of unequal length") for f in LeafCells._fields},
     **{f"short nodes.{f}": (built, shorten("nodes", f), "columns of unequal length") for f in Nodes._fields},
     "top unit": (built, lambda v: v._replace(top_shift=1), r"top unit 2\^1 steps, expected 2\^0"),
     "no cells": (built, no_cells, "nodes for 0 cells are inconsistent"),

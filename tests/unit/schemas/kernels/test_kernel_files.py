@@ -164,7 +164,7 @@ def test_a_folder_that_cannot_be_made_is_said_and_done_without(
     assert files.read(NAME) is None
     with files.starting() as unfinished:
         assert not unfinished
-    files.wipe()
+    files.remove_all()
     files.prune()
     assert len(lines(caplog)) == 1
 
@@ -202,10 +202,10 @@ def test_the_least_recently_used_goes(files: KernelFiles, folder: Path) -> None:
         files.write(f"{number}.kernel", PAYLOAD)
         os.utime(folder / f"{number}.kernel", (now, now - 86_400 * 10 * number))
     size = (folder / "0.kernel").stat().st_size
-    files.prune(most_days=45)
+    files.prune(max_days=45)
     assert sorted(path.name for path in folder.iterdir()) == [f"{n}.kernel" for n in range(5)]
     files.read("4.kernel")  # used now
-    files.prune(most_bytes=2 * size)
+    files.prune(max_bytes=2 * size)
     assert sorted(path.name for path in folder.iterdir()) == ["0.kernel", "4.kernel"]
 
 
@@ -220,7 +220,7 @@ def test_what_a_killed_writer_left_goes_after_a_day(files: KernelFiles, folder: 
 def test_wiping_leaves_no_kernel(files: KernelFiles, folder: Path) -> None:
     files.write(NAME, PAYLOAD)
     (folder / "b.kernel").mkdir()
-    files.wipe()
+    files.remove_all()
     assert list(folder.iterdir()) == []
 
 

@@ -13,7 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.schemas.process import interrupts
-from solidcloud.schemas.process.interrupts import Interrupted, came, check, children_ignore, kept_back, taken
+from solidcloud.schemas.process.interrupts import (
+    Interrupted,
+    blocking_interrupts,
+    blocking_sigint,
+    check_interrupt,
+    deferring_interrupts,
+    interrupt_pending,
+)
 from solidcloud.schemas.process.new_file import new_file
 
 
@@ -26,7 +33,7 @@ def usual_handler() -> Iterator[None]:
 
 def test_an_interrupt_comes_when_the_block_ends() -> None:
     seen = []
-    with pytest.raises(KeyboardInterrupt), kept_back():
+    with pytest.raises(KeyboardInterrupt), blocking_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         seen.append("went on")
     assert seen == ["went on"]
@@ -36,7 +43,7 @@ def test_an_interrupt_comes_when_the_block_ends() -> None:
 
 def test_an_interrupt_comes_when_it_is_asked_for() -> None:
     seen = []
-    with pytest.raises(KeyboardInterrupt), kept_back() as deliver:
+    with pytest.raises(KeyboardInterrupt), blocking_interrupts() as deliver:
         deliver()
         os.kill(os.getpid(), signal.SIGINT)
         seen.append("went on")
@@ -46,7 +53,7 @@ def test_an_interrupt_comes_when_it_is_asked_for() -> None:
 
 
 def test_an_error_of_the_block_does_not_hide_it() -> None:
-    with pytest.raises(KeyboardInterrupt), kept_back():
+    with pytest.raises(KeyboardInterrupt), blocking_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         raise OSError("the disk")
 
@@ -56,7 +63,7 @@ def test_other_threads_and_signals_that_are_ignored_are_left_alone() -> None:
 
     def run() -> None:
         try:
-            with kept_back() as deliver:
+            with blocking_interrupts() as deliver:
                 deliver()
         except BaseException as error:
             failed.append(error)
@@ -66,7 +73,7 @@ def test_other_threads_and_signals_that_are_ignored_are_left_alone() -> None:
     thread.join()
     assert failed == []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with kept_back():
+    with blocking_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
@@ -89,40 +96,40 @@ def test_an_interrupt_while_hdf5_writes_is_one(tmp_path: Path, monkeypatch: pyte
 def test_a_signal_is_raised_where_the_work_checks(number: int) -> None:
     seen = []
     before = signal.getsignal(number)
-    with pytest.raises(Interrupted), taken():
-        check()
+    with pytest.raises(Interrupted), deferring_interrupts():
+        check_interrupt()
         os.kill(os.getpid(), number)
         os.kill(os.getpid(), number)  # twice, as a wrapper may pass on what the terminal sent too
-        seen.append(came())
-        check()
+        seen.append(interrupt_pending())
+        check_interrupt()
         seen.append(False)
     assert seen == [True]
-    assert signal.getsignal(number) is before and not came()
-    check()  # of the next command, nothing has come
+    assert signal.getsignal(number) is before and not interrupt_pending()
+    check_interrupt()  # of the next command, nothing has come
 
 
 def test_whatever_ends_an_interrupted_block_is_an_interrupt() -> None:
-    with pytest.raises(Interrupted) as caught, taken():
+    with pytest.raises(Interrupted) as caught, deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         raise ValueError("of a library")
     assert isinstance(caught.value.__cause__, ValueError)
-    with pytest.raises(Interrupted), taken():
+    with pytest.raises(Interrupted), deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
-    with pytest.raises(ValueError), taken():
+    with pytest.raises(ValueError), deferring_interrupts():
         raise ValueError("of the file")
 
 
 def test_a_check_that_was_swallowed_is_made_up_for() -> None:
-    with pytest.raises(Interrupted), taken():
+    with pytest.raises(Interrupted), deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         with contextlib.suppress(BaseException):
-            check()
+            check_interrupt()
 
 
 def test_work_that_does_not_check_is_interrupted_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.05)
     deadline = time.monotonic() + 30
-    with pytest.raises(Interrupted), taken():
+    with pytest.raises(Interrupted), deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         while time.monotonic() < deadline:
             time.sleep(0.01)
@@ -141,7 +148,7 @@ def test_an_interrupt_that_python_has_to_drop_comes_again_without_a_word(
                 time.sleep(0.01)
 
     hook, deadline = sys.unraisablehook, time.monotonic() + 30
-    with pytest.raises(Interrupted), taken():
+    with pytest.raises(Interrupted), deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         Long()
         while time.monotonic() < deadline:
@@ -151,7 +158,7 @@ def test_an_interrupt_that_python_has_to_drop_comes_again_without_a_word(
 
 
 def test_a_second_signal_after_a_while_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(Interrupted), taken():
+    with pytest.raises(Interrupted), deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
         monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.0)
         os.kill(os.getpid(), signal.SIGINT)
@@ -161,8 +168,8 @@ def test_a_second_signal_after_a_while_does_not_wait(monkeypatch: pytest.MonkeyP
 def test_calls_of_a_library_are_not_interrupted_however_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interrupts, "GRACE_SECONDS", 0.02)
     seen = []
-    with pytest.raises(Interrupted), taken():
-        with kept_back():
+    with pytest.raises(Interrupted), deferring_interrupts():
+        with blocking_interrupts():
             os.kill(os.getpid(), signal.SIGINT)
             until = time.monotonic() + 0.2
             while time.monotonic() < until:
@@ -175,13 +182,13 @@ def test_calls_of_a_library_are_not_interrupted_however_long(monkeypatch: pytest
 
 def test_an_ignored_signal_stays_ignored_and_other_threads_take_none() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with taken():
+    with deferring_interrupts():
         os.kill(os.getpid(), signal.SIGINT)
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not came()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not interrupt_pending()
     handlers = []
 
     def run() -> None:
-        with taken():
+        with deferring_interrupts():
             handlers.append(signal.getsignal(signal.SIGTERM))
 
     before = signal.getsignal(signal.SIGTERM)
@@ -193,16 +200,16 @@ def test_an_ignored_signal_stays_ignored_and_other_threads_take_none() -> None:
 
 def test_a_block_within_a_block_is_part_of_it() -> None:
     seen = []
-    with pytest.raises(Interrupted), taken():
-        with taken():
+    with pytest.raises(Interrupted), deferring_interrupts():
+        with deferring_interrupts():
             os.kill(os.getpid(), signal.SIGINT)
-        seen.append(came())
-        check()
+        seen.append(interrupt_pending())
+        check_interrupt()
     assert seen == [True]
 
 
 def test_a_process_started_by_others_is_not_reached_by_the_terminal() -> None:
     code = "import signal, sys; sys.exit(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
-    with children_ignore():
+    with blocking_sigint():
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 1
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

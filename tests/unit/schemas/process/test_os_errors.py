@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from solidcloud.schemas.errors import SolidcloudError
-from solidcloud.schemas.process.os_errors import check_writable, os_error_line, writing
+from solidcloud.schemas.process.os_errors import check_writable, naming_write_errors, os_error_line
 
 
 def test_the_line_names_the_path_and_no_number():
@@ -22,27 +22,27 @@ def test_writing_names_the_output_and_not_its_temporary_file(tmp_path: Path) -> 
     output = tmp_path / "out.laz"
     with (
         pytest.raises(SolidcloudError, match=r"out\.laz: cannot be written: permission denied: .*choose"),
-        writing(output),
+        naming_write_errors(output),
     ):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".out.laz.71.tmp"))
     with (
         pytest.raises(
             SolidcloudError, match=r"out\.laz: cannot be written: no space left on the disk: make room"
         ),
-        writing(output),
+        naming_write_errors(output),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")
     with (
         pytest.raises(SolidcloudError, match=r"there is no folder .*/no: make it first"),
-        writing(tmp_path / "no" / "out"),
+        naming_write_errors(tmp_path / "no" / "out"),
     ):
         (tmp_path / "no" / "out").write_text("")
 
 
 def test_an_error_about_another_file_stays_what_it_is(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), writing(tmp_path / "out.laz"):
+    with pytest.raises(FileNotFoundError), naming_write_errors(tmp_path / "out.laz"):
         (tmp_path / "in.laz").read_bytes()
-    with pytest.raises(BrokenPipeError), writing(tmp_path / "out.laz"):
+    with pytest.raises(BrokenPipeError), naming_write_errors(tmp_path / "out.laz"):
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
 

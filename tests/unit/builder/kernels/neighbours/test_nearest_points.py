@@ -13,7 +13,7 @@ from solidcloud.builder.kernels.neighbours.nearest_points import (
 )
 from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints
-from solidcloud.schemas.archive.codec import OpenRecord
+from solidcloud.schemas.archive.codec import DecompressedRecord
 
 pytestmark = pytest.mark.interpreted
 interpreted_only = pytest.mark.skipif(
@@ -103,7 +103,7 @@ def test_as_little_is_looked_at_as_ever(kind: str, centers: int, points: int) ->
 
 
 def asked(
-    record: OpenRecord, queries: np.ndarray, best: np.ndarray, homes: np.ndarray | None = None
+    record: DecompressedRecord, queries: np.ndarray, best: np.ndarray, homes: np.ndarray | None = None
 ) -> np.ndarray:
     """What `closest_in_record` makes of best: queries one by one, or with the leaf node of each, a node's together."""
     starts = np.arange(len(queries)) if homes is None else np.flatnonzero(np.diff(homes, prepend=-1))

@@ -6,7 +6,7 @@ from opened_records import open_scan
 from solidcloud.builder.kernels.points.voxel_records import last_loose_node
 from solidcloud.builder.voxel.exact_enclosure import loose_nodes
 from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
-from solidcloud.schemas.archive.codec import OpenRecord
+from solidcloud.schemas.archive.codec import DecompressedRecord
 
 pytestmark = pytest.mark.interpreted
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.interpreted
 class Bounds:
     """The bounds of a record's nodes, to be changed, and what kernel and integers say of them."""
 
-    def __init__(self, record: OpenRecord) -> None:
+    def __init__(self, record: DecompressedRecord) -> None:
         self.voxel, self.links = record.decode()
         self.leaves, self.spheres = leaves_of(record), spheres_of(record)
         self.radius, self.normal = self.spheres.radius.copy(), record.nodes.normal

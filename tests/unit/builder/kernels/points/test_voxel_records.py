@@ -14,7 +14,7 @@ from solidcloud.builder.kernels.points.voxel_records import (
 )
 from solidcloud.builder.voxel.record_points import Taken, hash_limit, leaves_of, taken
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints
-from solidcloud.schemas.archive.codec import OpenRecord
+from solidcloud.schemas.archive.codec import DecompressedRecord
 
 pytestmark = pytest.mark.interpreted
 
@@ -148,7 +148,7 @@ def test_the_places_of_a_record_are_summed(kind: str) -> None:
     assert int(sum_places(leaves_of(record), BASE, SEEDS[1])) == int(content_sum(columns, SEEDS[1]))
 
 
-def spoilt(record: OpenRecord, plane: int, row: int, value: int) -> OpenRecord:
+def spoilt(record: DecompressedRecord, plane: int, row: int, value: int) -> DecompressedRecord:
     """The record with one byte of its points another."""
     planes = record.planes.copy()
     planes[plane, row] = value

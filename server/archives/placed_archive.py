@@ -53,6 +53,7 @@ _MAX_USER_POSES = 8
 # Limits of a user's request, as in kernels/core/pose_transform.py: others will be refused. Margin or
 # reach [m], scale of the avatar.
 _MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
+_FLOAT64 = np.dtype(np.float64)  # compared faster than the type
 _NUMBER = (float, int)  # `float | int` would be made anew for each request
 # Voxels within this distance of a user are prefetched, however far its requests reach [m].
 _USER_REACH = 1.0
@@ -176,7 +177,7 @@ class ArchiveGeneration:
         teleported.
         """
         # Other arguments will be refused, or have no voxels to prefetch.
-        if not isinstance(poses, np.ndarray) or poses.dtype != np.float64 or poses.shape[1:] != (4, 4):
+        if not isinstance(poses, np.ndarray) or poses.dtype != _FLOAT64 or poses.shape[1:] != (4, 4):
             return False
         if not len(poses) or not len(avatar.points):
             return False

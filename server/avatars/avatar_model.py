@@ -21,6 +21,7 @@ class AvatarModel(NamedTuple):
     """Avatar as added.
 
     points: (n, 3) float64, avatar frame [m], as given.  radius: of each point's sphere [m].
+    bounding_radius: of a sphere around all of the avatar's spheres [m].
     arrays: what the kernels read.
     rows: (b, LANES) int32, the row of `points` in each lane of a block.
     digest: `avatar_digest` of an avatar that a client added; empty for one of the scene's own.
@@ -30,12 +31,8 @@ class AvatarModel(NamedTuple):
     radius: float
     arrays: Avatar
     rows: NDArray[np.int32]
+    bounding_radius: float
     digest: bytes = b""
-
-    @property
-    def bounding_radius(self) -> float:
-        """Return the radius of a sphere around all of the avatar's spheres [m]."""
-        return float(self.arrays.radius[0]) + self.radius if len(self.arrays.radius) else 0.0
 
 
 def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
@@ -62,7 +59,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
             np.empty((4, 0)),
             0,
         )
-        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32))
+        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0)
     local = build_local(array, leaf=LANES, degree=DEGREE)
     if radius is None:
         radius = mean_closest_distance(local) / 2
@@ -100,4 +97,5 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
     )
-    return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32))
+    bounding_radius = float(node_radius[0]) + float(radius)
+    return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32), bounding_radius)

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Any, TypeVar
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import ArrayLike
 
 from ...schemas.errors import BadRequestError
@@ -19,13 +20,13 @@ from ..archives.placed_archive import ArchiveGeneration, PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..avatars.client_avatars import Avatars
 from ..observability.request_stats import RequestStats
-from ..queries.context.query_budget import QueryBudget, ask_until_stopped, make_budget
+from ..queries.context.query_budget import EXACT, QueryBudget, make_budget, unknown_answers
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.engines import ENGINES
 from ..queries.objects import SCENE_GROUP
 from ..queries.path import PATH_THREADS, largest_part, path_parts
 from ..runtime.path_threads import PathThreads
-from ..runtime.stop_flag import NO_STOP, StopFlag
+from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import QueryMethods
 
 _A = TypeVar("_A", bound=Cost)
@@ -64,40 +65,53 @@ class SceneQuestions(QueryMethods):
         compared by the rounded figure. Of one another, `objects` are asked in the frame of the
         first archive.
         """
-        given = question.all_arguments(arguments, options)
+        complete = len(arguments) == len(question.arguments)
+        given = arguments if complete else question.all_arguments(arguments, options)
         if question.other_defaults:
             options = question.other_defaults | options
-        if question.whole:
-            return self._ask_objects(question, given, client, options)
-        if not question.about_avatars:
-            return self._ask_vectors(question, given, options)
-        answers: Any = self._ask(question, given, client, options)
-        if question.listed is not None and len(self.archives) > 1:
-            answers = limited(answers, given[question.arguments.index(question.listed[0])])
-        return answers  # type: ignore[no-any-return]
-
-    def _ask(
-        self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
-    ) -> _A:
-        """Ask about an avatar. The last pose of the last poses tells where its user is."""
-        if self._alone is None:
+        if self._alone is None or question.whole:
             return self._ask_placed(question, given, client, options)
-        name, last, engine = given[0], given[len(question.arrays)], ENGINES[question.name]
+        # No transformation and no merging. Every call counts: one pose takes 30 µs in all.
+        rows = given[len(question.arrays) - (not question.about_avatars)]  # of the last array
         with self._alone.take() as opened:
-            data, budget = _terms(opened, **options)
-            avatar = self.avatar(name, client)
-            if opened.record_user((client, name), avatar, last, _around(question, given)):
-                budget = budget._replace(scan=True)
-            answers = ask_until_stopped(
-                question, _count(last), budget, lambda: engine(data, avatar, *given[1:], budget=budget)
-            )
-        self._metrics.answered(client, name, answers)
+            data, budget = _terms(opened, **options) if options else (opened.data, EXACT)
+            user = ("", "")
+            subject: Any = given
+            if question.about_avatars:
+                # The last pose says where the user is.
+                user = client, given[0]
+                avatar = self._avatars.get(given[0], client)
+                around = 0.0 if question.around is None else given[question.around]
+                if opened.record_user(user, avatar, rows, around):
+                    budget = budget._replace(scan=True)
+                subject = avatar, *given[1:]
+            try:
+                answers: _A = ENGINES[question.name](data, *subject, budget=budget)
+            except StoppedError:
+                answers = unknown_answers(question, _count(rows), budget)
+            else:
+                if budget.stop:
+                    answers = structs.replace(answers, stopped=budget.stop.reason)
+        self._metrics.answered(*user, answers)
         return answers
 
     def _ask_placed(
         self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
     ) -> _A:
-        """Ask about an avatar in each archive's own frame; see `_ask`."""
+        """Ask archives at poses, or several; see `ask`."""
+        if question.whole:
+            return self._ask_objects(question, given, client, options)
+        if not question.about_avatars:
+            return self._ask_vectors(question, given, options)
+        answers: Any = self._ask_avatar(question, given, client, options)
+        if question.listed is not None and len(self.archives) > 1:
+            answers = limited(answers, given[question.arguments.index(question.listed[0])])
+        return answers  # type: ignore[no-any-return]
+
+    def _ask_avatar(
+        self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
+    ) -> _A:
+        """Ask about an avatar in each archive's own frame."""
         count, name, engine = len(question.arrays), given[0], ENGINES[question.name]
         avatar, arrays, what = self.avatar(name, client), given[1 : 1 + count], given[1 + count :]
         arrays = tuple(make_poses(each) for each in arrays)
@@ -105,6 +119,8 @@ class SceneQuestions(QueryMethods):
             raise BadRequestError(
                 f"{len(arrays[0])} poses to begin at and {len(arrays[-1])} to end at: expected as many"
             )
+
+        around = 0.0 if question.around is None else given[question.around]
 
         def prepare(archive: PlacedArchive, opened: ArchiveGeneration) -> Prepared:
             own = [archive.poses_in(each) for each in arrays]
@@ -115,7 +131,7 @@ class SceneQuestions(QueryMethods):
                 )
                 return answers
 
-            return ask, opened.record_user((client, name), avatar, own[-1], _around(question, given))
+            return ask, opened.record_user((client, name), avatar, own[-1], around)
 
         answers = ask_each(self.archives, question, len(arrays[0]), prepare, **options)
         self._metrics.answered(client, name, answers)
@@ -123,16 +139,7 @@ class SceneQuestions(QueryMethods):
 
     def _ask_vectors(self, question: Question[_A], given: tuple[Any, ...], options: dict[str, Any]) -> _A:
         """Ask about vectors (k, 3), points or directions."""
-        engine = ENGINES[question.name]
-        if self._alone is not None:
-            with self._alone.take() as opened:
-                data, budget = _terms(opened, **options)
-                found: _A = ask_until_stopped(
-                    question, _count(given[0]), budget, lambda: engine(data, *given, budget=budget)
-                )
-            self._metrics.answered("", "", found)
-            return found
-        names = tuple(question.arrays)
+        engine, names = ENGINES[question.name], tuple(question.arrays)
         arrays, what = given[: len(names)], given[len(names) :]
         arrays = tuple(make_vectors(each, name) for each, name in zip(arrays, names, strict=True))
         if len(arrays[0]) != len(arrays[-1]):
@@ -245,8 +252,3 @@ def _terms(
 def _count(rows: ArrayLike) -> int:
     """Return how many rows an argument has; 0 for one that the question is about to refuse."""
     return len(rows) if isinstance(rows, Sized) else 0
-
-
-def _around(question: Question[Any], given: tuple[Any, ...]) -> float:
-    """Return the margin or reach among a question's arguments [m]; 0 if it has neither."""
-    return 0.0 if question.around is None else given[question.around]

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import structs
 
 from ..archive.radius_model import parse_radius_model
+from ..archive.rigid_pose import gram, rigid_fault
 from ..archive.voxel_grid import MAX_COORDINATE
 from ..errors import BadRequestError
 from ..wire.key_expressions import check_name
@@ -189,7 +190,9 @@ def parse_scene(text: bytes, where: str) -> SceneFile:
     scene = decode(text, SceneFile, where)
     for place, said in _faults(scene):
         raise fault(where, place, said, text)
-    return structs.replace(scene, archives=_rigid(scene.archives), objects=_rigid(scene.objects))
+    return structs.replace(
+        scene, archives=_orthonormalise(scene.archives), objects=_orthonormalise(scene.objects)
+    )
 
 
 def check_scene(scene: SceneFile, where: str) -> None:
@@ -310,40 +313,14 @@ def _position(position: Vector, place: str) -> Iterator[tuple[str, str]]:
 
 def _pose(pose: list[list[float]], place: str) -> Iterator[tuple[str, str]]:
     """Yield the fault of a pose that is not rigid, or that shifts too far."""
-    if pose[3] != [0.0, 0.0, 0.0, 1.0]:
-        yield (
-            f"{place}[3]",
-            f"found {pose[3]}: expected the last row 0 0 0 1: a pose is 4 rows of 4, row-major",
-        )
-        return
-    gram = _gram(pose)
-    off = max(abs(gram[row][column] - (row == column)) for row in range(3) for column in range(3))
-    if not off <= _ALMOST_RIGID:  # false for NaN, too
-        yield (
-            place,
-            f"scales or shears, by {off:.2g}: expected a rotation and a shift, within {_ALMOST_RIGID:g}",
-        )
-    elif _determinant(pose) < 0:
-        yield place, "mirrors: expected a rotation and a shift"
+    fault = rigid_fault(pose, _ALMOST_RIGID)
+    if fault is not None:
+        yield place, fault
     else:
         yield from _position((pose[0][3], pose[1][3], pose[2][3]), place)
 
 
-def _gram(pose: list[list[float]]) -> list[list[float]]:
-    """Return the Gram matrix of the rows of a pose's rotation; the identity for an exact rotation."""
-    return [
-        [sum(a * b for a, b in zip(one[:3], other[:3], strict=True)) for other in pose[:3]]
-        for one in pose[:3]
-    ]
-
-
-def _determinant(pose: list[list[float]]) -> float:
-    """Return the determinant of a pose's rotation."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _) = pose[:3]
-    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-
-
-def _rigid(items: list[Any]) -> list[Any]:
+def _orthonormalise(items: list[Any]) -> list[Any]:
     """Return archives or objects with their rotations orthonormalised to the last digits.
 
     The iteration (3 R - R R' R) / 2 squares the distance of R from the nearest rotation: two steps
@@ -353,11 +330,11 @@ def _rigid(items: list[Any]) -> list[Any]:
     for item in items:
         pose = item.pose
         for _ in range(2):
-            gram = _gram(pose)
-            if all(abs(gram[i][j] - (i == j)) <= _RIGID for i in range(3) for j in range(3)):
+            found = gram(pose)
+            if all(abs(found[i][j] - (i == j)) <= _RIGID for i in range(3) for j in range(3)):
                 break
             pose = [
-                [1.5 * pose[i][j] - 0.5 * sum(gram[i][k] * pose[k][j] for k in range(3)) for j in range(3)]
+                [1.5 * pose[i][j] - 0.5 * sum(found[i][k] * pose[k][j] for k in range(3)) for j in range(3)]
                 + [pose[i][3]]
                 for i in range(3)
             ] + [pose[3]]

@@ -1,47 +1,34 @@
-"""An archive that lies at a pose in the world: points carried out to the world, poses carried in to the archive.
+"""Transforms between the world and the frame of an archive that has a pose.
 
-Every sum is of four float64 products in one order, so that all who carry a point get the same bits.
+All sums are of float64 products in one order, so that every caller gets the same bits.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...schemas.archive.voxel_grid import MAX_COORDINATE
-from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.archive.rigid_pose import RIGID_TOLERANCE, rigid_pose
 
 Pose = NDArray[np.float64]  # (4, 4), archive to world
 
-# How far a pose may be from rigid: that of kernels/core/pose_transform.py, which an avatar's pose
-# and this one share between them.
-RIGID_WITHIN = 5e-10
+# How far the pose of an archive may be from rigid: half of what an avatar's pose may be
+# (kernels/core/pose_transform.py). A query's pose in the archive's frame is off by both.
+_TOLERANCE = RIGID_TOLERANCE / 2
 
 
 def archive_pose(pose: ArrayLike | None, where: str = "pose of the archive") -> Pose | None:
-    """The pose (4, 4) of an archive, archive to world; None for one at the identity.
+    """Return the pose (4, 4) of an archive, archive to world; None for the identity.
 
-    Raises BadRequestError, BadTransformError for what is not rigid. where: for messages.
+    where: for messages. Raises BadRequestError or BadTransformError unless the pose is rigid.
     """
-    if pose is None:
-        return None
-    found = np.array(pose, np.float64)
-    if found.shape != (4, 4):
-        raise BadRequestError(f"{where}: shape {found.shape}: expected (4, 4), archive to world")
-    if not np.isfinite(found).all() or np.abs(found[:3, 3]).max() > MAX_COORDINATE:
-        raise BadRequestError(f"{where}: expected finite numbers, and a translation within 1e9 m")
-    if np.array_equal(found, np.eye(4)):
-        return None
-    turn = found[:3, :3]
-    off = float(np.abs(turn @ turn.T - np.eye(3)).max())
-    if off > RIGID_WITHIN or np.linalg.det(turn) < 0 or not np.array_equal(found[3], [0, 0, 0, 1]):
-        raise BadTransformError(
-            f"{where}: not rigid (off by {off:g}): expected a rotation and a translation, last row 0 0 0 1: an archive "
-            "is neither scaled nor mirrored"
-        )
-    return found
+    found = None if pose is None else rigid_pose(pose, where, _TOLERANCE)
+    return None if found is None or np.array_equal(found, np.eye(4)) else found
 
 
 def inverse_of(pose: Pose) -> Pose:
-    """World to archive, of a rigid pose: transposed, which is exact; the translation rounded as `to_world` rounds."""
+    """Return the inverse of a rigid pose, world to archive.
+
+    The rotation is transposed, which is exact; the translation is rounded as by `moved`.
+    """
     found = np.eye(4)
     found[:3, :3] = pose[:3, :3].T
     found[:3, 3] = -turned(found, pose[None, :3, 3])[0]
@@ -50,18 +37,18 @@ def inverse_of(pose: Pose) -> Pose:
 
 
 def turned(pose: Pose, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors (n, 3) turned by a pose, not moved."""
+    """Return vectors (n, 3) rotated by a pose."""
     x, y, z = vectors.T
     return np.stack([(m[0] * x + m[1] * y) + m[2] * z for m in pose[:3]], axis=1)
 
 
 def moved(pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (n, 3) carried by a pose: ((m0 x + m1 y) + m2 z) + m3."""
+    """Return points (n, 3) transformed by a pose: ((m0 x + m1 y) + m2 z) + m3."""
     return np.asarray(turned(pose, points) + pose[:3, 3])
 
 
 def under(pose: Pose, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses (k, 4, 4) followed by a pose: pose @ poses. What makes them no poses, such as a last row, stays."""
+    """Return pose @ poses for poses (k, 4, 4). Faults of theirs, such as a last row, are kept."""
     found = poses.copy()
     for column in range(4):
         carry = moved if column == 3 else turned
@@ -72,7 +59,7 @@ def under(pose: Pose, poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def moved_boxes(
     pose: Pose, low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The boxes low, high (n, 3) around the eight corners of each of the boxes low, high (n, 3) carried by a pose."""
+    """Return the boxes low, high (n, 3) around the eight corners of each box low, high (n, 3), transformed."""
     chosen = [[(low, high)[i >> k & 1][:, k] for k in range(3)] for i in range(8)]
     corners = np.array([moved(pose, np.stack(corner, axis=1)) for corner in chosen])
     return corners.min(axis=0), corners.max(axis=0)

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ...schemas.archive.rigid_pose import check_rigid
 from ...schemas.errors import (
     BadRequestError,
-    BadTransformError,
     BusyError,
     ExpiredError,
     InternalError,
@@ -49,7 +49,6 @@ SILENT_SECONDS = 30.0
 # A longer pause is not one frame: a viewer that stood still continues as after a pause [s].
 LONGEST_FRAME = 0.1
 # Tolerance of the check that a pose is rigid (NUMERICS.md N6).
-_RIGID = 1e-9
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
 
@@ -315,25 +314,6 @@ class Simulation:
         if self._recorder is not None:
             with self._frame:
                 self._recorder.reloaded(generation)
-
-
-def check_rigid(pose: Pose, what: str) -> Pose:
-    """Return the pose. Raises BadTransformError unless it is a rotation and a translation."""
-    # With Python's floats: for one pose this takes a fifth of numpy's time.
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), last = pose.tolist()
-    if last != [0.0, 0.0, 0.0, 1.0]:
-        raise BadTransformError(f"{what} has a last row that is not 0 0 0 1: give a row-major 4x4 pose")
-    off = max(
-        abs(a * a + b * b + c * c - 1), abs(d * d + e * e + f * f - 1), abs(g * g + h * h + i * i - 1),
-        abs(a * d + b * e + c * f), abs(a * g + b * h + c * i), abs(d * g + e * h + f * i),
-    )  # fmt: skip
-    mirrored = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0
-    if not off <= _RIGID or mirrored:
-        raise BadTransformError(
-            f"{what} {'mirrors' if mirrored else f'is not rigid (off by {off:g})'}: expected a rotation, within 1e-9, "
-            "and a translation: renormalise it"
-        )
-    return pose
 
 
 def frame_seconds(command: Wish, before: float | None) -> float:

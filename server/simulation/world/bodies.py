@@ -12,16 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.archive.rigid_pose import rigid_pose
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.errors import BadRequestError, BadTransformError
+from ....schemas.errors import BadRequestError
 from ....schemas.kernels.normal_codes import NONE, decode_normal, normal_code
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies.body_pairs import CONTACT, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
 from ...kernels.bodies.near_bodies import bound_body
-from ...kernels.core.pose_transform import MAX_REACH_UNITS, SIMILARITY_TOLERANCE
+from ...kernels.core.pose_transform import MAX_REACH_UNITS
 from ...kernels.core.stop_flag_checks import NO_LIMIT
-from ...queries.context.query_context import kernel_poses, to_units
+from ...queries.context.query_context import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Pose, Vec
 from .vectors import horizontal, rotate, rotate_back
@@ -184,7 +185,7 @@ class Bodies:
     def add_object(self, name: str, model: AvatarModel, pose: Pose, *, pushed: bool) -> None:
         """Add an object at its initial pose; BadTransformError unless the pose is rigid."""
         with self.lock:
-            self._add(name, PUSHED if pushed else KINEMATIC, model, _checked(name, pose))
+            self._add(name, PUSHED if pushed else KINEMATIC, model, rigid_pose(pose, f"object {name!r}"))
 
     def row_of(self, name: str, *, user: bool) -> int:
         """Return the row of a user or an object, or -1."""
@@ -263,7 +264,10 @@ class Bodies:
         """
         with self.lock:
             self.begin()
-            checked = [(self._kinematic_row(name), _checked(name, poses[name])) for name in sorted(poses)]
+            checked = [
+                (self._kinematic_row(name), rigid_pose(poses[name], f"object {name!r}"))
+                for name in sorted(poses)
+            ]
             came_from, stood = dict(self._came_from), [(row, self.poses[row].copy()) for row, _ in checked]
             for (row, pose), (_, before) in zip(checked, stood, strict=True):
                 self._put(row, pose)
@@ -344,23 +348,3 @@ class Bodies:
             )  # fmt: skip
             found[at] = verdict == CONTACT
         return found
-
-
-def _checked(name: str, pose: Sequence[Sequence[float]] | Pose) -> Pose:
-    """Return the pose (4, 4) of an object; raise an error unless it is rigid.
-
-    Raises BadRequestError or BadTransformError.
-    """
-    array = np.array(pose, np.float64)
-    if array.shape != (4, 4):
-        raise BadRequestError(f"object {name!r}: pose of shape {array.shape}: expected 4 rows of 4 numbers")
-    array = kernel_poses(array[None])[0]
-    if not np.isfinite(array).all() or np.abs(array[:3, 3]).max() > 1e9:
-        raise BadRequestError(f"object {name!r}: expected finite numbers, and a position within 1e9 m")
-    off = float(np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max())
-    if array[3].tolist() != [0, 0, 0, 1] or off > SIMILARITY_TOLERANCE or np.linalg.det(array[:3, :3]) < 0:
-        raise BadTransformError(
-            f"object {name!r}: its pose is not rigid (off by {off:g}): expected a row-major 4x4 pose, a rotation and a "
-            "translation, within 1e-9"
-        )
-    return array

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from solidcloud.schemas.archive.rigid_pose import check_rigid
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.scene.scene_file import Spawn
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, MoveRequest, Wish
 from solidcloud.server.simulation.simulation import (
     LONGEST_FRAME,
-    check_rigid,
     first_pose,
     frame_seconds,
     spawn_pose,
@@ -96,6 +96,7 @@ def test_users_begin_at_the_spawn_or_where_they_say():
         (lambda pose: pose.__setitem__((0, 1), 1e-8), "not rigid"),
         (lambda pose: pose.__setitem__((2, 2), -1.0), "mirrors"),
         (lambda pose: pose.__setitem__((slice(3), slice(3)), 0.0), "not rigid"),
+        (lambda pose: pose.__setitem__((1, 1), np.nan), "off by nan"),
     ],
 )
 def test_what_is_not_rigid_is_refused(change, said):

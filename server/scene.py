@@ -25,7 +25,7 @@ from .runtime.stop_flag import NO_STOP, StopFlag
 from .scene_interface import EVERYBODY, AvatarLimits
 from .scenes.scene_archives import (
     ReadPoints,
-    at_place,
+    error_location,
     find_archives,
     is_scene_file,
     open_archives,
@@ -134,7 +134,7 @@ class Scene(SceneQuestions):
             archives = open_archives(file, path, name, found, budget_bytes, policy, metrics.loaded)
             for archive in archives:
                 stack.callback(archive.close)
-            with at_place(path, "$.effects"):
+            with error_location(path, "$.effects"):
                 scene = cls(archives, name, metrics, file, own)
                 scene._simulation = make_simulation(scene, file)
             stack.pop_all()

@@ -18,8 +18,8 @@ from ..archive.rigid_pose import gram, rigid_fault
 from ..archive.voxel_grid import MAX_COORDINATE
 from ..errors import BadRequestError
 from ..wire.key_expressions import check_name
-from .effect_options import AnyEffect, Stop, Through, Vector
-from .toml_faults import MOST_BYTES, decode, fault, nearest, shown
+from .effect_table import AnyEffect, Stop, Through, Vector, effect_name
+from .toml_faults import MAX_BYTES, decode, fault, nearest, shown
 
 SUFFIX = ".toml"
 FORMAT = 1
@@ -96,7 +96,7 @@ class Spawn(_Part, frozen=True):
     heading: float = 0.0
 
 
-class Limits(_Part, frozen=True):
+class SceneLimits(_Part, frozen=True):
     """Limits of a scene's cost.
 
     users: at the same time.
@@ -129,18 +129,13 @@ class SceneFile(_Part, frozen=True):
     avatars: list[AvatarItem] = []
     objects: list[ObjectItem] = []
     spawn: Spawn | None = None
-    limits: Limits = Limits()
+    limits: SceneLimits = SceneLimits()
     effects: list[AnyEffect] = msgspec.field(default_factory=lambda: [Stop()])
 
 
 def scene_of(archive: str) -> SceneFile:
     """Return the scene of an archive without a file: the archive and `stop`."""
     return SceneFile(format=1, archives=[ArchiveItem(path=archive)])
-
-
-def effect_name(effect: AnyEffect) -> str:
-    """Return the name of an effect in the file and in answers."""
-    return str(type(effect).__struct_config__.tag)
 
 
 def up_of(scene: SceneFile) -> Vector:
@@ -174,7 +169,7 @@ def read_scene(path: Path) -> SceneFile:
         )
     try:
         with open(path, "rb") as file:
-            text = file.read(MOST_BYTES + 1)  # limits the read if a scan was given by mistake
+            text = file.read(MAX_BYTES + 1)  # limits the read if a scan was given by mistake
     except OSError as error:
         raise BadRequestError(
             f"{path}: {error.strerror}: expected a scene file: make one with: solidcloud scene new"

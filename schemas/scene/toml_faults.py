@@ -21,7 +21,7 @@ from ..errors import BadRequestError
 _T = TypeVar("_T")
 
 # Largest file [bytes]. A scene of a thousand objects with poses takes 300 KB.
-MOST_BYTES = 4 << 20
+MAX_BYTES = 4 << 20
 
 _PLACE = re.compile(r" - at `(?:key in )?(\$[^`]*)`$")
 _TOKEN = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
@@ -29,7 +29,7 @@ _FIELD = re.compile(r"^Object (contains unknown|missing required) field `([^`]*)
 _LONGEST_SHOWN = 60
 # TOML's integers have 64 bits. Python's are unlimited, and Python refuses to print more than 4,300
 # digits.
-_MOST_BITS = 63
+_MAX_BITS = 63
 # Tokens that decide where a statement ends: brackets and line ends. Strings and comments match
 # first, so that those inside them do not count.
 _MARKS = re.compile(
@@ -50,8 +50,8 @@ def decode(text: bytes, kind: type[_T], where: str) -> _T:
     try:
         for place, value in _numbers(data, "$"):
             if isinstance(value, int):
-                if value.bit_length() > _MOST_BITS:
-                    said = f"found an integer of {value.bit_length():,} bits: expected at most {_MOST_BITS}"
+                if value.bit_length() > _MAX_BITS:
+                    said = f"found an integer of {value.bit_length():,} bits: expected at most {_MAX_BITS}"
                     raise fault(where, place, said, text)
             elif not math.isfinite(value):
                 raise fault(where, place, f"found {shown(value)}: expected a finite number", text)
@@ -65,8 +65,8 @@ def decode(text: bytes, kind: type[_T], where: str) -> _T:
 
 def load(text: bytes, where: str) -> dict[str, Any]:
     """Parse a TOML file. Raises BadRequestError with line and column."""
-    if len(text) > MOST_BYTES:
-        raise BadRequestError(f"{where}: more than {MOST_BYTES:,} bytes: expected a scene file")
+    if len(text) > MAX_BYTES:
+        raise BadRequestError(f"{where}: more than {MAX_BYTES:,} bytes: expected a scene file")
     try:
         return tomllib.loads(_decoded(text))
     except UnicodeDecodeError as error:

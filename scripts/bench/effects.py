@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_options import (
+from solidcloud.schemas.scene.effect_table import (
     AnyEffect,
     Contacts,
     Crowd,
@@ -21,8 +21,9 @@ from solidcloud.schemas.scene.effect_options import (
     Through,
     ThroughBox,
     Uncertainty,
+    effect_name,
 )
-from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile, effect_name
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.scene import Scene

@@ -7,8 +7,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from solidcloud.schemas.scene.effect_options import Crowd
-from solidcloud.schemas.scene.scene_file import effect_name
+from solidcloud.schemas.scene.effect_table import Crowd, effect_name
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.through_effect import store_without

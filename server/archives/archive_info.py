@@ -6,8 +6,8 @@ import numpy as np
 from msgspec import structs
 
 from ...schemas.archive.index import Header
-from ...schemas.scene.effect_order import ORDER
-from ...schemas.scene.scene_file import SceneFile, effect_name, up_of
+from ...schemas.scene.effect_table import ORDER, effect_name
+from ...schemas.scene.scene_file import SceneFile, up_of
 from ...schemas.wire.messages import (
     WIRE_VERSION,
     AvatarInfo,

@@ -28,7 +28,7 @@ from .commands import replay_command as replay
 from .commands import scene_command as scene
 from .commands import serve_command as serve
 from .commands import top_command as top
-from .commands.command_options import complain
+from .commands.command_options import print_error
 
 # Rich markup is off: importing it doubles the time of --help, to more than the 0.3 s allowed.
 app = typer.Typer(
@@ -93,11 +93,11 @@ def run(arguments: Sequence[str]) -> int:
         with contextlib.nullcontext() if name.split()[-1] in WAITING else deferring_interrupts():
             return _run(command, name, rest)
     except SolidcloudError as error:
-        return complain(str(error), error.exit_code)
+        return print_error(str(error), error.exit_code)
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "solidcloud"
-        return complain(
+        return print_error(
             f"{error.format_message().rstrip('.')}: see {command} --help", BadRequestError.exit_code
         )
     except (KeyboardInterrupt, typer.Abort) as error:
@@ -109,9 +109,9 @@ def run(arguments: Sequence[str]) -> int:
         sys.stdout = None
         return 1
     except OSError as error:
-        return complain(os_error_line(error), 1)
+        return print_error(os_error_line(error), 1)
     except MemoryError as error:
-        return complain(f"out of memory{f' ({error})' if str(error) else ''}: close other programs", 1)
+        return print_error(f"out of memory{f' ({error})' if str(error) else ''}: close other programs", 1)
 
 
 def _run(command: Any, name: str, arguments: list[str]) -> int:

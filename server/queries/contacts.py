@@ -55,14 +55,14 @@ from .context.signed_distance import signed_from_square
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
 # columns temporarily takes some three times as much. The wire's largest message holds an eighth.
-MOST_BYTES = 256 << 20
+MAX_BYTES = 256 << 20
 # Node visits between two checks of the clock, about a millisecond; and, without a deadline, between
 # two checks of the size of the lists.
 SLICE_VISITS = 1 << 15
 SIZE_VISITS = 1 << 19
 # Initial capacity in cells, a power of two and at least LANES. A kernel doubles it as needed, up to
-# MOST_CELLS, which take 200 MB.
-FIRST_CELLS, MOST_CELLS = 256, 1 << 20
+# MAX_CELLS, which take 200 MB.
+FIRST_CELLS, MAX_CELLS = 256, 1 << 20
 
 
 def contacts(
@@ -106,7 +106,7 @@ def contacts(
     memory = _empty_memory(limit)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        asked = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MOST_CELLS)
+        asked = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MAX_CELLS)
         parts = list(pieces(reach, data.residency, budget.share, budget.stop))
         for number, (which, rows, part) in enumerate(parts):
             # A pose that is split over several pieces is alone in each, and the pieces are
@@ -187,15 +187,15 @@ def _gather(
 
 def _check_room(memory: ContactState) -> None:
     """Raise TooLargeError if the lists or the cells touched by a pose exceed their limits."""
-    if memory.sizes[CELLS] + LANES > MOST_CELLS:
+    if memory.sizes[CELLS] + LANES > MAX_CELLS:
         raise TooLargeError(
-            f"a pose touches {memory.sizes[CELLS]} cells or more: at most {MOST_CELLS - LANES}: ask for "
+            f"a pose touches {memory.sizes[CELLS]} cells or more: at most {MAX_CELLS - LANES}: ask for "
             "a larger cluster_distance"
         )
     pairs, clusters = int(memory.sizes[LISTED]), int(memory.sizes[CLUSTERS])
-    if 8 * (pairs * RECORD + clusters * CLUSTER) > MOST_BYTES:
+    if 8 * (pairs * RECORD + clusters * CLUSTER) > MAX_BYTES:
         raise TooLargeError(
-            f"{pairs} pairs and {clusters} clusters listed, more than the {MOST_BYTES >> 20} MiB of a request: ask for "
+            f"{pairs} pairs and {clusters} clusters listed, more than the {MAX_BYTES >> 20} MiB of a request: ask for "
             "fewer poses, a smaller limit or a larger cluster_distance"
         )
 

@@ -17,7 +17,7 @@ from ...schemas.archive.normal_reach import NORMAL_REACH
 from ...schemas.archive.radius_model import class_radii
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.scene.effect_options import Crowd, Ground, Objects, Slide, Through, Uncertainty
+from ...schemas.scene.effect_table import Crowd, Ground, Objects, Slide, Through, Uncertainty
 from ...schemas.scene.scene_file import SUFFIX, SceneFile
 from ...schemas.wire.messages import AvatarInfo, SceneInfo
 from ..archives.archive_info import describe
@@ -29,12 +29,12 @@ from ..residency.voxel_store import OpenStore, VoxelStore
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/effects/bodies.py).
-MOST_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
+MAX_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
 
-class Found(NamedTuple):
+class FoundArchive(NamedTuple):
     """One archive of a scene.
 
     info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
@@ -62,7 +62,7 @@ def is_scene_file(path: Path) -> bool:
     return path.suffix == SUFFIX and not path.is_dir()
 
 
-def find_archives(file: SceneFile, path: Path) -> list[Found]:
+def find_archives(file: SceneFile, path: Path) -> list[FoundArchive]:
     """Return the archives that a scene file names, after checking their indexes.
 
     Also checks that each archive stores what the scene file requires.
@@ -71,16 +71,16 @@ def find_archives(file: SceneFile, path: Path) -> list[Found]:
     """
     found = []
     for number, item in enumerate(file.archives):
-        with at_place(path, f"$.archives[{number}].path"):
-            store = VoxelStore(_beside(path, item.path), normals=normals_asked(file))
+        with error_location(path, f"$.archives[{number}].path"):
+            store = VoxelStore(_resolve_relative(path, item.path), normals=normals_asked(file))
         try:
             header = store.archive.header
             if file.radius_model is not None:
-                with at_place(path, f"$.radius_model: {store.archive.folder}"):
+                with error_location(path, f"$.radius_model: {store.archive.folder}"):
                     class_radii(file.radius_model, header.radius, header.models)
             info = describe(store, store.archive.folder.name)
             found.append(
-                Found(store.archive.folder, info, store.sizes, header.scan_index, header.normal_reach)
+                FoundArchive(store.archive.folder, info, store.sizes, header.scan_index, header.normal_reach)
             )
         finally:
             store.close()
@@ -96,14 +96,14 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[F
     found = []
     meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
-        avatar_file = _beside(path, item.file)
-        with at_place(path, f"$.avatars[{number}].file"):
+        avatar_file = _resolve_relative(path, item.file)
+        with error_location(path, f"$.avatars[{number}].file"):
             points = read_points(avatar_file)
-        with at_place(path, f"$.avatars[{number}]"):
+        with error_location(path, f"$.avatars[{number}]"):
             model = make_avatar(points, item.radius)
-            if meet and model.radius > MOST_BODY_RADIUS:
+            if meet and model.radius > MAX_BODY_RADIUS:
                 raise BadRequestError(
-                    f"avatar radius {model.radius:g} m: expected at most {MOST_BODY_RADIUS:g} m with the effect "
+                    f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "
                     "`objects` or `crowd`, under which avatars collide with others"
                 )
         info = AvatarInfo(item.name, len(points), model.radius, model.bounding_radius)
@@ -159,7 +159,7 @@ def open_archives(
     file: SceneFile,
     path: Path,
     name: str,
-    found: list[Found],
+    found: list[FoundArchive],
     budget_bytes: int,
     policy: str,
     took: Callable[[float], None],
@@ -170,12 +170,12 @@ def open_archives(
     policy, see eviction.py.  took: called with the duration of each voxel load [s].
     Raises the errors of opening, with the place in the scene file; then none stays open.
     """
-    with at_place(path, "$.archives"):
+    with error_location(path, "$.archives"):
         budgets = share_budget(budget_bytes, [each.sizes for each in found])
     opened: list[PlacedArchive] = []
     with ExitStack() as stack:
         for number, (each, budget, item) in enumerate(zip(found, budgets, file.archives, strict=True)):
-            with at_place(path, f"$.archives[{number}]"):
+            with error_location(path, f"$.archives[{number}]"):
                 archive = PlacedArchive.open(
                     each.folder,
                     name,
@@ -192,7 +192,7 @@ def open_archives(
     return opened
 
 
-def _beside(path: Path, named: str) -> Path:
+def _resolve_relative(path: Path, named: str) -> Path:
     """Return a path that a scene file names, which is relative to the file's folder.
 
     Links in it are not resolved here. They are followed at each opening, and a reload finds their
@@ -204,19 +204,19 @@ def _beside(path: Path, named: str) -> Path:
     return folder / there
 
 
-def _check_noise(file: SceneFile, path: Path, found: list[Found]) -> None:
+def _check_noise(file: SceneFile, path: Path, found: list[FoundArchive]) -> None:
     """Raise BadRequestError if the effect `uncertainty` gives noise for an unknown scan."""
     for number, effect in enumerate(file.effects):
         if isinstance(effect, Uncertainty):
             from ..simulation.effects.uncertainty_effect import check
 
             sources = [source for each in found for source in each.info.sources]
-            with at_place(path, f"$.effects[{number}]"):
+            with error_location(path, f"$.effects[{number}]"):
                 check(effect, structs.replace(found[0].info, sources=sources))
 
 
 @contextmanager
-def at_place(path: Path, place: str) -> Iterator[None]:
+def error_location(path: Path, place: str) -> Iterator[None]:
     """Prefix errors raised in this block with the scene file and the place in it."""
     try:
         yield

@@ -48,7 +48,6 @@ log = logging.getLogger(__name__)
 SILENT_SECONDS = 30.0
 # A longer pause is not one frame: a viewer that stood still continues as after a pause [s].
 LONGEST_FRAME = 0.1
-# Tolerance of the check that a pose is rigid (NUMERICS.md N6).
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
 

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
-from solidcloud.schemas.scene.scene_file import Limits, SceneFile, scene_of
+from solidcloud.schemas.scene.scene_file import SceneFile, SceneLimits, scene_of
 from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
@@ -79,7 +79,9 @@ class FloorPipeline:
 def floor_simulation(name="floor", users=64, **fields):
     """A simulation of the floor, with a stand-in for its effects; its `scene` has it as its own."""
     scene = FloorScene(name)
-    scene.file = SceneFile(format=1, archives=scene_of(name).archives, limits=Limits(users=users), **fields)
+    scene.file = SceneFile(
+        format=1, archives=scene_of(name).archives, limits=SceneLimits(users=users), **fields
+    )
     scene.simulation = Simulation(scene, scene.file, FloorPipeline())
     return scene.simulation
 

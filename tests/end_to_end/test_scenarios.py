@@ -18,7 +18,7 @@ from solidcloud.builder.synthetic.truth import FacadeTruth
 from solidcloud.schemas.wire.answers import Verdict
 
 POINTS = 300_000
-# Feet are held so far above the ground (schemas/scene/effect_options.py, `Ground.clearance`).
+# Feet are held so far above the ground (schemas/scene/effect_table.py, `Ground.clearance`).
 FEET = 0.03
 # The scan's noise and half its spacing, with the spheres of both sides: how far from a true surface a body may stop.
 NEAR = 0.08

@@ -11,16 +11,7 @@ import archive_cases
 import numpy as np
 import pytest
 from floor import DEADLINE, eventually
-from solidcloud.schemas.scene.effect_options import (
-    Contacts,
-    Crowd,
-    Ground,
-    Proximity,
-    Slide,
-    Step,
-    Stop,
-    Sweep,
-)
+from solidcloud.schemas.scene.effect_table import Contacts, Crowd, Ground, Proximity, Slide, Step, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import SceneFile, scene_of
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.key_expressions import User

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import same_answers
 import synthetic_scans
-from solidcloud.schemas.scene.effect_order import ORDER
+from solidcloud.schemas.scene.effect_table import ORDER
 from solidcloud.schemas.scene.scene_file import SceneFile
 from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, encode
 from solidcloud.server.scene import Scene

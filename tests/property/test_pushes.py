@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from effect_rooms import INTERPRETED, Play, play
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_options import AnyEffect, Ground, Slide, Step, Stop, Sweep
+from solidcloud.schemas.scene.effect_table import AnyEffect, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.simulation.world.frame import Body
 

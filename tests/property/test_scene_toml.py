@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene.effect_options import Ground, Objects, Slide, Stop
+from solidcloud.schemas.scene.effect_table import Ground, Objects, Slide, Stop
 from solidcloud.schemas.scene.scene_file import SceneFile, check_scene, parse_scene
 from solidcloud.schemas.scene.toml_faults import decode
 from solidcloud.server.cli.scene_files.scene_text import toml_value

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import archive_cases
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_options import AnyEffect
-from solidcloud.schemas.scene.scene_file import ArchiveItem, Limits, SceneFile
+from solidcloud.schemas.scene.effect_table import AnyEffect
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile, SceneLimits
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.scene import Scene
@@ -96,14 +96,16 @@ class Play(NamedTuple):
 
 
 @contextmanager
-def play(archive: Path, *effects: AnyEffect, limits: Limits | None = None, **options: Any) -> Iterator[Play]:
+def play(
+    archive: Path, *effects: AnyEffect, limits: SceneLimits | None = None, **options: Any
+) -> Iterator[Play]:
     """An archive opened, with effects."""
     how = {name: options.pop(name) for name in ("up", "radius_model") if name in options}
     file = SceneFile(
         format=1,
         archives=[ArchiveItem(path=str(archive))],
         effects=list(effects),
-        limits=limits or Limits(),
+        limits=limits or SceneLimits(),
         **how,
     )
     with Scene.open(archive, **options) as scene:

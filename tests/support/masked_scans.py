@@ -11,7 +11,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.scene.effect_options import Through, ThroughBox
+from solidcloud.schemas.scene.effect_table import Through, ThroughBox
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.through_effect import store_without
 

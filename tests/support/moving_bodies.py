@@ -10,7 +10,7 @@ import archive_cases
 import naive
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_options import AnyEffect
+from solidcloud.schemas.scene.effect_table import AnyEffect
 from solidcloud.schemas.scene.scene_file import ArchiveItem, AvatarItem, ObjectItem, SceneFile
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, complain, print_json
+from .command_options import ArchivePath, AsJson, print_error, print_json
 
 
 def info(archive: ArchivePath, as_json: AsJson = False) -> None:
@@ -63,5 +63,5 @@ def validate(
         for note in report.notes:
             print(f"note: {note}")
     for fault in report.faults:
-        complain(fault, 3)
+        print_error(fault, 3)
     raise typer.Exit(3 if report.faults else 0)

@@ -44,7 +44,7 @@ def needs_extra(name: str) -> Iterator[None]:
         ) from None
 
 
-def complain(message: str, code: int) -> int:
+def print_error(message: str, code: int) -> int:
     """Print an error on standard error and return the exit code.
 
     The message becomes one line; only indented lines, as in lists, stay on lines of their own.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, complain, print_json
+from .command_options import AsJson, print_error, print_json
 from .interruptible import interruptible
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def inspect(
             print(f"warning: {entry.warning}", file=sys.stderr)
     faults = [entry.fault for entry in entries if entry.fault]
     for fault in faults:
-        complain(fault, 3)
+        print_error(fault, 3)
     raise typer.Exit(3 if faults else 0)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, KeyFile, complain, print_json
+from .command_options import AsJson, KeyFile, print_error, print_json
 
 if TYPE_CHECKING:
     from ...client import Client
@@ -132,7 +132,9 @@ def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) ->
     Returns the exit code.
     """
     if client.unanswered:
-        return complain(f"{client.unanswered} of {asked} {word} were not answered: {client.silence(op)}", 1)
+        return print_error(
+            f"{client.unanswered} of {asked} {word} were not answered: {client.silence(op)}", 1
+        )
     if line:
         print(f"warning: {line}", file=sys.stderr)
     return 0

@@ -15,7 +15,7 @@ from ....schemas.wire.motion_messages import LONGEST_SECONDS, Moved
 from ....schemas.wire.questions import OBJECTS, QUESTIONS, Question, path_questions
 from ....schemas.wire.requests import QuestionRequest
 from .pose_file import read_objects, read_poses, read_rays
-from .scan_bounds import Bodies, Places, Points, Rays, box_of
+from .scan_bounds import BodyPlaces, Places, PointPlaces, RayPlaces, box_of
 
 # Files that give arguments of questions: option of each.
 _FILES = {
@@ -30,12 +30,12 @@ _FILES = {
 }
 # Options that are not sent as parameters.
 _NOT_SENT = frozenset({*_FILES.values(), "radius", "along"})
-_OF_ALL = QuestionRequest.__struct_fields__
+_COMMON_OPTIONS = QuestionRequest.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 
 
-class Asker(Protocol):
+class QueryTarget(Protocol):
     """A `Client` or a `Scene`."""
 
     def add_avatar(self, *what: Any) -> Any: ...
@@ -44,7 +44,7 @@ class Asker(Protocol):
     def move(self, *what: Any) -> Moved: ...
 
 
-class Asked(NamedTuple):
+class AnswerPart(NamedTuple):
     """Answers to a query or to a part of it.
 
     labels: description of the item of each answer.  times: of each item [s], if it is a pose or
@@ -89,10 +89,10 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
         if along not in path_questions():
             raise BadRequestError(f"--along {along}: expected one of {', '.join(path_questions())}")
         needed, others = _options(QUESTIONS[along])
-        others = (*others, "along", *_OF_ALL)
+        others = (*others, "along", *_COMMON_OPTIONS)
     else:
         needed, others = _options(QUESTIONS[op])
-        others = (*others, *_OF_ALL)
+        others = (*others, *_COMMON_OPTIONS)
     takes = ", ".join(map(_option, (*needed, *others)))
     for name in given:
         if name not in (*needed, *others):
@@ -112,7 +112,7 @@ def _options(question: Question[Any]) -> tuple[tuple[str, ...], tuple[str, ...]]
     return needed, (*radius, *(name for name in parameters if name not in question.required))
 
 
-def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
+def ask(scene: QueryTarget, query: Query, read_points: ReadPoints) -> Iterator[AnswerPart]:
     """Make a query and yield its answers at once, or in parts for a path.
 
     read_points: returns the points (n, 3) of a file [m].
@@ -128,8 +128,8 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
         what = read_rays(given["rays"]) if rays else (read_points(given["points"]),)
         answers = scene.ask(question, *what, **parameters)
         labels = [f"{'ray' if rays else 'point'} {number}" for number in range(len(answers))]
-        kind: Any = Rays if rays else Points
-        yield Asked(labels, [], answers, kind(*what, given.get("reach", 0.0)))
+        kind: Any = RayPlaces if rays else PointPlaces
+        yield AnswerPart(labels, [], answers, kind(*what, given.get("reach", 0.0)))
         return
     moving = question.moving
     times, poses = read_poses(given["poses"])
@@ -138,14 +138,14 @@ def ask(scene: Asker, query: Query, read_points: ReadPoints) -> Iterator[Asked]:
     if query.op == "path":
         for part in scene.path("avatar", poses, question.name, **parameters):
             which = slice(part.first, part.first + len(part))
-            yield Asked(labels[which], begins[which], without_part(part), places)
+            yield AnswerPart(labels[which], begins[which], without_part(part), places)
     else:
         ends = (poses[:-1], poses[1:]) if moving else (poses,)
-        yield Asked(labels, begins, scene.ask(question, "avatar", *ends, **parameters), places)
+        yield AnswerPart(labels, begins, scene.ask(question, "avatar", *ends, **parameters), places)
 
 
 def ask_moves(
-    scene: Asker, query: Query, read_points: ReadPoints
+    scene: QueryTarget, query: Query, read_points: ReadPoints
 ) -> tuple[Places, Iterator[tuple[str, Moved]]]:
     """Simulate one frame from each pose towards the next; frames do not depend on one another.
 
@@ -164,27 +164,27 @@ def ask_moves(
     return places, frames()
 
 
-def joined(found: list[Asked]) -> Asked:
+def joined(found: list[AnswerPart]) -> AnswerPart:
     """Join the parts of one query's answers."""
     labels = [label for part in found for label in part.labels]
     times = [time for part in found for time in part.times]
-    return Asked(labels, times, join([part.answers for part in found]), found[0].places)
+    return AnswerPart(labels, times, join([part.answers for part in found]), found[0].places)
 
 
 def _add_body(
-    scene: Asker, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
-) -> Bodies:
+    scene: QueryTarget, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
+) -> BodyPlaces:
     """Add the avatar of a query; return its positions at the poses, or on motions between them."""
     points = read_points(query.given["avatar"])
     radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
     reach = query.given.get("reach", query.given.get("margin", 0.0))
     ends = (poses[:-1], poses[1:]) if moving else (poses, poses)
-    return Bodies(box_of(points)[None], np.array([radius or 0.0]), reach, *ends)
+    return BodyPlaces(box_of(points)[None], np.array([radius or 0.0]), reach, *ends)
 
 
 def _ask_objects(
-    scene: Asker, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
-) -> Asked:
+    scene: QueryTarget, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
+) -> AnswerPart:
     """Query the objects of a file."""
     rows = read_objects(path)
     names = {
@@ -199,9 +199,9 @@ def _ask_objects(
     boxes = np.array([bodies[row.avatar][0] for row in rows]).reshape(-1, 2, 3)
     radii = np.array([bodies[row.avatar][1] for row in rows], np.float64)
     poses = np.array([row.pose for row in rows]).reshape(-1, 4, 4)
-    places = Bodies(boxes, radii, parameters.get("margin", 0.0), poses, poses)
+    places = BodyPlaces(boxes, radii, parameters.get("margin", 0.0), poses, poses)
     labels = [f"object {number} {row.avatar.name}" for number, row in enumerate(rows)]
-    return Asked(labels, [], answers, places)
+    return AnswerPart(labels, [], answers, places)
 
 
 def _labels(times: list[float], *, moving: bool) -> tuple[list[str], list[float]]:

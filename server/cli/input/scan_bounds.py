@@ -34,12 +34,12 @@ class Places(Protocol):
         """
         ...
 
-    def farthest(self) -> float:
+    def largest_coordinate(self) -> float:
         """Return the largest absolute coordinate of all positions [m]."""
         ...
 
 
-class Bodies(NamedTuple):
+class BodyPlaces(NamedTuple):
     """Avatars at poses, or on motions between two poses.
 
     boxes: (k, 2, 3) or (1, 2, 3), low and high corner of each avatar's points, in its own frame
@@ -68,7 +68,7 @@ class Bodies(NamedTuple):
         most = np.maximum(ends[0][1], ends[1][1]) + bulge
         return np.asarray(((least > high) | (most < low)).any(axis=1))
 
-    def farthest(self) -> float:
+    def largest_coordinate(self) -> float:
         """Return the largest absolute coordinate of the poses [m]."""
         return _largest(self.pose_from[:, :3, 3], self.pose_to[:, :3, 3])
 
@@ -89,8 +89,8 @@ class Bodies(NamedTuple):
         return np.broadcast_to(corners, (len(self.pose_from), 8, 3))
 
 
-class Rays(NamedTuple):
-    """Rays.
+class RayPlaces(NamedTuple):
+    """Rays of a query.
 
     origins, directions: (k, 3), world frame [m]; directions of any length except 0.
     reach: length of the rays [m].
@@ -112,13 +112,13 @@ class Rays(NamedTuple):
         far = np.where(level, np.where(within, np.inf, -np.inf), ends.max(axis=0)).min(axis=1)
         return np.asarray(np.maximum(near, 0.0) > np.minimum(far, self.reach))
 
-    def farthest(self) -> float:
+    def largest_coordinate(self) -> float:
         """Return the largest absolute coordinate of the origins [m]."""
         return _largest(self.origins)
 
 
-class Points(NamedTuple):
-    """Points. points: (k, 3), world frame [m].  reach: search radius around each [m]."""
+class PointPlaces(NamedTuple):
+    """Points of a query. points: (k, 3), world frame [m].  reach: search radius around each [m]."""
 
     points: Vec
     reach: float
@@ -129,7 +129,7 @@ class Points(NamedTuple):
         apart = np.maximum(np.maximum(low - points, points - high), 0.0)
         return np.asarray(np.linalg.norm(apart, axis=1) > self.reach)
 
-    def farthest(self) -> float:
+    def largest_coordinate(self) -> float:
         """Return the largest absolute coordinate of the points [m]."""
         return _largest(self.points)
 
@@ -157,10 +157,10 @@ def outside_line(places: Places, outside: Mask, info: SceneInfo, word: str) -> s
     """
     low, high = (" ".join(f"{value:.3f}" for value in corner) for corner in info.bounds)
     count = int(outside.sum())
-    farthest = _largest(np.array(info.bounds))
+    largest = _largest(np.array(info.bounds))
     line = f"{count} of {len(outside)} {word} lie outside the scan (its bounds: {low} .. {high} m)"
     inside = int((outside & ~places.outside(*_bounds(info), 1e-3)).sum())
-    if inside >= _MOST * count and places.farthest() * 1e-3 >= _LEAST * farthest:
+    if inside >= _MOST * count and places.largest_coordinate() * 1e-3 >= _LEAST * largest:
         which = "they" if inside == count else f"{inside} of them"
         line += f"; divided by 1000 {which} would lie inside: expected metres, not millimetres?"
     return line

@@ -28,7 +28,7 @@ HEAD_START_SECONDS = 0.05
 LINE_SECONDS, JSON_SECONDS = 10.0, 1.0
 
 
-class Pace:
+class StageProgress:
     """Progress, rate and remaining time of one stage of work.
 
     done, total: in `unit`.  clock: seconds since any epoch.
@@ -93,9 +93,9 @@ class Listener:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._pace: Pace | None = None
+        self._pace: StageProgress | None = None
         # The stage in which an error occurred, with its progress at that time.
-        self._broken: Pace | None = None
+        self._broken: StageProgress | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -108,7 +108,7 @@ class Listener:
     def start(self, stage: str, total: int, unit: str) -> None:
         """Begin a stage. Raises Interrupted if a signal has arrived."""
         check_interrupt()
-        self._pace = Pace(stage, total, unit, self._clock)
+        self._pace = StageProgress(stage, total, unit, self._clock)
         self._began(self._pace)
 
     def advance(self, amount: int) -> None:
@@ -138,13 +138,13 @@ class Listener:
             if done >= total:
                 self.finish()
 
-    def _began(self, pace: Pace) -> None:
+    def _began(self, pace: StageProgress) -> None:
         """Display that a stage begins."""
 
-    def _moved(self, pace: Pace) -> None:
+    def _moved(self, pace: StageProgress) -> None:
         """Display progress of the stage."""
 
-    def _ended(self, pace: Pace) -> None:
+    def _ended(self, pace: StageProgress) -> None:
         """Display that the stage is complete."""
 
 
@@ -177,14 +177,14 @@ class Bars(Listener):
     ) -> None:
         self._bars.stop()
 
-    def _began(self, pace: Pace) -> None:
+    def _began(self, pace: StageProgress) -> None:
         self._task = self._bars.add_task(pace.stage, total=pace.total, pace=pace)
 
-    def _moved(self, pace: Pace) -> None:
+    def _moved(self, pace: StageProgress) -> None:
         if self._task is not None:
             self._bars.update(self._task, completed=pace.done)
 
-    def _ended(self, pace: Pace) -> None:
+    def _ended(self, pace: StageProgress) -> None:
         if self._task is None:
             return
         # A stage with a total of 0 also ends with a full bar.
@@ -199,7 +199,7 @@ class Bars(Listener):
 class _Cell(ProgressColumn):
     """Column of fixed width with a text about the pace of a task."""
 
-    def __init__(self, say: Callable[[Pace], str], width: int) -> None:
+    def __init__(self, say: Callable[[StageProgress], str], width: int) -> None:
         super().__init__(Column(width=width, no_wrap=True, justify="left" if width == 8 else "right"))
         self._say = say
 
@@ -216,11 +216,11 @@ class Lines(Listener):
         self._stream = stream
         self._said = 0.0
 
-    def _began(self, pace: Pace) -> None:
+    def _began(self, pace: StageProgress) -> None:
         self._said = self._clock()
         self._say(f"{pace.stage}: {pace.total:,} {pace.unit}")
 
-    def _moved(self, pace: Pace) -> None:
+    def _moved(self, pace: StageProgress) -> None:
         if self._clock() - self._said < LINE_SECONDS:
             return
         self._said = self._clock()
@@ -232,7 +232,7 @@ class Lines(Listener):
             facts.append(f"{clock_text(pace.left)} left")
         self._say(", ".join(filter(None, facts)))
 
-    def _ended(self, pace: Pace) -> None:
+    def _ended(self, pace: StageProgress) -> None:
         rate = _rate_text(pace, pace.unit)
         self._say(
             f"{pace.stage}: done, {pace.done:,} {pace.unit} in {clock_text(pace.seconds)}{rate and ', '}{rate}"
@@ -269,19 +269,19 @@ class JsonLines(Listener):
         if error is not None:
             self._say("failed", self._pace or self._broken, message=str(error) or type(error).__name__)
 
-    def _began(self, pace: Pace) -> None:
+    def _began(self, pace: StageProgress) -> None:
         self._said = self._clock()
         self._say("start", pace)
 
-    def _moved(self, pace: Pace) -> None:
+    def _moved(self, pace: StageProgress) -> None:
         if self._clock() - self._said >= JSON_SECONDS:
             self._said = self._clock()
             self._say("progress", pace)
 
-    def _ended(self, pace: Pace) -> None:
+    def _ended(self, pace: StageProgress) -> None:
         self._say("end", pace)
 
-    def _say(self, event: str, pace: Pace | None, **more: str) -> None:
+    def _say(self, event: str, pace: StageProgress | None, **more: str) -> None:
         facts = {
             "time": self._now().isoformat(timespec="milliseconds"),
             "event": event,
@@ -329,18 +329,18 @@ def clock_text(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def _amount_text(pace: Pace) -> str:
+def _amount_text(pace: StageProgress) -> str:
     if pace.ended or not pace.total:
         return f"{count_text(pace.done)} {pace.unit}"
     return f"{count_text(pace.done)} of {count_text(pace.total)} {pace.unit}"
 
 
-def _rate_text(pace: Pace, unit: str) -> str:
+def _rate_text(pace: StageProgress, unit: str) -> str:
     rate = pace.rate
     return "" if rate is None else f"{count_text(rate)}{unit and ' '}{unit}/s"
 
 
-def _left_text(pace: Pace) -> str:
+def _left_text(pace: StageProgress) -> str:
     if pace.ended:
         return f"in {clock_text(pace.seconds)}"
     left = pace.left

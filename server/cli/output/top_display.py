@@ -14,11 +14,11 @@ from ....schemas.wire.stats import StatsAnswer, UserStats
 from .console import bytes_text
 
 # Maximum number of users shown, the most recently active.
-MOST_ROWS = 16
+MAX_USERS_SHOWN = 16
 BAR = 30
 # Maximum delay of Ctrl-C: a signal delivered to one of zenoh's threads does not wake the main
 # thread.
-NAP_SECONDS = 0.2
+POLL_SECONDS = 0.2
 
 # Label of each counter, and its field of `StatsAnswer`.
 _COUNTS = (
@@ -47,14 +47,14 @@ class Watched(Protocol):
     def stats(self) -> StatsAnswer: ...
 
 
-class Look(NamedTuple):
+class Sample(NamedTuple):
     """A sample of a scene's statistics. at: time of the sample [s]."""
 
     at: float
     stats: StatsAnswer
 
 
-def rate(before: Look | None, now: Look, field: str) -> float | None:
+def rate(before: Sample | None, now: Sample, field: str) -> float | None:
     """Return the increase per second of a counter of StatsAnswer between two samples.
 
     Returns None if the counter fell: another server answers, or another generation is served.
@@ -82,16 +82,18 @@ def rate_text(value: float | None) -> str:
     return "" if value is None else f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 
-def plain(text: str) -> str:
+def printable(text: str) -> str:
     """Replace unprintable characters in a name from a client, which could move the cursor."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-def scene_view(before: Look | None, now: Look) -> RenderableType:
+def scene_view(before: Sample | None, now: Sample) -> RenderableType:
     """Return all tables of one scene. before: the previous sample, for rates."""
     stats = now.stats
     generation = f", generation {stats.generation}" if stats.generation else ""
-    facts = Text(f"{plain(stats.scene)}{generation}, policy {plain(stats.policy) or '?'}", style="bold")
+    facts = Text(
+        f"{printable(stats.scene)}{generation}, policy {printable(stats.policy) or '?'}", style="bold"
+    )
     voxels = f"{stats.resident:,} of {stats.voxels:,} voxels resident, {stats.kept:,} with users in them"
     right = Group(_bytes_table(before, now), Text(), _times_table(stats))
     tables = Columns([_counts_table(before, now), right], padding=(1, 3))
@@ -117,14 +119,14 @@ def _table(first: str, *numbers: str) -> Table:
     return table
 
 
-def _counts_table(before: Look | None, now: Look) -> Table:
+def _counts_table(before: Sample | None, now: Sample) -> Table:
     table = _table("", "total", "per second")
     for name, field in _COUNTS:
         table.add_row(name, f"{getattr(now.stats, field):,}", rate_text(rate(before, now, field)))
     return table
 
 
-def _bytes_table(before: Look | None, now: Look) -> Table:
+def _bytes_table(before: Sample | None, now: Sample) -> Table:
     table = _table("bytes", "total", "per second")
     for name, field in _BYTES:
         a_second = rate(before, now, field)
@@ -142,11 +144,11 @@ def _times_table(stats: StatsAnswer) -> Table:
     return table
 
 
-def _users_table(before: Look | None, now: Look) -> Table:
+def _users_table(before: Sample | None, now: Sample) -> Table:
     """Return a table of the most recently active users, with the number of the others."""
     table = _table("user", "requests", "/s", "misses", "late", "unknown", "waited", "p99", "max", "silent")
     known = {} if before is None else {(user.client, user.avatar): user for user in before.stats.users}
-    for user in now.stats.users[:MOST_ROWS]:
+    for user in now.stats.users[:MAX_USERS_SHOWN]:
         last = known.get((user.client, user.avatar))
         more = (
             None
@@ -154,7 +156,7 @@ def _users_table(before: Look | None, now: Look) -> Table:
             else _rise(user.requests - last.requests, now.at - before.at)
         )
         table.add_row(*_user_row(user, more))
-    left = len(now.stats.users) - MOST_ROWS
+    left = len(now.stats.users) - MAX_USERS_SHOWN
     if left > 0:
         table.add_row(f"and {left:,} more")
     return table
@@ -162,7 +164,7 @@ def _users_table(before: Look | None, now: Look) -> Table:
 
 def _user_row(user: UserStats, a_second: float | None) -> Iterable[RenderableType]:
     """Yield the cells of one user. A client is shown by the first characters of its random name."""
-    yield Text(f"{plain(user.client[:6]) or '-'} {plain(user.avatar)[:10] or '-'}")
+    yield Text(f"{printable(user.client[:6]) or '-'} {printable(user.avatar)[:10] or '-'}")
     yield f"{user.requests:,}"
     yield rate_text(a_second)
     for count in (user.misses, user.late, user.unknown, user.waited):
@@ -185,10 +187,10 @@ def watch(
     Raises the errors of `stats`.
     """
     console = console or Console()
-    before: list[Look | None] = [None] * len(scenes)
+    before: list[Sample | None] = [None] * len(scenes)
 
     def look() -> RenderableType:
-        now = [Look(clock(), scene.stats()) for scene in scenes]
+        now = [Sample(clock(), scene.stats()) for scene in scenes]
         views = [scene_view(*looks) for looks in zip(before, now, strict=True)]
         before[:] = now
         return Group(*views)
@@ -206,4 +208,4 @@ def watch(
                 console.print(view)
             wake = clock() + interval
             while (left := wake - clock()) > 0:
-                sleep(min(left, NAP_SECONDS))
+                sleep(min(left, POLL_SECONDS))

@@ -7,15 +7,15 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ....schemas.scene.effect_options import Objects, Through, Uncertainty
-from ....schemas.scene.scene_file import SceneFile, effect_name, identity, read_scene, scene_name, up_of
+from ....schemas.scene.effect_table import Objects, Through, Uncertainty, effect_name
+from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_name, up_of
 from ...archives.archive_info import run_order
 from ...archives.rigid_transform import moved_boxes
 from ...scenes.scene_archives import (
-    Found,
+    FoundArchive,
     FoundAvatar,
     ReadPoints,
-    at_place,
+    error_location,
     find_archives,
     normals_asked,
     read_avatars,
@@ -33,7 +33,7 @@ class Checked(NamedTuple):
     path: Path
     name: str
     file: SceneFile
-    archives: list[Found]
+    archives: list[FoundArchive]
     avatars: list[FoundAvatar]
     left_out: int
     notes: list[str]
@@ -111,20 +111,20 @@ def scene_json(checked: Checked) -> dict[str, Any]:
     }
 
 
-def _left_out(file: SceneFile, path: Path, archives: list[Found]) -> int:
+def _left_out(file: SceneFile, path: Path, archives: list[FoundArchive]) -> int:
     """Return the number of scan points that the effect `through` removes."""
     if not any(isinstance(effect, Through) for effect in file.effects):
         return 0
     left_out = 0
     for number, found in enumerate(archives):
-        with at_place(path, f"$.archives[{number}]"):
+        with error_location(path, f"$.archives[{number}]"):
             store = store_opener(file, number)(found.folder)
         left_out += found.info.points - int(store.archive.voxels["rows"][:, 2].sum(dtype=np.int64))
         store.close()
     return left_out
 
 
-def _notes(file: SceneFile, archives: list[Found], left_out: int) -> Iterator[str]:
+def _notes(file: SceneFile, archives: list[FoundArchive], left_out: int) -> Iterator[str]:
     """Yield sentences about settings that are valid but possibly unintended."""
     for effect in file.effects:
         if isinstance(effect, Objects) and not file.objects:
@@ -154,7 +154,7 @@ def _notes(file: SceneFile, archives: list[Found], left_out: int) -> Iterator[st
             yield f"spawn lies outside the bounds of the archives, {_numbers(low)} .. {_numbers(high)} m"
 
 
-def _bounds(file: SceneFile, archives: list[Found]) -> tuple[list[float], list[float]]:
+def _bounds(file: SceneFile, archives: list[FoundArchive]) -> tuple[list[float], list[float]]:
     """Return the low and high corner of a box around all archives, world frame [m]."""
     lows, highs = [], []
     for item, found in zip(file.archives, archives, strict=True):

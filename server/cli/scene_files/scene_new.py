@@ -15,7 +15,7 @@ from ....schemas.scene.scene_file import SUFFIX, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
 from ...archives.archive_info import describe
 from ...residency.voxel_store import VoxelStore
-from .scene_text import Beginning, scene_text
+from .scene_text import SceneContent, scene_text
 
 # Characters that an avatar's name must not contain (schemas/scene/scene_file.py, SceneName), and
 # its maximum length.
@@ -51,7 +51,7 @@ def new_scene(
         with closing(VoxelStore(folder)) as store:
             infos.append(describe(store, folder.resolve().name))
     bounds = np.array([info.bounds for info in infos])
-    begin = Beginning(
+    begin = SceneContent(
         [_relative(folder, out) for folder in archives],
         [(called, _relative(file, out)) for called, file in _named(avatars).items()],
         effects,

@@ -1,7 +1,7 @@
 """Text of a new scene file.
 
 The file has the given archives and avatars, and every other field commented out with its default.
-The text is generated from the types in schemas/scene/scene_file.py and effect_options.py, so that
+The text is generated from the types in schemas/scene/scene_file.py and effect_table.py, so that
 no field is missing.
 """
 
@@ -15,14 +15,14 @@ from typing import Any, NamedTuple, get_args
 import msgspec
 
 from ....schemas.errors import BadRequestError
-from ....schemas.scene.effect_options import AnyEffect, Through
-from ....schemas.scene.scene_file import FORMAT, Limits, identity
+from ....schemas.scene.effect_table import AnyEffect, Through
+from ....schemas.scene.scene_file import FORMAT, SceneLimits, identity
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _WIDTH = 100
 
 
-class Beginning(NamedTuple):
+class SceneContent(NamedTuple):
     """Content of a new scene file.
 
     archives: paths, relative to the file.  avatars: (name, path).
@@ -39,7 +39,7 @@ class Beginning(NamedTuple):
     high: Sequence[float]
 
 
-def scene_text(begin: Beginning) -> str:
+def scene_text(begin: SceneContent) -> str:
     """Return the text of a scene file.
 
     Raises BadRequestError for a path that TOML cannot represent, or for an unknown effect.
@@ -85,7 +85,7 @@ def _key(name: str) -> str:
     return name if _BARE_KEY.fullmatch(name) else toml_value(name)
 
 
-def _head(begin: Beginning) -> Iterator[str]:
+def _head(begin: SceneContent) -> Iterator[str]:
     """Yield the top-level fields."""
     yield "# A scene for `solidcloud serve`: archives, avatars, dynamic objects, and simulated effects."
     yield "# `solidcloud scene check` checks this file. Lengths are metres; paths are relative to this file;"
@@ -111,7 +111,7 @@ def _head(begin: Beginning) -> Iterator[str]:
         yield "effects = []"
 
 
-def _places(begin: Beginning) -> Iterator[str]:
+def _places(begin: SceneContent) -> Iterator[str]:
     """Yield the archives, avatars, objects and the spawn."""
     pose = toml_value(identity())
     for path in begin.archives:
@@ -165,12 +165,12 @@ def _limits() -> Iterator[str]:
         "needed for safety; default: no limit. longest_move: maximum motion of a frame."
     )
     yield "#[limits]"
-    for name, value in msgspec.to_builtins(Limits()).items():
+    for name, value in msgspec.to_builtins(SceneLimits()).items():
         yield f"#{name} = {toml_value({'frame_ms': 5.0, 'frame_visits': 20_000}[name] if value is None else value)}"
     yield ""
 
 
-def _effect(name: str, kind: Any, begin: Beginning, declared: bool) -> Iterator[str]:
+def _effect(name: str, kind: Any, begin: SceneContent, declared: bool) -> Iterator[str]:
     """Yield one effect, commented out unless declared."""
     for paragraph in inspect.cleandoc(kind.__doc__).split("\n\n"):
         yield from _comment(" ".join(paragraph.split()))

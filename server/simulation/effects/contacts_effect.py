@@ -6,7 +6,7 @@ It reports each frame, on the scene as scanned; users and dynamic objects are no
 from collections.abc import Iterator
 from typing import Any
 
-from ....schemas.scene.effect_options import Contacts
+from ....schemas.scene.effect_table import Contacts
 from ....schemas.wire.answers import ContactsAnswers
 from ....schemas.wire.motion_messages import ContactCluster, ContactsReport
 from ..world.frame import Frame

@@ -9,7 +9,7 @@ deeper (blocking.py).
 from typing import Any
 
 from ....schemas.errors import BadRequestError
-from ....schemas.scene.effect_options import Crowd
+from ....schemas.scene.effect_table import Crowd
 from ....schemas.wire.motion_messages import CrowdReport
 from ...queries.context.query_context import to_units
 from ..world.bodies import USER, Bodies

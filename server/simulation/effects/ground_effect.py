@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....schemas.scene.effect_options import Ground, Slide, Step, Sweep
+from ....schemas.scene.effect_table import Ground, Slide, Step, Sweep
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import GroundReport
 from ...queries.surface_normals import warm

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ....schemas.scene.effect_options import Objects
+from ....schemas.scene.effect_table import Objects
 from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import ObjectsReport

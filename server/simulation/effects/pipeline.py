@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from ....schemas.errors import BadRequestError
-from ....schemas.scene.effect_order import NEVER_SKIPPED, ORDER
-from ....schemas.scene.scene_file import SceneFile, effect_name
+from ....schemas.scene.effect_table import NEVER_SKIPPED, ORDER, effect_name
+from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import FRAME_SECONDS, Moved, Touched
 from ...queries.context.query_budget import EXACT, QueryBudget

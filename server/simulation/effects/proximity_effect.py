@@ -6,7 +6,7 @@ are not included.
 
 from typing import Any
 
-from ....schemas.scene.effect_options import Proximity
+from ....schemas.scene.effect_table import Proximity
 from ....schemas.wire.motion_messages import ProximityReport
 from ..world.frame import Frame
 from ..world.separation_cache import nearest

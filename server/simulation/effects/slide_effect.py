@@ -22,7 +22,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ....schemas.scene.effect_options import Ground, Slide, Stop
+from ....schemas.scene.effect_table import Ground, Slide, Stop
 from ....schemas.wire.answers import Verdict
 from ...queries.surface_normals import warm
 from ..world.collision_world import World

@@ -6,7 +6,7 @@ command than sliding did, ends on ground, and rose by no more than `height`; oth
 as before. `ground` does the descending: it searches that far down for ground.
 """
 
-from ....schemas.scene.effect_options import Ground, Step
+from ....schemas.scene.effect_table import Ground, Step
 from ..world.collision_world import World
 from ..world.frame import MIN_MOTION, Frame, Pose, Vec, lowest_height, translated
 from ..world.vectors import dot, norm

@@ -10,7 +10,7 @@ MAX_ESCAPE, whose end is clear. What lies between is not tested: an avatar in a 
 side to stay on. If no end is clear, it stays, and the verdict says so.
 """
 
-from ....schemas.scene.effect_options import Stop, Sweep
+from ....schemas.scene.effect_table import Stop, Sweep
 from ....schemas.wire.answers import Verdict
 from ..world.collision_world import World
 from ..world.frame import (

@@ -5,7 +5,7 @@ The way from one pose to the next is the screw motion of server/queries/sweep.py
 is the sweep's bit for bit; otherwise it is queried.
 """
 
-from ....schemas.scene.effect_options import Stop, Sweep
+from ....schemas.scene.effect_table import Stop, Sweep
 from ..world.collision_world import World
 from ..world.frame import (
     Frame,

@@ -9,7 +9,7 @@ from functools import partial
 
 from numpy.typing import ArrayLike
 
-from ....schemas.scene.effect_options import Through
+from ....schemas.scene.effect_table import Through
 from ...archives.masked_archive import LeftOut
 from ...residency.voxel_store import OpenStore, VoxelStore
 

@@ -34,7 +34,7 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError
-from ....schemas.scene.effect_options import Uncertainty
+from ....schemas.scene.effect_table import Uncertainty
 from ....schemas.wire.messages import SceneInfo, SourceInfo
 from ....schemas.wire.motion_messages import UncertaintyReport
 from ...archives.rigid_transform import under

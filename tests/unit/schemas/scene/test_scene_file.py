@@ -8,13 +8,21 @@ import msgspec
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene import scene_file as scene_module
-from solidcloud.schemas.scene.effect_options import Ground, Slide, Step, Stop, Sweep, Through, ThroughBox
+from solidcloud.schemas.scene.effect_table import (
+    Ground,
+    Slide,
+    Step,
+    Stop,
+    Sweep,
+    Through,
+    ThroughBox,
+    effect_name,
+)
 from solidcloud.schemas.scene.scene_file import (
     ArchiveItem,
     SceneFile,
     Spawn,
     check_scene,
-    effect_name,
     json_schema,
     parse_scene,
     read_scene,
@@ -117,7 +125,7 @@ def test_the_document_has_every_field_with_its_default() -> None:
     rows = dict(re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|", documented(), re.M))
     kinds = {name: kind for name, kind in vars(scene_module).items() if isinstance(kind, type)}
     parts = {"": "SceneFile", "archives": "ArchiveItem", "avatars": "AvatarItem", "objects": "ObjectItem"}
-    parts |= {"spawn": "Spawn", "limits": "Limits"}
+    parts |= {"spawn": "Spawn", "limits": "SceneLimits"}
     expected = {}
     for table, kind in parts.items():
         for field in msgspec.structs.fields(kinds[kind]):

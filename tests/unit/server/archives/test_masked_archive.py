@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.scene.effect_options import ThroughBox
+from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.schemas.wire.columns import array_fields
 from solidcloud.server.archives.masked_archive import LeftOut
 from solidcloud.server.scene import Scene

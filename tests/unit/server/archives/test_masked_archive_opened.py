@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
-from solidcloud.schemas.scene.effect_options import ThroughBox
+from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.server.archives import masked_archive as left_out
 from solidcloud.server.archives.masked_archive import LeftOut
 from solidcloud.server.archives.rigid_transform import moved

@@ -315,11 +315,11 @@ def test_more_cells_than_there_may_be_are_refused(row: ScanCase, monkeypatch: py
     avatar, poses = make_avatar(row_of_points(1), 5.0), at((0.0, 0.0, 0.0))
     whole = contacts(row.data, avatar, poses, 0, 0.0, 0.0)
     assert whole.pairs_found[0] > LANES
-    for name in ("FIRST_CELLS", "MOST_CELLS"):
+    for name in ("FIRST_CELLS", "MAX_CELLS"):
         monkeypatch.setattr(contacts_module, name, LANES)
     with pytest.raises(TooLargeError, match="larger cluster_distance"):
         contacts(row.data, avatar, poses, 0, 0.0, 0.0)
-    monkeypatch.setattr(contacts_module, "MOST_CELLS", 2 * LANES)
+    monkeypatch.setattr(contacts_module, "MAX_CELLS", 2 * LANES)
     assert contacts(row.data, avatar, poses, 0, 0.0, 0.0).pairs_found.tolist() == whole.pairs_found.tolist()
     row.data.residency.check()
 
@@ -332,7 +332,7 @@ def test_more_than_a_request_may_list_is_refused_before_it_is_kept(
     room = contacts_module._check_room
     monkeypatch.setattr(contacts_module, "_check_room", lambda memory: kept.append(memory) or room(memory))
     monkeypatch.setattr(contacts_module, "SIZE_VISITS", 64)
-    monkeypatch.setattr(contacts_module, "MOST_BYTES", 100_000)
+    monkeypatch.setattr(contacts_module, "MAX_BYTES", 100_000)
     poses = at(*((0.05 * i, 0.0, 0.0) for i in range(60))).repeat(20, axis=0)
     avatar = make_avatar(row_of_points(8), 0.06)
     for limit in (MAX_CONTACTS, 0):

@@ -36,7 +36,7 @@ from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 from solidcloud.server.scenes import scene_archives
 from solidcloud.server.scenes.scene_archives import (
-    at_place,
+    error_location,
     is_scene_file,
     normals_asked,
     share_budget,
@@ -383,8 +383,11 @@ def test_a_reload_finds_where_a_link_points_then(folder: Path, tmp_path: Path) -
 
 
 def test_an_error_keeps_its_kind_and_its_paths() -> None:
-    with pytest.raises(CorruptError) as found, at_place(Path("a.toml"), "$.x"):
+    with pytest.raises(CorruptError) as found, error_location(Path("a.toml"), "$.x"):
         raise CorruptError("broken", (Path("b.h5"),))
     assert str(found.value) == "a.toml: $.x: broken" and found.value.paths == (Path("b.h5"),)
-    with pytest.raises(BadRequestError, match=r"^a.toml: \$.x: .*denied"), at_place(Path("a.toml"), "$.x"):
+    with (
+        pytest.raises(BadRequestError, match=r"^a.toml: \$.x: .*denied"),
+        error_location(Path("a.toml"), "$.x"),
+    ):
         raise PermissionError(13, "Permission denied")

@@ -13,7 +13,7 @@ from solidcloud.schemas.errors import (
     InternalError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.scene.effect_options import Ground, Stop
+from solidcloud.schemas.scene.effect_table import Ground, Stop
 from solidcloud.schemas.scene.scene_file import SceneFile, Spawn, scene_of
 from solidcloud.schemas.wire.key_expressions import User, public_id
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Moved, State, Wish

@@ -2,7 +2,14 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.cli.input.scan_bounds import Bodies, Points, Rays, box_of, lying_outside, outside_line
+from solidcloud.server.cli.input.scan_bounds import (
+    BodyPlaces,
+    PointPlaces,
+    RayPlaces,
+    box_of,
+    lying_outside,
+    outside_line,
+)
 
 LOW, HIGH = np.array([-1.0, -2.0, 0.0]), np.array([4.0, 3.0, 5.0])
 
@@ -26,7 +33,7 @@ def bodies(places, *, half=0.5, radius=0.1, reach=0.0, scale=1.0, to=None):
     """Cubes at places, or on their way to others."""
     box = np.array([[[-half] * 3, [half] * 3]])
     poses = poses_at(places, scale)
-    return Bodies(box, np.array([radius]), reach, poses, poses if to is None else poses_at(to, scale))
+    return BodyPlaces(box, np.array([radius]), reach, poses, poses if to is None else poses_at(to, scale))
 
 
 def lies(places, radius=0.0):
@@ -59,7 +66,7 @@ def test_a_turned_body_is_held_by_its_box():
     for x, outside in ((4.0 + 0.1 + 0.70, False), (4.0 + 0.1 + 0.72, True)):
         turn[:3, 3] = [x, 0.0, 1.0]
         poses = turn[None]
-        body = Bodies(np.array([[[-0.5] * 3, [0.5] * 3]]), np.array([0.1]), 0.0, poses, poses)
+        body = BodyPlaces(np.array([[[-0.5] * 3, [0.5] * 3]]), np.array([0.1]), 0.0, poses, poses)
         assert lies(body) is outside
 
 
@@ -108,13 +115,13 @@ def test_no_point_of_a_turning_motion_leaves_the_box_that_is_judged(rng):
     ],
 )
 def test_a_ray_lies_outside_where_it_does_not_meet_the_bounds(origin, direction, reach, outside):
-    rays = Rays(np.array([origin], float), np.array([direction], float), reach)
+    rays = RayPlaces(np.array([origin], float), np.array([direction], float), reach)
     assert lies(rays) is outside
 
 
 def test_a_point_lies_outside_beyond_its_reach():
-    assert lies(Points(np.array([[5.0, 4.0, 6.0]]), 1.73))
-    assert not lies(Points(np.array([[5.0, 4.0, 6.0]]), 1.74))
+    assert lies(PointPlaces(np.array([[5.0, 4.0, 6.0]]), 1.73))
+    assert not lies(PointPlaces(np.array([[5.0, 4.0, 6.0]]), 1.74))
 
 
 def line(places):

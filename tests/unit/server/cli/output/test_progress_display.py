@@ -14,7 +14,7 @@ from solidcloud.server.cli.output.progress_display import (
     JsonLines,
     Lines,
     Listener,
-    Pace,
+    StageProgress,
     clock_text,
     count_text,
     progress_listener,
@@ -36,7 +36,7 @@ def clock() -> Clock:
 
 
 def test_a_rate_is_of_late_and_the_time_left_runs_down(clock: Clock) -> None:
-    pace = Pace("build", 1000, "points", clock)
+    pace = StageProgress("build", 1000, "points", clock)
     assert (pace.rate, pace.left) == (None, None)
     for _ in range(10):
         clock.now += 1
@@ -59,7 +59,7 @@ def test_a_rate_is_of_late_and_the_time_left_runs_down(clock: Clock) -> None:
 
 
 def test_what_an_interrupted_build_had_done_is_no_rate(clock: Clock) -> None:
-    pace = Pace("build", 1_000_000, "points", clock)
+    pace = StageProgress("build", 1_000_000, "points", clock)
     pace.advance(900_000)  # vouched for by the journal
     assert (pace.done, pace.rate, pace.left) == (900_000, None, None)
     clock.now += 10
@@ -70,7 +70,7 @@ def test_what_an_interrupted_build_had_done_is_no_rate(clock: Clock) -> None:
 
 
 def test_many_small_steps_are_few_samples(clock: Clock) -> None:
-    pace = Pace("survey", 10**6, "points", clock)
+    pace = StageProgress("survey", 10**6, "points", clock)
     for _ in range(100_000):
         clock.now += 0.001
         pace.advance(10)

@@ -10,10 +10,10 @@ from solidcloud.schemas.errors import BusyError
 from solidcloud.schemas.wire.stats import StatsAnswer, Times, UserStats
 from solidcloud.server.cli.output import top_display as top
 from solidcloud.server.cli.output.top_display import (
-    MOST_ROWS,
-    Look,
+    MAX_USERS_SHOWN,
+    Sample,
     budget_line,
-    plain,
+    printable,
     rate,
     rate_text,
     seconds_text,
@@ -42,7 +42,7 @@ class Clock:
         return self.now
 
     def sleep(self, seconds: float) -> None:
-        assert 0 < seconds <= top.NAP_SECONDS
+        assert 0 < seconds <= top.POLL_SECONDS
         self.now += seconds
 
 
@@ -70,11 +70,11 @@ def line(text: str, name: str, which: int = -1) -> list[str]:
 
 
 def test_a_rate_is_what_a_count_rose_a_second() -> None:
-    before, now = Look(10.0, hall(hits=100)), Look(12.0, hall(hits=150))
+    before, now = Sample(10.0, hall(hits=100)), Sample(12.0, hall(hits=150))
     assert rate(before, now, "hits") == 25.0
     assert rate(before, now, "misses") == 0.0
     assert rate(None, now, "hits") is None
-    assert rate(now, Look(14.0, hall(hits=3)), "hits") is None, "another generation"
+    assert rate(now, Sample(14.0, hall(hits=3)), "hits") is None, "another generation"
     assert rate(now, now, "hits") is None
 
 
@@ -122,10 +122,14 @@ def test_it_fits_a_terminal_without_losing_a_number(width: int) -> None:
 
 
 def test_users_have_rates_of_their_own_and_the_last_are_counted() -> None:
-    many = [UserStats(f"{number:06}", "al", requests=100 + number) for number in range(MOST_ROWS + 3)]
+    many = [UserStats(f"{number:06}", "al", requests=100 + number) for number in range(MAX_USERS_SHOWN + 3)]
     later = [UserStats("000001", "al", requests=161), UserStats("new", "al", requests=5)]
     text = shown([hall(users=many), hall(users=later)], 120)
-    assert "and 3 more" in text and f"{MOST_ROWS - 1:06} al" in text and f"{MOST_ROWS:06} al" not in text
+    assert (
+        "and 3 more" in text
+        and f"{MAX_USERS_SHOWN - 1:06} al" in text
+        and f"{MAX_USERS_SHOWN:06} al" not in text
+    )
     assert line(text, "000001 al")[:2] == ["161", "60"]
     assert line(text, "new al")[:2] == ["5", "0"], "no rate yet: the next is the misses"
 
@@ -163,7 +167,7 @@ def test_rates_for_a_reader() -> None:
 
 
 def test_names_cannot_move_the_cursor() -> None:
-    assert plain("al\x1b[2J\r\n\u202e\x07b") == "al?[2J????b"
+    assert printable("al\x1b[2J\r\n\u202e\x07b") == "al?[2J????b"
     text = shown([hall(users=[UserStats("c\x1b[2J", "[red]x\x1b")])], once=True)
     assert "\x1b" not in text and "c?[2J [red]x?" in text
 

@@ -8,7 +8,7 @@ import pytest
 import synthetic_scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_options import Contacts, Proximity
+from solidcloud.schemas.scene.effect_table import Contacts, Proximity
 from solidcloud.schemas.wire.motion_messages import ContactsReport
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene

@@ -10,7 +10,7 @@ import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, staged, touch
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene.effect_options import AnyEffect, Crowd, Slide, Stop, Sweep
+from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Slide, Stop, Sweep
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.bodies.moving_bodies import BodyScratch
 from solidcloud.server.simulation.effects import crowd_effect as crowd

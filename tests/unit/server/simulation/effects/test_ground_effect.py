@@ -10,7 +10,7 @@ from effect_frames import flip_a_byte
 from effect_rooms import APART, INTERPRETED, RADIUS, Play, at, play
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.scene.effect_options import Ground, Slide, Step, Stop, Sweep
+from solidcloud.schemas.scene.effect_table import Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.simulation.world.frame import Body

@@ -9,7 +9,7 @@ import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, room, staged, touch
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.schemas.scene.effect_options import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
+from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import ObjectItem
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar

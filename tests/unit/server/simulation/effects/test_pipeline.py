@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from effect_rooms import at, play
 from solidcloud.schemas.errors import BadTransformError
-from solidcloud.schemas.scene.effect_options import Ground, Proximity, Slide, Step, Stop, Sweep
-from solidcloud.schemas.scene.scene_file import Limits
+from solidcloud.schemas.scene.effect_table import Ground, Proximity, Slide, Step, Stop, Sweep
+from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.simulation.world.collision_world import World
@@ -21,7 +21,7 @@ BALL = make_avatar([[0.0, 0, 0]], 0.2)
 
 IMPORTED = """
 import sys
-from solidcloud.schemas.scene.effect_options import *
+from solidcloud.schemas.scene.effect_table import *
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.simulation.effects.pipeline import make_pipeline
 from solidcloud.server.scene import Scene
@@ -103,14 +103,14 @@ def test_an_effect_more_adds_nothing_to_answers_and_counts_of_those_there(floor:
 @pytest.mark.interpreted
 def test_a_frame_without_room_skips_what_may_be_skipped_and_says_which(floor: archive_cases.Case) -> None:
     effects = (Stop(), Sweep(), Slide(), Ground(), Proximity())
-    with play(floor.archive, *effects, limits=Limits(frame_visits=1)) as game:
+    with play(floor.archive, *effects, limits=SceneLimits(frame_visits=1)) as game:
         body = game.body(BALL, at(0, 0, 0.5))
         for _ in range(4):
             moved = game.go(body, (0.05, 0, 0))
         assert moved.simulated[:2] == ["stop", "sweep"]
         assert "ground" in moved.skipped and "stop" not in moved.skipped
         assert moved.ground is None and (moved.proximity is None) == ("proximity" in moved.skipped)
-    with play(floor.archive, *effects, limits=Limits(frame_ms=1e-6)) as game:
+    with play(floor.archive, *effects, limits=SceneLimits(frame_ms=1e-6)) as game:
         body = game.body(BALL, at(0, 0, 0.5))
         moved = game.go(body, (0.05, 0, 0))
         assert moved.simulated == ["stop", "sweep"] and moved.skipped == ["slide", "ground", "proximity"]
@@ -119,7 +119,7 @@ def test_a_frame_without_room_skips_what_may_be_skipped_and_says_which(floor: ar
 
 @pytest.mark.interpreted
 def test_an_effect_that_once_took_long_is_tried_again(floor: archive_cases.Case) -> None:
-    with play(floor.archive, Stop(), Proximity(), limits=Limits(frame_visits=10_000)) as game:
+    with play(floor.archive, Stop(), Proximity(), limits=SceneLimits(frame_visits=10_000)) as game:
         body = game.body(BALL, at(0, 0, 0.5))
         runner, long = Counted(game.world, game.pipeline.runners[-1]), 1_000_000
         game.pipeline.runners[-1] = runner
@@ -142,7 +142,7 @@ def test_an_effect_that_once_took_long_is_tried_again(floor: archive_cases.Case)
 
 @pytest.mark.interpreted
 def test_a_frame_that_is_replayed_skips_what_it_is_told_to(floor: archive_cases.Case) -> None:
-    with play(floor.archive, Stop(), Sweep(), Slide(), Ground(), limits=Limits(frame_ms=1e-6)) as game:
+    with play(floor.archive, Stop(), Sweep(), Slide(), Ground(), limits=SceneLimits(frame_ms=1e-6)) as game:
         body = game.body(BALL, at(0, 0, 0.5))
         moved = game.pipeline.run(body, at(0.1, 0, 0.5), 1 / 30, skip=["slide", "stop"])
         assert moved.skipped == ["slide"] and moved.simulated == ["stop", "sweep", "ground"]

@@ -9,7 +9,7 @@ import pytest
 import synthetic_scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_options import Proximity
+from solidcloud.schemas.scene.effect_table import Proximity
 from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.motion_messages import ProximityReport
 from solidcloud.server.avatars.avatar_model import make_avatar

@@ -7,7 +7,7 @@ import effect_rooms
 import numpy as np
 import pytest
 from effect_rooms import INTERPRETED, RADIUS, at, play
-from solidcloud.schemas.scene.effect_options import Slide, Stop, Sweep
+from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.simulation.effects.slide_effect import clip

@@ -10,8 +10,8 @@ from effect_frames import flip_a_byte
 from effect_rooms import APART, RADIUS, at, play
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene.effect_options import Slide, Stop, Sweep
-from solidcloud.schemas.scene.scene_file import Limits
+from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
+from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 
@@ -142,7 +142,7 @@ def test_who_touches_a_wall_does_not_get_free_through_it(wall: archive_cases.Cas
 
 @pytest.mark.interpreted
 def test_a_wish_that_is_too_far_is_refused_and_changes_nothing(wall: archive_cases.Case) -> None:
-    with play(wall.archive, Stop(), Sweep(), limits=Limits(longest_move=2.0)) as game:
+    with play(wall.archive, Stop(), Sweep(), limits=SceneLimits(longest_move=2.0)) as game:
         body = game.body(BALL, at(-1, 0, 0))
         with pytest.raises(BadRequestError, match="within 2 m"):
             game.go(body, (0, 2.1, 0))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene.effect_options import Uncertainty
+from solidcloud.schemas.scene.effect_table import Uncertainty
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.motion_messages import UncertaintyReport
 from solidcloud.server.avatars.avatar_model import make_avatar

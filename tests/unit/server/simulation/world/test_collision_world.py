@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from effect_frames import body_of, placed, report
 from effect_rooms import at
-from solidcloud.schemas.scene.effect_options import Contacts
+from solidcloud.schemas.scene.effect_table import Contacts
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar

@@ -1,7 +1,13 @@
-"""Types of the effects in a scene file: a tagged union with the tag `effect`.
+"""Table of the effects that a scene file may declare: their options, their order, what no budget skips.
 
-server/simulation/effects/ implements the effects, one file each; SCENE.md explains the defaults. Bounds catch
-values in other units: a step of 200, a skin of 2.
+To add an effect:
+
+1. declare its options here as a class, and add it to `AnyEffect` and `ORDER`;
+2. write server/simulation/effects/<name>_effect.py, with the function `make`; it is found by the name;
+3. describe its options in SCENE.md, and a report, if it adds one to a frame's answer, in WIRE.md.
+
+The parser of scene files, the pipeline of frames, `info` and `solidcloud scene new` read this table.
+Bounds of options catch values in other units: a step of 200, a skin of 2.
 """
 
 from typing import Annotated, ClassVar
@@ -11,9 +17,9 @@ import msgspec
 # A pair reaches 16 m at most, radii and margin or reach together (WIRE.md); this leaves room for
 # radii. It is an integer because Python merges two equal annotations: with a float elsewhere, the
 # import order would decide if the JSON Schema contains 10.0 or 10.
-MOST_REACH = 10
+MAX_REACH = 10
 
-Length = Annotated[float, msgspec.Meta(ge=0, le=MOST_REACH)]
+Length = Annotated[float, msgspec.Meta(ge=0, le=MAX_REACH)]
 Near = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Degrees = Annotated[float, msgspec.Meta(ge=0, lt=90)]
 Vector = tuple[float, float, float]
@@ -93,7 +99,7 @@ class Proximity(Effect, frozen=True, tag="proximity"):
     reach: farthest distance worth reporting [m].
     """
 
-    reach: Annotated[float, msgspec.Meta(gt=0, le=MOST_REACH)] = 0.5
+    reach: Annotated[float, msgspec.Meta(gt=0, le=MAX_REACH)] = 0.5
 
 
 class Contacts(Effect, frozen=True, tag="contacts"):
@@ -159,3 +165,15 @@ class Uncertainty(Effect, frozen=True, tag="uncertainty"):
 AnyEffect = (
     Stop | Sweep | Slide | Step | Ground | Proximity | Contacts | Objects | Crowd | Through | Uncertainty
 )
+# The order in which a frame runs the effects; server/simulation/effects gives the reasons. `through`
+# is missing: it acts when an archive is opened.
+ORDER = (
+    "objects", "crowd", "stop", "sweep", "slide", "step", "ground", "proximity", "contacts", "uncertainty",
+)  # fmt: skip
+# Effects needed for safety: never skipped, whatever a frame's budget.
+NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})
+
+
+def effect_name(effect: AnyEffect) -> str:
+    """Return the name of an effect in the file and in answers."""
+    return str(type(effect).__struct_config__.tag)

@@ -20,7 +20,7 @@ from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.octree_cells import voxel_codes
 from ..kernels.points.spool_rows import fill_local
-from ..kernels.points.voxel_records import sum_places
+from ..kernels.points.voxel_records import position_hash_sum
 from ..passes.radius_classes import voxel_classes
 from ..resume.journal import new_file
 from ..spool.spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, spool_dtype, write_directory
@@ -199,7 +199,7 @@ def gather(unit: GatherUnit) -> Gathered:
         for row in unit.rows:
             record, key = archive.open_voxel(row, columns=wanted), int(archive.voxels["key"][row])
             places += int(
-                sum_places(leaves_of(record), archive.coordinates[row] * record.voxel_steps, SEEDS[0])
+                position_hash_sum(leaves_of(record), archive.coordinates[row] * record.voxel_steps, SEEDS[0])
             )
             with archive.locating(row):
                 for points in record_points(record, dtype):

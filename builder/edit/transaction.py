@@ -24,7 +24,7 @@ from ...schemas.errors import BadRequestError, CorruptError, FormatError, Solidc
 from ...schemas.process.new_file import sync_folder
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
-from ..kernels.points.voxel_records import sum_places
+from ..kernels.points.voxel_records import position_hash_sum
 from ..passes.preview import write_preview
 from ..passes.verify import voxel_faults
 from ..resume.build_directory import locked
@@ -266,7 +266,7 @@ def _read_back(unit: _ReadUnit) -> int:
                 faults = voxel_faults(archive, row, record, deep=False)
                 record.class_counts()
                 corner = archive.coordinates[row] * record.voxel_steps
-                places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
+                places += int(position_hash_sum(leaves_of(record), corner, SEEDS[0]))
             if faults:
                 raise CorruptError(faults[0], (archive.shard_path(int(archive.voxels["shard"][row])),))
             del record  # free it before the next one is read

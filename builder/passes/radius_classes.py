@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.radius_model import LOCAL_RADII, RIM_BIT
 from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_coordinates, voxel_keys
 from ..kernels.neighbours.nearest_neighbours import bound_boxes, box_starts
-from ..kernels.neighbours.point_classes import FEW, point_classes
+from ..kernels.neighbours.point_classes import TOO_FEW_NEIGHBOURS, point_classes
 from ..kernels.points.octree_cells import voxel_codes
 from ..spool.spool import Spool
 
@@ -105,7 +105,7 @@ def voxel_classes(
         else:
             found[begin:end] = _classify(asked, near, limits)
     stored = np.uint8((RIM_BIT - 1 if "local" in models else 0) | (RIM_BIT if "border" in models else 0))
-    return Classes((found & stored)[back], int(np.count_nonzero(found[back] & FEW)))
+    return Classes((found & stored)[back], int(np.count_nonzero(found[back] & TOO_FEW_NEIGHBOURS)))
 
 
 def _points_near(
@@ -197,7 +197,7 @@ def _points_in(key: int, box: NDArray[np.int64], spool: Spool, without: range) -
 
 
 def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: Limits) -> NDArray[np.uint8]:
-    """Compute the classes (q,) of points, with the FEW bit, from each other and from points nearby.
+    """Compute the classes (q,) of points, with the TOO_FEW_NEIGHBOURS bit, from each other and from points nearby.
 
     asked: (q, 3).  near: (m, 3).  All points are distinct.
     """

@@ -14,7 +14,7 @@ from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.process.interrupts import check_interrupt
 from ..kernels.points.content_hash import SEEDS
-from ..kernels.points.voxel_records import last_loose_node, measure_points, sum_places
+from ..kernels.points.voxel_records import last_unenclosing_node, measure_points, position_hash_sum
 from ..run.executor import Executor, worker_count
 from ..run.progress import Progress, Silent
 from ..run.work_units import jobs_of, portions, run_units
@@ -185,7 +185,7 @@ def _verify_rows(unit: _Unit) -> _Found:
                         record.check_normals()
                 if unit.summed:
                     corner = archive.coordinates[row] * record.voxel_steps
-                    places += int(sum_places(leaves_of(record), corner, SEEDS[0]))
+                    places += int(position_hash_sum(leaves_of(record), corner, SEEDS[0]))
                 del record
                 if unit.deep and archive.header.normals:
                     faults += normal_faults(archive, row)
@@ -227,7 +227,7 @@ def voxel_faults(archive: Archive, row: int, record: DecompressedRecord, deep: b
     if len(stray):
         faults.append(f"{archive.where(row)}: node {stray[0]} has a slab but no normal: rebuild the archive")
     if deep:
-        node = last_loose_node(leaves, spheres_of(record), nodes.normal, nodes.slab)
+        node = last_unenclosing_node(leaves, spheres_of(record), nodes.normal, nodes.slab)
         if node >= 0:
             faults.append(_loose(archive, row, node))
     return faults

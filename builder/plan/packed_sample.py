@@ -18,7 +18,7 @@ from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.errors import ScanError
 from ...schemas.process.interrupts import check_interrupt
 from ..config import BuildConfig
-from ..kernels.points.occupied_cubes import FREE, insert_all, take_cubes
+from ..kernels.points.occupied_cubes import FREE, find_cube_points, insert_all
 from ..sources.common.scan import Scan, ScanBlock
 from ..spool.spool_pass import usable
 from ..voxel.voxel_octree import VoxelPoints, build_voxel
@@ -87,7 +87,7 @@ _NOTHING = _Gathered(
 class _Cubes:
     """Cubes of the octree, each around a point.
 
-    around: (c, 3) int64, the point in its voxel [steps].  chosen: (c, 5), see `take_cubes`.
+    around: (c, 3) int64, the point in its voxel [steps].  chosen: (c, 5), see `find_cube_points`.
     weight: (c,), number of drawn points in the cube.
     """
 
@@ -162,7 +162,7 @@ class _Reader:
         local = np.empty((size, 3), np.int64)
         count = done = 0
         while done < size:
-            more, past = take_cubes(
+            more, past = find_cube_points(
                 block.xyz[done:], np.array(lattice.origin), lattice.step, lattice.voxel_steps, chosen,
                 self.table, self._known, picked[count:], slots[count:], local[count:],
             )  # fmt: skip

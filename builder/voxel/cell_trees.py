@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.voxel import CELL_BITS, LeafCells, Nodes
 from ..config import BuildConfig
-from ..kernels.trees.bounding_sphere import SPREAD
-from ..kernels.trees.build_tree import EXTREMES, build_cells, leaf_rows, take_runs
-from ..kernels.trees.pack_tree import most_nodes
+from ..kernels.trees.bounding_sphere import MOMENTS
+from ..kernels.trees.build_tree import EXTREMES, build_cells, copy_runs, leaf_rows
+from ..kernels.trees.pack_tree import max_nodes
 
 HIGHEST = (1 << CELL_BITS) - 1
 
@@ -27,7 +27,7 @@ class CellTrees(NamedTuple):
     nodes: m rows, cell by cell, level by level.
     xyz: (3, n) uint16, points in leaf-node order, from their cell's corner.
     rank: (n,) int32, index of each point among the input points.
-    spreads: (c, SPREAD) float64 and extremes: (c, EXTREMES, 3) int32, see kernels/trees/build_tree.py.
+    spreads: (c, MOMENTS) float64 and extremes: (c, EXTREMES, 3) int32, see kernels/trees/build_tree.py.
     """
 
     low: NDArray[np.int64]
@@ -56,7 +56,7 @@ def build_trees(
     size = np.int64(1) << log2_size.astype(np.int64)
     low = points[starts] // size[:, None] * size[:, None]
     bounds = np.append(starts, n).astype(np.int64)
-    m = sum(map(most_nodes, np.diff(bounds).tolist(), [config.leaf] * c))
+    m = sum(map(max_nodes, np.diff(bounds).tolist(), [config.leaf] * c))
     nodes = Nodes(
         np.empty((m, 3), np.uint16),
         np.empty(m, np.uint16),
@@ -68,7 +68,7 @@ def build_trees(
     )
     held = np.empty(c, np.int64)
     xyz, rank = np.empty((3, n), np.uint16), np.empty(n, np.int32)
-    spreads, extremes = np.empty((c, SPREAD)), np.empty((c, EXTREMES, 3), np.int32)
+    spreads, extremes = np.empty((c, MOMENTS)), np.empty((c, EXTREMES, 3), np.int32)
     tree = (config.leaf, config.degree, config.with_slab, HIGHEST)
     total = build_cells(points, bounds, low, *tree, tuple(nodes), held, xyz, rank, spreads, extremes)
     nodes = Nodes._make(column[:total].copy() for column in nodes)
@@ -87,8 +87,8 @@ def take_cells(trees: CellTrees, order: NDArray[np.int64]) -> CellTrees:
     points, held = np.diff(trees.starts)[order], np.diff(trees.rows)[order]
     of_nodes = run_indices(trees.rows[order], held)
     xyz, rank = np.empty_like(trees.xyz), np.empty((1, len(trees.rank)), np.int32)
-    take_runs(trees.xyz, trees.starts, order, xyz)
-    take_runs(trees.rank[None], trees.starts, order, rank)
+    copy_runs(trees.xyz, trees.starts, order, xyz)
+    copy_runs(trees.rank[None], trees.starts, order, rank)
     return CellTrees(
         trees.low[order],
         trees.log2_size[order],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.voxel import Nodes
 from ...schemas.kernels.morton import morton_decode
 from ..config import BuildConfig
-from ..kernels.trees.pack_tree import heap_counts, most_nodes
+from ..kernels.trees.pack_tree import max_nodes, node_counts
 from ..spool.spool_pass import ranks
 from .cell_trees import CellTrees, build_trees
 
@@ -35,9 +35,9 @@ def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
     one = build_trees(
         np.repeat(heap_place(code), 3, axis=0), np.zeros(1, np.int64), np.zeros(1, np.uint8), config
     )
-    most = most_nodes(points, config.leaf)
+    most = max_nodes(points, config.leaf)
     count, held = np.empty(most, np.uint8), np.empty(most, np.int64)
-    total = heap_counts(points, config.leaf, config.degree, count, held)
+    total = node_counts(points, config.leaf, config.degree, count, held)
     nodes = Nodes._make(np.repeat(column[:1], total, axis=0) for column in one.nodes)
     nodes.normal[held[:total] < 3] = 0  # as in `stored_direction`
     spreads = one.spreads.copy()

@@ -42,7 +42,7 @@ from ...schemas.archive.zstd_frame import RowStream, pwrite_all
 from ...schemas.errors import BadRequestError, CorruptError
 from ..config import BuildConfig
 from ..kernels.points.octree_cells import by_axis, by_cell, split_octree
-from ..kernels.trees.bounding_sphere import SPREAD
+from ..kernels.trees.bounding_sphere import MOMENTS
 from ..kernels.trees.build_tree import EXTREMES
 from ..spool.spool import Spool
 from .cell_trees import CellTrees, block_points, build_trees, leaf_runs
@@ -278,9 +278,9 @@ class _Spill:
         spreads, extremes, at = [], [], 0
         for low, *_ in self._cells:
             c = len(low)
-            raw = os.pread(self._files[3].fileno(), c * (8 * SPREAD + 12 * EXTREMES), at)
-            spreads.append(np.frombuffer(raw, np.float64, c * SPREAD).reshape(c, SPREAD))
-            extremes.append(np.frombuffer(raw, np.int32, offset=8 * c * SPREAD).reshape(c, EXTREMES, 3))
+            raw = os.pread(self._files[3].fileno(), c * (8 * MOMENTS + 12 * EXTREMES), at)
+            spreads.append(np.frombuffer(raw, np.float64, c * MOMENTS).reshape(c, MOMENTS))
+            extremes.append(np.frombuffer(raw, np.int32, offset=8 * c * MOMENTS).reshape(c, EXTREMES, 3))
             at += len(raw)
         return np.concatenate(spreads), np.concatenate(extremes)
 
@@ -384,7 +384,7 @@ class _Layout:
             Nodes._make(np.ascontiguousarray(stored[name]) for name in Nodes._fields),
             by_axis(self.spill.take(0, self.first_point[of], held, 6).view(np.uint16), starts),
             np.empty(0, np.int32),
-            np.empty((0, SPREAD)),
+            np.empty((0, MOMENTS)),
             np.empty((0, EXTREMES, 3), np.int32),
         )
         if self.top is not None:

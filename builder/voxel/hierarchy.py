@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.trees.bounding_sphere import SPREAD
-from ..kernels.trees.build_tree import build_tree, tree_rows, tree_space
+from ..kernels.trees.bounding_sphere import MOMENTS
+from ..kernels.trees.build_tree import build_tree, tree_rows, tree_workspace
 from ..kernels.trees.pack_tree import ROWS
 
 
@@ -71,8 +71,8 @@ def build_hierarchy(
     n = len(points)
     own = np.empty((ROWS, n), np.int32)
     own[:3], own[3] = points.T, np.arange(n)
-    space, rows = tree_space(n, leaf, degree), tree_rows(n, leaf)
-    total, height = build_tree(own, n, leaf, degree, with_slab, highest, space, rows, np.empty(SPREAD))
+    space, rows = tree_workspace(n, leaf, degree), tree_rows(n, leaf)
+    total, height = build_tree(own, n, leaf, degree, with_slab, highest, space, rows, np.empty(MOMENTS))
     begin, end, levels = space[2]
     center, radius, normal, slab, count, axis, block_low = (column[:total] for column in rows)
     tree = Tree(own[3].astype(np.int64), begin[:total], end[:total], count, levels[: height + 2])

@@ -10,7 +10,7 @@ from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.index import Header
 from ...schemas.archive.voxel import top_shift
 from ..kernels.neighbours.nearest_points import NodeSpheres
-from ..kernels.points.voxel_records import Leaves, take_points
+from ..kernels.points.voxel_records import Leaves, copy_points
 
 BLOCK_POINTS = 1 << 16
 # Name in `--keep` -> field of a record, and its type.
@@ -112,6 +112,6 @@ def taken(
     at, nodes = 0, len(leaves.first)
     xyz, rows, node = np.empty((block, 3), np.int32), np.empty(block, np.int64), np.empty(block, np.int32)
     while at < nodes:
-        at, held = take_points(leaves, at, base, low, high, limit, xyz, rows, node)
+        at, held = copy_points(leaves, at, base, low, high, limit, xyz, rows, node)
         if held:
             yield Taken(xyz[:held].copy(), rows[:held].copy(), node[:held].copy())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.voxel import Nodes, top_shift
 from ..config import BuildConfig
 from ..kernels.trees.bounding_sphere import ceil_sqrt
-from ..kernels.trees.build_tree import grow_bounds, guess_bounds
+from ..kernels.trees.build_tree import enlarge_bounds, initial_bounds
 from ..kernels.trees.pack_tree import pack_tree
 from .cell_trees import HIGHEST
 
@@ -46,7 +46,7 @@ class Top(NamedTuple):
         """
         of = slice(first, first + len(low))
         above, boxes = np.ascontiguousarray(self.above[:, of]), self.boxes[of]
-        grow_bounds(
+        enlarge_bounds(
             xyz, starts, low, boxes, above, self.center, self.normal, self.unit, self.reach2, self.slab
         )
 
@@ -84,7 +84,7 @@ def pack_top(
     reach2 = np.empty(t, np.int64)
     tree = (begin, count, levels)
     extremes = extremes[order]
-    guess_bounds(
+    initial_bounds(
         tree, spreads[order], extremes, unit, HIGHEST, config.with_slab, center, normal, reach2, slab
     )
     # The points least along x, y and z are 1st, 3rd and 5th, each followed by the greatest

@@ -17,18 +17,18 @@ SUMS = 10
 
 
 @nb.njit(nogil=True, cache=True, inline="always")
-def _add_point(sums, times, x, y, z):
+def _add_point(sums, multiplicity, x, y, z):
     """Add a difference with a multiplicity."""
-    sums[0] += times
-    sums[1] += times * x
-    sums[2] += times * y
-    sums[3] += times * z
-    sums[4] += times * x * x
-    sums[5] += times * y * y
-    sums[6] += times * z * z
-    sums[7] += times * y * z
-    sums[8] += times * z * x
-    sums[9] += times * x * y
+    sums[0] += multiplicity
+    sums[1] += multiplicity * x
+    sums[2] += multiplicity * y
+    sums[3] += multiplicity * z
+    sums[4] += multiplicity * x * x
+    sums[5] += multiplicity * y * y
+    sums[6] += multiplicity * z * z
+    sums[7] += multiplicity * y * z
+    sums[8] += multiplicity * z * x
+    sums[9] += multiplicity * x * y
 
 
 @nb.njit(nogil=True, cache=True)
@@ -58,11 +58,11 @@ def _diagonal(boxes, box):
 
 
 @nb.njit(nogil=True, cache=True)
-def box_sums(points, times, boxes, starts, square):
+def box_sums(points, multiplicity, boxes, starts, square):
     """Return the sums (b, SUMS) int64 of the points of each box from its least corner.
 
     points: (n, 3) int32, distinct.
-    times: (n,) int64, the multiplicity of each point.
+    multiplicity: (n,) int64, the multiplicity of each point.
     boxes, starts: of these points (nearest_neighbours.py).
     square: of the reach.
     The sums are zero for a box that fits into no ball of the reach.
@@ -73,7 +73,7 @@ def box_sums(points, times, boxes, starts, square):
             continue
         x, y, z = np.int64(boxes[box, 0]), np.int64(boxes[box, 1]), np.int64(boxes[box, 2])
         for i in range(box * BLOCK, min((box + 1) * BLOCK, points.shape[0])):
-            _add_point(sums[box], times[i], points[i, 0] - x, points[i, 1] - y, points[i, 2] - z)
+            _add_point(sums[box], multiplicity[i], points[i, 0] - x, points[i, 1] - y, points[i, 2] - z)
     for level in range(1, starts.shape[0] - 1):
         for box in range(starts[level], starts[level + 1]):
             if _diagonal(boxes, box) > 4 * square:
@@ -91,7 +91,7 @@ def box_sums(points, times, boxes, starts, square):
 
 
 @nb.njit(nogil=True, cache=True)
-def point_normals(points, times, boxes, starts, sums, square, codes):
+def point_normals(points, multiplicity, boxes, starts, sums, square, codes):
     """Write the codes (n,) uint16 of the normals at all points.
 
     sums: the result of `box_sums`. Other arguments as in `box_sums`.
@@ -129,7 +129,7 @@ def point_normals(points, times, boxes, starts, sums, square, codes):
                 for j in range(box * BLOCK, min((box + 1) * BLOCK, points.shape[0])):
                     dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
                     if dx * dx + dy * dy + dz * dz <= square:
-                        _add_point(total, times[j], dx, dy, dz)
+                        _add_point(total, multiplicity[j], dx, dy, dz)
             else:
                 first = starts[level - 1] + (box - starts[level]) * FAN
                 for child in range(first, min(first + FAN, starts[level])):

@@ -58,7 +58,7 @@ def bound_boxes(points, starts):
 
 
 @nb.njit(nogil=True, cache=True, inline="always")
-def _outside(boxes, box, x, y, z):
+def _box_distance2(boxes, box, x, y, z):
     """Return the squared distance of a point from a box; 0 inside it."""
     dx = max(max(np.int64(boxes[box, 0]) - x, x - np.int64(boxes[box, 3])), np.int64(0))
     dy = max(max(np.int64(boxes[box, 1]) - y, y - np.int64(boxes[box, 4])), np.int64(0))
@@ -94,7 +94,7 @@ def _insert(closest, held, d2, dx, dy, dz):
 
 
 @nb.njit(nogil=True, cache=True)
-def _look_into(points, block, i, closest, held, limit2):
+def _search_block(points, block, i, closest, held, limit2):
     """Insert the points of a block into the closest of point i. Returns the new number of entries."""
     x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
     k = closest.shape[0]
@@ -124,10 +124,10 @@ def closest_distinct(points, boxes, starts, i, limit2, closest, stack):
     x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
     k, own = closest.shape[0], i // BLOCK
     first, last = max(own - 1, 0), min(own + 1, starts[1] - 1)
-    held = _look_into(points, own, i, closest, 0, limit2)
+    held = _search_block(points, own, i, closest, 0, limit2)
     for block in range(first, last + 1):
         if block != own:
-            held = _look_into(points, block, i, closest, held, limit2)
+            held = _search_block(points, block, i, closest, held, limit2)
     level = starts.shape[0] - 2
     stack[0, 0], stack[0, 1] = level, starts[level]
     depth = 1
@@ -135,20 +135,20 @@ def closest_distinct(points, boxes, starts, i, limit2, closest, stack):
         depth -= 1
         level, box = stack[depth, 0], stack[depth, 1]
         bound = closest[k - 1, 0] if held == k else limit2
-        if _outside(boxes, box, x, y, z) > bound:
+        if _box_distance2(boxes, box, x, y, z) > bound:
             continue
         if level == 0:
             if not first <= box <= last:
-                held = _look_into(points, box, i, closest, held, limit2)
+                held = _search_block(points, box, i, closest, held, limit2)
             continue
         child = starts[level - 1] + (box - starts[level]) * FAN
         base = depth
         nearest, least = -1, np.int64(0)
         for c in range(child, min(child + FAN, starts[level])):
-            away = _outside(boxes, c, x, y, z)
-            if away <= bound:
-                if nearest < 0 or away < least:
-                    nearest, least = depth, away
+            distance2 = _box_distance2(boxes, c, x, y, z)
+            if distance2 <= bound:
+                if nearest < 0 or distance2 < least:
+                    nearest, least = depth, distance2
                 stack[depth, 0], stack[depth, 1] = level - 1, c
                 depth += 1
         if depth - base > 1 and nearest != depth - 1:  # open the closest first: it bounds the others

@@ -105,7 +105,7 @@ class NodeSpheres(NamedTuple):
 # clamped difference is larger than any distance that this path searches for.
 _CLAMP = 26754
 # Factor that lowers a bound by more than its float64 rounding error.
-_SURE = 1 - 1e-14
+_BOUND_FACTOR = 1 - 1e-14
 
 
 @nb.njit(nogil=True, inline="always")
@@ -135,7 +135,7 @@ def _nearest_lane(lanes, held, x, y, z, found):
 
 
 @nb.njit(nogil=True, inline="always")
-def _ask_leaf(leaves, node, queries, a, b, lanes, best):
+def _query_leaf(leaves, node, queries, a, b, lanes, best):
     """Lower best[a:b] by the points of a leaf node; return the greatest of them."""
     held, cell, farthest = read_leaf(leaves, node, lanes), U(leaves.cell[node]), np.int64(0)
     x = np.int64(leaves.cell_low[U(0), cell]) + np.int64(leaves.block_low[U(0), node])
@@ -151,13 +151,13 @@ def _ask_leaf(leaves, node, queries, a, b, lanes, best):
 
 
 @nb.njit(nogil=True, cache=True)
-def closest_in_record(leaves, spheres, queries, groups, home, best):
+def closest_in_record(leaves, spheres, queries, groups, start_leaf, best):
     """Lower best (q,) int64 to the squared distance of the closest *distinct* point of a record.
 
     queries: (q, 3) int64 [voxel steps], at most 2^31 from any point.
     groups: (g + 1,) int64; queries groups[i] to groups[i + 1] are processed together and should lie
     close to each other.
-    home: (g,) int64, the leaf node that contains a group, which is visited first, or -1.
+    start_leaf: (g,) int64, the leaf node that contains a group, which is visited first, or -1.
     best: the known upper bound on entry, FAR for none.
     Points at FAR or beyond are not found. A point equal to its query is skipped: duplicates are not
     neighbours (NUMERICS.md case 28). A node is pruned when it is certainly farther from the group's
@@ -176,8 +176,8 @@ def closest_in_record(leaves, spheres, queries, groups, home, best):
             ly, hy = min(ly, queries[q, 1]), max(hy, queries[q, 1])
             lz, hz = min(lz, queries[q, 2]), max(hz, queries[q, 2])
             farthest = max(farthest, best[q])
-        if home[g] >= 0:
-            farthest = _ask_leaf(leaves, U(home[g]), queries, a, b, lanes, best)
+        if start_leaf[g] >= 0:
+            farthest = _query_leaf(leaves, U(start_leaf[g]), queries, a, b, lanes, best)
         reach = np.sqrt(np.float64(farthest))
         stack[0], bounds[0], depth = 0, 0.0, 1
         while depth > 0:
@@ -186,8 +186,8 @@ def closest_in_record(leaves, spheres, queries, groups, home, best):
             if bounds[depth] > reach:
                 continue
             if leaves.is_leaf[node]:
-                if np.int64(node) != home[g]:
-                    farthest = _ask_leaf(leaves, node, queries, a, b, lanes, best)
+                if np.int64(node) != start_leaf[g]:
+                    farthest = _query_leaf(leaves, node, queries, a, b, lanes, best)
                     reach = np.sqrt(np.float64(farthest))
                 continue
             nearest, least = depth, np.inf
@@ -206,7 +206,7 @@ def closest_in_record(leaves, spheres, queries, groups, home, best):
                 dx = np.float64(max(lx - x, x - hx, 0))
                 dy = np.float64(max(ly - y, y - hy, 0))
                 dz = np.float64(max(lz - z, z - hz, 0))
-                bound = np.sqrt(dx * dx + dy * dy + dz * dz) * _SURE - np.float64(
+                bound = np.sqrt(dx * dx + dy * dy + dz * dz) * _BOUND_FACTOR - np.float64(
                     np.int64(radius[child]) * scale
                 )
                 if bound <= reach:

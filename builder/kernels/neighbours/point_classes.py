@@ -22,7 +22,7 @@ LOCAL_NEIGHBOUR = 12
 # squared distances divided by this.
 RIM_SHARE = 6
 # Flag added to the class of a point with too few neighbours.
-FEW = 32
+TOO_FEW_NEIGHBOURS = 32
 
 
 @nb.njit(nogil=True, cache=True)
@@ -57,7 +57,7 @@ def point_classes(points, boxes, starts, rows, reach2, local2, classes):
     rows: (n,) int32, the row of `classes` for each point; -1 to skip the point.
     reach2, local2: `Limits` of builder/passes/radius_classes.py.
     Writes classes (q,) uint8: the local class, with RIM_BIT on a rim. A point with too few
-    neighbours gets the last class with FEW. With steps of at least 1 micrometre all sums stay below
+    neighbours gets the last class with TOO_FEW_NEIGHBOURS. With steps of at least 1 micrometre all sums stay below
     2^50.
     """
     closest, stack = np.empty((NEIGHBOURS, 4), np.int64), np.empty((STACK, 2), np.int64)
@@ -66,7 +66,7 @@ def point_classes(points, boxes, starts, rows, reach2, local2, classes):
             continue
         held = closest_distinct(points, boxes, starts, i, reach2, closest, stack)
         if held < LOCAL_NEIGHBOUR:
-            classes[rows[i]] = LOCAL_CLASSES - 1 | FEW
+            classes[rows[i]] = LOCAL_CLASSES - 1 | TOO_FEW_NEIGHBOURS
             continue
         found = _local_class(closest[LOCAL_NEIGHBOUR - 1, 0], local2)
         if _is_rim(closest, held):

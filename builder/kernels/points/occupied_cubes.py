@@ -32,7 +32,7 @@ def insert_all(keys, table):
 
 
 @nb.njit(nogil=True, cache=True)
-def take_cubes(xyz, origin, step, voxel_steps, chosen, table, known, picked, slots, local):
+def find_cube_points(xyz, origin, step, voxel_steps, chosen, table, known, picked, slots, local):
     """Find the points of chosen cubes among points (n, 3) float64, finite; count all occupied voxels.
 
     chosen: (c, 5) int64: a voxel's key, the cube's coordinates in it, and s; the cube has 2^s steps

@@ -99,7 +99,7 @@ def measure_points(leaves, voxel_steps, low, high):
 
 
 @nb.njit(nogil=True, cache=True)
-def sum_places(leaves, base, seed):
+def position_hash_sum(leaves, base, seed):
     """Return the `content_sum` (content_hash.py) over the lattice coordinates of all points: modulo 2^64.
 
     base: (3,) int64, lattice coordinates of the voxel's corner.
@@ -123,7 +123,7 @@ def sum_places(leaves, base, seed):
 
 
 @nb.njit(nogil=True, cache=True)
-def take_points(leaves, start, base, low, high, limit, xyz, rows, nodes):
+def copy_points(leaves, start, base, low, high, limit, xyz, rows, nodes):
     """Write points of the leaf nodes from node `start` on, as many leaf nodes as have room.
 
     base: (3,) int64, lattice coordinates of the voxel's corner.
@@ -229,7 +229,7 @@ def first_of_each(xyz):
 
 
 @nb.njit(nogil=True, cache=True)
-def last_loose_node(leaves, spheres, normal, slab):
+def last_unenclosing_node(leaves, spheres, normal, slab):
     """Return the last node of a record whose sphere or slab misses a point below it, or -1.
 
     leaves, spheres: see voxel_records.py, nearest_points.py.
@@ -241,7 +241,7 @@ def last_loose_node(leaves, spheres, normal, slab):
     center, radius, unit = spheres
     parents = link_parents(leaves.first, leaves.count, leaves.is_leaf)
     lanes = np.empty((3, LANES), np.int32)
-    loose = np.int64(-1)
+    unenclosing = np.int64(-1)
     for i in range(leaves.first.shape[0]):
         if not leaves.is_leaf[i]:
             continue
@@ -266,8 +266,8 @@ def last_loose_node(leaves, spheres, normal, slab):
                 dx, dy, dz = x + lanes[U(0), j], y + lanes[U(1), j], z + lanes[U(2), j]
                 along = nx * dx + ny * dy + nz * dz
                 if dx * dx + dy * dy + dz * dz > square or (not flat and (along < least or along > most)):
-                    if node > loose:
-                        loose = node
+                    if node > unenclosing:
+                        unenclosing = node
                     break
             node = np.int64(parents[at])
-    return loose
+    return unenclosing

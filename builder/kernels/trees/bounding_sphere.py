@@ -28,9 +28,9 @@ BLOCK = 256
 # The slab's direction is stored in three int8; a finer direction gave no measurable gain.
 NORMAL_LENGTH = 127.0
 
-# Length of a spread, the statistics of a set of points: the number of points; their mean x, y, z;
+# Length of the moments, the statistics of a set of points: the number of points; their mean x, y, z;
 # the sums of products of deviations from the mean: xx, xy, xz, yy, yz, zz.
-SPREAD = 10
+MOMENTS = 10
 
 
 @nb.njit(nogil=True, cache=True)
@@ -45,8 +45,8 @@ def ceil_sqrt(value):
 
 
 @nb.njit(nogil=True, cache=True)
-def bound_space(n):
-    """Allocate the work space of `ball_center` for up to n points.
+def bound_workspace(n):
+    """Allocate the workspace of `ball_center` for up to n points.
 
     Returns (coordinates (3, n) float32, distances (BLOCK,) float32, the same distances viewed as
     int32).
@@ -56,15 +56,15 @@ def bound_space(n):
 
 
 @nb.njit(nogil=True, cache=True)
-def ball_center(space, lo, hi, steps, center):
-    """Improve an estimated centre (3,) float64 of the least ball around points of `space`.
+def ball_center(workspace, lo, hi, steps, center):
+    """Improve an estimated centre (3,) float64 of the least ball around points of `workspace`.
 
     lo, hi: the range of points.
     steps: number of iterations.
     The farthest point is found among distances compared by their bits as integers, which order like
     the floats. A loop that looks for the greatest float would stay scalar.
     """
-    points, distances, bits = space
+    points, distances, bits = workspace
     place = np.int32(BLOCK - 1)
     for step in range(steps):
         x, y, z = np.float32(center[0]), np.float32(center[1]), np.float32(center[2])
@@ -86,36 +86,36 @@ def ball_center(space, lo, hi, steps, center):
 
 
 @nb.njit(nogil=True, cache=True)
-def leaf_spread(own, lo, hi, spread):
-    """Write the spread (SPREAD,) float64 of the points [lo, hi) of a leaf node.
+def leaf_moments(xyz, lo, hi, moments):
+    """Write the moments (MOMENTS,) float64 of the points [lo, hi) of a leaf node.
 
     Sums are exact until they are divided.
     """
     n = np.int64(hi - lo)
-    x0, y0, z0 = own[0, lo], own[1, lo], own[2, lo]
+    x0, y0, z0 = xyz[0, lo], xyz[1, lo], xyz[2, lo]
     x = y = z = xx = xy = xz = yy = yz = zz = np.int64(0)
     for i in range(lo, hi):
         dx, dy, dz = (
-            np.int64(np.int32(own[0, i] - x0)),
-            np.int64(np.int32(own[1, i] - y0)),
-            np.int64(np.int32(own[2, i] - z0)),
+            np.int64(np.int32(xyz[0, i] - x0)),
+            np.int64(np.int32(xyz[1, i] - y0)),
+            np.int64(np.int32(xyz[2, i] - z0)),
         )
         x, y, z = x + dx, y + dy, z + dz
         xx, xy, xz = xx + dx * dx, xy + dx * dy, xz + dx * dz
         yy, yz, zz = yy + dy * dy, yz + dy * dz, zz + dz * dz
     by = 1.0 / float(n)
-    spread[0] = float(n)
-    spread[1], spread[2], spread[3] = (
+    moments[0] = float(n)
+    moments[1], moments[2], moments[3] = (
         float(x0) + float(x) * by,
         float(y0) + float(y) * by,
         float(z0) + float(z) * by,
     )
-    spread[4], spread[5], spread[6] = (
+    moments[4], moments[5], moments[6] = (
         float(n * xx - x * x) * by,
         float(n * xy - x * y) * by,
         float(n * xz - x * z) * by,
     )
-    spread[7], spread[8], spread[9] = (
+    moments[7], moments[8], moments[9] = (
         float(n * yy - y * y) * by,
         float(n * yz - y * z) * by,
         float(n * zz - z * z) * by,
@@ -123,45 +123,50 @@ def leaf_spread(own, lo, hi, spread):
 
 
 @nb.njit(nogil=True, cache=True)
-def join_spread(spreads, first, count, spread):
-    """Write the joint spread (SPREAD,) of the rows first to first + count of spreads (n, SPREAD)."""
+def join_moments(moment_rows, first, count, moments):
+    """Write the joint moments (MOMENTS,) of the rows first to first + count of moment_rows (n, MOMENTS)."""
     n = 0.0
     x = y = z = 0.0
     for i in range(first, first + count):
-        held = spreads[i, 0]
+        held = moment_rows[i, 0]
         n += held
-        x, y, z = x + held * spreads[i, 1], y + held * spreads[i, 2], z + held * spreads[i, 3]
+        x, y, z = x + held * moment_rows[i, 1], y + held * moment_rows[i, 2], z + held * moment_rows[i, 3]
     x, y, z = x / n, y / n, z / n
     xx = xy = xz = yy = yz = zz = 0.0
     for i in range(first, first + count):
-        held, dx, dy, dz = spreads[i, 0], spreads[i, 1] - x, spreads[i, 2] - y, spreads[i, 3] - z
+        held, dx, dy, dz = (
+            moment_rows[i, 0],
+            moment_rows[i, 1] - x,
+            moment_rows[i, 2] - y,
+            moment_rows[i, 3] - z,
+        )
         xx, xy, xz = (
-            xx + spreads[i, 4] + held * dx * dx,
-            xy + spreads[i, 5] + held * dx * dy,
-            xz + spreads[i, 6] + held * dx * dz,
+            xx + moment_rows[i, 4] + held * dx * dx,
+            xy + moment_rows[i, 5] + held * dx * dy,
+            xz + moment_rows[i, 6] + held * dx * dz,
         )
         yy, yz, zz = (
-            yy + spreads[i, 7] + held * dy * dy,
-            yz + spreads[i, 8] + held * dy * dz,
-            zz + spreads[i, 9] + held * dz * dz,
+            yy + moment_rows[i, 7] + held * dy * dy,
+            yz + moment_rows[i, 8] + held * dy * dz,
+            zz + moment_rows[i, 9] + held * dz * dz,
         )
-    spread[0], spread[1], spread[2], spread[3] = n, x, y, z
-    spread[4], spread[5], spread[6], spread[7], spread[8], spread[9] = xx, xy, xz, yy, yz, zz
+    moments[0], moments[1], moments[2], moments[3] = n, x, y, z
+    moments[4], moments[5], moments[6], moments[7], moments[8], moments[9] = xx, xy, xz, yy, yz, zz
 
 
 @nb.njit(nogil=True, cache=True)
-def _flat_direction(spread, direction):
+def _flat_direction(moments, direction):
     """Write the direction (3,) of least variance where it is distinct; return whether it is.
 
     Newton's method from 0, which never passes it, finds the least root of the characteristic
     polynomial. The direction is the cross product of two rows of the matrix minus that root. Only +
     - * / and sqrt are used: the result is the same on any machine.
     """
-    size = (spread[4] + spread[7] + spread[9]) / 3.0
+    size = (moments[4] + moments[7] + moments[9]) / 3.0
     if not size > 0.0:
         return False
-    xx, xy, xz = spread[4] / size, spread[5] / size, spread[6] / size
-    yy, yz, zz = spread[7] / size, spread[8] / size, spread[9] / size
+    xx, xy, xz = moments[4] / size, moments[5] / size, moments[6] / size
+    yy, yz, zz = moments[7] / size, moments[8] / size, moments[9] / size
     second = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
     third = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     root = 0.0
@@ -191,15 +196,15 @@ def _flat_direction(spread, direction):
 
 
 @nb.njit(nogil=True, cache=True)
-def least_variance(spread, direction):
-    """Write the unit direction (3,) float64 of least variance of a spread (SPREAD,)."""
-    if _flat_direction(spread, direction):
+def least_variance(moments, direction):
+    """Write the unit direction (3,) float64 of least variance of moments (MOMENTS,)."""
+    if _flat_direction(moments, direction):
         return
     a, v = np.zeros((3, 3)), np.zeros((3, 3))
     v[0, 0] = v[1, 1] = v[2, 2] = 1.0
-    a[0, 0], a[0, 1], a[0, 2] = spread[4], spread[5], spread[6]
-    a[1, 0], a[1, 1], a[1, 2] = spread[5], spread[7], spread[8]
-    a[2, 0], a[2, 1], a[2, 2] = spread[6], spread[8], spread[9]
+    a[0, 0], a[0, 1], a[0, 2] = moments[4], moments[5], moments[6]
+    a[1, 0], a[1, 1], a[1, 2] = moments[5], moments[7], moments[8]
+    a[2, 0], a[2, 1], a[2, 2] = moments[6], moments[8], moments[9]
     for _ in range(8):  # cyclic Jacobi rotations
         for p in range(2):
             for q in range(p + 1, 3):
@@ -228,8 +233,8 @@ def least_variance(spread, direction):
 
 
 @nb.njit(nogil=True, cache=True)
-def farthest2(own, lo, hi, x, y, z):
-    """Return the greatest squared distance, int64, of the points [lo, hi) of own from (x, y, z).
+def greatest_distance2(xyz, lo, hi, x, y, z):
+    """Return the greatest squared distance, int64, of the points [lo, hi) of xyz from (x, y, z).
 
     All points lie within 2^30 of (x, y, z).
     """
@@ -237,17 +242,17 @@ def farthest2(own, lo, hi, x, y, z):
     farthest = np.int64(0)
     for i in range(lo, hi):
         dx, dy, dz = (
-            np.int64(np.int32(own[0, i] - x)),
-            np.int64(np.int32(own[1, i] - y)),
-            np.int64(np.int32(own[2, i] - z)),
+            np.int64(np.int32(xyz[0, i] - x)),
+            np.int64(np.int32(xyz[1, i] - y)),
+            np.int64(np.int32(xyz[2, i] - z)),
         )
         farthest = max(farthest, dx * dx + dy * dy + dz * dz)
     return farthest
 
 
 @nb.njit(nogil=True, cache=True)
-def extent_along(own, lo, hi, normal, x, y, z):
-    """Return the least and greatest dot(normal, point - (x, y, z)) of the points [lo, hi) of own.
+def extent_along(xyz, lo, hi, normal, x, y, z):
+    """Return the least and greatest dot(normal, point - (x, y, z)) of the points [lo, hi) of xyz.
 
     normal: (3,) integers in the range of int8.
     """
@@ -256,9 +261,9 @@ def extent_along(own, lo, hi, normal, x, y, z):
     least, most = np.int64(1) << 62, -(np.int64(1) << 62)
     for i in range(lo, hi):
         dx, dy, dz = (
-            np.int64(np.int32(own[0, i] - x)),
-            np.int64(np.int32(own[1, i] - y)),
-            np.int64(np.int32(own[2, i] - z)),
+            np.int64(np.int32(xyz[0, i] - x)),
+            np.int64(np.int32(xyz[1, i] - y)),
+            np.int64(np.int32(xyz[2, i] - z)),
         )
         along = a * dx + b * dy + c * dz
         least, most = min(least, along), max(most, along)
@@ -266,25 +271,25 @@ def extent_along(own, lo, hi, normal, x, y, z):
 
 
 @nb.njit(nogil=True, cache=True)
-def box_center(own, lo, hi, center):
-    """Write the centre (3,) float64 of the bounding box of the points [lo, hi) of own."""
+def box_center(xyz, lo, hi, center):
+    """Write the centre (3,) float64 of the bounding box of the points [lo, hi) of xyz."""
     for k in range(np.uint64(3)):
-        least, most = own[k, lo], own[k, lo]
+        least, most = xyz[k, lo], xyz[k, lo]
         for i in range(lo, hi):
-            least, most = min(least, own[k, i]), max(most, own[k, i])
+            least, most = min(least, xyz[k, i]), max(most, xyz[k, i])
         center[k] = (float(least) + float(most)) * 0.5
 
 
 @nb.njit(nogil=True, cache=True)
-def bound_run(own, space, lo, hi, highest, spread, with_slab, guess, center, normal, slab):
-    """Bound the points [lo, hi) of own by a sphere cut by a slab; return the radius, rounded up.
+def bound_points(xyz, workspace, lo, hi, highest, moments, with_slab, guess, center, normal, slab):
+    """Bound the points [lo, hi) of xyz by a sphere cut by a slab; return the radius, rounded up.
 
-    own: (>= 3, n) int32, 0 to 2^23 [steps]; lo < hi.
-    space: of `bound_space`, with the coordinates of own written.
+    xyz: (>= 3, n) int32, 0 to 2^23 [steps]; lo < hi.
+    workspace: of `bound_workspace`, with the coordinates of xyz written.
     highest: upper limit of a stored centre's coordinates and of the radius.
-    spread: of these points.
+    moments: of these points.
     with_slab: False leaves the normal zero.
-    guess: (3,) float64, work space.
+    guess: (3,) float64, workspace.
     Writes integers: center (3,), normal (3,) of length about 127, slab (2,): least and greatest
     dot(normal, point - center) [steps]. Returns the radius [steps], int64.
     """
@@ -293,26 +298,26 @@ def bound_run(own, space, lo, hi, highest, spread, with_slab, guess, center, nor
     while radius > highest:
         # If the first radius is too large, the second try takes the box's centre. Its radius is at
         # most half the diagonal, 0.87 of `highest`, and fits.
-        box_center(own, lo, hi, guess)
-        ball_center(space, lo, hi, steps, guess)
+        box_center(xyz, lo, hi, guess)
+        ball_center(workspace, lo, hi, steps, guess)
         for k in range(np.uint64(3)):
             center[k] = min(max(np.int64(np.rint(guess[k])), 0), highest)
         x, y, z = np.int64(center[0]), np.int64(center[1]), np.int64(center[2])
-        radius = ceil_sqrt(farthest2(own, lo, hi, x, y, z))
+        radius = ceil_sqrt(greatest_distance2(xyz, lo, hi, x, y, z))
         if steps == 0:
             break
         steps = 0
-    stored_direction(spread, with_slab, guess, normal)
-    slab[0], slab[1] = extent_along(own, lo, hi, normal, x, y, z)
+    stored_direction(moments, with_slab, guess, normal)
+    slab[0], slab[1] = extent_along(xyz, lo, hi, normal, x, y, z)
     return radius
 
 
 @nb.njit(nogil=True, cache=True)
-def stored_direction(spread, with_slab, guess, normal):
-    """Write the slab's direction (3,) of length about 127 for a spread; zero for fewer than 3 points."""
-    if not with_slab or spread[0] < 3.0:
+def stored_direction(moments, with_slab, guess, normal):
+    """Write the slab's direction (3,) of length about 127 for moments; zero for fewer than 3 points."""
+    if not with_slab or moments[0] < 3.0:
         normal[0] = normal[1] = normal[2] = 0
         return
-    least_variance(spread, guess)
+    least_variance(moments, guess)
     for k in range(np.uint64(3)):
         normal[k] = np.int64(np.rint(guess[k] * NORMAL_LENGTH))

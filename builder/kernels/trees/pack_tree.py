@@ -4,7 +4,7 @@
 and Lee, "OMT: Overlap minimizing top-down bulk loading", 2003): split along the longest edge, at a
 multiple of the leaf size, until every part is one child.
 
-The points are moved while they are split, and every loop runs over consecutive memory. `own` holds
+The points are moved while they are split, and every loop runs over consecutive memory. `ranked` holds
 x, y, z and rank in rows; its final order is the order of the leaf nodes. Loop indices are uint64,
 see schemas/kernels/record_rows.py.
 """
@@ -15,22 +15,22 @@ from ....schemas.kernels import compiling as nb
 
 # Maximum bins of the histogram in which a median is located.
 BINS = 256
-# Rows of `own`: x, y, z [steps], and the original index of the point.
+# Rows of `ranked`: x, y, z [steps], and the original index of the point.
 ROWS = 4
 RANK = np.uint64(3)
 
 
 @nb.njit(nogil=True, cache=True)
-def longest_edge(own, lo, hi):
+def longest_edge(ranked, lo, hi):
     """Return the axis of greatest extent of points [lo, hi), its least coordinate and its extent.
 
-    own: (4, n). On a tie the lower axis is returned.
+    ranked: (4, n). On a tie the lower axis is returned.
     """
     axis, low, widest = np.uint64(0), np.int64(0), np.int64(-1)
     for k in range(np.uint64(3)):
-        least, most = own[k, lo], own[k, lo]
+        least, most = ranked[k, lo], ranked[k, lo]
         for i in range(lo, hi):
-            least, most = min(least, own[k, i]), max(most, own[k, i])
+            least, most = min(least, ranked[k, i]), max(most, ranked[k, i])
         if np.int64(most) - np.int64(least) > widest:
             axis, low, widest = np.uint64(k), np.int64(least), np.int64(most) - np.int64(least)
     return axis, low, widest
@@ -66,7 +66,7 @@ def _nth(keys, count, nth):
 
 
 @nb.njit(nogil=True, cache=True)
-def _border(own, keys, bins, lo, hi, at, axis, low, extent):
+def _split_key(ranked, keys, bins, lo, hi, at, axis, low, extent):
     """Return the key, coordinate << 32 | rank, with `at - lo` smaller ones among the points [lo, hi).
 
     The points are counted into bins along the axis; the key is then selected in the one bin that
@@ -80,7 +80,7 @@ def _border(own, keys, bins, lo, hi, at, axis, low, extent):
     for b in range(limit):
         bins[b] = 0
     for i in range(lo, hi):
-        bins[(np.int64(own[axis, i]) - low) >> shift] += 1
+        bins[(np.int64(ranked[axis, i]) - low) >> shift] += 1
     chosen, below = np.int64(0), np.int64(0)
     while below + bins[chosen] <= wanted:
         below += bins[chosen]
@@ -89,35 +89,35 @@ def _border(own, keys, bins, lo, hi, at, axis, low, extent):
         return (low + (chosen << shift)) << 32
     found = 0
     for i in range(lo, hi):
-        coordinate = np.int64(own[axis, i])
-        keys[found] = coordinate << 32 | np.int64(own[RANK, i])
+        coordinate = np.int64(ranked[axis, i])
+        keys[found] = coordinate << 32 | np.int64(ranked[RANK, i])
         found += (coordinate - low) >> shift == chosen
     return _nth(keys, found, wanted - below)
 
 
 @nb.njit(nogil=True, cache=True)
-def _cut(own, spare, keys, bins, lo, hi, at):
+def _split(ranked, spare, keys, bins, lo, hi, at):
     """Move the `at - lo` least of the points [lo, hi) along the longest edge to the front.
 
     Ties are broken by rank: the two sets depend on the points and their ranks alone.
     """
-    axis, low, extent = longest_edge(own, lo, hi)
-    border = _border(own, keys, bins, lo, hi, at, axis, low, extent)
+    axis, low, extent = longest_edge(ranked, lo, hi)
+    key = _split_key(ranked, keys, bins, lo, hi, at, axis, low, extent)
     left, right = lo, at
     for i in range(lo, hi):
-        is_left = (np.int64(own[axis, i]) << 32 | np.int64(own[RANK, i])) < border
+        is_left = (np.int64(ranked[axis, i]) << 32 | np.int64(ranked[RANK, i])) < key
         to = left if is_left else right
         for q in range(np.uint64(ROWS)):
-            spare[q, to] = own[q, i]
+            spare[q, to] = ranked[q, i]
         left += np.uint64(is_left)
         right += np.uint64(not is_left)
     for q in range(np.uint64(ROWS)):
         for i in range(lo, hi):
-            own[q, i] = spare[q, i]
+            ranked[q, i] = spare[q, i]
 
 
 @nb.njit(nogil=True, cache=True)
-def _cut_into(own, spare, keys, bins, stack, lo, hi, leaf, parts, ends):
+def _split_into(ranked, spare, keys, bins, stack, lo, hi, leaf, parts, ends):
     """Split the points [lo, hi) into `parts` runs with numbers of whole leaves as equal as possible.
 
     Writes the runs' ends in order. The split halves recursively, with a stack of (lo, hi, parts)
@@ -135,14 +135,14 @@ def _cut_into(own, spare, keys, bins, stack, lo, hi, leaf, parts, ends):
         leaves = (b - a + leaf - 1) // leaf
         left = k // 2
         middle = a + (leaves * left // k) * leaf
-        _cut(own, spare, keys, bins, np.uint64(a), np.uint64(b), np.uint64(middle))
+        _split(ranked, spare, keys, bins, np.uint64(a), np.uint64(b), np.uint64(middle))
         stack[depth, 0], stack[depth, 1], stack[depth, 2] = middle, b, k - left
         stack[depth + 1, 0], stack[depth + 1, 1], stack[depth + 1, 2] = a, middle, left
         depth += 2
 
 
 @nb.njit(nogil=True, cache=True)
-def most_nodes(n, leaf):
+def max_nodes(n, leaf):
     """Return an upper bound on the nodes of a tree of n points in leaf nodes of `leaf`.
 
     Degree 2 is the worst case: a level for 2^l leaves has at most 2 leaves / 2^l + 1 nodes.
@@ -151,8 +151,8 @@ def most_nodes(n, leaf):
 
 
 @nb.njit(nogil=True, cache=True)
-def pack_space(n, degree):
-    """Allocate the work space of `pack_points` for up to n points: spare, keys, bins, stack, ends."""
+def pack_workspace(n, degree):
+    """Allocate the workspace of `pack_points` for up to n points: spare, keys, bins, stack, ends."""
     return (
         np.empty((ROWS, n), np.int32),
         np.empty(n + 1, np.int64),
@@ -163,19 +163,19 @@ def pack_space(n, degree):
 
 
 @nb.njit(nogil=True, cache=True)
-def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
-    """Pack the first n points of own into a tree; return h, the level of the leaf nodes.
+def pack_points(ranked, n, leaf, degree, workspace, begin, end, count, levels):
+    """Pack the first n points of ranked into a tree; return h, the level of the leaf nodes.
 
-    own: (4, >= n) int32, 1 <= n < 2^31: x, y, z of 0 to 2^23, distinct ranks.
+    ranked: (4, >= n) int32, 1 <= n < 2^31: x, y, z of 0 to 2^23, distinct ranks.
     leaf: maximum points of a leaf node.
     degree: maximum children of an inner node.
-    space: of `pack_space`.
+    workspace: of `pack_workspace`.
     Moves the points into leaf-node order; inside a leaf node the order is undefined. Writes the
     nodes level by level from the root, children in order: begin, end (>= t,) int64, each node's
     run; count (>= t,) uint8, children, or points of a leaf node; levels (>= h + 2,) int64, first
     node of each level, and t.
     """
-    spare, keys, bins, stack, ends = space
+    spare, keys, bins, stack, ends = workspace
     leaves = (n + leaf - 1) // leaf
     height, capacity = 0, np.int64(1)  # capacity: maximum leaf nodes below one node of this level
     while capacity < leaves:
@@ -191,7 +191,7 @@ def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
             a, b = begin[node], end[node]
             held = (b - a + leaf - 1) // leaf
             parts = (held + capacity - 1) // capacity
-            _cut_into(own, spare, keys, bins, stack, a, b, leaf, parts, ends)
+            _split_into(ranked, spare, keys, bins, stack, a, b, leaf, parts, ends)
             count[node] = parts
             for part in range(parts):
                 begin[total], end[total] = a, ends[part]
@@ -204,7 +204,7 @@ def pack_points(own, n, leaf, degree, space, begin, end, count, levels):
 
 
 @nb.njit(nogil=True, cache=True)
-def heap_counts(n, leaf, degree, count, held):
+def node_counts(n, leaf, degree, count, held):
     """Write the counts of `pack_points` for n points without the points; return t, the number of nodes.
 
     Splits depend on the number of points alone, and the counts are the same for any points.
@@ -247,22 +247,24 @@ def heap_counts(n, leaf, degree, count, held):
 
 
 @nb.njit(nogil=True, cache=True)
-def sort_run(own, spare, lo, hi, axis):
-    """Sort the points [lo, hi) of own along an axis, ties by rank.
+def sort_run(ranked, spare, lo, hi, axis):
+    """Sort the points [lo, hi) of ranked along an axis, ties by rank.
 
     Each point moves to the index given by the number of points before it.
     """
     for j in range(lo, hi):
-        coordinate, rank = own[axis, j], own[RANK, j]
+        coordinate, rank = ranked[axis, j], ranked[RANK, j]
         before = np.int32(0)
         for i in range(lo, hi):
-            is_before = (own[axis, i] < coordinate) | ((own[axis, i] == coordinate) & (own[RANK, i] < rank))
+            is_before = (ranked[axis, i] < coordinate) | (
+                (ranked[axis, i] == coordinate) & (ranked[RANK, i] < rank)
+            )
             before = np.int32(before + np.int32(is_before))
         for q in range(np.uint64(ROWS)):
-            spare[q, lo + np.uint64(before)] = own[q, j]
+            spare[q, lo + np.uint64(before)] = ranked[q, j]
     for q in range(np.uint64(ROWS)):
         for i in range(lo, hi):
-            own[q, i] = spare[q, i]
+            ranked[q, i] = spare[q, i]
 
 
 @nb.njit(nogil=True, cache=True)
@@ -273,16 +275,21 @@ def pack_tree(points, leaf, degree):
     uint8; levels (h + 2,) int64).
     """
     n = points.shape[0]
-    own = np.empty((ROWS, n), np.int32)
+    ranked = np.empty((ROWS, n), np.int32)
     for i in range(n):
-        own[0, i], own[1, i], own[2, i], own[3, i] = points[i, 0], points[i, 1], points[i, 2], i
-    most = most_nodes(n, leaf)
+        ranked[0, i], ranked[1, i], ranked[2, i], ranked[3, i] = (
+            points[i, 0],
+            points[i, 1],
+            points[i, 2],
+            i,
+        )
+    most = max_nodes(n, leaf)
     begin, end = np.empty(most, np.int64), np.empty(most, np.int64)
     count, levels = np.empty(most, np.uint8), np.empty(64, np.int64)
-    height = pack_points(own, n, leaf, degree, pack_space(n, degree), begin, end, count, levels)
+    height = pack_points(ranked, n, leaf, degree, pack_workspace(n, degree), begin, end, count, levels)
     total = levels[height + 1]
     return (
-        own[RANK].astype(np.int64),
+        ranked[RANK].astype(np.int64),
         begin[:total].copy(),
         end[:total].copy(),
         count[:total].copy(),

@@ -11,7 +11,7 @@ from dense_voxels import KEY, rows_of, spooled
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig, parse_radius
 from solidcloud.builder.kernels.neighbours.nearest_neighbours import bound_boxes, box_starts
-from solidcloud.builder.kernels.neighbours.point_classes import FEW, point_classes
+from solidcloud.builder.kernels.neighbours.point_classes import TOO_FEW_NEIGHBOURS, point_classes
 from solidcloud.builder.kernels.points.octree_cells import voxel_codes
 from solidcloud.builder.passes import build_shards as shards
 from solidcloud.builder.passes import radius_classes as classes
@@ -223,11 +223,11 @@ def test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule(held: int) -> N
             for side in (0, 1, 2):
                 points = _ring(held, math.isqrt(limit) + beyond, side)
                 at = naive_classes.judge(points.astype(np.int64), "0.001")[0, 0, 0]
-                assert class_of_origin(points) == at.local + RIM_BIT * at.rim + FEW * at.few
+                assert class_of_origin(points) == at.local + RIM_BIT * at.rim + TOO_FEW_NEIGHBOURS * at.few
 
 
 def class_of_origin(points: NDArray[np.integer]) -> int:
-    """The class that the kernel gives the first of the points (n, 3) that is (0, 0, 0), FEW among the bits."""
+    """The class that the kernel gives the first of points (n, 3) that is (0, 0, 0), with TOO_FEW_NEIGHBOURS."""
     points = points.astype(np.int32)
     rows = np.where((points == 0).all(axis=1), 0, -1).astype(np.int32)
     starts, classes = box_starts(len(points)), np.empty(1, np.uint8)
@@ -241,11 +241,11 @@ def test_the_twelfth_neighbour_decides_and_at_the_limit_is_within() -> None:
     for twelfth, expected in (([26, 0, 0], 3), ([26, 0, 1], 4), ([0, -26, 0], 3), ([362, 0, 0], 15)):
         points = np.array([[0, 0, 0], *near, twelfth])
         assert class_of_origin(points) % RIM_BIT == expected
-        assert class_of_origin(points) & FEW == 0
+        assert class_of_origin(points) & TOO_FEW_NEIGHBOURS == 0
         # A thirteenth, farther, changes nothing; a nearer one takes its place.
         assert class_of_origin(np.array([*points, [0, 300, 200]])) % RIM_BIT == expected
         assert class_of_origin(np.array([*points, [0, 0, 2]])) % RIM_BIT == 0
-    assert class_of_origin(np.array([[0, 0, 0], *near, [362, 0, 1]])) == 15 + FEW
+    assert class_of_origin(np.array([[0, 0, 0], *near, [362, 0, 1]])) == 15 + TOO_FEW_NEIGHBOURS
 
 
 @pytest.mark.interpreted

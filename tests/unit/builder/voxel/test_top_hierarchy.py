@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import split_octree
-from solidcloud.builder.kernels.trees.build_tree import guess_bounds
+from solidcloud.builder.kernels.trees.build_tree import initial_bounds
 from solidcloud.builder.voxel.cell_trees import CellTrees, build_trees, take_cells
 from solidcloud.builder.voxel.top_hierarchy import Top, pack_top
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, canonical
@@ -102,7 +102,7 @@ def test_a_guess_whose_radius_might_not_fit_is_given_up_for_the_box() -> None:
     for highest in (255, 221):
         center, normal, slab = (np.empty((1, k), np.int64) for k in (3, 3, 2))
         reach2 = np.empty(1, np.int64)
-        guess_bounds(tree, spreads, extremes, 1, highest, True, center, normal, reach2, slab)
+        initial_bounds(tree, spreads, extremes, 1, highest, True, center, normal, reach2, slab)
         assert reach2[0] == ((places - center[0]) ** 2).sum(axis=1).max()
         centers.append(center[0].tolist())
     assert centers[1] == [128, 128, 128]

@@ -7,8 +7,8 @@ from solidcloud.builder.kernels.neighbours.nearest_neighbours import (
     BLOCK,
     FAN,
     STACK,
+    _box_distance2,
     _insert,
-    _outside,
     bound_boxes,
     box_starts,
     closest_distinct,
@@ -109,7 +109,7 @@ def test_the_distance_of_a_box_is_that_of_its_nearest_place() -> None:
             at = rng.integers(-2 * wide, 2 * wide, 3)
             nearest = np.clip(at, edges[0], edges[1])
             boxes = edges.reshape(1, 6).astype(np.int32)
-            assert _outside(boxes, 0, *at) == ((at - nearest) ** 2).sum()
+            assert _box_distance2(boxes, 0, *at) == ((at - nearest) ** 2).sum()
 
 
 def test_a_far_cluster_is_dense_and_one_point_alone() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from opened_records import open_scan
-from solidcloud.builder.kernels.points.voxel_records import last_loose_node
+from solidcloud.builder.kernels.points.voxel_records import last_unenclosing_node
 from solidcloud.builder.voxel.exact_enclosure import loose_nodes
 from solidcloud.builder.voxel.record_points import leaves_of, spheres_of
 from solidcloud.schemas.archive.codec import DecompressedRecord
@@ -23,7 +23,7 @@ class Bounds:
     def named(self) -> int:
         """What the kernel says."""
         spheres = self.spheres._replace(radius=self.radius)
-        return int(last_loose_node(self.leaves, spheres, self.normal, self.slab))
+        return int(last_unenclosing_node(self.leaves, spheres, self.normal, self.slab))
 
     def proved(self) -> list[int]:
         """What Python's integers say."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.points.occupied_cubes import FREE, insert_all, take_cubes
+from solidcloud.builder.kernels.points.occupied_cubes import FREE, find_cube_points, insert_all
 
 MOST = (1 << 20) - 1
 
@@ -29,7 +29,7 @@ def test_cubes_and_voxels_are_those_of_numpy(voxel_steps: int, rng: np.random.Ge
         expected[(keys_of(voxels) == key) & (at >> shift == cube).all(axis=1)] = slot
     table, known = np.full(1 << 10, FREE), np.zeros(1, np.int64)
     picked, slots, local = np.empty(3000, np.int64), np.empty(3000, np.int64), np.empty((3000, 3), np.int64)
-    count, done = take_cubes(xyz, origin, step, voxel_steps, chosen, table, known, picked, slots, local)
+    count, done = find_cube_points(xyz, origin, step, voxel_steps, chosen, table, known, picked, slots, local)
     assert done == 3000
     assert np.array_equal(picked[:count], np.flatnonzero(expected >= 0))
     assert np.array_equal(slots[:count], expected[expected >= 0])
@@ -45,11 +45,11 @@ def test_a_full_table_ends_it_and_a_larger_one_goes_on() -> None:
         np.empty((0, 5), np.int64),
         (np.empty(40, np.int64), np.empty(40, np.int64), np.empty((40, 3), np.int64)),
     )
-    assert take_cubes(xyz, np.zeros(3), 1.0, 1, none, table, known, *out) == (0, 12)
+    assert find_cube_points(xyz, np.zeros(3), 1.0, 1, none, table, known, *out) == (0, 12)
     assert known[0] == np.count_nonzero(table != FREE) == 12
     larger = np.full(64, FREE)
     insert_all(table, larger)
-    assert take_cubes(xyz[12:], np.zeros(3), 1.0, 1, none, larger, known, *out) == (0, 28)
+    assert find_cube_points(xyz[12:], np.zeros(3), 1.0, 1, none, larger, known, *out) == (0, 28)
     assert np.array_equal(np.sort(larger[larger != FREE]), np.unique(keys_of(xyz.astype(np.int64))))
 
 
@@ -57,5 +57,5 @@ def test_voxels_beyond_the_edge_are_counted_as_at_it() -> None:
     xyz = np.array([[1e7, -1e7, 0.0], [2e7, -2e7, 0.0]])
     table, known = np.full(16, FREE), np.zeros(1, np.int64)
     out = (np.empty(2, np.int64), np.empty(2, np.int64), np.empty((2, 3), np.int64))
-    take_cubes(xyz, np.zeros(3), 1.0, 1, np.empty((0, 5), np.int64), table, known, *out)
+    find_cube_points(xyz, np.zeros(3), 1.0, 1, np.empty((0, 5), np.int64), table, known, *out)
     assert known[0] == 1 and table.max() == keys_of(np.array([[MOST, -MOST, 0]]))[0]

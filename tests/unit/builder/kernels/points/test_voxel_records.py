@@ -10,7 +10,7 @@ from solidcloud.builder.kernels.points.voxel_records import (
     measure_points,
     point_hash,
     point_hashes,
-    sum_places,
+    position_hash_sum,
 )
 from solidcloud.builder.voxel.record_points import Taken, hash_limit, leaves_of, taken
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints
@@ -145,7 +145,7 @@ def test_the_places_of_a_record_are_summed(kind: str) -> None:
     record = open_scan(kind, 7, 150, 70_000)
     points, _ = points_of(record)
     columns = np.ascontiguousarray((points + BASE).T).view(np.uint64)
-    assert int(sum_places(leaves_of(record), BASE, SEEDS[1])) == int(content_sum(columns, SEEDS[1]))
+    assert int(position_hash_sum(leaves_of(record), BASE, SEEDS[1])) == int(content_sum(columns, SEEDS[1]))
 
 
 def spoilt(record: DecompressedRecord, plane: int, row: int, value: int) -> DecompressedRecord:

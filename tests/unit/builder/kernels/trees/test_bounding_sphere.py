@@ -6,14 +6,14 @@ import minimal_ball
 import numpy as np
 import pytest
 from solidcloud.builder.kernels.trees.bounding_sphere import (
-    SPREAD,
+    MOMENTS,
     _flat_direction,
     ceil_sqrt,
-    join_spread,
-    leaf_spread,
+    join_moments,
+    leaf_moments,
     least_variance,
 )
-from solidcloud.builder.kernels.trees.build_tree import build_tree, tree_rows, tree_space
+from solidcloud.builder.kernels.trees.build_tree import build_tree, tree_rows, tree_workspace
 from solidcloud.builder.voxel.hierarchy import Bounds, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
@@ -167,10 +167,10 @@ def test_what_stood_in_the_arrays_before_is_not_read() -> None:
     found = []
     for stale in (0, 77):
         own = np.stack([*points.T, np.arange(40)]).astype(np.int32)
-        space, rows = tree_space(40, 8, 4), tree_rows(40, 8)
+        space, rows = tree_workspace(40, 8, 4), tree_rows(40, 8)
         for column in rows:
             column[:] = stale
-        total, height = build_tree(own, 40, 8, 4, True, 65535, space, rows, np.full(SPREAD, stale))
+        total, height = build_tree(own, 40, 8, 4, True, 65535, space, rows, np.full(MOMENTS, stale))
         found.append([total, height, own.tolist(), *(column[:total].tolist() for column in rows)])
     assert found[0] == found[1]
     assert found[0][0] > 5
@@ -189,11 +189,11 @@ def test_spreads_of_parts_join_to_that_of_all() -> None:
     parts = [rng.integers(0, high, (n, 3)) + low for n, high, low in ((1, 9, 0), (20, 300, 65000), (7, 2, 5))]
     own = np.concatenate(parts).T.astype(np.int32).copy()
     ends = np.cumsum([len(part) for part in parts]).astype(np.uint64)
-    spreads, joined = np.empty((3, SPREAD)), np.empty(SPREAD)
+    spreads, joined = np.empty((3, MOMENTS)), np.empty(MOMENTS)
     for i, part in enumerate(parts):
-        leaf_spread(own, ends[i] - np.uint64(len(part)), ends[i], spreads[i])
+        leaf_moments(own, ends[i] - np.uint64(len(part)), ends[i], spreads[i])
         assert np.allclose(spreads[i], plain_spread(part), rtol=1e-12, atol=1e-9)
-    join_spread(spreads, 0, 3, joined)
+    join_moments(spreads, 0, 3, joined)
     assert np.allclose(joined, plain_spread(np.concatenate(parts)), rtol=1e-12, atol=1e-6)
 
 

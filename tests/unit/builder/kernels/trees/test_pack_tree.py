@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.trees.pack_tree import heap_counts, most_nodes, pack_tree, sort_run
+from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree, sort_run
 from solidcloud.builder.voxel.hierarchy import Tree, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
@@ -152,14 +152,14 @@ def test_the_border_of_a_cut_is_found_in_any_crowd(kind: str) -> None:
 @pytest.mark.parametrize("degree", [2, 3, 16])
 def test_no_tree_has_more_nodes_than_are_made_room_for(degree: int) -> None:
     for n in [*range(1, 70), 129, 257, 513]:
-        assert len(pack(np.zeros((n, 3)), 1, degree).begin) <= most_nodes(n, 1)
+        assert len(pack(np.zeros((n, 3)), 1, degree).begin) <= max_nodes(n, 1)
 
 
 @pytest.mark.parametrize(("leaf", "degree"), [*SHAPES, (7, 5), (1, 16)])
 def test_the_counts_of_a_tree_need_no_points(leaf: int, degree: int) -> None:
     for n in [*range(1, 40), 64, 65, 130, 257]:
         tree = pack(make_steps("noise", n, n, 1000), leaf, degree)
-        count, held = (np.empty(most_nodes(n, leaf), kind) for kind in (np.uint8, np.int64))
-        total = heap_counts(n, leaf, degree, count, held)
+        count, held = (np.empty(max_nodes(n, leaf), kind) for kind in (np.uint8, np.int64))
+        total = node_counts(n, leaf, degree, count, held)
         assert count[:total].tolist() == tree.count.tolist()
         assert held[:total].tolist() == (tree.end - tree.begin).tolist()

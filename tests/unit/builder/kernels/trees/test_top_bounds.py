@@ -9,9 +9,9 @@ from solidcloud.builder.kernels.trees.build_tree import (
     EXTREMES,
     _join_extremes,
     _stored_center,
-    grow_bounds,
+    copy_runs,
+    enlarge_bounds,
     leaf_rows,
-    take_runs,
 )
 
 pytestmark = pytest.mark.interpreted
@@ -21,12 +21,12 @@ def grown(
     points: list[np.ndarray], low: np.ndarray, boxes: np.ndarray, center: np.ndarray, normal: np.ndarray,
     unit: int, reach2: int, slab: list[int],
 ) -> tuple[int, list[int]]:  # fmt: skip
-    """What `grow_bounds` makes of one node's bounds over some cells with these points, from their corners."""
+    """What `enlarge_bounds` makes of one node's bounds over some cells with these points, from their corners."""
     starts = np.cumsum([0, *map(len, points)])
     xyz = np.concatenate(points).T.astype(np.uint16)
     new_reach2, new_slab = np.array([reach2]), np.array([slab])
     above = np.zeros((1, len(points)), np.int64)
-    grow_bounds(xyz, starts, low, boxes, above, center[None], normal[None], unit, new_reach2, new_slab)
+    enlarge_bounds(xyz, starts, low, boxes, above, center[None], normal[None], unit, new_reach2, new_slab)
     return int(new_reach2[0]), new_slab[0].tolist()
 
 
@@ -88,7 +88,7 @@ def test_each_levels_node_above_a_cell_grows() -> None:
     reach2, slab = np.zeros(3, np.int64), np.zeros((3, 2), np.int64)
     boxes = np.stack([place, place], axis=1)
     xyz = points.T.astype(np.uint16)
-    grow_bounds(xyz, np.arange(4), low, boxes, above, center, normal, 1, reach2, slab)
+    enlarge_bounds(xyz, np.arange(4), low, boxes, above, center, normal, 1, reach2, slab)
     for node in range(3):
         own = bounds(place[(above == node).any(axis=0)], center[node], normal[node])
         assert (reach2[node], *slab[node]) == (own[0], min(own[1], 0), max(own[2], 0))
@@ -142,5 +142,5 @@ def test_runs_are_taken_in_the_order_chosen(width: int) -> None:
     for chosen in ([3, 0, 2, 1], [2], [], [1, 1], [0, 0, 3]):
         expected = [values[:, starts[i] : starts[i + 1]] for i in chosen]
         taken = np.full((width, sum(part.shape[1] for part in expected)), -1)
-        take_runs(values, starts, np.array(chosen, np.int64), taken)
+        copy_runs(values, starts, np.array(chosen, np.int64), taken)
         assert np.array_equal(taken, np.concatenate([values[:, :0], *expected], axis=1))

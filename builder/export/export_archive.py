@@ -30,7 +30,7 @@ from .export_contents import Contents
 FORMATS = ("laz", "las", "ply", "vtkhdf")
 
 
-class Exported(NamedTuple):
+class ExportSummary(NamedTuple):
     """Result of an export. low, high: (3,) least and greatest coordinates [m]; None without points.
 
     notes: sentences about what the file does not contain, although a user might expect it.
@@ -63,7 +63,7 @@ def export_archive(
     form: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-) -> Exported:
+) -> ExportSummary:
     """Write the points of the archive in `folder` that lie in `box` to the file `output`.
 
     box: (x0, y0, z0, x1, y1, z1) [m], half open; None: all points.  form: one of FORMATS; None: by
@@ -91,14 +91,14 @@ def export_archive(
         rows = np.flatnonzero(near.all(axis=1))
         points = archive.voxels["rows"][rows, 2].astype(np.int64)
         progress.start("look", int(points.sum()), "points")
-        contents = _look(archive, rows, base, limits, progress)
+        contents = _survey_points(archive, rows, base, limits, progress)
         progress.finish()
         notes = [] if contents.points else ["no point is in the box"]
         temporary = output.with_name(f".{output.name}.{os.getpid()}.tmp")
         try:
             progress.start("export", contents.points, "points")
             with _writer(form, temporary, archive.header, contents, notes) as writer:
-                _write(archive, rows, base, limits, contents, writer, progress)
+                _write_points(archive, rows, base, limits, contents, writer, progress)
             progress.finish()
             with open(temporary, "rb") as file:
                 os.fsync(file.fileno())
@@ -108,7 +108,7 @@ def export_archive(
             temporary.unlink(missing_ok=True)
         bounds = archive.header.lattice.to_world(np.stack([contents.low, contents.high])).tolist()
     low, high = bounds if contents.points else (None, None)
-    return Exported(output, form, contents.points, output.stat().st_size, low, high, tuple(notes))
+    return ExportSummary(output, form, contents.points, output.stat().st_size, low, high, tuple(notes))
 
 
 def lattice_box(lattice: Lattice, box: tuple[float, ...] | None) -> NDArray[np.int64]:
@@ -158,7 +158,7 @@ def _blocks(
             yield block, read_columns(record, columns, block.rows)
 
 
-def _look(
+def _survey_points(
     archive: Archive,
     rows: NDArray[np.int64],
     base: NDArray[np.int64],
@@ -170,11 +170,11 @@ def _look(
     Writing LAS takes 80 ns, LAZ 300 ns.
     """
     columns = stored_columns(archive.header)
-    looked = {name: kind for name, kind in columns.items() if name == "intensity"}
+    wanted = {name: kind for name, kind in columns.items() if name == "intensity"}
     points, whole = 0, True
     low, high = np.full(3, 1 << 62), np.full(3, -(1 << 62))
     for row in rows.tolist():
-        for block, held in _blocks(archive, row, base, box, looked):
+        for block, held in _blocks(archive, row, base, box, wanted):
             points += len(block.xyz)
             low = np.minimum(low, block.xyz.min(axis=0) + base[row])
             high = np.maximum(high, block.xyz.max(axis=0) + base[row])
@@ -189,7 +189,7 @@ def _look(
     return Contents(points, low, high, columns, whole)
 
 
-def _write(
+def _write_points(
     archive: Archive,
     rows: NDArray[np.int64],
     base: NDArray[np.int64],
@@ -206,13 +206,13 @@ def _write(
             progress.advance(len(steps))
 
 
-class _Vtk:
+class _VtkWriter:
     """VTKHDF file (vtkhdf.py) as a `Writer`; a context manager."""
 
     def __init__(self, path: Path, contents: Contents) -> None:
         self._file = vtk_file(path, contents.columns)
 
-    def __enter__(self) -> "_Vtk":
+    def __enter__(self) -> "_VtkWriter":
         self._points = self._file.__enter__()
         return self
 
@@ -226,7 +226,7 @@ class _Vtk:
         self._points.append(world, columns)
 
 
-class _Ply:
+class _PlyWriter:
     """Binary PLY file of doubles; a context manager. The number of vertices is known in advance."""
 
     _TYPES = {"<f4": "float", "<u2": "ushort"}  # noqa: RUF012  never changed
@@ -239,7 +239,7 @@ class _Ply:
         self._file = path.open("wb")
         self._file.write(head.encode("ascii"))
 
-    def __enter__(self) -> "_Ply":
+    def __enter__(self) -> "_PlyWriter":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -262,15 +262,15 @@ def _writer(
 ) -> AbstractContextManager[Writer]:
     """Return the writer of a format; append to `notes` what the format cannot hold."""
     if form in ("las", "laz"):
-        from .las_export import LasOut, wkt_of
+        from .las_export import LasWriter, wkt_of
 
         crs, note = wkt_of(header.sources)
         notes += [note] if note else []
-        out = LasOut(path, header.lattice, contents, crs, compressed=form == "laz")
+        out = LasWriter(path, header.lattice, contents, crs, compressed=form == "laz")
         notes += out.notes
         return out
     makers: dict[str, Callable[[Path, Contents], AbstractContextManager[Writer]]] = {
-        "ply": _Ply,
-        "vtkhdf": _Vtk,
+        "ply": _PlyWriter,
+        "vtkhdf": _VtkWriter,
     }
     return makers[form](path, contents)

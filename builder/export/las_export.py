@@ -30,7 +30,7 @@ _LONGEST_WKT = 65534
 EXACT_INTENSITY = "intensity_float"
 
 
-class LasOut:
+class LasWriter:
     """LAS or LAZ file being written; a context manager. notes: facts that a reader should know."""
 
     def __init__(
@@ -60,7 +60,7 @@ class LasOut:
             path.open("wb"), mode="w", header=header, do_compress=compressed, closefd=True
         )
 
-    def __enter__(self) -> "LasOut":
+    def __enter__(self) -> "LasWriter":
         return self
 
     def __exit__(self, *_: object) -> None:

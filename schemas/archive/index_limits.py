@@ -32,7 +32,7 @@ _MAX_SAMPLE = 1 << 53
 # Links are int32 (schemas/archive/voxel.py).
 _MAX_ROWS = (1 << 31) - 1
 # The shortest zstd frame: magic number, header, one block and checksum.
-_LEAST_FRAME = 13
+_MIN_FRAME_BYTES = 13
 
 
 def _refuse(what: str, found: Any, expected: str) -> None:
@@ -205,8 +205,8 @@ def _check_frames(voxels: NDArray, sizes: NDArray[np.uint64]) -> None:
     beyond = (length > room) | (offset > room - np.minimum(length, room))  # a sum would overflow
     if beyond.any():
         _refuse(_at(voxels, beyond), "points beyond a shard's end", "frames inside their shards")
-    if (short := length < _LEAST_FRAME).any():
-        _refuse(_at(voxels, short), f"with a frame under {_LEAST_FRAME} bytes", "whole frames")
+    if (short := length < _MIN_FRAME_BYTES).any():
+        _refuse(_at(voxels, short), f"with a frame under {_MIN_FRAME_BYTES} bytes", "whole frames")
     shard = np.repeat(voxels["shard"], 3)
     begin, end = offset.ravel(), (offset + length).ravel()
     order = np.lexsort((begin, shard))

@@ -42,7 +42,7 @@ _OF_THREAD = threading.local()
 # A zstd frame in memory, or in a file that is deleted with the mapping.
 Frame = bytes | mmap.mmap
 # A block of zstd takes at least 3 bytes of header and 1 of content.
-_LEAST_BLOCK = 4
+_MIN_BLOCK_BYTES = 4
 
 
 class Expansion(NamedTuple):
@@ -85,8 +85,8 @@ def sparse_frame(parts: Iterable[bytes | memoryview], size: int, ratio: int) -> 
     """
     stream = new_compressor().compressobj(size=size)
     for part in parts:
-        for begin in range(0, len(part), _LEAST_BLOCK * ratio):
-            yield stream.compress(part[begin : begin + _LEAST_BLOCK * ratio])
+        for begin in range(0, len(part), _MIN_BLOCK_BYTES * ratio):
+            yield stream.compress(part[begin : begin + _MIN_BLOCK_BYTES * ratio])
             yield stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
     yield stream.flush()
 

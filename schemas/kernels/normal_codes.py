@@ -6,9 +6,9 @@ steps: count, sums and sums of products, exact int64. From these compute in floa
 operation exactly as it stands here and nothing but + - * / and square root, which IEEE 754 rounds
 identically everywhere: the covariance, divided by its trace; SWEEPS cyclic sweeps of Jacobi
 rotations (Jacobi 1846; the stable form is Golub and Van Loan, Matrix Computations, section 8.5);
-the eigenvector of the least eigenvalue. There is no normal, code NONE,
+the eigenvector of the least eigenvalue. There is no normal, code NO_NORMAL,
 
-- for fewer than LEAST_POINTS points, or if all are in one place;
+- for fewer than MIN_POINTS points, or if all are in one place;
 - for points along a line: the second eigenvalue is at most LINE times the greatest;
 - for points without a thin direction: the least eigenvalue is above THICK times the second.
 
@@ -25,8 +25,8 @@ import numpy as np
 
 from . import compiling as nb
 
-NONE = np.uint16(0)
-LEAST_POINTS = 3
+NO_NORMAL = np.uint16(0)
+MIN_POINTS = 3
 # Ratio of variances; standard deviations of 1 : 32. The points of one scanner row, with noise, are
 # below it. A strip at the edge of a surface, a tenth as wide as it is long, is above it.
 LINE = 2.0**-10
@@ -112,7 +112,7 @@ def encode_normal(x, y, z):
 
 @nb.njit(nogil=True, cache=True)
 def decode_normal(code):
-    """Return the unit vector (x, y, z), z >= 0, of a code that is not NONE."""
+    """Return the unit vector (x, y, z), z >= 0, of a code that is not NO_NORMAL."""
     u, v = np.float64(np.int64(code) // 256 - _MIDDLE), np.float64(np.int64(code) % 256 - _MIDDLE)
     x, y = (u + v) * 0.5, (u - v) * 0.5
     z = _LEVELS - abs(x) - abs(y)
@@ -127,8 +127,8 @@ def normal_code(sums):
     sums: (10,) int64, over the differences to the point [steps]: count, x, y, z, xx, yy, zz, yz,
     zx, xy.
     """
-    if sums[0] < LEAST_POINTS:
-        return NONE
+    if sums[0] < MIN_POINTS:
+        return NO_NORMAL
     n = np.float64(sums[0])
     x, y, z = np.float64(sums[1]) / n, np.float64(sums[2]) / n, np.float64(sums[3]) / n
     xx, yy = np.float64(sums[4]) / n - x * x, np.float64(sums[5]) / n - y * y
@@ -137,8 +137,8 @@ def normal_code(sums):
     xy = np.float64(sums[9]) / n - x * y
     trace = xx + yy + zz
     if not trace > 0.0:
-        return NONE
+        return NO_NORMAL
     values, vector = least_direction(xx / trace, yy / trace, zz / trace, yz / trace, zx / trace, xy / trace)
     if values[1] <= LINE * values[2] or values[0] > THICK * values[1]:
-        return NONE
+        return NO_NORMAL
     return encode_normal(vector[0], vector[1], vector[2])

@@ -30,7 +30,7 @@ def temporary_path(path: Path) -> Path:
 
 # No piece of HDF5's own structures is longer than this [bytes]; the longest is a group's list of
 # its links.
-_MOST_METADATA = 1 << 20
+_MAX_METADATA = 1 << 20
 
 
 class _Disk:
@@ -71,7 +71,7 @@ class _Disk:
                     done += os.pwrite(self._descriptor, data[done:], self._position + done)
             except OSError as error:
                 self.error = OSError(error.errno, error.strerror, str(self._path))
-        if self.error is not None and len(data) <= _MOST_METADATA:
+        if self.error is not None and len(data) <= _MAX_METADATA:
             self._kept.append((self._position, bytes(data)))
         self._position += len(data)
         self._end = max(self._end, self._position)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.errors import CorruptError
-from ...schemas.kernels.normal_codes import NONE, decode_normal
+from ...schemas.kernels.normal_codes import NO_NORMAL, decode_normal
 from ..kernels.core.voxel_layout import LANES
 from ..kernels.rays.stored_normals import NOT_ESTIMATED, code_at, find_voxel, stored_code_at
 from ..residency.voxel_store import VoxelStore
@@ -79,7 +79,7 @@ class Normals:
         StoppedError.
         """
         code = self.code(cloud, reach, stop)
-        if code == NONE:
+        if code == NO_NORMAL:
             return None
         x, y, z = decode_normal(code)
         a, b, c = (float(t) for t in np.asarray(toward))
@@ -87,7 +87,7 @@ class Normals:
         return np.array([side * x, side * y, side * z])
 
     def code(self, cloud: ArrayLike, reach: float, stop: StopFlag = NO_STOP) -> int:
-        """Return the code of the normal (schemas/kernels/normal_codes.py); NONE if there is none.
+        """Return the code of the normal (schemas/kernels/normal_codes.py); NO_NORMAL if there is none.
 
         stop: ends a wait for a load. Raise CorruptError, StoppedError.
         """
@@ -101,7 +101,7 @@ class Normals:
         x, y, z = (round((c - o) / step) for c, o in zip(place, self._origin, strict=True))
         row = find_voxel(self._data.broad.keys, self._data.arrays.voxel_steps, x, y, z)
         if row < 0:
-            return int(NONE)
+            return int(NO_NORMAL)
         residency = self._data.residency
         with residency.frozen():
             if self._data.arrays.where[row, 0] >= 0:

@@ -222,13 +222,13 @@ def closest_in_record(leaves, spheres, queries, groups, start_leaf, best):
 
 
 # Boxes per box of the next level.
-DEGREE = 8
+BOX_DEGREE = 8
 # Differences from here on count as FAR: their squares would overflow.
-_MOST = 1 << 31
+_MAX_DIFFERENCE = 1 << 31
 
 
 class BoxTree(NamedTuple):
-    """Boxes level by level, up to a single root; each encloses DEGREE boxes of the level below.
+    """Boxes level by level, up to a single root; each encloses BOX_DEGREE boxes of the level below.
 
     low, high: (t, 3) int64, inclusive corners.
     starts: (levels + 1,) int64, where each level begins; level 0 holds the given boxes.
@@ -243,7 +243,7 @@ def make_box_tree(low: NDArray[np.int64], high: NDArray[np.int64]) -> BoxTree:
     """Build the tree over boxes low, high (v, 3), v >= 1."""
     lows, highs = [low], [high]
     while len(lows[-1]) > 1:
-        cuts = np.arange(0, len(lows[-1]), DEGREE)
+        cuts = np.arange(0, len(lows[-1]), BOX_DEGREE)
         lows.append(np.minimum.reduceat(lows[-1], cuts))
         highs.append(np.maximum.reduceat(highs[-1], cuts))
     starts = np.cumsum([0, *map(len, lows)]).astype(np.int64)
@@ -256,7 +256,7 @@ def _box_distance2(low, high, box, x, y, z):
     gx = max(low[box, 0] - x, x - high[box, 0], 0)
     gy = max(low[box, 1] - y, y - high[box, 1], 0)
     gz = max(low[box, 2] - z, z - high[box, 2], 0)
-    if gx >= _MOST or gy >= _MOST or gz >= _MOST:
+    if gx >= _MAX_DIFFERENCE or gy >= _MAX_DIFFERENCE or gz >= _MAX_DIFFERENCE:
         return FAR
     # Compare in float64 first: three squares below 2^62 may sum to more than int64 holds.
     if np.float64(gx) * gx + np.float64(gy) * gy + np.float64(gz) * gz > 1.1 * FAR:
@@ -293,8 +293,8 @@ def near_boxes(tree, queries, own, best, after, rows, distances):
             if d2 >= best[q] or (held == most and d2 > distances[q, held - 1]):
                 continue
             if level > 0:
-                end = min((item + 1) * DEGREE, tree.starts[level] - tree.starts[level - 1])
-                for child in range(item * DEGREE, end):
+                end = min((item + 1) * BOX_DEGREE, tree.starts[level] - tree.starts[level - 1])
+                for child in range(item * BOX_DEGREE, end):
                     stack[depth, 0], stack[depth, 1] = level - 1, child
                     depth += 1
                 continue

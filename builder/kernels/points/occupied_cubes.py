@@ -7,7 +7,7 @@ from ....schemas.kernels import compiling as nb
 # Free slot of a voxel table: no key is negative.
 FREE = np.int64(-1)
 # Maximum voxel coordinate, either way; voxels beyond it are counted as if at the limit.
-_MOST = (1 << 20) - 1
+_MAX_VOXEL = (1 << 20) - 1
 
 
 @nb.njit(nogil=True, cache=True)
@@ -57,8 +57,8 @@ def find_cube_points(xyz, origin, step, voxel_steps, chosen, table, known, picke
             # The multiplication may be off by one.
             voxel += np.int64(left >= voxel_steps) - np.int64(left < 0)
             at[axis] = steps - voxel * voxel_steps
-            clipped = min(max(int(voxel), -_MOST), _MOST)
-            key = (key << 21) | np.int64(clipped + _MOST)
+            clipped = min(max(int(voxel), -_MAX_VOXEL), _MAX_VOXEL)
+            key = (key << 21) | np.int64(clipped + _MAX_VOXEL)
         if key != last:
             if 4 * known[0] >= 3 * table.shape[0]:
                 return count, i

@@ -17,7 +17,7 @@ from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_row
 
 # Bytes of the shortest row of three numbers, "0 0 0" and a line end. A declared count is checked
 # against the bytes left in the file.
-LEAST_ROW_BYTES = 6
+MIN_ROW_BYTES = 6
 # Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
 # (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
 MAX_SCANS = 1 << 16
@@ -90,8 +90,8 @@ def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_li
     begin = file.tell()
     left = file.seek(0, 2) - begin
     file.seek(begin)
-    if count * LEAST_ROW_BYTES > left + 1:  # the last row may lack its line end
-        raise _too_few(path, index, max(0, (left + 1) // LEAST_ROW_BYTES), count)
+    if count * MIN_ROW_BYTES > left + 1:  # the last row may lack its line end
+        raise _too_few(path, index, max(0, (left + 1) // MIN_ROW_BYTES), count)
     raw = file.readline(LONGEST_LINE)
     fields = split_row(raw.decode("latin-1"), None)
     if len(fields) not in (3, 4, 6, 7) or not all(map(is_number, fields)):

@@ -10,17 +10,17 @@ from .console import bytes_text, print_facts
 
 if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
-    from ....builder.export.export_archive import Exported
+    from ....builder.export.export_archive import ExportSummary
     from ....schemas.archive.index import Source
     from ...residency.voxel_store import VoxelStore
 
 
-def print_export(done: "Exported") -> None:
+def print_export(done: "ExportSummary") -> None:
     """Print the summary of a completed export."""
     print_facts(_export_facts(done))
 
 
-def _export_facts(done: "Exported") -> Iterator[tuple[str, str]]:
+def _export_facts(done: "ExportSummary") -> Iterator[tuple[str, str]]:
     yield "file", f"{done.file}, {done.format}, {bytes_text(done.bytes)}"
     yield "points", f"{done.points:,}"
     if done.low is not None and done.high is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
-from ....schemas.kernels.normal_codes import NONE, normal_code
+from ....schemas.kernels.normal_codes import NO_NORMAL, normal_code
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
 from ..core.voxels_in_reach import find_key
@@ -128,18 +128,18 @@ def code_at(scene, voxel, x, y, z, square, codes):
     scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], found to fit by
     `normals.normal_reach`.  codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; an
     estimate is stored there. With length 0, nothing is stored.
-    Returns (code, nodes visited, whether it was estimated). The code is NONE where the voxel has no
+    Returns (code, nodes visited, whether it was estimated). The code is NO_NORMAL where the voxel has no
     point there, or is not resident.
     """
     if scene.where[voxel, 0] < 0:
-        return NONE, 0, False
+        return NO_NORMAL, 0, False
     rows, sums = np.empty(STACK, np.int64), np.zeros(SUMS, np.int64)
     x -= scene.coordinates[voxel, 0] * scene.voxel_steps
     y -= scene.coordinates[voxel, 1] * scene.voxel_steps
     z -= scene.coordinates[voxel, 2] * scene.voxel_steps
     lane, visits = _find_point(scene, voxel, x, y, z, rows)
     if lane < 0:
-        return NONE, visits, False
+        return NO_NORMAL, visits, False
     if codes.shape[0] > 0 and codes[lane] != NOT_ESTIMATED:
         return codes[lane], visits, False
     visits += _add_near(scene, voxel, x, y, z, square, rows, sums)
@@ -156,12 +156,12 @@ def stored_code_at(scene, voxel, x, y, z, with_scan):
     with_scan: whether scan numbers are in memory.
     """
     if scene.where[voxel, 0] < 0:
-        return NONE, 0
+        return NO_NORMAL, 0
     rows = np.empty(STACK, np.int64)
     x -= scene.coordinates[voxel, 0] * scene.voxel_steps
     y -= scene.coordinates[voxel, 1] * scene.voxel_steps
     z -= scene.coordinates[voxel, 2] * scene.voxel_steps
     lane, visits = _find_point(scene, voxel, x, y, z, rows)
     if lane < 0:
-        return NONE, visits
+        return NO_NORMAL, visits
     return scene.halves[normal_run(scene.where, voxel, scene.block_words, with_scan) + lane], visits

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.rigid_pose import rigid_pose
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
-from ....schemas.kernels.normal_codes import NONE, decode_normal, normal_code
+from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies.body_pairs import CONTACT, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
@@ -68,7 +68,7 @@ class Shape(NamedTuple):
             x, y, z = near.T
             products = [x * x, y * y, z * z, y * z, z * x, x * y]
             code = normal_code(np.array([len(near), *(c.sum() for c in (x, y, z, *products))], np.int64))
-            self.normals[point] = None if code == NONE else np.array(decode_normal(code))
+            self.normals[point] = None if code == NO_NORMAL else np.array(decode_normal(code))
         return self.normals[point]
 
 

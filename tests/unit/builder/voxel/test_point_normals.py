@@ -21,7 +21,7 @@ from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.kernels.normal_codes import NONE, normal_code
+from solidcloud.schemas.kernels.normal_codes import NO_NORMAL, normal_code
 
 pytestmark = pytest.mark.interpreted
 
@@ -48,7 +48,7 @@ def test_codes_are_those_of_the_definition(kind: str, reach: int) -> None:
     assert found.dtype == np.uint16
     assert found.tolist() == expected
     if kind in ("plane", "corner") and reach == 900:
-        assert np.count_nonzero(found != NONE) > len(local) / 2
+        assert np.count_nonzero(found != NO_NORMAL) > len(local) / 2
 
 
 def test_sums_of_boxes_are_those_of_their_points_and_of_those_that_fit_no_reach_zeros() -> None:
@@ -106,7 +106,7 @@ def test_sums_at_the_bound_are_exact() -> None:
     }
     found = voxel_normals(local, square)
     assert [expected[tuple(p)] for p in local] == found.tolist()
-    assert any(code != NONE for code in expected.values())
+    assert any(code != NO_NORMAL for code in expected.values())
 
 
 # --- archives ---------------------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def test_an_archive_has_the_normals_of_its_points(tmp_path: Path, options: dict[
     archive = build(tmp_path, **options)
     codes = stored(archive)
     assert codes == expected(archive)
-    assert sum(code != NONE for code in codes.values()) > 100
+    assert sum(code != NO_NORMAL for code in codes.values()) > 100
     with Archive(archive) as opened:
         assert opened.header.format_version == 4
         assert opened.header.normal_reach == opened.header.options["normal_reach"] == 0.3

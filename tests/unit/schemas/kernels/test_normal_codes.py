@@ -10,7 +10,7 @@ from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.kernels.normal_codes import (
     LINE,
-    NONE,
+    NO_NORMAL,
     THICK,
     decode_normal,
     encode_normal,
@@ -115,9 +115,9 @@ def test_thresholds_are_where_they_are_said_to_be() -> None:
         if min(abs(line - 1), abs(thick - 1)) < 1e-9:
             continue
         code = code_of(ends * axes)
-        assert (code == NONE) == (line <= 1 or thick > 1)
+        assert (code == NO_NORMAL) == (line <= 1 or thick > 1)
         kinds.add((line <= 1, thick > 1))
-        if code != NONE:
+        if code != NO_NORMAL:
             assert decode_normal(code)[int(np.argmin(axes))] == 1.0
     assert kinds == {(False, False), (True, False), (False, True), (True, True)}
 
@@ -125,15 +125,15 @@ def test_thresholds_are_where_they_are_said_to_be() -> None:
 def test_few_points_lines_and_balls_have_no_normal() -> None:
     rng = np.random.default_rng(5)
     plane = np.array([[0, 0, 0], [300, 0, 0], [0, 300, 0]])
-    assert code_of(plane) != NONE
-    assert code_of(plane[:2]) == code_of(plane[:1]) == NONE
-    assert code_of(np.zeros((50, 3), np.int64)) == code_of(np.full((3, 3), 7)) == NONE
+    assert code_of(plane) != NO_NORMAL
+    assert code_of(plane[:2]) == code_of(plane[:1]) == NO_NORMAL
+    assert code_of(np.zeros((50, 3), np.int64)) == code_of(np.full((3, 3), 7)) == NO_NORMAL
     for _ in range(20):
         way = rng.normal(size=3)
         line = np.rint(np.outer(rng.uniform(-800, 800, 40), way)).astype(np.int64)
-        assert code_of(line) == NONE
+        assert code_of(line) == NO_NORMAL
     ball = rng.normal(size=(4000, 3))
-    assert code_of(np.rint(ball * 500).astype(np.int64)) == NONE
+    assert code_of(np.rint(ball * 500).astype(np.int64)) == NO_NORMAL
 
 
 def test_least_direction_is_numpys() -> None:

@@ -17,7 +17,7 @@ import pytest
 import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.kernels.normal_codes import LINE, NONE, THICK, decode_normal
+from solidcloud.schemas.kernels.normal_codes import LINE, NO_NORMAL, THICK, decode_normal
 from solidcloud.server.archives.masked_archive import LeftOut
 from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
@@ -221,7 +221,7 @@ def test_where_no_point_is_there_is_no_normal(tmp_path: Path) -> None:
     with asked(case.archive) as (opened, normals):
         header = opened.store.archive.header
         place = next(place for place, *_ in judged(opened, case.points))
-        assert normals.code(place, REACH) != NONE
+        assert normals.code(place, REACH) != NO_NORMAL
         near = place + 0.4 * header.lattice.step
         assert normals.code(near, REACH) == normals.code(place, REACH)
         before = normals.estimated
@@ -293,7 +293,7 @@ def test_what_is_stored_is_what_is_found_at_first_use(
         assert (opened.store.sizes == own + 64 * leaves.astype(int)).all()
         assert [normals.code(place, REACH) for place in places] == first
         assert normals.estimated == normals.used_bytes == 0 < opened.data.residency.evictions
-        assert normals.code(places[0] + 0.01, REACH) == NONE
+        assert normals.code(places[0] + 0.01, REACH) == NO_NORMAL
         opened.data.residency.check()
         # Another reach is found as ever.
         assert normals.code(places[0], REACH / 2) in range(1 << 16) and normals.estimated == 1

@@ -121,7 +121,7 @@ class Scene(SceneQuestions):
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
         if read_points is None:
-            from .cli.input.point_file import read_avatar  # needs the readers of all formats
+            from .avatars.avatar_file import read_avatar  # needs the readers of all formats
 
             read_points = read_avatar
         file = read_scene(path)

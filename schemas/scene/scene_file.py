@@ -19,7 +19,7 @@ from ..archive.voxel_grid import MAX_COORDINATE
 from ..errors import BadRequestError
 from ..wire.key_expressions import check_name
 from .effect_table import AnyEffect, Stop, Through, Vector, effect_name
-from .toml_faults import MAX_BYTES, decode, fault, nearest, shown
+from .toml_faults import MAX_BYTES, decode, format_value, suggestion, toml_error
 
 SUFFIX = ".toml"
 FORMAT = 1
@@ -184,7 +184,7 @@ def parse_scene(text: bytes, where: str) -> SceneFile:
     """
     scene = decode(text, SceneFile, where)
     for place, said in _faults(scene):
-        raise fault(where, place, said, text)
+        raise toml_error(where, place, said, text)
     return structs.replace(
         scene, archives=_orthonormalise(scene.archives), objects=_orthonormalise(scene.objects)
     )
@@ -196,7 +196,7 @@ def check_scene(scene: SceneFile, where: str) -> None:
     Names must be unique and defined, required effects present, poses rigid.
     """
     for place, said in _faults(scene):
-        raise fault(where, place, said)
+        raise toml_error(where, place, said)
 
 
 def json_schema() -> str:
@@ -259,11 +259,11 @@ def _objects(scene: SceneFile, effects: list[str]) -> Iterator[tuple[str, str]]:
     known = [item.name for item in scene.avatars]
     for number, item in enumerate(scene.objects):
         if item.avatar not in known:
-            listed = f"one of {', '.join(map(shown, known))}" if known else "it in [[avatars]]"
-            close = nearest(item.avatar, known)
+            listed = f"one of {', '.join(map(format_value, known))}" if known else "it in [[avatars]]"
+            close = suggestion(item.avatar, known)
             yield (
                 f"$.objects[{number}].avatar",
-                f"{shown(item.avatar)} is not an avatar of the scene: expected {listed}{close}",
+                f"{format_value(item.avatar)} is not an avatar of the scene: expected {listed}{close}",
             )
     if scene.objects and "objects" not in effects:
         yield (
@@ -278,7 +278,10 @@ def _twice(names: list[str], what: str, field: str) -> Iterator[tuple[str, str]]
     for number, name in enumerate(names):
         if name in names[:number]:
             first = f"$.{what}[{names.index(name)}]"
-            yield f"$.{what}[{number}].{field}", f"{shown(name)} is a duplicate: expected once, as in {first}"
+            yield (
+                f"$.{what}[{number}].{field}",
+                f"{format_value(name)} is a duplicate: expected once, as in {first}",
+            )
 
 
 def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
@@ -289,7 +292,8 @@ def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
         if not all(low <= high for low, high in zip(box.low, box.high, strict=True)):
             yield (
                 f"{place}[{number}]",
-                f"box {shown(box.name)} from {list(box.low)} to {list(box.high)}: expected low <= high along each axis",
+                f"box {format_value(box.name)} from {list(box.low)} to {list(box.high)}: expected low <= high along "
+                "each axis",
             )
     yield from _twice([box.name for box in effect.boxes], place[2:], "name")
 
@@ -297,7 +301,7 @@ def _boxes(effect: Through, place: str) -> Iterator[tuple[str, str]]:
 def _path(path: str, place: str) -> Iterator[tuple[str, str]]:
     """Yield the fault of a path that no file can have."""
     if "\0" in path:
-        yield place, f"found {shown(path)}: expected a path, without the character NUL"
+        yield place, f"found {format_value(path)}: expected a path, without the character NUL"
 
 
 def _position(position: Vector, place: str) -> Iterator[tuple[str, str]]:

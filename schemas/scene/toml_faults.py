@@ -1,7 +1,7 @@
 """Explanations of invalid TOML files, in one sentence: where, what was found, what was expected.
 
 msgspec reports the place (`$.effects[0].skin`) and the type. This module adds the value found
-there, everything that is allowed, the nearest valid name, and the line.
+there, everything that is allowed, a suggestion of the valid name, and the line.
 """
 
 import bisect
@@ -52,13 +52,13 @@ def decode(text: bytes, kind: type[_T], where: str) -> _T:
             if isinstance(value, int):
                 if value.bit_length() > _MAX_BITS:
                     said = f"found an integer of {value.bit_length():,} bits: expected at most {_MAX_BITS}"
-                    raise fault(where, place, said, text)
+                    raise toml_error(where, place, said, text)
             elif not math.isfinite(value):
-                raise fault(where, place, f"found {shown(value)}: expected a finite number", text)
+                raise toml_error(where, place, f"found {format_value(value)}: expected a finite number", text)
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         place, said = _explained(str(error), data, kind)
-        raise fault(where, place, said, text) from None
+        raise toml_error(where, place, said, text) from None
     except RecursionError:  # dotted keys nest without brackets
         raise BadRequestError(f"{where}: nested too deeply") from None
 
@@ -85,7 +85,7 @@ def _decoded(text: bytes) -> str:
     return text.decode("utf-8-sig")
 
 
-def fault(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
+def toml_error(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
     """Return the error for a fault at a place of a file.
 
     text: the file's bytes, to find the line; None: no line.
@@ -95,16 +95,16 @@ def fault(where: str, place: str, said: str, text: bytes | None = None) -> BadRe
     return BadRequestError(f"{where}: {at}{place}: {said}")
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value as in the file, shortened."""
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= _LONGEST_SHOWN else text[: _LONGEST_SHOWN - 1] + "…"
 
 
-def nearest(name: Any, names: list[str]) -> str:
+def suggestion(name: Any, names: list[str]) -> str:
     """Return a hint with the most similar name, or ""."""
     close = difflib.get_close_matches(str(name), names, 1)
-    return f": did you mean {shown(close[0])}?" if close else ""
+    return f": did you mean {format_value(close[0])}?" if close else ""
 
 
 def line_of(text: str, place: str) -> int | None:
@@ -186,7 +186,7 @@ def _explained(message: str, data: Any, kind: Any) -> tuple[str, str]:
     if field[1] == "missing required":
         needed = [each.encode_name for each in node.fields if each.required]
         return place, f"has no `{field[2]}`: expected {', '.join(f'`{name}`' for name in needed)}"
-    hint = nearest(field[2], names)
+    hint = suggestion(field[2], names)
     of_file = [each.encode_name for each in root.fields] if isinstance(root, inspect.StructType) else []
     if not hint and place != "$" and field[2] in of_file:
         # A line after a table's header belongs to that table; the author probably meant a field of
@@ -206,22 +206,26 @@ def _of_value(place: str, node: Any, value: Any) -> tuple[str, str]:
         if tags:
             field = str(_struct(next(iter(tags.values()))).tag_field)
             return _of_tag(place, field, list(tags), value)
-    return place, f"found {shown(value)}: expected {_expected(node)}"
+    return place, f"found {format_value(value)}: expected {_expected(node)}"
 
 
 def _of_tag(place: str, field: str, tags: list[str], value: Any) -> tuple[str, str]:
     """Explain a fault of a tagged table: return its place and the explanation."""
     listed = ", ".join(tags)
     if not isinstance(value, dict):
-        hint = f": write [[{place.partition('[')[0][2:]}]] {field} = {shown(value)}" if value in tags else ""
-        return place, f"found {shown(value)}: expected a table with `{field}`, one of {listed}{hint}"
+        hint = (
+            f": write [[{place.partition('[')[0][2:]}]] {field} = {format_value(value)}"
+            if value in tags
+            else ""
+        )
+        return place, f"found {format_value(value)}: expected a table with `{field}`, one of {listed}{hint}"
     place = place.removesuffix(f".{field}")
     if field not in value:
         return place, f"has no `{field}`: expected one of {listed}"
     tag = value[field]
     return (
         f"{place}.{field}",
-        f"{shown(tag)} is not a known {field}: expected one of {listed}{nearest(tag, tags)}",
+        f"{format_value(tag)} is not a known {field}: expected one of {listed}{suggestion(tag, tags)}",
     )
 
 
@@ -269,7 +273,7 @@ def _narrowed(node: Any, value: Any) -> Any:
 
 def _name(node: inspect.StructType) -> str:
     """Return the name of a tagged table, for messages."""
-    return f"{node.tag_field} {shown(node.tag)}"
+    return f"{node.tag_field} {format_value(node.tag)}"
 
 
 def _expected(node: Any) -> str:
@@ -285,7 +289,7 @@ def _expected(node: Any) -> str:
     if isinstance(node, inspect.StrType):
         return f"a string{_lengths(node, 'characters')}"
     if isinstance(node, inspect.LiteralType):
-        return " or ".join(shown(value) for value in sorted(node.values, key=str))
+        return " or ".join(format_value(value) for value in sorted(node.values, key=str))
     if isinstance(node, inspect.TupleType):
         return f"a list of {len(node.item_types)}, each {_expected(node.item_types[0])}"
     if isinstance(node, inspect.ListType):

@@ -21,7 +21,7 @@ from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.cli.input.point_file import read_thinned
+from solidcloud.server.report.common.thinned_points import read_thinned
 from solidcloud.server.scene import Scene
 
 SCENE = "chaos"

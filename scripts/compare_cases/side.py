@@ -108,7 +108,8 @@ def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
         open_scene = find("open_scene", "server.scenes.open_scene", "server.scene_file")
     except ImportError:  # since Scene.open takes scene files, too
         return stack.enter_context(find("Scene", "server.scene").open(path, budget_bytes=1 << 30))
-    read_avatar = find("read_avatar", "server.cli.input.point_file", "server.report.points")
+    rooms = ("server.avatars.avatar_file", "server.cli.input.point_file", "server.report.points")
+    read_avatar = find("read_avatar", *rooms)
     return stack.enter_context(open_scene(path, read_points=read_avatar, budget_bytes=1 << 30))
 
 

@@ -1,4 +1,4 @@
-"""What an archive says of itself, and what a scene file adds to it. Reads no voxel."""
+"""Description of an archive, and what a scene file adds to it. Reads no voxel."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ from ..residency.voxel_store import VoxelStore
 
 
 def describe(store: VoxelStore, name: str) -> SceneInfo:
-    """What the archive of `store` holds: counts, bounds, lattice, radius, sources. Reads no voxel."""
+    """Return the description of an archive: counts, bounds, lattice, radius, sources."""
     header = store.archive.header
     lattice, now = header.lattice, header.radius_now
     return SceneInfo(
@@ -58,13 +58,15 @@ def describe(store: VoxelStore, name: str) -> SceneInfo:
 
 
 def listed_sources(header: Header) -> int:
-    """How many sources an archive lists: a point's scan_index is a row of them, so what was left out stays in its place
-    where others stand behind."""
+    """Return how many sources an archive lists: all up to the last one that was not left out.
+
+    A point's scan_index is a row of the list, so a source that was left out keeps its row.
+    """
     return max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
 
 
 def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInfo] = ()) -> SceneInfo:
-    """What is said of a scene besides its archives: what its file calls for. avatars: the scene's own."""
+    """Return the description of a scene with what its file declares. avatars: the scene's own."""
     spawn = file.spawn
     return structs.replace(
         info,
@@ -78,7 +80,10 @@ def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInf
 
 
 def run_order(file: SceneFile) -> list[str]:
-    """The names of a scene's effects as they run: what is left out of the scene is when it is opened, before all."""
+    """Return the names of a scene's effects in the order in which they run.
+
+    `through` is the first: it acts when the archive is opened.
+    """
     declared = {effect_name(effect) for effect in file.effects}
     if len(declared) < 2:
         return list(declared)

@@ -1,14 +1,15 @@
-"""An archive without its points in some boxes, as if they had never been scanned. What `through` opens.
+"""An archive without its points in some boxes, as if they had never been scanned, for the effect `through`.
 
-The rule: a point is in a box if its world coordinates, as every answer gives them (`Lattice.to_world`, then the
-archive's pose, server/archives/rigid_transform.py), are within low to high on each axis, both included.
+A point is in a box if its world coordinates, as every answer gives them (`Lattice.to_world`, then the
+archive's pose, rigid_transform.py), are within low to high on each axis, both included.
 
-The few voxels that a box cuts are built anew by the builder's code when the archive is opened, and their records kept
-in a temporary file without a name: a load costs what it always does, no memory is taken that nobody counts, and the
-bytes a voxel takes are known before it is loaded. Voxels whose cell lies in a box whole are gone unread, so
-however large a box, what it costs is what its borders cut; while it is built, a voxel takes 90 bytes a point. All else
-stays: the header stays the archive's, its bounds (`outside`), counts and radius with it, and so do regions of scans
-left out, which are unknown inside a box too.
+Only the few voxels that a box intersects are rebuilt, by the builder's code, when the archive is
+opened. Their records are kept in an unnamed temporary file, so that a load costs what it always
+does, no memory is used that is not counted, and the size of a voxel is known before it is loaded.
+Voxels whose cell lies inside a box are dropped unread: a large box costs only what its borders
+intersect. Rebuilding a voxel takes 90 bytes a point. The header is unchanged, with its bounds
+(`outside`), counts and radius, and so are the regions of scans left out, which are unknown inside a
+box too.
 """
 
 import io
@@ -29,55 +30,55 @@ from .rigid_transform import archive_pose, moved, moved_boxes
 
 log = logging.getLogger(__name__)
 
-# What a corner carried by a pose may be off, of the largest coordinate: boxes of voxels are only to choose those that
-# are read.
+# Rounding error of a transformed corner, as a share of the largest coordinate. Boxes of voxels only
+# decide which voxels are read.
 _ROUNDING = 1e-14
-# How often whoever waits is told how far it is [s].
-_SAID_EVERY = 10.0
+# Interval between two lines of progress in the log [s].
+_LOG_SECONDS = 10.0
 
-# Where a record built anew lies in the temporary file: (offset, bytes) of each frame.
+# Place of a rebuilt record in the temporary file: (offset, bytes) of each frame.
 _Place = list[tuple[int, int]]
 
 
-class LeftOut(Archive):
-    """An archive opened for reading, points in some boxes left out."""
+class MaskedArchive(Archive):
+    """An archive opened for reading, without the points in some boxes."""
 
     def __init__(
         self, folder: str | os.PathLike[str], boxes: Sequence[ArrayLike], pose: ArrayLike | None = None
     ) -> None:
-        """Open the archive in `folder`, which lies at `pose` in the world; None: at the identity.
+        """Open the archive in `folder`, at `pose` in the world; None: at the identity.
 
-        boxes: (2, 3) each, low and high, world [m]. The voxels that they cut are read. Raises FormatError as `Archive`
-        does, and where one cannot be read now; SolidcloudError where there is no room for what is built anew,
-        BadRequestError where the boxes hold all points. A corrupt record stays one: whoever asks for the voxel is told
-        why.
+        boxes: (2, 3) each, low and high, world [m]. The voxels that they intersect are read.
+        Raises FormatError as `Archive` does, and for a voxel that cannot be read now,
+        SolidcloudError without room for the rebuilt records, BadRequestError if the boxes hold all
+        points. A corrupt record stays corrupt: the request that loads the voxel gets the error.
         """
         self._boxes = [np.asarray(box, np.float64) for box in boxes]
         self._pose = archive_pose(pose)
         self._file: io.FileIO | None = None
         self._end = 0
-        self._anew: dict[int, _Place] = {}
+        self._rebuilt: dict[int, _Place] = {}
         self._corrupt: dict[int, CorruptError] = {}
         super().__init__(folder)
         try:
-            self._leave_out()
+            self._mask()
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Close the shards and forget what was built anew."""
+        """Close the shards and the file of rebuilt records."""
         super().close()
         if self._file is not None:
             self._file.close()
 
-    def _leave_out(self) -> None:
-        """Build anew what a box cuts, and make the index say so."""
+    def _mask(self) -> None:
+        """Rebuild the voxels that a box intersects, and update the index."""
         voxels = self.voxels.copy()
-        anew: dict[int, _Place] = {}
+        rebuilt: dict[int, _Place] = {}
         corrupt: dict[int, CorruptError] = {}
-        cut, gone = self._met()
-        for row, boxes in self._telling(cut):
+        partial, gone = self._intersected()
+        for row, boxes in self._log_progress(partial):
             try:
                 points = read_points(self, row)
             except CorruptError as error:
@@ -94,8 +95,8 @@ class LeftOut(Archive):
                 gone[row] = True
                 continue
             built = build_rest(self.header, int(self.voxels["key"][row]), points, stays)
-            anew[row] = self._keep(built)
-            _say(voxels, row, built)
+            rebuilt[row] = self._store(built)
+            _update_row(voxels, row, built)
         kept = np.flatnonzero(~gone)
         if len(voxels) and not len(kept):
             raise BadRequestError(
@@ -104,14 +105,15 @@ class LeftOut(Archive):
             )
         now = {row: at for at, row in enumerate(kept.tolist())}
         self.voxels, self.coordinates = voxels[kept], self.coordinates[kept]
-        self._anew = {now[row]: place for row, place in anew.items()}
+        self._rebuilt = {now[row]: place for row, place in rebuilt.items()}
         self._corrupt = {now[row]: said for row, said in corrupt.items()}
 
-    def _met(self) -> tuple[dict[int, list[NDArray[np.float64]]], NDArray[np.bool_]]:
-        """The rows of voxels that boxes cut, and these; and which voxels (v,) lie in one whole.
+    def _intersected(self) -> tuple[dict[int, list[NDArray[np.float64]]], NDArray[np.bool_]]:
+        """Return the boxes that intersect voxels, by row, and the mask (v,) of voxels inside one box.
 
-        A box cuts a voxel by the bounds of its points in the index. What lies in a box whole is never read, so that
-        goes by the voxel's cell, which no index can make smaller (server/residency/index_proof.py).
+        A box intersects a voxel by the bounds of its points in the index. A voxel inside a box is
+        never read, so the voxel's cell decides, which no forged index can shrink
+        (server/residency/index_proof.py).
         """
         steps = self.header.lattice.voxel_steps
         base = self.coordinates * steps
@@ -130,7 +132,7 @@ class LeftOut(Archive):
     def _world_boxes(
         self, low: NDArray[np.int64], high: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Boxes (v, 3) each [steps] as boxes that hold them in the world [m]."""
+        """Return world boxes [m] that enclose lattice boxes, low and high (v, 3) each."""
         world = self.header.lattice.to_world(low), self.header.lattice.to_world(high)
         if self._pose is None or not len(low):
             return world
@@ -138,21 +140,23 @@ class LeftOut(Archive):
         least, greatest = moved_boxes(self._pose, *world)
         return least - far * _ROUNDING, greatest + far * _ROUNDING
 
-    def _telling(
-        self, cut: dict[int, list[NDArray[np.float64]]]
+    def _log_progress(
+        self, partial: dict[int, list[NDArray[np.float64]]]
     ) -> Iterator[tuple[int, list[NDArray[np.float64]]]]:
-        """The voxels that are cut, one after the other; where they take long, the log says how far it is."""
-        said = time.monotonic()
-        for number, (row, boxes) in enumerate(cut.items()):
-            if time.monotonic() - said > _SAID_EVERY:
-                said = time.monotonic()
-                log.info("%s: %d of %d voxels that boxes cut are built anew", self.folder, number, len(cut))
+        """Yield the voxels to rebuild, and log the progress if it takes long."""
+        logged = time.monotonic()
+        for number, (row, boxes) in enumerate(partial.items()):
+            if time.monotonic() - logged > _LOG_SECONDS:
+                logged = time.monotonic()
+                log.info(
+                    "%s: %d of %d voxels that boxes intersect are rebuilt", self.folder, number, len(partial)
+                )
             yield row, boxes
 
     def _in_boxes(
         self, row: int, local: NDArray[np.int32], boxes: list[NDArray[np.float64]]
     ) -> NDArray[np.bool_]:
-        """Which points (n, 3) of a voxel [steps from its corner] are in one of the boxes; the rule."""
+        """Return the mask of the points (n, 3) of a voxel [steps from its corner] that are in a box."""
         lattice = self.header.lattice
         world = lattice.to_world(local + self.coordinates[row] * lattice.voxel_steps)
         if self._pose is not None:
@@ -162,7 +166,7 @@ class LeftOut(Archive):
             within |= ((world >= low) & (world <= high)).all(axis=1)
         return within
 
-    def _keep(self, built: BuiltVoxel) -> _Place:
+    def _store(self, built: BuiltVoxel) -> _Place:
         """Write a record into the temporary file."""
         frames: _Place = []
         try:
@@ -182,20 +186,20 @@ class LeftOut(Archive):
         return frames
 
     def _read_frame(self, row: int, i: int) -> bytes:
-        """The frame of dataset `i` of a voxel; of one built anew that of its new record."""
+        """Return the frame of dataset `i` of a voxel; of a rebuilt voxel, that of its new record."""
         if row in self._corrupt:
-            # Not read again: mended meanwhile, it would be served with the points in the boxes.
+            # Do not read it again: if it was repaired meanwhile, its points in boxes would be served.
             error = self._corrupt[row]
             raise type(error)(str(error), error.paths)
-        place = self._anew.get(row)
+        place = self._rebuilt.get(row)
         if place is None or self._file is None or self._file.closed:
             return super()._read_frame(row, i)
         offset, size = place[i]
         return os.pread(self._file.fileno(), size, offset)
 
 
-def _say(voxels: NDArray, row: int, built: BuiltVoxel) -> None:
-    """Make the index's row say what a record built anew holds; where it lay in its shard, it says on."""
+def _update_row(voxels: NDArray, row: int, built: BuiltVoxel) -> None:
+    """Write the sizes and bounds of a rebuilt record into the index's row; its place in the shard stays."""
     record = built.record
     voxels["rows"][row] = record.cell_rows, record.node_rows, record.point_rows
     voxels["leaves"][row] = record.leaf_rows

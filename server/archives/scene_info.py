@@ -1,4 +1,4 @@
-"""What the archives of a scene say of themselves as one: `info` and `stats`."""
+"""Answers of `info` and `stats` for all archives of a scene together."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,9 +17,9 @@ from .rigid_transform import Pose, moved_boxes, under
 def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> SceneInfo:
     """Return the description of all archives as one scene.
 
-    Counts are added, bounds are in the world, sources stand one archive's behind the other's. Of
-    lattice and trees, of which each archive has its own, the first archive's are said; of radii and
-    of how far points were moved, the largest. The radius models are those that all archives hold.
+    Counts are added, bounds are in the world, and sources are listed archive by archive. Lattice and
+    trees, of which each archive has its own, are those of the first; radii and the distance by which
+    points were moved are the largest. The radius models are those that all archives hold.
     each: the description of one archive, and its pose; None: at the identity.
     """
     infos = [info for info, _ in each]
@@ -59,7 +59,7 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
 
 
 def sources_asked(opened: ArchiveGeneration) -> int:
-    """How many sources an archive lists, of the generation that is asked: those of the next archive stand behind."""
+    """Return how many sources a generation lists; the sources of the next archive follow them."""
     count = opened.kept.get("sources")
     if count is None:
         count = opened.kept["sources"] = listed_sources(opened.store.archive.header)
@@ -67,7 +67,7 @@ def sources_asked(opened: ArchiveGeneration) -> int:
 
 
 def _box(box: list[list[float]], pose: Pose | None) -> Any:
-    """A box (2, 3), or that around it carried by a pose."""
+    """Return a box (2, 3), or the box around it transformed by a pose."""
     sides = np.array(box)
     return sides if pose is None else np.concatenate(moved_boxes(pose, sides[:1], sides[1:]))
 

@@ -16,10 +16,10 @@ from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.process.interrupts import deferring_interrupts
 from ...schemas.process.os_errors import os_error_line
 from .commands import accuracy_command as accuracy
-from .commands import archive_command as archive
+from .commands import add_remove_command as add_remove
 from .commands import build_command as build
-from .commands import edit_command as generation
 from .commands import export_command as export
+from .commands import info_validate_command as info_validate
 from .commands import inspect_command as inspect
 from .commands import make_command as make
 from .commands import plan_command as plan
@@ -53,8 +53,8 @@ verb: Callable[..., int | None]
 for verb in (
     inspect.inspect,
     build.build,
-    archive.info,
-    archive.validate,
+    info_validate.info,
+    info_validate.validate,
     serve.serve,
     accuracy.accuracy,
     query.query,
@@ -62,9 +62,9 @@ for verb in (
     app.command()(verb)
 for verb in (
     export.export,
-    generation.add,
-    generation.remove,
-    generation.reload,
+    add_remove.add,
+    add_remove.remove,
+    add_remove.reload,
     plan.plan,
     top.top,
     replay.replay,

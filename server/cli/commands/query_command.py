@@ -88,8 +88,8 @@ def query(
     error, with exit code 0.
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
+    from ...avatars.avatar_file import read_avatar
     from ...client import Client
-    from ..input.point_file import read_avatar
     from ..input.query_input import ask, check_query, joined
     from ..output.answer_text import answer_lines, answers_json, summary_line, unknown_line, word_of
 
@@ -167,8 +167,8 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
 
     from ....schemas.wire.answers import Verdict
     from ....schemas.wire.encoding import JSON, encode
+    from ...avatars.avatar_file import read_avatar
     from ...client import Client
-    from ..input.point_file import read_avatar
     from ..input.query_input import ask_moves
     from ..output.answer_text import move_line
 

@@ -43,7 +43,7 @@ def check(
 
     Exit code 2: the file is invalid. Exit code 3: an archive or avatar it names is invalid.
     """
-    from ..input.point_file import read_avatar
+    from ...avatars.avatar_file import read_avatar
     from ..output.console import print_facts
     from ..scene_files.scene_check import check_scene_file, scene_facts, scene_json
 

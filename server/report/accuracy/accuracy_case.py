@@ -18,8 +18,8 @@ from ....schemas.archive.archive import Archive
 from ....schemas.archive.index import Header
 from ....schemas.errors import BadDataError
 from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_file import read_avatar
 from ...avatars.avatar_model import make_avatar
-from ...cli.input.point_file import read_avatar
 from ...scene import Scene
 from ..common.floor_walk import floor_walk
 from .accuracy_plan import Plan

@@ -24,11 +24,11 @@ from ....builder.synthetic.figure import figure_points
 from ....schemas.errors import SolidcloudError
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.messages import SceneInfo
-from ...cli.input.point_file import read_thinned
 from ...cli.output.console import bytes_text, print_build, print_facts
 from ...cli.output.progress_display import progress_listener
 from ...client import Client
 from ..common.floor_walk import floor_walk
+from ..common.thinned_points import read_thinned
 from .server_process import served
 from .walk_frames import Frames, Walk
 

@@ -10,7 +10,7 @@ from functools import partial
 from numpy.typing import ArrayLike
 
 from ....schemas.scene.effect_table import Through
-from ...archives.masked_archive import LeftOut
+from ...archives.masked_archive import MaskedArchive
 from ...residency.voxel_store import OpenStore, VoxelStore
 
 
@@ -22,4 +22,4 @@ def store_without(effect: Through, pose: ArrayLike | None = None, normals: float
     identity.  normals: as for `VoxelStore`.
     """
     boxes = [(box.low, box.high) for box in effect.boxes]
-    return partial(VoxelStore, open_archive=partial(LeftOut, boxes=boxes, pose=pose), normals=normals)
+    return partial(VoxelStore, open_archive=partial(MaskedArchive, boxes=boxes, pose=pose), normals=normals)

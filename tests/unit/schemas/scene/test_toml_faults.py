@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.scene_file import parse_scene
-from solidcloud.schemas.scene.toml_faults import decode, line_of, nearest, shown
+from solidcloud.schemas.scene.toml_faults import decode, format_value, line_of, suggestion
 
 TOP = 'format = 1\n[[archives]]\npath = "hall"\n'
 
@@ -71,10 +71,10 @@ def test_the_line_of_every_place_of_a_file_is_found() -> None:
 
 
 def test_a_long_value_is_shortened_and_a_name_like_none_is_not_guessed() -> None:
-    assert shown("é" * 3) == '"ééé"' and shown(True) == "true"
-    assert len(shown(list(range(100)))) == 60 and shown(list(range(100))).endswith("…")
-    assert nearest("slid", ["stop", "slide"]) == ': did you mean "slide"?'
-    assert nearest("xyz", ["stop", "slide"]) == ""
+    assert format_value("é" * 3) == '"ééé"' and format_value(True) == "true"
+    assert len(format_value(list(range(100)))) == 60 and format_value(list(range(100))).endswith("…")
+    assert suggestion("slid", ["stop", "slide"]) == ': did you mean "slide"?'
+    assert suggestion("xyz", ["stop", "slide"]) == ""
 
 
 class _Inner(msgspec.Struct, forbid_unknown_fields=True):

@@ -16,7 +16,7 @@ from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.schemas.wire.columns import array_fields
-from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.archives.masked_archive import MaskedArchive
 from solidcloud.server.scene import Scene
 
 
@@ -113,7 +113,7 @@ def test_verdicts_and_distances_are_those_of_the_naive_judges(whole: Path, rng: 
 @pytest.mark.interpreted
 def test_voxels_are_those_that_a_build_of_the_rest_stores(whole: Path, rest: Path) -> None:
     boxes = [(box.low, box.high) for box in (DOOR, ROOM)]
-    with LeftOut(whole, boxes) as found, Archive(rest) as expected, Archive(whole) as before:
+    with MaskedArchive(whole, boxes) as found, Archive(rest) as expected, Archive(whole) as before:
         served, stored = voxel_bytes(found), voxel_bytes(expected)
         assert served == stored
         # Some are rebuilt, one is gone, most are what they were.
@@ -143,7 +143,10 @@ def test_a_box_beside_everything_changes_no_byte(whole: Path, rng: np.random.Gen
     # Between two lattice planes: it meets voxels, and holds no point.
     between = ThroughBox("between", (0.5 + STEP / 4, 0.0, 0.0), (0.5 + STEP / 2, 2.0, 2.0))
     poses = poses_near(rng, 6)
-    with LeftOut(whole, [(b.low, b.high) for b in (outside, between)]) as found, Archive(whole) as before:
+    with (
+        MaskedArchive(whole, [(b.low, b.high) for b in (outside, between)]) as found,
+        Archive(whole) as before,
+    ):
         assert found.voxels.tobytes() == before.voxels.tobytes()
         frames = [
             [archive.read_frames(row) for row in range(len(before.voxels))] for archive in (found, before)
@@ -167,7 +170,7 @@ def test_scan_intensity_and_class_of_the_points_that_stay_are_what_they_were(who
             found += zip(map(tuple, world.tolist()), *(c.tolist() for c in columns), strict=True)
         return sorted(found)
 
-    with LeftOut(whole, [(DOOR.low, DOOR.high)]) as archive, Archive(whole) as before:
+    with MaskedArchive(whole, [(DOOR.low, DOOR.high)]) as archive, Archive(whole) as before:
         found, everything = stored(archive), stored(before)
     held = in_boxes(np.array([point[0] for point in everything]), (DOOR,))
     assert found == [point for point, left_out in zip(everything, held, strict=True) if not left_out]
@@ -220,7 +223,7 @@ def test_boxes_are_in_the_world_where_an_archive_lies_at_a_pose(
     box = ThroughBox("tilted", tuple(corners[0].tolist()), tuple(corners[1].tolist()))
     expected = points[~in_boxes(world, (box,))]
     assert len(points) - 2 >= len(expected) > 0
-    with LeftOut(whole, [(box.low, box.high)], pose) as archive:
+    with MaskedArchive(whole, [(box.low, box.high)], pose) as archive:
         found = []
         for row in range(len(archive.voxels)):
             base = archive.coordinates[row] * archive.header.lattice.voxel_steps

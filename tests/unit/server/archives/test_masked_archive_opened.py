@@ -17,7 +17,7 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
 from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.server.archives import masked_archive as left_out
-from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.archives.masked_archive import MaskedArchive
 from solidcloud.server.archives.rigid_transform import moved
 from solidcloud.server.scene import Scene
 
@@ -157,7 +157,7 @@ def test_voxels_that_lie_in_a_box_whole_are_not_read(
         low, high = tuple((middle - 0.8).tolist()), tuple((middle + 0.8).tolist())
     # Another box cuts what lies in the first whole.
     middle = np.mean([low, high], axis=0) if posed else np.full(3, 0.75)
-    with LeftOut(whole, [(low, high), (middle, middle + 0.01)], pose) as archive:
+    with MaskedArchive(whole, [(low, high), (middle, middle + 0.01)], pose) as archive:
         rows = archive.voxels["rows"][:, 2].sum()
     world = every if pose is None else moved(pose, every)
     assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()

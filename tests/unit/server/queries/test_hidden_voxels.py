@@ -14,7 +14,7 @@ from forged_archives import Columns, forge
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.voxel_grid import voxel_coordinates
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.archives.masked_archive import MaskedArchive
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import EXACT
@@ -182,7 +182,7 @@ def test_one_hidden_voxel_among_others_is_not_clear(name: str, tmp_path: Path) -
 def test_a_box_that_is_passed_through_takes_no_voxel_whole_that_the_index_places_in_it(every: Hidden) -> None:
     for place, said in list(zip(every.hidden, every.said, strict=True))[:8]:
         boxes = [np.stack([said - 0.001, said + 0.001])]
-        store = VoxelStore(every.folder, partial(LeftOut, boxes=boxes))
+        store = VoxelStore(every.folder, partial(MaskedArchive, boxes=boxes))
         try:
             data = make_scene_data(store.archive, VoxelCache(store, 1 << 26))
             answers = collide(data, make_avatar(BALL, RADIUS), poses_at(place[None]))

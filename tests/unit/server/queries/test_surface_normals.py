@@ -18,7 +18,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.schemas.kernels.normal_codes import LINE, NO_NORMAL, THICK, decode_normal
-from solidcloud.server.archives.masked_archive import LeftOut
+from solidcloud.server.archives.masked_archive import MaskedArchive
 from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
 from solidcloud.server.queries.context.query_context import with_stop
@@ -315,7 +315,7 @@ def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path:
     options = {"keep": frozenset({"normal"}), "normal_reach": REACH}
     case = build(tmp_path, "corner", COUNT // 3, **options)
     box = np.array([[-0.6, -0.6, -0.6], [0.1, 0.4, 1.5]])
-    without = partial(LeftOut, boxes=[box])
+    without = partial(MaskedArchive, boxes=[box])
     with asked(case.archive) as (opened, normals):
         places = [place for place, *_ in judged(opened, case.points)]
         left = [place for place in places if not ((box[0] <= place) & (place <= box[1])).all()]

@@ -1,15 +1,13 @@
-"""Reading of points from scan files: all points for an avatar, or thinned ones for a picture."""
+"""Avatars from files: all points of a scan, or the vertices of a mesh. Imports the readers of all formats."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.sources.placed_scan import place_scan
-from ....builder.sources.scan_files import find_scan_files, open_scans
-from ....schemas.errors import ScanError, TooLargeError
-from ....schemas.wire.messages import MAX_AVATAR_POINTS
+from ...builder.sources.scan_files import open_scans
+from ...schemas.errors import ScanError, TooLargeError
+from ...schemas.wire.messages import MAX_AVATAR_POINTS
 
 
 def read_avatar(path: Path) -> NDArray[np.float64]:
@@ -31,19 +29,3 @@ def read_avatar(path: Path) -> NDArray[np.float64]:
                 )
             blocks.append(block.xyz)
     return np.concatenate([np.empty((0, 3)), *blocks])
-
-
-def read_thinned(paths: Sequence[Path], points: int, at_most: int) -> NDArray[np.float64]:
-    """Read every n-th of the `points` points of scans, about `at_most` in all, (n, 3) [m].
-
-    Raises the errors of open_scans.
-    """
-    step = max(1, -(-points // at_most))
-    blocks = [
-        block.xyz[::step]
-        for path in find_scan_files(paths)
-        for scan in open_scans(path)
-        for block in place_scan(scan).blocks()
-    ]
-    thinned = np.concatenate([np.empty((0, 3)), *blocks])
-    return thinned[np.isfinite(thinned).all(axis=1)]

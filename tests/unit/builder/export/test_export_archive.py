@@ -1,4 +1,4 @@
-"""Exported points are the archive's in the box, to the last bit where the format holds them; or nothing is written."""
+"""Test that exported points are the archive's in the box, bit for bit where the format permits."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A scan whose points all lie at one place is told of, wherever scans are looked at."""
+"""Test the warning about a scan whose points all lie at one position."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The table of scan formats: its readers exist, and README.md and `--help` name every format."""
+"""Test the table of scan formats: its readers exist, and README.md and `--help` name every format."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Scans in other units, with another axis up, at a given pose: the right numbers, the same bits, the lattice."""
+"""Test scans in other units, with another axis up and at a given pose: coordinates, bits and lattice."""
 
 import pickle
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The readers on real scans, samples and malformed files; their MANIFEST is where the figures come from."""
+"""Test the readers on real scans, samples and malformed files. MANIFEST gives the origin of the figures."""
 
 import os
 from collections.abc import Iterator

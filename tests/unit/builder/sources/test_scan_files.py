@@ -1,5 +1,7 @@
-"""What every scan reader must do, whatever the format: the same truth written in each, read back whole,
-in small blocks, and with its end cut off. The expected points never pass through the code under test."""
+"""Test every scan reader on the same points: read whole, in small blocks, and from a truncated file.
+
+The expected points never pass through the code under test.
+"""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""The list of scans: what headers say, written and read back, edited by hand, wrong edits; what a build opens."""
+"""Test scan lists: written, read back, edited by hand, invalid; and the files that a build opens."""
 
 import json
 import os

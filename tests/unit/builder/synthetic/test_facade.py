@@ -1,4 +1,4 @@
-"""The façade is what its truth says: rays cast at the mesh itself, without noise, find the figures."""
+"""Compare the façade with its ground truth: rays cast at the mesh, without noise, find the figures."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The figure: its count, its size, and points spread evenly over its surface."""
+"""Test the figure: its number of points, its size, and their even distribution."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Places on the made façade's walls: on them, seen, as sparse as is said, and the same every time."""
+"""Test places on the generated façade's walls: on them, visible, as sparse as stated, reproducible."""
 
 import laspy
 import numpy as np

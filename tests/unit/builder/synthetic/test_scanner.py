@@ -1,4 +1,4 @@
-"""Scans have what real ones have: noise along the ray, shadows, density falling with range, lost returns."""
+"""Test that simulated scans have noise along the ray, shadows, falling density and lost returns."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""What scenes write: exact counts, the same points in every format, and nothing half-written."""
+"""Test generated scenes: exact counts, the same points in every format, and no partial file."""
 
 from pathlib import Path
 

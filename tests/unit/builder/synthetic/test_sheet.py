@@ -1,4 +1,4 @@
-"""The made sheet: where its points and places lie, and how dense it is."""
+"""Test the generated sheet: positions of its points and places, and its density."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The walk: rigid and continuous, feet above the floor, through the door, in contact where it means to."""
+"""Test the walk: rigid, continuous, above the floor, through the door, in contact where intended."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""An archive as it is opened: what went in, an index that contradicts it, a change meanwhile."""
+"""Test an opened archive: its content, an index that contradicts it, and changes meanwhile."""
 
 import shutil
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A disk that takes no more: whatever HDF5 makes of it, the system's own error comes out, naming the file."""
+"""Test full disks: the system's own error, naming the file, is raised whatever HDF5 makes of it."""
 
 import errno
 import resource

@@ -1,4 +1,4 @@
-"""Shards: what HDF5 says of one, and every fault of their bytes."""
+"""Test shards: what HDF5 reads from one, and every fault of their bytes."""
 
 import re
 import zlib

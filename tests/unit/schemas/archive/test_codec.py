@@ -1,4 +1,4 @@
-"""decode(encode(v)) == v bit for bit."""
+"""Test that decode(encode(v)) == v bit for bit."""
 
 import os
 

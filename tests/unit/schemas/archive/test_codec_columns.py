@@ -1,4 +1,4 @@
-"""The optional columns of a record: read apart, left out, and no class that there is none of."""
+"""Test the optional columns of a record: read separately, left out, and out of range."""
 
 import numpy as np
 import pytest

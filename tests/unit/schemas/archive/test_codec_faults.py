@@ -1,4 +1,4 @@
-"""No damaged or foreign record gets through."""
+"""Test that no damaged or foreign record is accepted."""
 
 import struct
 

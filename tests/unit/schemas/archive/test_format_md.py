@@ -1,4 +1,4 @@
-"""FORMAT.md's worked example gives every point back, and its text names every dataset and field."""
+"""Test that FORMAT.md's worked example returns every point, and that it names every dataset and field."""
 
 import ast
 import re

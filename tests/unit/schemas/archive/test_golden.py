@@ -1,4 +1,4 @@
-"""An archive somebody has stays readable: the committed one holds what the JSON beside it says, to the bit."""
+"""Test that existing archives stay readable: each committed one has the content of its JSON, bit for bit."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What an index says of its sources, and that it says nothing of what is usual."""
+"""Test the sources of an index, and that defaults are not stored."""
 
 import json
 from dataclasses import replace

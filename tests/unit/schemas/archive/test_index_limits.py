@@ -1,4 +1,4 @@
-"""Every number of an index out of its range, one at a time, under a right checksum: refused by its own guard."""
+"""Test that every number of an index out of its range is refused, under a right checksum."""
 
 import shutil
 import time

@@ -1,4 +1,4 @@
-"""Radius models: their names, and the radii that classes stand for."""
+"""Test the names of radius models, and the radii of their classes."""
 
 import numpy as np
 import pytest

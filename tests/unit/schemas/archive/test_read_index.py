@@ -1,4 +1,4 @@
-"""The index as a file: damaged, cut, of another kind, or none of ours."""
+"""Test index files that are damaged, truncated, of another kind, or not written by solidcloud."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Rows that come in parts become one frame, and one that the index cannot name is refused."""
+"""Test that rows given in parts become one frame, and that a frame too long for the index is refused."""
 
 import os
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""`link_nodes` against a plain walk, and every guard of `check_voxel` broken alone."""
+"""Compare `link_nodes` with a plain walk, and test every check of `check_voxel` alone."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""World, lattice, voxel: half-open cells, negative coordinates, bits kept, keys that are a bijection."""
+"""Test world, lattice and voxel frames: half-open cells, negative coordinates, exact bits, keys."""
 
 from fractions import Fraction
 

@@ -1,4 +1,4 @@
-"""A file of points is VTKHDF PolyData as its specification says, read by VTK itself where that is installed."""
+"""Test files of points against the VTKHDF specification, and with VTK where it is installed."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""A start with damaged compiled kernels: right answers, exit code 0, one line, and the next start is silent."""
+"""Test starts with damaged compiled kernels: right answers, exit code 0, and one warning."""
 
 import json
 import os

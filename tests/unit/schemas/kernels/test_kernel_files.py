@@ -1,4 +1,4 @@
-"""The folder of compiled kernels: what it refuses, what it removes, what it keeps."""
+"""Test the folder of compiled kernels: what it refuses, removes and keeps."""
 
 import logging
 import os

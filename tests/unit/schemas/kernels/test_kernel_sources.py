@@ -1,4 +1,4 @@
-"""Which edits invalidate which kernels."""
+"""Test which edits invalidate which kernels."""
 
 import shutil
 import subprocess

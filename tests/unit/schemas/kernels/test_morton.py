@@ -1,4 +1,4 @@
-"""Morton codes against bits moved one by one."""
+"""Compare Morton codes with bits moved one by one."""
 
 import numpy as np
 import pytest

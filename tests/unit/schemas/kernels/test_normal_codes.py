@@ -1,4 +1,4 @@
-"""Codes of surface normals: what they say of planes, edges, corners, balls, lines, against numpy."""
+"""Compare the codes of surface normals of planes, edges, corners, balls and lines with numpy."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Links of a voxel's nodes, by the kernel alone: trees written down as lists of levels, and each fault at its row."""
+"""Test the links of a voxel's nodes by the kernel alone: trees given as lists of levels, and each fault."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The rows of a record by the kernels alone, each against a few lines of plain Python."""
+"""Compare the kernels of a record's rows with a few lines of plain Python each."""
 
 from typing import NamedTuple
 

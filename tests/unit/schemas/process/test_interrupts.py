@@ -1,4 +1,4 @@
-"""Signals that are noted, and raised where the work checks or where a block of a library's calls ends."""
+"""Test that signals are deferred until the work checks, or until a block of library calls ends."""
 
 import contextlib
 import os

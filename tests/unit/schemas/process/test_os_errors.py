@@ -1,4 +1,4 @@
-"""Errors of the operating system are told in words, with the path that was asked for."""
+"""Test that errors of the operating system are reported in words, with the path concerned."""
 
 import errno
 import os

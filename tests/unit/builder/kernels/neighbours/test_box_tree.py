@@ -1,4 +1,4 @@
-"""The nearest boxes are those of brute force, nearest first, in as many goes as it takes."""
+"""Compare the nearest boxes with brute force, nearest first, over several calls."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The filters' kernels, asked one by one, against every pair in plain integers."""
+"""Compare the kernels of the filters with all pairs in plain integers."""
 
 import itertools
 import math

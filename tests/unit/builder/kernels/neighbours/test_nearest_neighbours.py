@@ -1,4 +1,4 @@
-"""The closest distinct points equal brute force, ties and all, whatever the order and the boxes over them."""
+"""Compare the closest distinct points with brute force, ties included, for any order and boxes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The closest point by descent: trees made by hand, every tie and border of a bound, and how little is looked at."""
+"""Test the closest point by descent on trees made by hand: ties, limits of bounds, and visits."""
 
 import os
 

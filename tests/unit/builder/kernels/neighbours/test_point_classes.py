@@ -1,4 +1,4 @@
-"""The kernels of radius classes, asked one by one: the edge of a rim, and who is asked."""
+"""Test the kernels of radius classes: the limit of a rim, and the points that are queried."""
 
 from fractions import Fraction
 

@@ -1,4 +1,4 @@
-"""Bisection is np.searchsorted of a part."""
+"""Compare bisection with np.searchsorted of a part."""
 
 import numpy as np
 import pytest

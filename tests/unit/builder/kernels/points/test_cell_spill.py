@@ -1,4 +1,4 @@
-"""Cells' points side by side, and back."""
+"""Test the order of coordinates cell by cell, and its inverse."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""The sum that names an archive's points, against the published hash in Python's integers: old archives keep theirs."""
+"""Compare the hash of an archive's points with the published function in Python's integers."""
 
 from decimal import Decimal, localcontext
 

@@ -1,4 +1,4 @@
-"""The check that every bound encloses: a bound just wide enough passes, one a step tighter is named."""
+"""Test the check of bounds: a bound just wide enough passes, one a step tighter is named."""
 
 import numpy as np
 import pytest

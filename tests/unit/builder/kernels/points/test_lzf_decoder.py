@@ -1,4 +1,4 @@
-"""LZF step by step: steps of every kind, written from what they mean, wherever the bytes end or the room does."""
+"""Test LZF code by code, with the input or the output ending at any byte."""
 
 import numpy as np
 import pytest

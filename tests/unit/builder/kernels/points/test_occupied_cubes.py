@@ -1,4 +1,4 @@
-"""Points of chosen cubes, and voxels that hold any, against plain numpy."""
+"""Compare the points of chosen cubes and the occupied voxels with plain numpy."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""One voxel's octree: every point in exactly one cell, capacity, depth, and a `VoxelData` that encloses."""
+"""Test the octree of a voxel: every point in exactly one cell, capacity, depth and bounds."""
 
 import numpy as np
 import pytest

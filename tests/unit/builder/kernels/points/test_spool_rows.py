@@ -1,4 +1,4 @@
-"""What survey and spool do with each point, against plain integers and the lattice's own numpy."""
+"""Compare the work of survey and spool on each point with plain integers and the lattice's numpy."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Points read from a record's own bytes are those that decoding gives: all, in a box, or by their hash."""
+"""Compare points read from a record's bytes with decoded ones: all, in a box, or by their hash."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Bounds enclose, proved in Python integers. How close to the minimal ball: tests/hard_cases/test_bounds.py."""
+"""Prove in Python integers that bounds enclose. tests/hard_cases/test_bounds.py measures their size."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""The hierarchies of many cells made in one call are those of each cell."""
+"""Compare the hierarchies of many cells made in one call with those of each cell."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""The shape of packed trees: every item once, all leaf nodes on one level, nodes full where they can be."""
+"""Test the shape of packed trees: every item once, leaf nodes on one level, nodes as full as possible."""
 
 import numpy as np
 import pytest

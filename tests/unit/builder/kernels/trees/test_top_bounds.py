@@ -1,4 +1,4 @@
-"""The kernels of the top hierarchy, asked one by one: what makes a bound grow, and what is not looked at for it."""
+"""Test the kernels of the top hierarchy: which points enlarge a bound, and which cells are not read."""
 
 import itertools
 

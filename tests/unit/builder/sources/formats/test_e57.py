@@ -1,4 +1,4 @@
-"""E57: poses, invalid records, spherical coordinates, bounds in and of broken files."""
+"""Test E57: poses, invalid records, spherical coordinates, and bounds of sound and damaged files."""
 
 import struct
 from pathlib import Path

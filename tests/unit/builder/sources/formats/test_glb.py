@@ -1,4 +1,4 @@
-"""GLB: nodes and their places, what is shared, sampled surfaces, documents that lie."""
+"""Test GLB: node transforms, shared meshes, sampled surfaces, and inconsistent documents."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""LAS and LAZ: coordinates to the bit, headers that lie, chunks of every kind."""
+"""Test LAS and LAZ: exact coordinates, inconsistent headers, and chunks of every kind."""
 
 import struct
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""OBJ and STL: vertices as they stand in the file, and surfaces as samples."""
+"""Test OBJ and STL: vertices as stored, and sampled surfaces."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""PCD: fields of every type, directions without a return, the pose, headers that lie, LZF in small pieces."""
+"""Test PCD: fields of every type, missing returns, the pose, inconsistent headers, LZF in small pieces."""
 
 import struct
 from pathlib import Path

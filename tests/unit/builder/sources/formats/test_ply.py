@@ -1,4 +1,4 @@
-"""PLY: the order of elements, odd line ends, and headers that cannot be true."""
+"""Test PLY: the order of elements, unusual line ends, and inconsistent headers."""
 
 import tracemalloc
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""PTX and PTS: several scans a file, where each begins, what its head says, rows that are missing or too many."""
+"""Test PTX and PTS: several scans a file, their positions and headers, missing and surplus rows."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Text scans: the rules for columns, headers and counts, and lines that are broken."""
+"""Test text scans: the rules for columns, headers and counts, and broken lines."""
 
 import io
 import tracemalloc

@@ -1,8 +1,8 @@
-"""A question to the archives of a scene: asked of each in its own frame, the answers merged.
+"""One question to all archives of a scene: each is asked in its own frame, and the answers are merged.
 
-Contact with any is contact; unknown for any is unknown; clear is what is clear of all, and
-`outside` what is outside of all. A budget is for all archives together: each gets what those before
-it left. With one archive at the identity, nothing is transformed or merged.
+A pose is in contact if it is with any archive, unknown if it is for any, and clear if it is clear of
+all. It is `outside` if it is outside of all. A budget is for all archives together: each gets what
+the archives before it left. With one archive at the identity, nothing is transformed or merged.
 """
 
 import math
@@ -22,24 +22,24 @@ from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stop
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.path import part_stop, path_question
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from .merge_answers import carried, limited, merged
+from .merge_answers import answers_in_world, limit_pairs, merge_answers
 from .placed_archive import ArchiveGeneration, PlacedArchive
 from .rigid_transform import Pose
-from .scene_info import sources_asked
+from .scene_info import count_sources
 
 _A = TypeVar("_A", bound=Cost)
 # Some rows of a request; None: all.
 Rows = slice | None
 # Asks one archive about some rows of a request.
-Ask = Callable[[SceneData, QueryBudget, Rows], _A]
+AskRows = Callable[[SceneData, QueryBudget, Rows], _A]
 # What asks an archive, and whether what is looked at is passed by (`QueryBudget.scan`).
-Prepared = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
-Prepare = Callable[[PlacedArchive, ArchiveGeneration], Prepared]
+PreparedQuery = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
+PrepareQuery = Callable[[PlacedArchive, ArchiveGeneration], PreparedQuery]
 # Pairs that `contacts` lists where no limit is given.
-LISTED = 100
+DEFAULT_LIMIT = 100
 
 
-class Leg(NamedTuple):
+class PathLeg(NamedTuple):
     """A path through one archive. data: what it reads.  pose: archive to world, None: at the identity.
 
     first_source: which of the scene's sources the archive's first is.  poses: (k, 4, 4) in the archive's frame.
@@ -55,7 +55,7 @@ def ask_each(
     archives: Sequence[PlacedArchive],
     question: Question[_A],
     k: int,
-    prepare: Prepare,
+    prepare: PrepareQuery,
     tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
@@ -78,15 +78,17 @@ def ask_each(
             data = with_stop(opened.radius_model(radius_model), budget.stop)
             ask, scan = prepare(archive, opened)
             own = budget._replace(scan=scan)
-            found = ask_until_stopped(question, k, own, partial(in_budget, ask, data, own, visits))
-            answers.append(carried(found, archive.pose, first))
-            first += sources_asked(opened)
+            found = ask_until_stopped(question, k, own, partial(ask_within_budget, ask, data, own, visits))
+            answers.append(answers_in_world(found, archive.pose, first))
+            first += count_sources(opened)
         if budget.visits < NO_LIMIT:
             visits += found.node_visits  # type: ignore[attr-defined]  # all answers have them
-    return merged(answers)
+    return merge_answers(answers)
 
 
-def in_budget(ask: Ask[_A], data: SceneData, budget: QueryBudget, visits: NDArray[np.int64]) -> _A:
+def ask_within_budget(
+    ask: AskRows[_A], data: SceneData, budget: QueryBudget, visits: NDArray[np.int64]
+) -> _A:
     """Ask an archive within the budget of each pose less the node visits (k,) that others made.
 
     Consecutive poses with the same budget are asked about together: nearly always all poses that no
@@ -110,11 +112,11 @@ def make_legs(
     taken: Sequence[ArchiveGeneration],
     radius_model: str | None,
     poses: NDArray[np.float64],
-) -> list[Leg]:
+) -> list[PathLeg]:
     """Return a path's leg through each archive. taken: the archives' generations, in their order."""
-    firsts = [0, *np.cumsum([sources_asked(opened) for opened in taken]).tolist()]
+    firsts = [0, *np.cumsum([count_sources(opened) for opened in taken]).tolist()]
     return [
-        Leg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
+        PathLeg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
         for opened, archive, first in zip(taken, archives, firsts, strict=False)
     ]
 
@@ -124,8 +126,12 @@ def rows_of(column: Any, rows: Rows) -> Any:
     return column if rows is None else column[rows]
 
 
-def along(
-    legs: Sequence[Leg], avatar: AvatarModel, op: str, parameters: dict[str, Any], stop: StopFlag = NO_STOP
+def ask_along(
+    legs: Sequence[PathLeg],
+    avatar: AvatarModel,
+    op: str,
+    parameters: dict[str, Any],
+    stop: StopFlag = NO_STOP,
 ) -> tuple[Callable[[int, int], Cost], int]:
     """Return what answers [start, stop) of a path through all archives, and how many answers there are.
 
@@ -137,7 +143,7 @@ def along(
     visits, budget_ms = parameters.get("budget_visits"), parameters.get("budget_ms")
     limit = parameters.get("limit")
 
-    def ask_bounded(leg: Leg, start: int, spent: NDArray[np.int64], part: StopFlag | None) -> Cost:
+    def ask_bounded(leg: PathLeg, start: int, spent: NDArray[np.int64], part: StopFlag | None) -> Cost:
         """Ask with what is left of the visits of each answer from `start` on, and of the time."""
 
         def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> Cost:
@@ -149,7 +155,7 @@ def along(
                 options["budget_ms"] = max(0.0, budget_ms - (time.perf_counter() - begin) * 1e3)
             return path_question(data, avatar, own, op, options, stop)[0](0, k.stop - k.start, part)
 
-        return in_budget(ask, leg.data, QueryBudget(visits=int(visits or 0)), spent)
+        return ask_within_budget(ask, leg.data, QueryBudget(visits=int(visits or 0)), spent)
 
     def ask(start: int, end: int) -> Cost:
         spent = np.zeros(end - start, np.int64)
@@ -162,10 +168,10 @@ def along(
             else:
                 found = ask_bounded(leg, start, spent, part)
                 spent += found.node_visits  # type: ignore[attr-defined]  # all answers have them
-            answers.append(carried(found, leg.pose, leg.first_source))
-        together = merged(answers)
+            answers.append(answers_in_world(found, leg.pose, leg.first_source))
+        together = merge_answers(answers)
         if isinstance(together, ContactsAnswers):
-            return limited(together, LISTED if limit is None else limit)
+            return limit_pairs(together, DEFAULT_LIMIT if limit is None else limit)
         return together
 
     return ask, asks[0][1]

@@ -26,7 +26,7 @@ from ...builder.voxel.masked_voxel import BuiltVoxel, build_rest, read_points
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.zstd_frame import pwrite_all
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
-from .rigid_transform import archive_pose, moved, moved_boxes
+from .rigid_transform import archive_pose, transform_boxes, transform_points
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +137,7 @@ class MaskedArchive(Archive):
         if self._pose is None or not len(low):
             return world
         far = max(float(np.abs(side).max()) for side in (*world, self._pose[:3, 3]))
-        least, greatest = moved_boxes(self._pose, *world)
+        least, greatest = transform_boxes(self._pose, *world)
         return least - far * _ROUNDING, greatest + far * _ROUNDING
 
     def _log_progress(
@@ -160,7 +160,7 @@ class MaskedArchive(Archive):
         lattice = self.header.lattice
         world = lattice.to_world(local + self.coordinates[row] * lattice.voxel_steps)
         if self._pose is not None:
-            world = moved(self._pose, world)
+            world = transform_points(self._pose, world)
         within = np.zeros(len(world), bool)
         for low, high in boxes:
             within |= ((world >= low) & (world <= high)).all(axis=1)

@@ -1,7 +1,7 @@
-"""Answers of several archives as those of one scene: carried to the world, and merged by their columns' rules.
+"""Answers of several archives as those of one scene: transformed to the world, merged by the rules of columns.
 
-Pure functions. The nearest of equals is that with the least scan point (x, y, z), then the least avatar centre, as in
-the answers of one archive.
+Pure functions. Of equal distances, the nearest is the one with the least scan point (x, y, z), then
+the least avatar centre, as in the answers of one archive.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from ...schemas.wire.answers import ContactsAnswers, Cost, Verdict
 from ...schemas.wire.arrays import array_fields
 from ...schemas.wire.questions import CONTACTS, ColumnFrame, Merge, Question, Rows, question_of
-from .rigid_transform import Pose, moved, moved_boxes, turned
+from .rigid_transform import Pose, rotate_vectors, transform_boxes, transform_points
 
 _A = TypeVar("_A", bound=Cost)
 
 _PAIRS, _CLUSTERS = CONTACTS.rows_of("pair_starts"), CONTACTS.rows_of("cluster_starts")
 
 
-def carried(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
+def answers_in_world(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
     """Return the answers of an archive at a pose, in the world; None: at the identity.
 
     first_source: which of the scene's sources the archive's first is. A box becomes the box around its corners.
@@ -30,22 +30,22 @@ def carried(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
     low = ""
     for name, rule in question_of(type(answers)).columns.items():
         if rule.frame is ColumnFrame.SCAN and first_source:
-            numbers = _of(answers, name)
+            numbers = _column(answers, name)
             fields[name] = np.where(numbers >= 0, numbers + np.int32(first_source), numbers)
         if pose is None:
             continue
         if rule.frame is ColumnFrame.POINT:
-            fields[name] = moved(pose, _of(answers, name))
+            fields[name] = transform_points(pose, _column(answers, name))
         elif rule.frame is ColumnFrame.DIRECTION:
-            fields[name] = turned(pose, _of(answers, name))
+            fields[name] = rotate_vectors(pose, _column(answers, name))
         elif rule.frame is ColumnFrame.BOX_LOW:
             low = name
         elif rule.frame is ColumnFrame.BOX_HIGH:
-            fields[low], fields[name] = moved_boxes(pose, _of(answers, low), _of(answers, name))
+            fields[low], fields[name] = transform_boxes(pose, _column(answers, low), _column(answers, name))
     return structs.replace(answers, **fields) if fields else answers
 
 
-def merged(answers: Sequence[_A]) -> _A:
+def merge_answers(answers: Sequence[_A]) -> _A:
     """Return the answers of several archives to the same items, in the world, as those of one scene.
 
     What is no column, and no cost, is that of the first archive.
@@ -60,9 +60,9 @@ def merged(answers: Sequence[_A]) -> _A:
         for name in kind.__struct_fields__
         if name not in question.columns and name not in Cost.__struct_fields__
     }
-    found = _Found(answers, question, _verdict(answers), _nearest(answers, question))
+    found = _Merged(answers, question, _verdict(answers), _nearest(answers, question))
     for name, rule in question.columns.items():
-        if rule.rows is Rows.BOUNDED and not len(_of(first, name)):
+        if rule.rows is Rows.BOUNDED and not len(_column(first, name)):
             continue
         if rule.merge in _RULES:
             fields[name] = _RULES[rule.merge](found, name)
@@ -71,18 +71,18 @@ def merged(answers: Sequence[_A]) -> _A:
     return kind(**fields, **_cost(answers))
 
 
-def limited(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
+def limit_pairs(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
     """Return the answers with at most `limit` pairs listed for a pose, the first ones."""
     counts = np.minimum(np.diff(answers.pair_starts), limit)
     if int(counts.sum()) == len(answers.signed_distance):
         return answers
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     rows = np.arange(starts[-1]) + np.repeat(answers.pair_starts[:-1] - starts[:-1], counts)
-    columns = {name: _of(answers, name)[rows] for name in _PAIRS}
+    columns = {name: _column(answers, name)[rows] for name in _PAIRS}
     return structs.replace(answers, pair_starts=starts, **columns)
 
 
-class _Found(NamedTuple):
+class _Merged(NamedTuple):
     """Answers of several archives to one question.
 
     verdict: (k,), merged.  nearest: (k,), which archive is the nearest; empty if the question does not ask for it.
@@ -95,10 +95,10 @@ class _Found(NamedTuple):
 
     def stack(self, name: str) -> NDArray[Any]:
         """Return a column of each archive's answers, one row an archive."""
-        return np.stack([_of(a, name) for a in self.answers])
+        return np.stack([_column(a, name) for a in self.answers])
 
 
-def _of(answers: Cost, name: str) -> NDArray[Any]:
+def _column(answers: Cost, name: str) -> NDArray[Any]:
     """Return a column of answers."""
     column: NDArray[Any] = getattr(answers, name)
     return column
@@ -106,7 +106,7 @@ def _of(answers: Cost, name: str) -> NDArray[Any]:
 
 def _stack(answers: Sequence[Cost], name: str) -> NDArray[Any]:
     """Return a column of each archive's answers, one row an archive."""
-    return np.stack([_of(a, name) for a in answers])
+    return np.stack([_column(a, name) for a in answers])
 
 
 def _cost(answers: Sequence[Cost]) -> dict[str, Any]:
@@ -148,26 +148,26 @@ def _nearest(answers: Sequence[Cost], question: Question[Any]) -> NDArray[np.int
     return found
 
 
-def _sum(found: _Found, name: str) -> NDArray[Any]:
+def _sum(found: _Merged, name: str) -> NDArray[Any]:
     """Return the sums of a column, at most the largest number of its type."""
     dtype = array_fields(type(found.answers[0]))[name].dtype
-    total = sum(_of(a, name).astype(np.int64) for a in found.answers)
+    total = sum(_column(a, name).astype(np.int64) for a in found.answers)
     return np.minimum(total, np.iinfo(dtype).max).astype(dtype)
 
 
-def _of_nearest(found: _Found, name: str) -> NDArray[Any]:
+def _of_nearest(found: _Merged, name: str) -> NDArray[Any]:
     """Return the values of the nearest archive."""
     return np.asarray(found.stack(name)[found.nearest, np.arange(len(found.nearest))])
 
 
-def _exact_verdict(found: _Found, name: str) -> NDArray[np.bool_]:
+def _exact_verdict(found: _Merged, name: str) -> NDArray[np.bool_]:
     """Return which verdicts are those of tolerance 0: an exact contact with one, or all exact."""
     verdicts, exact = found.stack("verdict"), found.stack(name)
     touches = (exact & (verdicts == Verdict.CONTACT)).any(axis=0)
     return np.asarray(np.where(found.verdict == Verdict.CONTACT, touches, exact.all(axis=0)))
 
 
-def _exact_nearest(found: _Found, name: str) -> NDArray[np.bool_]:
+def _exact_nearest(found: _Merged, name: str) -> NDArray[np.bool_]:
     """Return where the nearest is exact, and no other archive may hold a nearer one."""
     value, _ = found.question.nearest or ("", ())
     exact = found.stack(name)
@@ -176,7 +176,7 @@ def _exact_nearest(found: _Found, name: str) -> NDArray[np.bool_]:
     return np.asarray(known & _of_nearest(found, name))
 
 
-def _exact_interval(found: _Found, name: str) -> NDArray[np.bool_]:
+def _exact_interval(found: _Merged, name: str) -> NDArray[np.bool_]:
     """Return where the first contact is within the tolerance, or where all is clear."""
     verdicts, lower = found.stack("verdict"), found.stack("lower")
     # An interval that begins first and ends no earlier than the one that is answered is within the tolerance.
@@ -185,13 +185,13 @@ def _exact_interval(found: _Found, name: str) -> NDArray[np.bool_]:
 
 
 # Merge.LISTED is missing: its columns depend on one another, see `_contacts`.
-_RULES: dict[Merge, Callable[[_Found, str], NDArray[Any]]] = {
+_RULES: dict[Merge, Callable[[_Merged, str], NDArray[Any]]] = {
     Merge.VERDICT: lambda found, _: found.verdict,
     Merge.ALL: lambda found, name: np.asarray(found.stack(name).all(axis=0)),
     Merge.SUM: _sum,
     Merge.LEAST: lambda found, name: np.asarray(found.stack(name).min(axis=0)),
     Merge.NEAREST: _of_nearest,
-    Merge.FIRST: lambda found, name: _of(found.answers[0], name),
+    Merge.FIRST: lambda found, name: _column(found.answers[0], name),
     Merge.EXACT_VERDICT: _exact_verdict,
     Merge.EXACT_NEAREST: _exact_nearest,
     Merge.EXACT_INTERVAL: _exact_interval,
@@ -209,13 +209,13 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
     cloud = np.concatenate([a.cluster_cloud for a in answers])[clusters]
     order = np.lexsort((*cloud.T[::-1], deepest, cluster_rows))
     clusters = clusters[order]
-    fields = {name: np.concatenate([_of(a, name) for a in answers])[clusters] for name in _CLUSTERS}
+    fields = {name: np.concatenate([_column(a, name) for a in answers])[clusters] for name in _CLUSTERS}
     fields["cluster_starts"] = cluster_starts
     # Where each archive's own cluster of each pose went, from the pose's first.
     place = np.empty(len(clusters), np.int64)
     place[clusters] = np.arange(len(clusters)) - cluster_starts[cluster_rows[order]]
     pairs, pair_starts, pair_rows = _by_pose(answers, "pair_starts", k)
-    columns = {name: np.concatenate([_of(a, name) for a in answers])[pairs] for name in _PAIRS}
+    columns = {name: np.concatenate([_column(a, name) for a in answers])[pairs] for name in _PAIRS}
     columns["cluster"] = place[_own_clusters(answers)][pairs].astype(np.int32)
     keys = (columns["avatar_index"], *columns["avatar_point"].T[::-1], *columns["cloud_point"].T[::-1])
     order = np.lexsort((*keys, columns["signed_distance"], pair_rows))
@@ -229,7 +229,7 @@ def _by_pose(
 
     Also returns the starts of the poses' rows (k + 1,), and the pose of each row.
     """
-    poses = np.concatenate([np.repeat(np.arange(k), np.diff(_of(a, starts))) for a in answers])
+    poses = np.concatenate([np.repeat(np.arange(k), np.diff(_column(a, starts))) for a in answers])
     order = np.argsort(poses, kind="stable")
     counts = np.bincount(poses, minlength=k) if k else np.zeros(0, np.int64)
     return order, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), poses[order]

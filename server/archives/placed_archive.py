@@ -1,14 +1,13 @@
 """One archive of a scene, at a pose in the world: the generation that answers now, and its hot reload.
 
-An archive at the identity answers with the very poses of a request, so the archives of two halves
-of a scan, on one lattice, answer as the archive of the whole. One at a pose is asked under
-inverse(pose) @ pose of the avatar, in float64, rounded once: exact for a signed permutation and
-shifts that float64 adds exactly, within some nanometres for others. Witnesses are carried back the
-same way.
+An archive at the identity is asked with the very poses of a request, so the archives of two halves
+of a scan, on one lattice, answer as the archive of the whole. An archive at a pose is asked with
+inverse(pose) @ pose, in float64, rounded once: exact for a signed permutation and shifts that float64
+adds exactly, within some nanometres for others. Witnesses are transformed back in the same way.
 
-A generation is what one opening of the archive's folder found. A reload opens the next one and swaps
-them; requests in progress are answered from the one that they began with. A generation counts its
-readers, and its files and memory are released with the last one.
+A generation is what one opening of the folder found. A reload opens the next one and swaps them; a
+request is answered from the one that it began with. A generation counts its readers, and its files
+and memory are released with the last one.
 """
 
 import math
@@ -41,7 +40,7 @@ from ..residency.voxel_cache import VoxelCache
 from ..residency.voxel_store import OpenStore, VoxelStore
 from ..runtime.threads import start_thread
 from .archive_info import describe
-from .rigid_transform import archive_pose, inverse_of, moved, turned, under
+from .rigid_transform import archive_pose, inverse_pose, rotate_vectors, transform_points, transform_poses
 
 _Floats = NDArray[np.float64]
 
@@ -283,7 +282,7 @@ class PlacedArchive:
         self._budget_bytes, self._policy, self._radius_model = budget_bytes, policy, radius_model
         self._took = took
         self.pose = archive_pose(pose)
-        self.inverse = None if self.pose is None else inverse_of(self.pose)
+        self.inverse = None if self.pose is None else inverse_pose(self.pose)
         self._opened = self._open(store, 0)
         self._before: ArchiveGeneration | None = None  # replaced; some requests may still read it
         self._info = describe(store, name)
@@ -389,12 +388,12 @@ class PlacedArchive:
 
     def poses_in(self, poses: _Floats) -> _Floats:
         """Return poses (k, 4, 4) of the world in the archive's frame."""
-        return poses if self.inverse is None else under(self.inverse, poses)
+        return poses if self.inverse is None else transform_poses(self.inverse, poses)
 
     def points_in(self, points: _Floats) -> _Floats:
         """Return points (k, 3) of the world in the archive's frame."""
-        return points if self.inverse is None else moved(self.inverse, points)
+        return points if self.inverse is None else transform_points(self.inverse, points)
 
-    def directions_in(self, directions: _Floats) -> _Floats:
+    def directions_in(self, vectors: _Floats) -> _Floats:
         """Return directions (k, 3) of the world, of any length, in the archive's frame."""
-        return directions if self.inverse is None else turned(self.inverse, make_directions(directions))
+        return vectors if self.inverse is None else rotate_vectors(self.inverse, make_directions(vectors))

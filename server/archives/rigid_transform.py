@@ -24,42 +24,42 @@ def archive_pose(pose: ArrayLike | None, where: str = "pose of the archive") -> 
     return None if found is None or np.array_equal(found, np.eye(4)) else found
 
 
-def inverse_of(pose: Pose) -> Pose:
+def inverse_pose(pose: Pose) -> Pose:
     """Return the inverse of a rigid pose, world to archive.
 
-    The rotation is transposed, which is exact; the translation is rounded as by `moved`.
+    The rotation is transposed, which is exact; the translation is rounded as by `transform_points`.
     """
     found = np.eye(4)
     found[:3, :3] = pose[:3, :3].T
-    found[:3, 3] = -turned(found, pose[None, :3, 3])[0]
+    found[:3, 3] = -rotate_vectors(found, pose[None, :3, 3])[0]
     found[:3, 3] += 0.0  # never -0.0
     return found
 
 
-def turned(pose: Pose, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotate_vectors(pose: Pose, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return vectors (n, 3) rotated by a pose."""
     x, y, z = vectors.T
     return np.stack([(m[0] * x + m[1] * y) + m[2] * z for m in pose[:3]], axis=1)
 
 
-def moved(pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def transform_points(pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points (n, 3) transformed by a pose: ((m0 x + m1 y) + m2 z) + m3."""
-    return np.asarray(turned(pose, points) + pose[:3, 3])
+    return np.asarray(rotate_vectors(pose, points) + pose[:3, 3])
 
 
-def under(pose: Pose, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def transform_poses(pose: Pose, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return pose @ poses for poses (k, 4, 4). Faults of theirs, such as a last row, are kept."""
     found = poses.copy()
     for column in range(4):
-        carry = moved if column == 3 else turned
+        carry = transform_points if column == 3 else rotate_vectors
         found[:, :3, column] = carry(pose, poses[:, :3, column])
     return found
 
 
-def moved_boxes(
+def transform_boxes(
     pose: Pose, low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the boxes low, high (n, 3) around the eight corners of each box low, high (n, 3), transformed."""
     chosen = [[(low, high)[i >> k & 1][:, k] for k in range(3)] for i in range(8)]
-    corners = np.array([moved(pose, np.stack(corner, axis=1)) for corner in chosen])
+    corners = np.array([transform_points(pose, np.stack(corner, axis=1)) for corner in chosen])
     return corners.min(axis=0), corners.max(axis=0)

@@ -11,7 +11,7 @@ from ...schemas.wire.stats import AvatarStats, Counters
 from ..observability.request_stats import RequestStats, times_of
 from .archive_info import listed_sources
 from .placed_archive import ArchiveGeneration
-from .rigid_transform import Pose, moved_boxes, under
+from .rigid_transform import Pose, transform_boxes, transform_poses
 
 
 def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> SceneInfo:
@@ -42,7 +42,9 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
         radius_sample=largest.radius_sample,
         moved_max=max(info.moved_max for info in infos),
         sources=[
-            s if pose is None else structs.replace(s, pose=under(pose, np.array([s.pose]))[0].tolist())
+            s
+            if pose is None
+            else structs.replace(s, pose=transform_poses(pose, np.array([s.pose]))[0].tolist())
             for info, pose in each
             for s in info.sources
         ],
@@ -58,7 +60,7 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
     )
 
 
-def sources_asked(opened: ArchiveGeneration) -> int:
+def count_sources(opened: ArchiveGeneration) -> int:
     """Return how many sources a generation lists; the sources of the next archive follow them."""
     count = opened.kept.get("sources")
     if count is None:
@@ -69,7 +71,7 @@ def sources_asked(opened: ArchiveGeneration) -> int:
 def _box(box: list[list[float]], pose: Pose | None) -> Any:
     """Return a box (2, 3), or the box around it transformed by a pose."""
     sides = np.array(box)
-    return sides if pose is None else np.concatenate(moved_boxes(pose, sides[:1], sides[1:]))
+    return sides if pose is None else np.concatenate(transform_boxes(pose, sides[:1], sides[1:]))
 
 
 def make_stats(

@@ -25,14 +25,14 @@ from .resident_fast_path import collide_fast
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
 # Pairs tested between two checks of a deadline.
-TIMED_PAIRS = 64
+PAIRS_PER_CHECK = 64
 # Largest distance of an object from the dataset's origin [m]: 2^37 m in exact units do not fit in
 # 63 bits. No object this far away is compared with the scene, but objects are compared with one
 # another everywhere.
 MAX_PLACE = 1e11
 
 
-class Placing(NamedTuple):
+class CheckedObjects(NamedTuple):
     """Checked objects of a request, n of them.
 
     models: the distinct avatars.  model_of: (n,) int64, index into `models`.  poses: (n, 4, 4).
@@ -50,7 +50,7 @@ class Placing(NamedTuple):
     margin_units: int
 
 
-class Met(NamedTuple):
+class ObjectContacts(NamedTuple):
     """Contacts between objects; fields as in `ObjectsAnswers`."""
 
     pairs: NDArray[np.int32]
@@ -83,24 +83,24 @@ def objects(
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
-    placing = _check(data, avatars, poses, groups, masks, margin)
-    n = len(placing.poses)
+    checked = _check(data, avatars, poses, groups, masks, margin)
+    n = len(checked.poses)
     verdict, outside, counts = np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((3, n), np.uint32)
     spent = CostCounter(begin, data.residency, data.broad.keys)
-    for number, model in enumerate(placing.models):
-        rows = np.flatnonzero((placing.model_of == number) & ((placing.masks & SCENE_GROUP) > 0))
+    for number, model in enumerate(checked.models):
+        rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):
             continue
         if budget.spent:
             verdict[rows] = UNKNOWN
             continue
-        found = collide_fast(data, model, placing.poses[rows], margin, budget._replace(tolerance=0.0))
+        found = collide_fast(data, model, checked.poses[rows], margin, budget._replace(tolerance=0.0))
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)
-    met = _meet(placing, data.arrays.origin, budget)
+    contacts = _touching_pairs(checked, data.arrays.origin, budget)
     return ObjectsAnswers(
-        verdict, outside, counts[0], counts[1], counts[2], *met, **spent.fields()
+        verdict, outside, counts[0], counts[1], counts[2], *contacts, **spent.fields()
     )  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def _check(
     groups: ArrayLike,
     masks: ArrayLike,
     margin: float,
-) -> Placing:
+) -> CheckedObjects:
     """Check the objects of a request: poses are valid, and squares of reaches fit in 63 bits.
 
     This takes milliseconds for the largest request, so it does not check the stop flag.
@@ -146,7 +146,7 @@ def _check(
                 f"objects {first} and {second} have radii and margin that add up to {together / UNITS_PER_METRE:g} m: "
                 "expected at most 16 m: give a smaller margin or radius"
             )
-    return Placing(list(distinct.values()), model_of, array, group, mask, scales, units, margin_units)
+    return CheckedObjects(list(distinct.values()), model_of, array, group, mask, scales, units, margin_units)
 
 
 def _check_places(
@@ -170,21 +170,21 @@ def _check_places(
         )
 
 
-def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
+def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
     """Return the pairs (p, 2) of objects to test, ascending, and how many the masks exclude.
 
     Pairs have first < second, and their bounds overlap. Sweep and prune along the axis on which the
     objects' root spheres are spread farthest. This takes milliseconds for the largest request, so
     it does not check the stop flag.
     """
-    full = [number for number, model in enumerate(placing.models) if len(model.points)]
-    present = np.flatnonzero(np.isin(placing.model_of, full))
-    low, high = np.zeros((len(placing.poses), 3)), np.zeros((len(placing.poses), 3))
+    full = [number for number, model in enumerate(checked.models) if len(model.points)]
+    present = np.flatnonzero(np.isin(checked.model_of, full))
+    low, high = np.zeros((len(checked.poses), 3)), np.zeros((len(checked.poses), 3))
     for number in full:
-        rows = np.flatnonzero(placing.model_of == number)
+        rows = np.flatnonzero(checked.model_of == number)
         bound_objects(
-            placing.models[number].arrays, placing.poses, rows, placing.scales, placing.units, origin,
-            placing.margin_units, low, high,
+            checked.models[number].arrays, checked.poses, rows, checked.scales, checked.units, origin,
+            checked.margin_units, low, high,
         )  # fmt: skip
     if len(present) < 2:
         return np.empty((0, 2), np.int64), 0
@@ -196,25 +196,27 @@ def find_pairs(placing: Placing, origin: NDArray[np.float64]) -> tuple[NDArray[n
     while True:
         pairs = np.empty((capacity, 2), np.int32)
         found, filtered = sweep_and_prune(
-            order, low, high, placing.groups, placing.masks, NO_STOP.flag, pairs
+            order, low, high, checked.groups, checked.masks, NO_STOP.flag, pairs
         )
         if found <= capacity:
             break
         capacity = found
     # One sort key a pair: sorting by two keys takes ten times as long.
-    n = len(placing.poses)
+    n = len(checked.poses)
     numbers = np.sort(pairs[:found, 0].astype(np.int64) * n + pairs[:found, 1])
     return np.column_stack((numbers // n, numbers % n)), filtered
 
 
-def _meet(placing: Placing, origin: NDArray[np.float64], budget: QueryBudget) -> Met:
+def _touching_pairs(
+    checked: CheckedObjects, origin: NDArray[np.float64], budget: QueryBudget
+) -> ObjectContacts:
     """Test the pairs; without a deadline, those of the same two avatars in one kernel call."""
-    pairs, filtered = find_pairs(placing, origin)
-    kinds = placing.model_of[pairs]
+    pairs, filtered = find_pairs(checked, origin)
+    kinds = checked.model_of[pairs]
     # Contact is symmetric, so two avatars are tested in one order only.
     turned = kinds[:, 0] > kinds[:, 1]
     ordered = np.where(turned[:, None], pairs[:, ::-1], pairs)
-    models = len(placing.models)
+    models = len(checked.models)
     # One sort key for each pair of avatars: sorting rows of two would hold the interpreter's lock,
     # for a second with 10^6 pairs.
     kind = kinds.min(axis=1) * models + kinds.max(axis=1)
@@ -228,18 +230,18 @@ def _meet(placing: Placing, origin: NDArray[np.float64], budget: QueryBudget) ->
             break
         rows = order[first:last]
         a, b = divmod(int(kind[rows[0]]), models)
-        step = TIMED_PAIRS if budget.deadline < np.inf else len(rows)
+        step = PAIRS_PER_CHECK if budget.deadline < np.inf else len(rows)
         for begin in range(0, len(rows), step):
             if budget.spent:
                 break
             part = rows[begin : begin + step]
             found = np.empty(len(part), np.uint8)
             touch_pairs(
-                placing.models[a].arrays, placing.models[b].arrays, placing.poses, placing.scales, placing.units,
-                ordered[part], placing.margin_units, origin, budget.visits, budget.stop.flag, found, counters,
+                checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.scales, checked.units,
+                ordered[part], checked.margin_units, origin, budget.visits, budget.stop.flag, found, counters,
             )  # fmt: skip
             verdict[part] = found
             tested += len(part)
     listed = verdict != CLEAR
     visits, tests = counters.tolist()
-    return Met(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)
+    return ObjectContacts(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)

@@ -12,7 +12,7 @@ from ...schemas.wire.requests import make_vectors
 from ..kernels.core.pose_transform import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import VoxelLists
 from ..kernels.rays.rays import ClosestHits, RayBatch, follow_rays
-from .context.front_to_back import finish, look, make_origins
+from .context.front_to_back import make_origins, search_front_to_back, verdict_and_bounds
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
 
@@ -72,8 +72,8 @@ def raycast(
         rays = RayBatch(units[first:last], unit[first:last], reach_units, data.radius_units)
         follow_rays(rays, lists, cursor, held, data.arrays, tolerance, budget.visits, best)
 
-    best = look(data, units, unit, reach_units, data.radius_units, budget, kernel, spent)
-    verdict, lower, upper, exact = finish(best.value, best.unseen, reach_units)
+    best = search_front_to_back(data, units, unit, reach_units, data.radius_units, budget, kernel, spent)
+    verdict, lower, upper, exact = verdict_and_bounds(best.value, best.unseen, reach_units)
     hit, cloud, normal = _where(data, world, units, unit, best)
     ends = np.stack([units.astype(np.float64), units + float(reach_units) * unit])
     low, high = (

@@ -12,7 +12,7 @@ from ..kernels.core.pose_transform import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import VoxelLists
 from ..kernels.rays.rays import ClosestHits
 from ..kernels.rays.within_point import search_points
-from .context.front_to_back import finish, look, make_origins
+from .context.front_to_back import make_origins, search_front_to_back, verdict_and_bounds
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
 
@@ -44,9 +44,9 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
             units[first:last], reach_units, lists, cursor, held, data.arrays, tolerance, budget.visits, best
         )
 
-    best = look(data, units, None, reach_units, 0, budget, kernel, spent)
+    best = search_front_to_back(data, units, None, reach_units, 0, budget, kernel, spent)
     near = np.where(best.square >= 0, np.sqrt(np.maximum(best.square, 0).astype(np.float64)), np.inf)
-    verdict, lower, upper, exact = finish(near, best.unseen, reach_units)
+    verdict, lower, upper, exact = verdict_and_bounds(near, best.unseen, reach_units)
     cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
     touched = best.square >= 0
     cloud[touched] = best.lattice[touched] * data.arrays.step + data.arrays.origin

@@ -14,8 +14,8 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.questions import Question
 from ...schemas.wire.requests import make_objects, make_poses, make_vectors
-from ..archives.ask_archives import PathParts, Prepared, Rows, along, ask_each, make_legs, rows_of
-from ..archives.merge_answers import limited
+from ..archives.ask_archives import PathParts, PreparedQuery, Rows, ask_along, ask_each, make_legs, rows_of
+from ..archives.merge_answers import limit_pairs
 from ..archives.placed_archive import ArchiveGeneration, PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..avatars.client_avatars import Avatars
@@ -105,7 +105,7 @@ class SceneQuestions(QueryMethods):
             return self._ask_vectors(question, given, options)
         answers: Any = self._ask_avatar(question, given, client, options)
         if question.listed is not None and len(self.archives) > 1:
-            answers = limited(answers, given[question.arguments.index(question.listed[0])])
+            answers = limit_pairs(answers, given[question.arguments.index(question.listed[0])])
         return answers  # type: ignore[no-any-return]
 
     def _ask_avatar(
@@ -122,7 +122,7 @@ class SceneQuestions(QueryMethods):
 
         around = 0.0 if question.around is None else given[question.around]
 
-        def prepare(archive: PlacedArchive, opened: ArchiveGeneration) -> Prepared:
+        def prepare(archive: PlacedArchive, opened: ArchiveGeneration) -> PreparedQuery:
             own = [archive.poses_in(each) for each in arrays]
 
             def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> _A:
@@ -147,7 +147,7 @@ class SceneQuestions(QueryMethods):
                 f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected as many"
             )
 
-        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> Prepared:
+        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
             own = [
                 archive.directions_in(each) if name in question.directions else archive.points_in(each)
                 for each, name in zip(arrays, names, strict=True)
@@ -173,7 +173,7 @@ class SceneQuestions(QueryMethods):
         groups = np.array([item.group for item in items], np.uint32)
         masks = np.array([item.mask for item in items], np.uint32)
 
-        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> Prepared:
+        def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
             # Objects of no group meet nobody but the scene.
             first = archive is self.archives[0]
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
@@ -216,7 +216,7 @@ class SceneQuestions(QueryMethods):
                 taken.append(archive.take())
             avatar, array = self.avatar(name, client), make_poses(poses)
             legs = make_legs(self.archives, taken, radius_model, array)
-            ask, total = along(legs, avatar, op, parameters, stop)
+            ask, total = ask_along(legs, avatar, op, parameters, stop)
 
             def ask_held(start: int, end: int) -> Cost:
                 with ExitStack() as stack:  # whoever wanted the parts may be gone, and their holds with them

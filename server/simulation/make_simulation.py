@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas.scene.scene_file import SceneFile
-from ..archives.rigid_transform import moved
+from ..archives.rigid_transform import transform_points
 from ..queries.within import within
 from .simulation import SimulatedScene, Simulation
 
@@ -31,4 +31,4 @@ def _find_scan_point(world: Any) -> Any:
         place = lattice.to_world(corner[None])
         found = within(data, place, min(16.0, 2 * lattice.voxel_size)).cloud_point
         place = found if np.isfinite(found).all() else place
-        return (place if pose is None else moved(pose, place))[0]
+        return (place if pose is None else transform_points(pose, place))[0]

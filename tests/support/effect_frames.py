@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
-from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of
+from solidcloud.server.archives.rigid_transform import archive_pose, inverse_pose
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.scene import Scene
@@ -64,7 +64,7 @@ def world_of(*scenes: Scene, poses: Any = ()) -> Counting:
 def placed(scene: Scene, pose: Any = None) -> Any:
     """The first archive of a scene, as if it lay at a pose; None: the identity."""
     archive, pose = scene.archives[0], archive_pose(pose)
-    inverse = None if pose is None else inverse_of(pose)
+    inverse = None if pose is None else inverse_pose(pose)
     return SimpleNamespace(take=archive.take, info=archive.info, pose=pose, inverse=inverse)
 
 

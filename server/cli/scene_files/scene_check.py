@@ -10,7 +10,7 @@ import numpy as np
 from ....schemas.scene.effect_table import Objects, Through, Uncertainty, effect_name
 from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_name, up_of
 from ...archives.archive_info import run_order
-from ...archives.rigid_transform import moved_boxes
+from ...archives.rigid_transform import transform_boxes
 from ...scenes.scene_archives import (
     FoundArchive,
     FoundAvatar,
@@ -160,7 +160,7 @@ def _bounds(file: SceneFile, archives: list[FoundArchive]) -> tuple[list[float],
     for item, found in zip(file.archives, archives, strict=True):
         low, high = np.array(found.info.bounds)[:, None]
         if item.pose != identity():
-            low, high = moved_boxes(np.array(item.pose), low, high)
+            low, high = transform_boxes(np.array(item.pose), low, high)
         lows.append(low[0])
         highs.append(high[0])
     return np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()

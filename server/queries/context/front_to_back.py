@@ -71,7 +71,7 @@ def _forget(best: ClosestHits) -> None:
     best.value[:], best.square[:], best.lattice[:], best.counts[:] = np.inf, -1, 0, 0
 
 
-def look(
+def search_front_to_back(
     data: SceneData,
     at_units: NDArray[np.int64],
     direction: NDArray[np.float64] | None,
@@ -254,7 +254,7 @@ def _next_rows(
     return np.array(chosen, np.int64)
 
 
-def finish(
+def verdict_and_bounds(
     found: NDArray[np.float64], unseen: NDArray[np.float64], reach_units: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Return verdict, lower, upper [m] and exact for the distances found (k,) [exact units].

@@ -37,7 +37,7 @@ from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_table import Uncertainty
 from ....schemas.wire.messages import SceneInfo, SourceInfo
 from ....schemas.wire.motion_messages import UncertaintyReport
-from ...archives.rigid_transform import under
+from ...archives.rigid_transform import transform_poses
 from ...avatars.avatar_model import make_avatar
 from ...queries.context.query_context import SceneData
 from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
@@ -250,7 +250,7 @@ class UncertaintyRunner:
         Also returns whether the search was complete.
         """
         inverse, avatar, margin = each.placed.inverse, frame.body.avatar, self._margin + EXACT_UNIT
-        pose = frame.pose if inverse is None else under(inverse, frame.pose[None])[0]
+        pose = frame.pose if inverse is None else transform_poses(inverse, frame.pose[None])[0]
         if scans.single_scan is None:
             found = separation_per_scan(each.data, avatar, pose, margin, len(scans.names), frame.budget)
             frame.world.count(found.node_visits, not found.exact)

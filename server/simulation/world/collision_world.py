@@ -19,7 +19,7 @@ from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
 from ...archives.placed_archive import ArchiveGeneration, PlacedArchive
-from ...archives.rigid_transform import moved, turned, under
+from ...archives.rigid_transform import rotate_vectors, transform_points, transform_poses
 from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
@@ -226,7 +226,7 @@ class World:
                 box = np.array([index.scene_low, index.scene_high]) * arrays.step + arrays.origin
                 corners = np.array([[box[i & 1, 0], box[i >> 1 & 1, 1], box[i >> 2, 2]] for i in range(8)])
                 if each.placed.pose is not None:
-                    corners = moved(each.placed.pose, corners)
+                    corners = transform_points(each.placed.pose, corners)
                 radius = each.data.radius_units / UNITS_PER_METRE
                 least = min(least, min_height(corners, self.up) - radius)
         return least
@@ -257,7 +257,11 @@ class World:
         least = np.inf
         with self as seen:
             for number, each in enumerate(seen):
-                there = place if each.placed.inverse is None else moved(each.placed.inverse, place[None])[0]
+                there = (
+                    place
+                    if each.placed.inverse is None
+                    else transform_points(each.placed.inverse, place[None])[0]
+                )
                 answers = within(each.data, there[None], reach, budget)
                 self._count_of(answers)
                 value = float(answers.distance[0])
@@ -284,9 +288,9 @@ class World:
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
                         answers,
-                        witness_avatar=moved(each.placed.pose, answers.witness_avatar),
-                        witness_cloud=moved(each.placed.pose, answers.witness_cloud),
-                        normal=turned(each.placed.pose, answers.normal),
+                        witness_avatar=transform_points(each.placed.pose, answers.witness_avatar),
+                        witness_cloud=transform_points(each.placed.pose, answers.witness_cloud),
+                        normal=rotate_vectors(each.placed.pose, answers.normal),
                     )
                 found = answers if found is None else merge_distances(found, answers)
         assert found is not None
@@ -311,7 +315,9 @@ class World:
                 self._count_of(answers)
                 if each.placed.pose is not None:
                     columns = ("avatar_point", "cloud_point", "cluster_avatar", "cluster_cloud")
-                    carried = {name: moved(each.placed.pose, getattr(answers, name)) for name in columns}
+                    carried = {
+                        name: transform_points(each.placed.pose, getattr(answers, name)) for name in columns
+                    }
                     answers = msgspec.structs.replace(answers, **carried)
                 found.append(answers)
         return found
@@ -338,7 +344,7 @@ class World:
             way = hit.avatar - hit.cloud
             place = hit.cloud
             if inverse is not None:
-                place, way = moved(inverse, place[None])[0], turned(inverse, way[None])[0]
+                place, way = transform_points(inverse, place[None])[0], rotate_vectors(inverse, way[None])[0]
             try:
                 found: Vec | None = normals.at(place, way, reach, held.stop)
                 if found is None:
@@ -346,19 +352,19 @@ class World:
             except CorruptError:
                 held.unknown = True
                 return None
-            return found if found is None or pose is None else turned(pose, found[None])[0]
+            return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
 
 
 def _to_archive(seen: HeldArchive, pose: Pose) -> Pose:
     """Return a pose of the world in an archive's frame."""
     inverse = seen.placed.inverse
-    return pose if inverse is None else under(inverse, pose[None])[0]
+    return pose if inverse is None else transform_poses(inverse, pose[None])[0]
 
 
 def _to_world(seen: HeldArchive, place: NDArray[np.float64]) -> Vec:
     """Return a point (3,) of an archive in the world frame."""
     pose = seen.placed.pose
-    return place if pose is None else moved(pose, place[None])[0]
+    return place if pose is None else transform_points(pose, place[None])[0]
 
 
 def _swept_in_world(swept: SweepResult, seen: HeldArchive, number: int) -> SweepResult:

@@ -29,8 +29,8 @@ def flags(monkeypatch):
 
 
 def asked_along(stop, **parameters):
-    legs = [ask_archives.Leg(None, None, 0, np.zeros((8, 4, 4))) for _ in range(3)]
-    return ask_archives.along(legs, None, "collide", parameters, stop)[0]
+    legs = [ask_archives.PathLeg(None, None, 0, np.zeros((8, 4, 4))) for _ in range(3)]
+    return ask_archives.ask_along(legs, None, "collide", parameters, stop)[0]
 
 
 @pytest.mark.parametrize("parameters", [{}, {"budget_visits": 100}])

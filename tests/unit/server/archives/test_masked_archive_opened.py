@@ -18,7 +18,7 @@ from solidcloud.schemas.errors import BadRequestError, BadTransformError, Solidc
 from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.server.archives import masked_archive as left_out
 from solidcloud.server.archives.masked_archive import MaskedArchive
-from solidcloud.server.archives.rigid_transform import moved
+from solidcloud.server.archives.rigid_transform import transform_points
 from solidcloud.server.scene import Scene
 
 
@@ -153,17 +153,19 @@ def test_voxels_that_lie_in_a_box_whole_are_not_read(
         )
     monkeypatch.setattr(left_out, "read_points", counted)
     if pose is not None:
-        middle = moved(pose, np.array([[0.8, 0.8, 0.8]]))[0]
+        middle = transform_points(pose, np.array([[0.8, 0.8, 0.8]]))[0]
         low, high = tuple((middle - 0.8).tolist()), tuple((middle + 0.8).tolist())
     # Another box cuts what lies in the first whole.
     middle = np.mean([low, high], axis=0) if posed else np.full(3, 0.75)
     with MaskedArchive(whole, [(low, high), (middle, middle + 0.01)], pose) as archive:
         rows = archive.voxels["rows"][:, 2].sum()
-    world = every if pose is None else moved(pose, every)
+    world = every if pose is None else transform_points(pose, every)
     assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()
     # Where a cell's eight corners are in the box, so are its points, whatever the index says of them.
     corners = np.array([bounds[[i & 1, i >> 1 & 1, i >> 2], :, [0, 1, 2]].T for i in range(8)])
-    carried = corners if pose is None else moved(pose, corners.reshape(-1, 3)).reshape(corners.shape)
+    carried = (
+        corners if pose is None else transform_points(pose, corners.reshape(-1, 3)).reshape(corners.shape)
+    )
     inside = ((carried >= low) & (carried <= high)).all(axis=(0, 2))
     assert inside.any() and read and not set(np.flatnonzero(inside)) & set(read)
 

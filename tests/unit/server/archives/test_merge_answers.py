@@ -14,7 +14,7 @@ from solidcloud.schemas.wire.answers import (
 )
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.schemas.wire.columns import unknown
-from solidcloud.server.archives.merge_answers import carried, limited, merged
+from solidcloud.server.archives.merge_answers import answers_in_world, limit_pairs, merge_answers
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in Verdict)
 INF = np.inf
@@ -38,7 +38,7 @@ def test_contact_wins_then_unknown_then_clear() -> None:
     second = answers(
         CollideAnswers, 9, verdict=[0, 1, 2] * 3, exact=[True, False, False] * 3, outside=[True] * 9
     )
-    found = merged([first, second])
+    found = merge_answers([first, second])
     assert found.verdict.tolist() == [0, 1, 2, 1, 1, 1, 2, 1, 2]
     # A contact is exact if one is; what is clear is so by all.
     assert found.exact.tolist() == [True, False, False, True, True, True, False, False, False]
@@ -51,7 +51,7 @@ def test_counts_are_added_and_do_not_wrap() -> None:
     second = answers(
         CollideAnswers, 2, node_visits=[5, 4], hits=3, engine_seconds=0.5, faults=("b",), late=(7, 8)
     )
-    found = merged([first, second])
+    found = merge_answers([first, second])
     assert found.node_visits.tolist() == [most, 7]
     assert (found.hits, found.misses, found.engine_seconds) == (5, 1, 0.5)
     assert found.faults == ("a", "b") and found.late == (7, 8)
@@ -63,7 +63,7 @@ def test_the_nearest_is_exact_if_nobody_may_hold_a_nearer_one() -> None:
     second = answers(DistanceAnswers, 4, signed_distance=[3.0, INF, 2.0, INF], lower=[0.9, 1.0, 2.0, 2.0],
                      upper=[3.0, INF, 2.0, INF], exact=[False, False, True, True], verdict=[2, 2, 0, 0])  # fmt: skip
     for pair in ([first, second], [second, first]):
-        found = merged(pair)
+        found = merge_answers(pair)
         assert found.signed_distance.tolist() == [1.0, 1.0, 1.0, INF]
         assert found.exact.tolist() == [False, True, False, True]
         assert found.lower.tolist() == [0.9, 1.0, 0.5, 2.0]
@@ -88,7 +88,7 @@ def test_of_equals_the_least_scan_point_is_named_then_the_least_avatar_centre() 
         witness_avatar=[[5, 5, 5], [9, 0, 1]],
     )
     for pair in ([first, second], [second, first]):
-        found = merged(pair)
+        found = merge_answers(pair)
         assert found.witness_cloud.tolist() == [[1, 2, 2], [1, 2, 3]]
         assert found.witness_avatar.tolist() == [[5, 5, 5], [9, 0, 1]]
 
@@ -112,7 +112,7 @@ def test_a_sweep_is_exact_if_what_begins_first_is_told(
     names = ("verdict", "lower", "upper", "exact")
     second = answers(SweepAnswers, 1, steps=[4], **{n: [v] for n, v in zip(names, other, strict=True)})
     for pair in ([first, second], [second, first]):
-        found = merged(pair)
+        found = merge_answers(pair)
         assert (found.lower[0], found.upper[0], found.exact[0], found.verdict[0]) == (
             lower,
             0.5001,
@@ -125,7 +125,7 @@ def test_a_sweep_is_exact_if_what_begins_first_is_told(
 def test_a_motion_without_contact_is_clear_or_unknown_from_the_first_doubt_on() -> None:
     first = answers(SweepAnswers, 2, verdict=[0, 0], lower=[1, 1], exact=[True, True])
     second = answers(SweepAnswers, 2, verdict=[0, 2], lower=[1, 0.25], exact=[True, False])
-    found = merged([first, second])
+    found = merge_answers([first, second])
     assert found.verdict.tolist() == [CLEAR, UNKNOWN]
     assert (found.lower.tolist(), found.upper.tolist(), found.exact.tolist()) == (
         [1.0, 0.25],
@@ -137,7 +137,7 @@ def test_a_motion_without_contact_is_clear_or_unknown_from_the_first_doubt_on() 
 def test_a_ray_that_starts_in_two_spheres_names_one() -> None:
     columns = {"verdict": [1], "distance": [0.0], "lower": [0.0], "upper": [0.0], "exact": [True]}
     pair = [answers(RaycastAnswers, 1, **columns, cloud_point=[[x, 0, 0]]) for x in (2.0, 1.0)]
-    assert merged(pair).cloud_point.tolist() == [[1.0, 0, 0]]
+    assert merge_answers(pair).cloud_point.tolist() == [[1.0, 0, 0]]
 
 
 def listed(depths: list[list[float]], scan: int) -> ContactsAnswers:
@@ -157,8 +157,11 @@ def listed(depths: list[list[float]], scan: int) -> ContactsAnswers:
 
 
 def test_contacts_are_listed_by_depth_with_the_clusters_they_are_in() -> None:
-    found = merged(
-        [listed([[-3.0, -1.0], [], [-5.0]], 0), carried(listed([[-2.0], [], [-6.0, -4.0]], 0), None, 2)]
+    found = merge_answers(
+        [
+            listed([[-3.0, -1.0], [], [-5.0]], 0),
+            answers_in_world(listed([[-2.0], [], [-6.0, -4.0]], 0), None, 2),
+        ]
     )
     assert found.pair_starts.tolist() == found.cluster_starts.tolist() == [0, 3, 3, 6]
     assert found.signed_distance.tolist() == found.cluster_deepest.tolist() == [-3, -2, -1, -6, -5, -4]
@@ -166,14 +169,14 @@ def test_contacts_are_listed_by_depth_with_the_clusters_they_are_in() -> None:
     assert found.scan_index.tolist() == found.cluster_scan.tolist() == [0, 2, 0, 2, 0, 2]
     assert found.pairs_found.tolist() == [3, 0, 3]
     assert found.verdict.tolist() == [CONTACT, CLEAR, CONTACT]
-    few = limited(found, 2)
+    few = limit_pairs(found, 2)
     assert few.pair_starts.tolist() == [0, 2, 2, 4] and few.signed_distance.tolist() == [-3, -2, -6, -5]
     assert few.cluster_deepest.tolist() == found.cluster_deepest.tolist()
-    assert limited(found, 0).signed_distance.tolist() == []
-    assert limited(found, 3) is found
+    assert limit_pairs(found, 0).signed_distance.tolist() == []
+    assert limit_pairs(found, 3) is found
 
 
 def test_scans_that_were_not_kept_get_no_number_of_another_archive() -> None:
-    assert carried(listed([[-3.0]], -1), None, 4).scan_index.tolist() == [-1]
+    assert answers_in_world(listed([[-3.0]], -1), None, 4).scan_index.tolist() == [-1]
     alone = listed([[-3.0]], 1)
-    assert merged([alone]) is alone and carried(alone, None) is alone
+    assert merge_answers([alone]) is alone and answers_in_world(alone, None) is alone

@@ -8,7 +8,7 @@ import naive
 import numpy as np
 import pytest
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.server.archives.rigid_transform import inverse_of, moved, under
+from solidcloud.server.archives.rigid_transform import inverse_pose, transform_points, transform_poses
 from solidcloud.server.scene import Scene
 from split_scans import BODY, COUNT, RADIUS, STEP, Built, exact_pose, near, several
 
@@ -136,7 +136,7 @@ def test_an_archive_moved_exactly_answers_as_the_pose_moved(built: Built, rng: n
         pose = exact_pose(rng)
         poses = near(rng, built.points[0], 20)
         carried = pose @ poses  # signed permutations and lattice shifts: exact
-        assert under(inverse_of(pose), carried).tobytes() == poses.tobytes()
+        assert transform_poses(inverse_pose(pose), carried).tobytes() == poses.tobytes()
         places, ways = poses[:, :3, 3].copy(), poses[:, :3, 0].copy()
         out_places, out_ways = carried[:, :3, 3].copy(), carried[:, :3, 0].copy()
         with several((built.first, pose)) as scene, Scene.open(built.first) as plain:
@@ -151,7 +151,7 @@ def test_an_archive_moved_exactly_answers_as_the_pose_moved(built: Built, rng: n
             ]  # fmt: skip
             for found, expected in pairs:
                 world = {
-                    name: moved(pose, getattr(expected, name))
+                    name: transform_points(pose, getattr(expected, name))
                     for name in ("witness_avatar", "witness_cloud", "avatar_point", "cloud_point")
                     if hasattr(expected, name)
                 }
@@ -165,13 +165,13 @@ def test_an_archive_moved_exactly_answers_as_the_pose_moved(built: Built, rng: n
             hits = scene.raycast(out_places, out_ways, 2.0), plain.raycast(places, ways, 2.0)
             assert hits[0].verdict.tolist() == hits[1].verdict.tolist()
             np.testing.assert_allclose(hits[0].distance, hits[1].distance, atol=1e-12)
-            np.testing.assert_array_equal(hits[0].cloud_point, moved(pose, hits[1].cloud_point))
+            np.testing.assert_array_equal(hits[0].cloud_point, transform_points(pose, hits[1].cloud_point))
 
 
 @pytest.mark.interpreted
 def test_verdicts_are_those_of_the_naive_judge_of_both(built: Built, rng: np.random.Generator) -> None:
     pose = exact_pose(rng)
-    seen = np.vstack([built.points[0], moved(pose, built.points[1])])
+    seen = np.vstack([built.points[0], transform_points(pose, built.points[1])])
     poses = near(rng, seen)
     with several((built.first, None), (built.second, pose)) as scene:
         verdict = scene.collide("al", poses).verdict

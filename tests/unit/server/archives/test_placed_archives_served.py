@@ -12,7 +12,12 @@ from msgspec import structs
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, FormatError, UnknownAvatarError
 from solidcloud.schemas.wire.key_expressions import public_id
-from solidcloud.server.archives.rigid_transform import archive_pose, inverse_of, moved, under
+from solidcloud.server.archives.rigid_transform import (
+    archive_pose,
+    inverse_pose,
+    transform_points,
+    transform_poses,
+)
 from solidcloud.server.scene import Scene
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 from solidcloud.server.zenoh_server.service import Service
@@ -56,7 +61,9 @@ def test_a_path_answers_as_its_question(
     built: Built, rng: np.random.Generator, op: str, parameters: dict[str, Any]
 ) -> None:
     pose = exact_pose(rng)
-    poses = near(rng, np.vstack([built.points[0], moved(pose, built.points[1])]), 90 if COUNT > 20 else 8)
+    poses = near(
+        rng, np.vstack([built.points[0], transform_points(pose, built.points[1])]), 90 if COUNT > 20 else 8
+    )
     with several((built.first, None), (built.second, pose)) as scene:
         # With a deadline a question is looked at in slices, so what a budget of visits leaves may differ: not the bits.
         options = {name: value for name, value in parameters.items() if name != "budget_ms"}
@@ -117,7 +124,7 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
             assert getattr(info, name) == sum(getattr(part, name) for part in each)
         assert [s.path for s in info.sources] == [s.path for part in each for s in part.sources]
         np.testing.assert_array_equal(info.sources[1].pose, pose @ np.array(each[1].sources[0].pose))
-        clouds = np.vstack([built.points[0], moved(pose, built.points[1])])
+        clouds = np.vstack([built.points[0], transform_points(pose, built.points[1])])
         np.testing.assert_array_equal(info.bounds, [clouds.min(axis=0), clouds.max(axis=0)])
         poses = near(rng, clouds, 10)
         scene.add_avatar("al", BODY, RADIUS, client="me")
@@ -207,7 +214,10 @@ def test_the_inverse_of_a_pose_carries_back(rng: np.random.Generator) -> None:
     for _ in range(20):
         pose = archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1e3, 1e3, 3))
         points = rng.uniform(-100, 100, (10, 3))
-        assert np.abs(moved(inverse_of(pose), moved(pose, points)) - points).max() < 1e-11
-        assert np.abs(under(inverse_of(pose), pose[None])[0] - np.eye(4)).max() < 1e-11
+        assert (
+            np.abs(transform_points(inverse_pose(pose), transform_points(pose, points)) - points).max()
+            < 1e-11
+        )
+        assert np.abs(transform_poses(inverse_pose(pose), pose[None])[0] - np.eye(4)).max() < 1e-11
         shift = exact_pose(rng)
-        assert under(inverse_of(shift), shift[None])[0].tobytes() == np.eye(4).tobytes()
+        assert transform_poses(inverse_pose(shift), shift[None])[0].tobytes() == np.eye(4).tobytes()

@@ -1,4 +1,4 @@
-"""Scene: placed archives opened in this process, and the questions asked of them. The methods of `Client`."""
+"""Scene: placed archives opened in this process, and their queries. It has the methods of `Client`."""
 
 import threading
 import time
@@ -43,7 +43,7 @@ class Scene(SceneQuestions):
     """One or more placed archives, served as one. Thread-safe; a context manager.
 
     name: what clients call it; the name in the scene file, or that of the file or folder, unless
-    given. The content of the archives' folders at opening answers, whatever becomes of the folders,
+    given. Answers are those of the archives' content at opening, whatever happens to the folders,
     until `reload`.
     """
 
@@ -92,7 +92,7 @@ class Scene(SceneQuestions):
         policy: of eviction, and whether voxels are prefetched; see eviction.py.
         open_store: opens the folder of an archive, now and at each reload; None: as it is.
         radius_model: of questions that name none, see schemas/archive/radius_model.py; None: the
-        archive's one figure. Both are for an archive; a scene file says them itself.
+        archive's single radius. Both are for an archive; a scene file declares them.
         read_points: returns the points (n, 3) of a file of an avatar [m]; None: reads scans and
         meshes.
         Raises FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
@@ -160,9 +160,9 @@ class Scene(SceneQuestions):
 
         Requests that began before are answered from the old generation, requests that begin after
         this returns from the new one; avatars stay. The old one is closed with its last reader:
-        until then both keep voxels in memory, `budget_bytes` each. Several archives are reloaded
-        one after the other: where one cannot be opened, those before it are new, and it and those
-        behind are served on as they were.
+        until then both keep voxels in memory, `budget_bytes` each. Several archives are reloaded one
+        after the other. If one cannot be opened, the archives before it are new, and it and those
+        after it are served unchanged.
         Raises FormatError, CorruptError or BadRequestError, saying why, when a new one cannot be
         opened, and BusyError when the generation before the old one is still being read.
         """

@@ -32,17 +32,19 @@ _A = TypeVar("_A", bound=Cost)
 Rows = slice | None
 # Asks one archive about some rows of a request.
 AskRows = Callable[[SceneData, QueryBudget, Rows], _A]
-# What asks an archive, and whether what is looked at is passed by (`QueryBudget.scan`).
+# Function that asks an archive, and whether its voxels are used in passing (`QueryBudget.scan`).
 PreparedQuery = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
 PrepareQuery = Callable[[PlacedArchive, ArchiveGeneration], PreparedQuery]
-# Pairs that `contacts` lists where no limit is given.
+# Pairs that `contacts` lists per pose by default.
 DEFAULT_LIMIT = 100
 
 
 class PathLeg(NamedTuple):
-    """A path through one archive. data: what it reads.  pose: archive to world, None: at the identity.
+    """A path through one archive.
 
-    first_source: which of the scene's sources the archive's first is.  poses: (k, 4, 4) in the archive's frame.
+    data: of the archive.  pose: archive to world; None: the identity.  poses: (k, 4, 4) in the
+    archive's frame.
+    first_source: number of the archive's first source among those of the scene.
     """
 
     data: SceneData

@@ -24,7 +24,8 @@ _PAIRS, _CLUSTERS = CONTACTS.rows_of("pair_starts"), CONTACTS.rows_of("cluster_s
 def answers_in_world(answers: _A, pose: Pose | None, first_source: int = 0) -> _A:
     """Return the answers of an archive at a pose, in the world; None: at the identity.
 
-    first_source: which of the scene's sources the archive's first is. A box becomes the box around its corners.
+    first_source: number of the archive's first source among those of the scene. A box becomes the
+    box around its transformed corners.
     """
     fields: dict[str, Any] = {}
     low = ""
@@ -171,7 +172,7 @@ def _exact_nearest(found: _Merged, name: str) -> NDArray[np.bool_]:
     """Return where the nearest is exact, and no other archive may hold a nearer one."""
     value, _ = found.question.nearest or ("", ())
     exact = found.stack(name)
-    # Others may hold something no nearer than their bounds say, where they do not know it.
+    # Where another archive is not exact, nothing in it is nearer than its lower bound.
     known = (exact | (found.stack("lower") >= _of_nearest(found, value))).all(axis=0)
     return np.asarray(known & _of_nearest(found, name))
 
@@ -179,7 +180,7 @@ def _exact_nearest(found: _Merged, name: str) -> NDArray[np.bool_]:
 def _exact_interval(found: _Merged, name: str) -> NDArray[np.bool_]:
     """Return where the first contact is within the tolerance, or where all is clear."""
     verdicts, lower = found.stack("verdict"), found.stack("lower")
-    # An interval that begins first and ends no earlier than the one that is answered is within the tolerance.
+    # The interval that begins first ends no earlier than the merged one, which is thus within the tolerance.
     first = found.stack(name) & (verdicts == Verdict.CONTACT) & (lower == lower.min(axis=0))
     return np.asarray(first.any(axis=0) | (verdicts == Verdict.CLEAR).all(axis=0))
 

@@ -44,10 +44,10 @@ from .rigid_transform import archive_pose, inverse_pose, rotate_vectors, transfo
 
 _Floats = NDArray[np.float64]
 
-# How long a reload waits for the last reader of the generation before the one that is current [s]:
-# with a third one opened meanwhile, three budgets would be in memory.
+# How long a reload waits for the last reader of the generation before the current one [s]: a third
+# open generation would mean three budgets in memory.
 RELOAD_WAIT = 10.0
-# A request of more poses passes through the archive: it says nothing about where a user is.
+# A request of more poses does not show where a user is.
 _MAX_USER_POSES = 8
 # Limits of a user's request, as in kernels/core/pose_transform.py: others will be refused. Margin or
 # reach [m], scale of the avatar.

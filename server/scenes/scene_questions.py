@@ -1,4 +1,4 @@
-"""The questions of a scene to its archives, in this process: each in the archive's frame, answers merged."""
+"""The queries of a scene in this process: each archive is asked in its own frame, and the answers are merged."""
 
 import os
 from collections.abc import Iterator, Sequence, Sized
@@ -39,7 +39,7 @@ class SceneQuestions(QueryMethods):
     """
 
     def __init__(self, archives: Sequence[PlacedArchive], name: str, metrics: RequestStats) -> None:
-        """Ask these archives; see `Scene`."""
+        """Query these archives; see `Scene`."""
         self.name, self.archives = name, list(archives)
         # A single archive at the identity: its questions take a request as it is.
         self._alone = self.archives[0] if len(archives) == 1 and archives[0].pose is None else None
@@ -61,9 +61,9 @@ class SceneQuestions(QueryMethods):
         budget_visits limit the cost of the answer, see server/queries/context/query_budget.py;
         radius_model sets the size of the scan's spheres, see schemas/archive/radius_model.py, None:
         as the scene was opened; stop ends the work early. server/queries has the definition of each
-        answer. A cluster of `contacts` is of one archive; the depths of several archives are
-        compared by the rounded figure. Of one another, `objects` are asked in the frame of the
-        first archive.
+        answer. A cluster of `contacts` has the points of one archive; depths in several archives are
+        compared as rounded. `objects` are tested against one another in the frame of the first
+        archive.
         """
         complete = len(arguments) == len(question.arguments)
         given = arguments if complete else question.all_arguments(arguments, options)
@@ -166,7 +166,7 @@ class SceneQuestions(QueryMethods):
     def _ask_objects(
         self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
     ) -> _A:
-        """Ask about objects; of one another in the frame of the first archive."""
+        """Ask about objects; they are tested against one another in the frame of the first archive."""
         engine, what = ENGINES[question.name], given[1:]
         items, poses = make_objects(given[0])
         avatars = [self.avatar(item.avatar, client) for item in items]
@@ -174,7 +174,7 @@ class SceneQuestions(QueryMethods):
         masks = np.array([item.mask for item in items], np.uint32)
 
         def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
-            # Objects of no group meet nobody but the scene.
+            # Objects without a group are tested against the scene only.
             first = archive is self.archives[0]
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
             mask = masks if first else masks & np.uint32(SCENE_GROUP)
@@ -219,7 +219,9 @@ class SceneQuestions(QueryMethods):
             ask, total = ask_along(legs, avatar, op, parameters, stop)
 
             def ask_held(start: int, end: int) -> Cost:
-                with ExitStack() as stack:  # whoever wanted the parts may be gone, and their holds with them
+                with (
+                    ExitStack() as stack
+                ):  # the consumer may have closed the path and released its generations
                     for opened in taken:
                         stack.enter_context(opened.taken())
                     part = ask(start, end)

@@ -193,8 +193,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/nearest/nearest_by_scan.py": (SERVER + "queries/test_distance_per_scan.py",),
     "server/kernels/nearest/nearest_search.py": work("distance", "distance deep"),
     "server/kernels/nearest/nearest_resident.py": (
-        SERVER + "queries/test_resident_distance.py",
-        "tests/property/test_near.py::test_one_pose_has_the_bits_of_distance",
+        SERVER + "queries/test_distance_fast.py",
+        "tests/property/test_distance_fast_naive.py::test_one_pose_has_the_bits_of_distance",
     ),
     "server/kernels/bodies/body_sweep.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/bodies/moving_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),

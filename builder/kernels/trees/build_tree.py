@@ -157,7 +157,7 @@ def extreme_points(ranked, n, low, extremes):
 
 @nb.njit(nogil=True, cache=True)
 def build_cells(
-    points, starts, low, leaf, degree, with_slab, highest, nodes, held, xyz, rank, moment_rows, extremes
+    points, starts, low, leaf, degree, with_slab, highest, nodes, row_counts, xyz, rank, moment_rows, extremes
 ):
     """Build the hierarchies of cells, one after the other; return the number of rows.
 
@@ -165,7 +165,7 @@ def build_cells(
     starts: (c + 1,) int64, first point of each cell, and n.
     low: (c, 3) int64, the cells' corners.
     leaf, degree, with_slab, highest: see `build_tree`.
-    Writes rows of nodes, cell by cell, level by level; held (c,), the number of rows of each cell;
+    Writes rows of nodes, cell by cell, level by level; row_counts (c,), the number of rows of each cell;
     xyz (3, n) uint16, the points in leaf-node order, from their cell's corner; rank (n,) int32,
     each point's index in `points`; moment_rows (c, MOMENTS) and extremes (c, EXTREMES, 3) int32 of the
     cells' points, from the voxel's corner.
@@ -197,7 +197,7 @@ def build_cells(
                 xyz[k, first + i] = ranked[k, i]
         for i in range(n):
             rank[first + i] = np.int32(first + np.uint64(ranked[3, i]))
-        held[cell] = total
+        row_counts[cell] = total
         row += total
     return row
 

@@ -204,12 +204,12 @@ def pack_points(ranked, n, leaf, degree, workspace, begin, end, count, levels):
 
 
 @nb.njit(nogil=True, cache=True)
-def node_counts(n, leaf, degree, count, held):
+def node_counts(n, leaf, degree, count, node_points):
     """Write the counts of `pack_points` for n points without the points; return t, the number of nodes.
 
     Splits depend on the number of points alone, and the counts are the same for any points.
     Coincident points therefore need no packing. Writes count (>= t,) as `pack_points` does, and
-    held (>= t,) int64, the points of each node.
+    node_points (>= t,) int64, the points of each node.
     """
     leaves = (n + leaf - 1) // leaf
     capacity = np.int64(1)
@@ -223,7 +223,7 @@ def node_counts(n, leaf, degree, count, held):
         below, found = np.empty(min(degree * sizes.shape[0], leaves), np.int64), 0
         for size in sizes:
             parts = ((size + leaf - 1) // leaf + capacity - 1) // capacity
-            count[total], held[total] = parts, size
+            count[total], node_points[total] = parts, size
             total += 1
             stack[0, 0], stack[0, 1] = size, parts
             depth = 1
@@ -241,7 +241,7 @@ def node_counts(n, leaf, degree, count, held):
                 depth += 2
         sizes = below[:found]
     for size in sizes:
-        count[total] = held[total] = size
+        count[total] = node_points[total] = size
         total += 1
     return total
 

@@ -17,17 +17,17 @@ from .truth import FacadeTruth, SceneTruth, StationTruth, WallTruth
 
 # Ratio of the largest to the smallest spacing: 24 to 96 mm on the façade of the paper's size.
 # Sparser places are seen only through the doors, at a grazing angle.
-SPREAD = 4.0
+SPACING_RATIO = 4.0
 # A wall counts as seen where it is visible all around at this distance [m]: a probe of 5 cm then
 # meets this wall and nothing else.
-AROUND = 0.15
+RING_RADIUS = 0.15
 # Places drawn on each wall to compute their density: enough for 2,000 distinct ones among the few
 # sparsest.
-TRIED = 40_000
+WALL_SAMPLES = 40_000
 # Candidates per wanted place, because the wall is hidden around some of them.
-DRAWN = 3
+DRAWS_A_PLACE = 3
 # Maximum distance between a ray's hit and the place it is cast at [m]: rays are cast in float32.
-NEAR = 0.003
+HIT_TOLERANCE = 0.003
 
 
 class WallPlaces(NamedTuple):
@@ -47,18 +47,18 @@ class WallPlaces(NamedTuple):
 def wall_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> WallPlaces:
     """Return exactly `places` places on the walls of the first façade.
 
-    Their spacings are distributed evenly by logarithm, up to SPREAD times the least. The same truth
+    Their spacings are distributed evenly by logarithm, up to SPACING_RATIO times the least. The same truth
     and seed give the same places. Raises BadDataError where the stations see too few places on the
     walls.
     """
     facade = truth.facades[0]
     rays = RayScene(build_facade(facade.seed, facade.door("main").width).mesh)
     rng = np.random.default_rng([seed, 0x9A7E])
-    tried = [_tried(rays, facade, truth.stations, wall, rng) for wall in facade.walls]
-    points, normals, spacing = (np.concatenate(column) for column in zip(*tried, strict=True))
+    samples = [_visible_samples(rays, facade, truth.stations, wall, rng) for wall in facade.walls]
+    points, normals, spacing = (np.concatenate(column) for column in zip(*samples, strict=True))
     order = np.argsort(spacing, kind="stable")
     if len(order):
-        wanted = spacing[order[0]] * SPREAD ** rng.uniform(size=DRAWN * places)
+        wanted = spacing[order[0]] * SPACING_RATIO ** rng.uniform(size=DRAWS_A_PLACE * places)
         drawn = order[np.searchsorted(spacing[order], wanted, side="right") - 1]
         # Each once, in the order drawn.
         drawn = drawn[np.sort(np.unique(drawn, return_index=True)[1])]
@@ -75,7 +75,7 @@ def wall_places(truth: SceneTruth, places: int = 2000, seed: int = 2012) -> Wall
     return WallPlaces(points[order] + np.asarray(facade.origin), normals[order], spacing[order])
 
 
-def _tried(
+def _visible_samples(
     rays: RayScene,
     facade: FacadeTruth,
     stations: tuple[StationTruth, ...],
@@ -84,11 +84,11 @@ def _tried(
 ) -> WallPlaces:
     """Draw places evenly over one wall, in the façade's frame; return those that a station sees."""
     axis = "xy".index(wall.axis)
-    points = np.empty((TRIED, 3))
+    points = np.empty((WALL_SAMPLES, 3))
     points[:, axis] = wall.offset
-    points[:, 1 - axis] = rng.uniform(wall.low + AROUND, wall.high - AROUND, TRIED)
-    points[:, 2] = rng.uniform(wall.z_low + AROUND, wall.z_high - AROUND, TRIED)
-    density = np.zeros((TRIED, 1))
+    points[:, 1 - axis] = rng.uniform(wall.low + RING_RADIUS, wall.high - RING_RADIUS, WALL_SAMPLES)
+    points[:, 2] = rng.uniform(wall.z_low + RING_RADIUS, wall.z_high - RING_RADIUS, WALL_SAMPLES)
+    density = np.zeros((WALL_SAMPLES, 1))
     for station in stations:
         density += _density(rays, facade, station, points[:, None], np.array([[axis]]))
     seen = density[:, 0] > 0
@@ -98,11 +98,11 @@ def _tried(
 
 
 def _ring(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return eight offsets (k, 8, 3) [m] of length AROUND in the planes of normals (k, 3) along x or y."""
+    """Return eight offsets (k, 8, 3) [m] of length RING_RADIUS in the planes of normals (k, 3) along x or y."""
     turn = np.arange(8) * np.pi / 4
     level = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
     up = np.array([0.0, 0.0, 1.0])
-    return AROUND * (np.cos(turn)[:, None] * level[:, None] + np.sin(turn)[:, None] * up)
+    return RING_RADIUS * (np.cos(turn)[:, None] * level[:, None] + np.sin(turn)[:, None] * up)
 
 
 def _density(
@@ -118,13 +118,13 @@ def _density(
     """
     position = np.subtract(station.position, facade.origin)
     x, y, z = position.tolist()
-    way = points - position
-    reach = np.linalg.norm(way, axis=-1)
-    elevation = np.arcsin(way[..., 2] / reach)
-    azimuth = np.arctan2(way[..., 1], way[..., 0]) - station.yaw
+    displacement = points - position
+    reach = np.linalg.norm(displacement, axis=-1)
+    elevation = np.arcsin(displacement[..., 2] / reach)
+    azimuth = np.arctan2(displacement[..., 1], displacement[..., 0]) - station.yaw
     returns = rays.cast(ScannerPose((x, y, z), station.yaw), azimuth, elevation)
-    cosine = np.abs(np.take_along_axis(way, axes[..., None], axis=2)[..., 0]) / reach
-    seen = (np.abs(returns.range - reach) < NEAR) & (cosine > GRAZING)
+    cosine = np.abs(np.take_along_axis(displacement, axes[..., None], axis=2)[..., 0]) / reach
+    seen = (np.abs(returns.range - reach) < HIT_TOLERANCE) & (cosine > GRAZING)
     seen &= (elevation > LOWEST) & (elevation < HIGHEST)
     # A ray covers a solid angle of step² cos(elevation); a square metre at this place covers cosine
     # / reach² of it.

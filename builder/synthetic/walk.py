@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from .truth import DoorTruth, FacadeTruth
 
-SOLE = 0.03
+SOLE_HEIGHT = 0.03
 # Half the figure's width (figure.py, 1.75 m): the distance of a path alongside a wall.
-SIDE = 0.256
+HALF_WIDTH = 0.256
 # Distance of the figure's side from a surface [m]: BRUSH overlaps it, PASS clears noise and radii.
 BRUSH, PASS = -0.01, 0.06
 # Length of the moving average that rounds the path's corners [m].
-ROUNDING = 0.40
-SPACING = 0.005
+ROUNDING_LENGTH = 0.40
+SAMPLE_SPACING = 0.005
 # The figure's hands and feet reach 0.39 m before and behind it. STRIDE, the range of the highest
 # floor, is larger: the ramp, rounded over RAMP, is complete before the foot is over the step.
 STRIDE, RAMP = 0.60, 0.40
@@ -38,7 +38,9 @@ def walk_poses(
     at = np.linspace(0.0, length[-1], frames)
     xy = np.column_stack([np.interp(at, length, path[:, k]) for k in range(2)])
     ahead = np.gradient(path, axis=0)
-    turned = _average(np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), int(ROUNDING / SPACING) | 1)
+    turned = _average(
+        np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), int(ROUNDING_LENGTH / SAMPLE_SPACING) | 1
+    )
     heading = np.interp(at, length, turned)
     height = np.interp(at, length, _heights(truth, path, length))
     # The avatar faces +y: it is rotated by heading - 90 degrees, whose cosine is the sine of the
@@ -68,16 +70,16 @@ def floor_height(truth: FacadeTruth, xy: NDArray[np.float64]) -> NDArray[np.floa
 
 def _corners(truth: FacadeTruth) -> NDArray[np.float64]:
     """Return the path's corners (n, 2), in the façade's frame."""
-    wall = truth.wall("cloister").offset + SIDE
-    nave = truth.wall("nave right").offset - SIDE
+    wall = truth.wall("cloister").offset + HALF_WIDTH
+    nave = truth.wall("nave right").offset - HALF_WIDTH
     column = truth.column("forecourt left")
     door: DoorTruth = truth.door("main")
     # On the way out the figure faces -y and keeps to the jamb at x_right.
-    jamb = door.x_right - SIDE
-    around = column.radius + SIDE
+    jamb = door.x_right - HALF_WIDTH
+    around = column.radius + HALF_WIDTH
     turn = np.linspace(np.pi, 2 * np.pi, 60)
     # Rounding shrinks a circle by about ROUNDING²/24/radius: 1 cm.
-    ring = around + ROUNDING**2 / 24 / around
+    ring = around + ROUNDING_LENGTH**2 / 24 / around
     gap = np.where(np.abs(turn - 1.5 * np.pi) < 0.8, BRUSH, PASS)
     circle = np.column_stack([column.x + (ring + gap) * np.cos(turn), column.y + (ring + gap) * np.sin(turn)])
     return np.concatenate(
@@ -103,11 +105,11 @@ def _corners(truth: FacadeTruth) -> NDArray[np.float64]:
 
 
 def _rounded(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rounded path with a point every SPACING; straight stretches stay unchanged."""
+    """Return the rounded path with a point every SAMPLE_SPACING; straight stretches stay unchanged."""
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    at = np.linspace(0.0, lengths[-1], int(lengths[-1] / SPACING))
+    at = np.linspace(0.0, lengths[-1], int(lengths[-1] / SAMPLE_SPACING))
     path = np.column_stack([np.interp(at, lengths, corners[:, k]) for k in range(2)])
-    width = int(ROUNDING / SPACING) | 1
+    width = int(ROUNDING_LENGTH / SAMPLE_SPACING) | 1
     return np.column_stack([_average(path[:, k], width) for k in range(2)])
 
 
@@ -116,14 +118,14 @@ def _heights(
 ) -> NDArray[np.float64]:
     """Return the heights of the soles along the path [m].
 
-    A height is the highest floor within a stride, ramped, plus SOLE.
+    A height is the highest floor within a stride, ramped, plus SOLE_HEIGHT.
     """
-    even = np.arange(0.0, length[-1], SPACING)
+    even = np.arange(0.0, length[-1], SAMPLE_SPACING)
     xy = np.column_stack([np.interp(even, length, path[:, k]) for k in range(2)])
-    reach = int(STRIDE / SPACING)
+    reach = int(STRIDE / SAMPLE_SPACING)
     padded = np.pad(floor_height(truth, xy), reach, mode="edge")
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
-    return np.interp(length, even, _average(highest, int(RAMP / SPACING) | 1)) + SOLE
+    return np.interp(length, even, _average(highest, int(RAMP / SAMPLE_SPACING) | 1)) + SOLE_HEIGHT
 
 
 def _average(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.synthetic.walk import RAMP, SOLE, STRIDE
+from solidcloud.builder.synthetic.walk import RAMP, SOLE_HEIGHT, STRIDE
 
 Floats = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def _heights(way: Way, floor: Callable[[Floats], Floats]) -> Floats:
     reach = int(STRIDE / SPACING)
     padded = np.pad(floor(way.xy), reach, mode="edge")
     highest = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
-    return _average(highest, int(RAMP / SPACING) | 1, False) + SOLE
+    return _average(highest, int(RAMP / SPACING) | 1, False) + SOLE_HEIGHT
 
 
 def turning(time: Floats, rng: np.random.Generator) -> Floats:
@@ -114,7 +114,7 @@ def stand(
     spot: Floats, heading: Floats, floor: Callable[[Floats], Floats], rng: np.random.Generator
 ) -> Floats:
     """Return poses (k, 4, 4) at places (k, 2), turned to headings (k,), with the jitter of tracking."""
-    return upright(spot + rng.normal(0.0, JITTER, spot.shape), floor(spot) + SOLE, heading)
+    return upright(spot + rng.normal(0.0, JITTER, spot.shape), floor(spot) + SOLE_HEIGHT, heading)
 
 
 def upright(xy: Floats, z: Floats, heading: Floats) -> Floats:

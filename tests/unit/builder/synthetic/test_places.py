@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from solidcloud.builder.synthetic.places import AROUND, SPREAD, WallPlaces, wall_places
+from solidcloud.builder.synthetic.places import RING_RADIUS, SPACING_RATIO, WallPlaces, wall_places
 from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
 from solidcloud.schemas.errors import BadDataError
@@ -28,8 +28,10 @@ def test_places_lie_on_the_walls_clear_of_their_edges(
     for wall in truth.facades[0].walls:
         axis = "xy".index(wall.axis)
         across, along, height = places.points[:, axis], places.points[:, 1 - axis], places.points[:, 2]
-        inside = (across == wall.offset) & (along >= wall.low + AROUND) & (along <= wall.high - AROUND)
-        inside &= (height >= wall.z_low + AROUND) & (height <= wall.z_high - AROUND)
+        inside = (
+            (across == wall.offset) & (along >= wall.low + RING_RADIUS) & (along <= wall.high - RING_RADIUS)
+        )
+        inside &= (height >= wall.z_low + RING_RADIUS) & (height <= wall.z_high - RING_RADIUS)
         assert (places.normals[inside, axis] == wall.facing).all()
         on += inside
     assert (on >= 1).all()
@@ -40,19 +42,19 @@ def test_spacings_are_spread_evenly_by_logarithm(
     made: tuple[SceneTruth, NDArray[np.float64], WallPlaces],
 ) -> None:
     _, _, places = made
-    share = np.log(places.spacing / places.spacing.min()) / np.log(SPREAD)
+    share = np.log(places.spacing / places.spacing.min()) / np.log(SPACING_RATIO)
     assert share.max() <= 1.0
     counts = np.histogram(share, 4, (0, 1))[0]
     assert counts.min() > 100
 
 
 def test_scan_has_the_spacing_that_is_said(made: tuple[SceneTruth, NDArray[np.float64], WallPlaces]) -> None:
-    """Counted in circles of AROUND, over many places: the scan is 3 % thinner than its rays, by the thinning."""
+    """Counted in circles of RING_RADIUS, over many places: the scan is 3 % thinner than its rays, by the thinning."""
     _, points, places = made
     tree = cKDTree(points)
     for part in np.array_split(np.argsort(places.spacing), 4):
-        found = tree.query_ball_point(places.points[part], AROUND, return_length=True)
-        expected = np.pi * AROUND**2 / places.spacing[part] ** 2
+        found = tree.query_ball_point(places.points[part], RING_RADIUS, return_length=True)
+        expected = np.pi * RING_RADIUS**2 / places.spacing[part] ** 2
         assert found.sum() == pytest.approx(0.97 * expected.sum(), rel=0.08)
 
 
@@ -77,6 +79,6 @@ def test_too_many_places_are_refused(
     made: tuple[SceneTruth, NDArray[np.float64], WallPlaces], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth, _, _ = made
-    monkeypatch.setattr("solidcloud.builder.synthetic.places.TRIED", 50)
+    monkeypatch.setattr("solidcloud.builder.synthetic.places.WALL_SAMPLES", 50)
     with pytest.raises(BadDataError, match="expected 600"):
         wall_places(truth, 600)

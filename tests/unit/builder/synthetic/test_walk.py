@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from solidcloud.builder.synthetic.facade import build_facade
 from solidcloud.builder.synthetic.figure import figure_points, half_width
 from solidcloud.builder.synthetic.scenes import make_facade
-from solidcloud.builder.synthetic.walk import SIDE, SOLE, floor_height, walk_poses
+from solidcloud.builder.synthetic.walk import HALF_WIDTH, SOLE_HEIGHT, floor_height, walk_poses
 
 TRUTH = build_facade().truth
 FIGURE = figure_points()
@@ -53,9 +53,9 @@ def test_feet_are_three_centimetres_above_the_floor() -> None:
     reach = np.stack([poses[:, :2, 3] + along * poses[:, :2, 1] for along in below])
     floors = np.stack([floor_height(TRUTH, spots) for spots in reach])
     sole = poses[:, 2, 3] + FIGURE[:, 2].min()
-    assert (sole - floors.max(axis=0)).min() > SOLE - 1e-9
+    assert (sole - floors.max(axis=0)).min() > SOLE_HEIGHT - 1e-9
     flat = np.ptp(floors, axis=0) == 0
-    assert np.median((sole - floors[0])[flat]) == pytest.approx(SOLE, abs=1e-12)
+    assert np.median((sole - floors[0])[flat]) == pytest.approx(SOLE_HEIGHT, abs=1e-12)
     assert floors.max() == TRUTH.floor and floors.min() == 0.0
 
 
@@ -67,7 +67,7 @@ def test_walk_goes_through_the_open_door_both_ways(width: float) -> None:
     x, y = poses[:, 0, 3], poses[:, 1, 3]
     within = (y > door.y_front) & (y < door.y_back)
     within &= np.abs(x) < 3
-    assert (np.abs(x[within]) < width / 2 - SIDE + 0.02).all()
+    assert (np.abs(x[within]) < width / 2 - HALF_WIDTH + 0.02).all()
     ways = poses[within, 1, 1]
     assert (ways > 0.9).any() and (ways < -0.9).any()
     # In along the middle.
@@ -75,7 +75,7 @@ def test_walk_goes_through_the_open_door_both_ways(width: float) -> None:
 
 
 def test_the_side_is_that_of_the_figure() -> None:
-    assert half_width(FIGURE) == pytest.approx(SIDE, abs=5e-4)
+    assert half_width(FIGURE) == pytest.approx(HALF_WIDTH, abs=5e-4)
 
 
 def test_walk_follows_the_facade_to_its_place() -> None:
@@ -94,7 +94,7 @@ def test_a_tenth_of_the_walk_is_in_contact(tmp_path: Path) -> None:
     reach = (
         tree.query(sample, k=2)[0][:, 1].mean() / 2 + cKDTree(FIGURE).query(FIGURE, k=2)[0][:, 1].mean() / 2
     )
-    assert reach < SOLE - 0.003
+    assert reach < SOLE_HEIGHT - 0.003
     poses = walk_poses(TRUTH)[1][::10]
     placed = np.einsum("kij,nj->kni", poses[:, :3, :3], FIGURE) + poses[:, None, :3, 3]
     nearest = tree.query(placed, distance_upper_bound=0.1)[0].min(axis=1)

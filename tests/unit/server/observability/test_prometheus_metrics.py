@@ -154,10 +154,10 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
             raise ModuleNotFoundError(f"No module named {name!r}", name="prometheus_client")
         return real(name, *arguments, **more)
 
-    monkeypatch.delitem(sys.modules, "solidcloud.server.observability.prometheus")
+    monkeypatch.delitem(sys.modules, "solidcloud.server.observability.prometheus_metrics")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(SolidcloudError, match=r"prometheus_client.*pip install 'solidcloud\[metrics\]'"):
-        importlib.import_module("solidcloud.server.observability.prometheus")
+        importlib.import_module("solidcloud.server.observability.prometheus_metrics")
 
 
 def test_times_that_say_nothing_have_all_buckets() -> None:

@@ -155,7 +155,7 @@ def test_a_client_that_went_is_forgotten_and_counts_in_all(metrics: RequestStats
 def test_the_longest_silent_is_forgotten_for_a_new_one(
     metrics: RequestStats, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(metrics_module, "MOST_USERS", 3)
+    monkeypatch.setattr(metrics_module, "MAX_USERS", 3)
     for client in "abcadae":
         metrics.answered(client, "al", answers(0, hits=1))
     total, users = metrics.snapshot()
@@ -198,7 +198,7 @@ def run_all(work: Callable[[int], None], count: int) -> None:
 
 
 def test_nothing_is_lost_between_threads(metrics: RequestStats, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_module, "MOST_USERS", 3)
+    monkeypatch.setattr(metrics_module, "MAX_USERS", 3)
     torn = []
 
     def work(number: int) -> None:

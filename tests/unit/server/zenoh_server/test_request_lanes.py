@@ -198,7 +198,7 @@ def test_a_request_that_is_made_slow_while_it_is_put_back_leaves_no_worker_behin
     """The watchdog finds a slow place for a request at the moment at which its thread puts it back."""
     hall = Hall(lambda *_: ANSWER)
     lane = hall.lane
-    ticket = Ticket("a", lanes_module.Request(Query("a"), lane._wire), 0)
+    ticket = Ticket("a", lanes_module.ReceivedRequest(Query("a"), lane._wire), 0)
     assert lane._queues.offer(ticket) is Offer.RUN
     put_back = lane._queues.put_back
 

@@ -31,7 +31,7 @@ RADIUS_CLASSES = 32
 LOCAL_RADII = (
     1000, 1260, 1587, 2000, 2520, 3175, 4000, 5040, 6350, 8000, 10079, 12699, 16000, 20159, 25398, 32000
 )  # fmt: skip
-# A pair reaches 16 m at most, both radii and the margin together (server/kernels/core/pose_transform.py). A
+# A pair reaches 16 m at most, both radii and the margin together (server/kernels/core/placed_avatar.py). A
 # scan point may take half of that.
 MAX_RADIUS = 8.0
 # Share of its radius that `border` leaves to a rim point.

@@ -1,7 +1,7 @@
 """The check that a pose is rigid: a rotation and a translation (NUMERICS.md N6).
 
 For poses of archives, of objects and of users in frames, and for those in scene files. Poses of
-queries may also scale, and a kernel checks thousands of them: server/kernels/core/pose_transform.py.
+queries may also scale, and a kernel checks thousands of them: server/kernels/core/voxels_in_reach.py.
 """
 
 from collections.abc import Sequence

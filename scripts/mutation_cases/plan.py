@@ -154,18 +154,20 @@ TESTS: dict[str, tuple[str, ...]] = {
         BUILDER + "kernels/trees/test_top_bounds.py",
         BUILDER + "voxel/test_top_hierarchy.py",
     ),
-    "server/kernels/core/pose_transform.py": (
-        SERVER + "kernels/core/test_pose_checks.py",
-        SERVER + "kernels/core/test_pose_transform.py",
-    ),
     "server/kernels/core/voxels_in_reach.py": (
+        SERVER + "kernels/core/test_pose_checks.py",
+        SERVER + "kernels/core/test_placed_points.py",
         SERVER + "kernels/core/test_voxels_in_reach_rows.py",
         SERVER + "kernels/core/test_voxels_in_reach.py::test_find_key_finds_what_is_there_and_nothing_else",
     ),
-    "server/kernels/bodies/body_pairs.py": (SERVER + "kernels/bodies/test_body_pairs.py",),
+    "server/kernels/bodies/body_pairs.py": (
+        SERVER + "kernels/bodies/test_body_pairs.py",
+        SERVER + "kernels/bodies/test_body_sweep.py",
+    ),
     "server/kernels/motion/screw_motion.py": (SERVER + "kernels/motion/test_screw_motion.py", *work("sweep")),
     "server/kernels/prediction/track_prediction.py": AHEAD,
     "server/kernels/motion/sweep_advance.py": (*work("sweep", "sweep bounded"), *SWEEPS),
+    "server/kernels/motion/sweep_segments.py": (*work("sweep", "sweep bounded"), *SWEEPS),
     "server/kernels/core/separation_order.py": (
         SERVER + "kernels/core/test_separation_order.py",
         *work("distance"),
@@ -178,11 +180,15 @@ TESTS: dict[str, tuple[str, ...]] = {
         SERVER + "kernels/collide/test_coarse_clearance.py",
     ),
     "server/kernels/contacts/contact_pairs.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
-    "server/kernels/core/avatar_front.py": work("collide", "distance"),
+    "server/kernels/core/node_overlap.py": (
+        SERVER + "kernels/core/test_placed_avatar.py",
+        *tangent("collide"),
+        *work("collide", "distance"),
+    ),
     "server/kernels/nearest/block_distances.py": work("distance", "distance deep", "bounded deep"),
-    "server/kernels/core/voxel_layout.py": (
+    "server/kernels/core/scene_arrays.py": (
         SERVER + "kernels/core/test_outward.py",
-        SERVER + "kernels/core/test_voxel_layout.py",
+        SERVER + "kernels/core/test_scene_arrays.py",
         *work("collide", "contacts"),
     ),
     "server/kernels/motion/contact_times.py": (*work("sweep", "sweep bounded"), *SWEEPS),
@@ -198,7 +204,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/bodies/body_sweep.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/bodies/moving_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
-    "server/kernels/bodies/near_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/rays/stored_normals.py": NORMALS,
     "server/kernels/collide/collide_poses.py": (
         *work("collide", "collide deep", "collide one"),
@@ -206,6 +211,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/core/placed_avatar.py": (
         SERVER + "kernels/core/test_placed_avatar.py",
+        SERVER + "kernels/core/test_placed_points.py",
         *tangent("collide"),
         *work("collide"),
     ),
@@ -242,5 +248,4 @@ NONE = {
     "server/kernels/core/kernel_decorators.py": (
         "options of the compiler only, which an interpreted kernel does not see"
     ),
-    "server/kernels/core/stop_flag_checks.py": "an atomic load, which is not interpreted, and limits of time",
 }

@@ -49,7 +49,7 @@ _Floats = NDArray[np.float64]
 RELOAD_WAIT = 10.0
 # A request of more poses does not show where a user is.
 _MAX_USER_POSES = 8
-# Limits of a user's request, as in kernels/core/pose_transform.py: others will be refused. Margin or
+# Limits of a user's request, as in kernels/core/voxels_in_reach.py: others will be refused. Margin or
 # reach [m], scale of the avatar.
 _MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
 _FLOAT64 = np.dtype(np.float64)  # compared faster than the type

@@ -11,7 +11,7 @@ from ...schemas.archive.rigid_pose import RIGID_TOLERANCE, rigid_pose
 Pose = NDArray[np.float64]  # (4, 4), archive to world
 
 # How far the pose of an archive may be from rigid: half of what an avatar's pose may be
-# (kernels/core/pose_transform.py). A query's pose in the archive's frame is off by both.
+# (kernels/core/voxels_in_reach.py). A query's pose in the archive's frame is off by both.
 _TOLERANCE = RIGID_TOLERANCE / 2
 
 

@@ -9,9 +9,8 @@ from ...builder.voxel.point_radius import build_local, mean_closest_distance
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.messages import make_positions
-from ..kernels.core.avatar_front import MAX_FRONT
-from ..kernels.core.pose_transform import Avatar
-from ..kernels.core.voxel_layout import LANES
+from ..kernels.core.placed_avatar import MAX_FRONT, Avatar
+from ..kernels.core.scene_arrays import LANES
 
 # Children per node of an avatar's tree; as for voxels, see BuildConfig.degree.
 DEGREE = 8

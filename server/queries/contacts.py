@@ -17,8 +17,7 @@ from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import ContactsAnswers, Verdict
 from ...schemas.wire.requests import MAX_CONTACTS
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.collide.collide_poses import STACK
-from ..kernels.contacts.contact_clusters import (
+from ..kernels.contacts.contact_cells import (
     CELLS,
     CENTER,
     CLUSTER,
@@ -34,11 +33,13 @@ from ..kernels.contacts.contact_clusters import (
     SCAN,
     SQUARE,
     TAG,
+    ContactOptions,
     ContactState,
     make_cells,
 )
-from ..kernels.contacts.contact_pairs import ContactOptions, ContactResults, gather_contacts
-from ..kernels.core.voxel_layout import LANES
+from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
+from ..kernels.core.node_overlap import STACK
+from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .context.query_budget import EXACT, CostCounter, QueryBudget

@@ -16,7 +16,8 @@ from ...schemas.errors import BadRequestError, BadTransformError
 from ...schemas.wire.answers import ObjectsAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
-from ..kernels.core.pose_transform import MAX_REACH_UNITS, check_poses
+from ..kernels.core.placed_avatar import MAX_REACH_UNITS
+from ..kernels.core.voxels_in_reach import check_poses
 from ..runtime.stop_flag import NO_STOP
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop

@@ -21,7 +21,7 @@ from ...schemas.wire.columns import as_part, in_pieces
 from ...schemas.wire.path_request import check_path_parameters
 from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.pose_transform import check_poses
+from ..kernels.core.voxels_in_reach import check_poses
 from ..runtime.deadlines import stop_at
 from ..runtime.stop_flag import NO_STOP, StopFlag
 from .context.query_budget import ask_until_stopped, make_budget, unknown_answers

@@ -9,7 +9,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
-from ..kernels.core.pose_transform import MAX_REACH_UNITS
+from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import VoxelLists
 from ..kernels.rays.rays import ClosestHits, RayBatch, follow_rays
 from .context.front_to_back import make_origins, search_front_to_back, verdict_and_bounds

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.errors import CorruptError
 from ...schemas.kernels.normal_codes import NO_NORMAL, decode_normal
-from ..kernels.core.voxel_layout import LANES
+from ..kernels.core.scene_arrays import LANES
 from ..kernels.rays.stored_normals import NOT_ESTIMATED, code_at, find_voxel, stored_code_at
 from ..residency.voxel_store import VoxelStore
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError

@@ -11,15 +11,9 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, BadTransformError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.pose_transform import SIMILARITY_TOLERANCE, check_poses
-from ..kernels.core.voxels_in_reach import VoxelsInReach
-from ..kernels.motion.sweep_advance import (
-    SweepProgress,
-    avatar_box,
-    find_unknown_regions,
-    plan_segments,
-    sweep_segments,
-)
+from ..kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE, VoxelsInReach, check_poses
+from ..kernels.motion.sweep_advance import advance_segments
+from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
 from .context.query_budget import EXACT, CostCounter, QueryBudget
@@ -56,7 +50,7 @@ def _check(
             "within 1e-9: a rigid motion changes no size"
         )
     # During the motion the scale lies between those of the ends. If both are well within 1e-9 of 1,
-    # it is 1 throughout (pose_transform.py).
+    # it is 1 throughout (voxels_in_reach.py).
     rigid = np.ones(k, bool)
     for poses in (first, last):
         rigid &= np.abs((poses[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3.0 - 1.0) <= SIMILARITY_TOLERANCE
@@ -195,7 +189,7 @@ def sweep(
                 for at in range(0, len(part), chunk):
                     if budget.spent:
                         progress.visits[part[at:]] = -1
-                    sweep_segments(
+                    advance_segments(
                         box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
                         seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress,
                         counts,

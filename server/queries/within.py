@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
-from ..kernels.core.pose_transform import MAX_REACH_UNITS
+from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import VoxelLists
 from ..kernels.rays.rays import ClosestHits
 from ..kernels.rays.within_point import search_points

@@ -4,7 +4,7 @@ import bisect
 
 import numpy as np
 
-from ..kernels.core.voxel_layout import Arena
+from ..kernels.core.scene_arrays import Arena
 
 ALIGNMENT = 64  # a cache line: a row of the arena straddles as few cache lines as possible
 

@@ -19,8 +19,8 @@ from ..kernels.collide.coarse_clearance import (
     copy_unproved_pairs,
     write_coarse_bounds,
 )
-from ..kernels.core.pose_transform import Avatar
-from ..kernels.core.voxel_layout import (
+from ..kernels.core.placed_avatar import Avatar
+from ..kernels.core.scene_arrays import (
     BLOCK_WORDS,
     CLASS_SHIFT,
     LOCAL_MASK,
@@ -94,7 +94,7 @@ class CoarseBounds:
     def store_from_arena(self, row: int, arena: Arena, where: NDArray[np.int64]) -> None:
         """Store the coarse bounds of a voxel in the arena, unless it has a slot or none is free.
 
-        where: (3,) int64, the voxel's runs (voxel_layout.py). The voxel must stay there until this
+        where: (3,) int64, the voxel's runs (scene_arrays.py). The voxel must stay there until this
         method returns.
         """
         number = self._take(row)

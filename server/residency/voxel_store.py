@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import OPTIONAL_COLUMNS
 from ...schemas.archive.voxel import top_shift
-from ..kernels.core.voxel_layout import (
+from ..kernels.core.scene_arrays import (
     LANES,
     Arena,
     block_words,
@@ -54,7 +54,7 @@ class VoxelStore:
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.
 
-        Return the offsets of its runs (3,) int64, see voxel_layout.py. Raise CorruptError or
+        Return the offsets of its runs (3,) int64, see scene_arrays.py. Raise CorruptError or
         OSError.
         """
         return self.decode(row, self.archive.read_frames(row), arena, offset)

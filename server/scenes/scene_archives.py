@@ -23,7 +23,7 @@ from ...schemas.wire.messages import AvatarInfo, SceneInfo
 from ..archives.archive_info import describe
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import make_avatar
-from ..kernels.core.pose_transform import MAX_REACH_UNITS
+from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..residency.arena import ArenaBuffer
 from ..residency.voxel_store import OpenStore, VoxelStore
 

@@ -17,7 +17,7 @@ from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.voxel import Links, VoxelData
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core.voxel_layout import ROW_WORDS
+from solidcloud.server.kernels.core.scene_arrays import ROW_WORDS
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

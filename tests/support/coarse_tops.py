@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from solidcloud.schemas.archive.radius_model import class_radii
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.kernels.collide.coarse_clearance import MAX_SLOT_NODES
-from solidcloud.server.kernels.core.pose_transform import VALID
-from solidcloud.server.kernels.core.voxel_layout import ROW_WORDS, Arena, SceneArrays, block_words
-from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
+from solidcloud.server.kernels.core.scene_arrays import ROW_WORDS, Arena, SceneArrays, block_words
+from solidcloud.server.kernels.core.voxels_in_reach import VALID, SceneIndex, VoxelsInReach, find_reach
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs
 from solidcloud.server.residency.voxel_store import VoxelStore

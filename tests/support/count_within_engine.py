@@ -6,7 +6,7 @@ import numpy as np
 from count_within_question import CountWithinAnswers
 from numpy.typing import ArrayLike, NDArray
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.kernels.core.voxel_layout import LANES, SceneArrays
+from solidcloud.server.kernels.core.scene_arrays import LANES, SceneArrays
 from solidcloud.server.queries.context.front_to_back import make_origins
 from solidcloud.server.queries.context.query_budget import EXACT, CostCounter, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData, to_units

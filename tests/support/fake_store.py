@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import CorruptError
-from solidcloud.server.kernels.core.voxel_layout import Arena
+from solidcloud.server.kernels.core.scene_arrays import Arena
 from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import synthetic_scans
-from solidcloud.server.kernels.core.pose_transform import place, to_units
+from solidcloud.server.kernels.core.placed_avatar import place, to_units
 from solidcloud.server.scene import Scene
 
 SCAN = ("corner", 21, 150)

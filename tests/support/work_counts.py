@@ -28,6 +28,8 @@ from solidcloud.server.scene import Scene
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "work.json"
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+# Functions of server/kernels that look at the stop flag or copy rows between two looks.
+CHECKS = ("_stopped_interpreted", "should_end", "copy_rows")
 COSTS = ("node_visits", "point_tests", "steps")
 
 Answers = dict[str, Any]
@@ -252,7 +254,7 @@ def counted_calls() -> Iterator[Counter[str]]:
             code = frame.f_code
             if code not in names:
                 path = Path(code.co_filename)
-                own = ("server", "kernels") in pairwise(path.parts) and path.stem != "stop_flag_checks"
+                own = ("server", "kernels") in pairwise(path.parts) and code.co_name not in CHECKS
                 names[code] = f"{path.stem}.{code.co_name}" if own else ""
             calls[names[code]] += 1
 

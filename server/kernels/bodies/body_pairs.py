@@ -16,13 +16,13 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
-from ..core.placed_avatar import U32
-from ..core.pose_transform import MAX_REACH_UNITS, largest_term, place, to_units
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import LANES
+from ..core.node_overlap import U32
+from ..core.placed_avatar import MAX_REACH_UNITS, largest_term, place, to_units
+from ..core.scene_arrays import LANES, stopped
+from ..motion.screw_motion import make_motion
 
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
-# As in collide_poses.py: a pair of trees leaves at most 15 pairs a level on the stack.
+# As in node_overlap.py: a pair of trees leaves at most 15 pairs a level on the stack.
 STACK = 2 * 80 * 15 + 16
 # A similarity may shear by SIMILARITY_TOLERANCE, 1e-9, and stretch a radius by as much.
 STRETCH = 1.0 + 1e-8
@@ -83,6 +83,50 @@ def bound_objects(avatar, poses, which, scales, units, origin, margin_units, low
         for r in range(3):
             center = place(m, shift, r, x, y, z)
             low[i, r], high[i, r] = center - extent, center + extent
+
+
+@nb.njit(nogil=True, cache=True)
+def bound_body(box, pose, origin, more, bounds):
+    """Write the bounds (2, 3) of a body's placed box, grown by `more` on all sides.
+
+    box: (2, 3), avatar frame.  bounds: relative to the origin [m].
+    """
+    for r in range(3):
+        middle, half, size = pose[r, 3] - origin[r], 0.0, abs(pose[r, 3]) + abs(origin[r])
+        for c in range(3):
+            middle += pose[r, c] * (0.5 * (box[0, c] + box[1, c]))
+            half += abs(pose[r, c]) * (0.5 * (box[1, c] - box[0, c]))
+            size += abs(pose[r, c]) * (abs(box[0, c]) + abs(box[1, c]))
+        half += more + 2.0 / UNITS_PER_METRE + size * 2.0**-48
+        bounds[0, r], bounds[1, r] = middle - half, middle + half
+
+
+@nb.njit(nogil=True, cache=True)
+def find_near_bodies(box, first, last, more, bounds, kinds, wanted, skip, rows):
+    """Write the bodies whose bounds meet those of a motion, ascending, to rows (n,) int64.
+
+    Returns how many.
+    box: (2, 3) of the moving avatar.  first, last: (4, 4), translations relative to the origin.
+    more: its radius plus the margin [m].  bounds: (n, 2, 3), see `bound_body`.  kinds: (n,) uint8,
+    one bit each.  wanted: the bits of the kinds to find.  skip: a row to omit.
+    """
+    origin = np.zeros(3)
+    begin, end = np.empty((2, 3)), np.empty((2, 3))
+    stray = make_motion(first, last, box, origin).bend / 8.0
+    bound_body(box, first, origin, more + stray, begin)
+    bound_body(box, last, origin, more + stray, end)
+    count = 0
+    for i in range(bounds.shape[0]):
+        if i == skip or not kinds[i] & wanted:
+            continue
+        apart = False
+        for r in range(3):
+            apart |= min(begin[0, r], end[0, r]) > bounds[i, 1, r]
+            apart |= max(begin[1, r], end[1, r]) < bounds[i, 0, r]
+        if not apart:
+            rows[count] = i
+            count += 1
+    return count
 
 
 @nb.njit(nogil=True, cache=True)

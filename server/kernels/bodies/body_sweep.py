@@ -24,9 +24,8 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.pose_transform import largest_term, place, to_units
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import LANES
+from ..core.placed_avatar import largest_term, place, to_units
+from ..core.scene_arrays import LANES, stopped
 from ..motion.contact_times import INFINITE, pair_times
 from ..motion.screw_motion import make_motion, pose_at
 from .moving_bodies import (

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.pose_transform import Avatar, place
-from ..core.voxel_layout import LANES
+from ..core.placed_avatar import Avatar, place
+from ..core.scene_arrays import LANES
 from ..motion.screw_motion import ScrewMotion
 from .body_pairs import STACK, STRETCH
 

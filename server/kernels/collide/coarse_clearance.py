@@ -1,7 +1,7 @@
 """Coarse bounds: the top nodes of a voxel's hierarchy, and the pairs they prove clear.
 
 A slot holds nodes that together enclose all points of one voxel. They have the layout of the
-arena's rows (voxel_layout.py) and no children. They prove what a descent would have found: the
+arena's rows (scene_arrays.py) and no children. They prove what a descent would have found: the
 bounds, the float32 tests, their slack and the thresholds by radius class are those of
 collide_poses.py. A pair found clear here is therefore clear by the definition.
 """
@@ -12,18 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.avatar_front import MAX_FRONT, mark_meeting, place_front
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import (
+from ..core.node_overlap import (
+    lanes_meet,
+    locate_voxel,
     make_class_thresholds,
-    make_placed,
-    place_block,
-    place_root,
+    mark_meeting,
+    nodes_meet,
     set_class_thresholds,
 )
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
-from .collide_poses import lanes_meet, locate_voxel, nodes_meet
+from ..core.placed_avatar import MAX_FRONT, make_placed, place_block, place_front, place_root
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, stopped
 
 # Nodes of a slot, 48 bytes each. Share of the clear pairs of pose and voxel that this many nodes
 # settle, on the walk through a generated town of 10^7 points (voxels of 8 m, mean 282 KB decoded):
@@ -40,7 +39,7 @@ class CoarseArrays(NamedTuple):
     """Coarse bounds of a scene's v voxels in s slots.
 
     words, ints: (s * SLOT_WORDS,) float32 and int32, two views of one buffer: MAX_SLOT_NODES rows a
-    slot, voxel_layout.py. COUNT holds the radius class only, and FIRST is -1.
+    slot, scene_arrays.py. COUNT holds the radius class only, and FIRST is -1.
     slot: (v,) int32, the slot of a voxel, -1: none.  count: (s,) int32, rows in a slot.
     A thread that finds a slot in `slot` may read it without a lock: the slot was written before and
     is never written again.

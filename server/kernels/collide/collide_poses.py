@@ -4,7 +4,7 @@ As printed, figures 5 and 6 descend into "all children A[i] and B[j]" when A is 
 a leaf has no children, the loop runs zero times, and the contact is lost. Here inner nodes are
 descended, whichever side they are on, and leaves never are.
 
-The scene's tree is descended with the whole front of the avatar's tree (avatar_front.py). Where a
+The scene's tree is descended with the whole front of the avatar's tree (placed_avatar.py). Where a
 scene node is a leaf, or flat compared with the avatar's leaf nodes, the avatar's points themselves
 are tested against its bound, LANES in a vector step. The slab of a floor then clears a foot that
 stands a centimetre above it, while the foot's sphere would not.
@@ -22,46 +22,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.avatar_front import (
-    MAX_LEVELS,
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_overlap import (
+    BROAD,
+    FLAT,
+    STACK,
     compact_marked,
     copy_node,
-    make_front,
-    mark_meeting,
-    pad_list,
-    place_front,
-)
-from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.placed_avatar import (
-    ONE_SLACK,
-    SLACK,
+    lanes_meet,
+    locate_voxel,
     make_class_thresholds,
-    make_placed,
-    node_reach,
-    pair_in_reach,
-    place_block,
-    place_lanes,
-    place_root,
+    mark_meeting,
+    next_near,
+    nodes_meet,
     set_class_thresholds,
 )
-from ..core.pose_transform import VALID, place
-from ..core.stop_flag_checks import MAX_RESIDENT_PATH_VISITS, NO_LIMIT, should_end, stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
-from ..core.voxels_in_reach import VoxelsInReach, find_reach
+from ..core.placed_avatar import (
+    make_front,
+    make_placed,
+    node_reach,
+    pad_list,
+    pair_in_reach,
+    place_block_once,
+    place_front,
+    place_lanes,
+    place_node,
+    place_root,
+)
+from ..core.scene_arrays import (
+    COUNT,
+    COUNTED,
+    FIRST,
+    LANES,
+    MAX_RESIDENT_PATH_VISITS,
+    NO_LIMIT,
+    ROW_WORDS,
+    node_class,
+    point_class,
+    should_end,
+    stopped,
+)
+from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
 
-# A pair is pushed for each child of one of its nodes: at most 15 a level stay behind on the stack.
-# This size holds two trees of MOST_LEVELS.
-STACK = 2 * MAX_LEVELS * 15 + 16
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
 
-U = np.uint64  # see avatar_front.py
-# A scene node is called flat if its slab is thinner than this many radii of an avatar's leaf node;
-# the avatar's points are then tested against it at once. Values from 0.5 to 2 take the same time on
-# the walk; 8 takes a fifth more.
-FLAT = np.float32(1.0)
-# Most of the avatar's front meets a scene node of more than this many radii of the avatar's root;
-# only the root is tested against it.
-BROAD = np.float32(2.0)
+U = np.uint64  # see placed_avatar.py
 
 
 class CollideScratch(NamedTuple):
@@ -81,21 +86,6 @@ class CollideScratch(NamedTuple):
     counters: NDArray[np.int64]
 
 
-class VoxelLocation(NamedTuple):
-    """Location of one voxel.
-
-    rows, blocks, lanes: its first row, block and lane in the arena.
-    x, y, z: its low corner relative to the frame, float32.
-    """
-
-    rows: int
-    blocks: int
-    lanes: int
-    x: np.float32
-    y: np.float32
-    z: np.float32
-
-
 @nb.njit(nogil=True, cache=True)
 def make_collide_scratch(avatar):
     """Allocate scratch for one avatar (not empty)."""
@@ -104,84 +94,6 @@ def make_collide_scratch(avatar):
     stack, counters = np.empty((STACK, 3), np.int64), np.zeros(3, np.int64)
     counters[2] = NO_LIMIT
     return CollideScratch(stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters)
-
-
-@njit_no_refcount
-def nodes_meet(words, row, x, y, z, radius, threshold):
-    """Return whether a sphere may come within `threshold` of a node's points, by the node's bounds.
-
-    x, y, z: float32, relative to the voxel's low corner.  threshold: reach plus error. Tests the
-    sphere as in [Fig12] line 2, then the slab.
-    """
-    w = U(row)
-    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
-    span = radius + threshold
-    both = words[w + U(3)] + span
-    along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
-    # The sphere test decides beyond `both`; the rounding of `along` is therefore at most SLACK of
-    # it.
-    wide = words[w + U(7)] * (span + SLACK * both + SLACK * both)
-    # One branch on all three costs less than three branches that are hard to predict.
-    return (
-        (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
-        & (along <= words[w + U(9)] + wide)
-        & (along >= words[w + U(8)] - wide)
-    )
-
-
-@njit_inlined
-def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
-    """Mark in `keep` the points of an avatar's block within `threshold` of a node's bounds.
-
-    lanes: relative to the frame.  threshold: reach plus error.  row: a scene node. Returns whether
-    any point is marked.
-    """
-    w = U(row)
-    cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
-    nx, ny, nz = words[w + U(4)], words[w + U(5)], words[w + U(6)]
-    both = words[w + U(3)] + threshold
-    wide = words[w + U(7)] * (threshold + SLACK * both + SLACK * both)
-    low, high = words[w + U(8)] - wide, words[w + U(9)] + wide
-    square = both * both * ONE_SLACK
-    b = U(block)
-    any_meets = False
-    for j in range(LANES):
-        dx, dy, dz = lanes[b, 0, U(j)] - cx, lanes[b, 1, U(j)] - cy, lanes[b, 2, U(j)] - cz
-        along = nx * dx + ny * dy + nz * dz
-        meets = (dx * dx + dy * dy + dz * dz <= square) & (along <= high) & (along >= low)
-        keep[U(j)] = meets
-        any_meets |= meets
-    return any_meets
-
-
-@njit_no_refcount
-def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin):
-    """Find the first marked point, from `begin` on, that may be near a point of a scene block.
-
-    The points are those of an avatar's block.  lane_at: the scene block in `halves`.  low: its
-    corner, relative to the frame.  far: a square, see `Thresholds`. Returns (lane or -1, number of
-    points tested against the block).
-    """
-    h, b = U(lane_at), U(block)
-    tested = 0
-    for eight in range(begin // 8, LANES // 8):
-        if keep8[U(eight)] == U(0):
-            continue
-        for lane in range(8 * eight, 8 * eight + 8):
-            if lane < begin or not keep[U(lane)]:
-                continue
-            tested += 1
-            x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
-            touched = False
-            for j in range(LANES):
-                i = h + U(j)
-                dx = np.float32(halves[i]) - x
-                dy = np.float32(halves[i + U(LANES)]) - y
-                dz = np.float32(halves[i + U(2 * LANES)]) - z
-                touched |= dx * dx + dy * dy + dz * dz <= far
-            if touched:
-                return lane, tested
-    return -1, tested
 
 
 @njit_no_refcount
@@ -224,14 +136,6 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class
 
 
 @njit_no_refcount
-def _block_placed(avatar, m, pose, block, placed, scene):
-    """Place a block of the avatar unless it is already placed for this pose."""
-    if placed.stamp[U(block)] != pose:
-        place_block(avatar, m, block, placed, scene)
-        placed.stamp[U(block)] = pose
-
-
-@njit_no_refcount
 def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch):
     """Return whether a point of a scene leaf node touches a point below an avatar's front node.
 
@@ -250,37 +154,19 @@ def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, locatio
         scratch.counters[0] += 1
         if a_first < 0:
             block = np.int64(~a_first)
-            _block_placed(avatar, m, pose, block, placed, scene)
+            place_block_once(avatar, m, pose, block, placed, scene)
             if lanes_meet(
                 words, row, placed.lanes, block, location.x, location.y, location.z, threshold, scratch.keep
             ) and leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
                 return True
             continue
-        x, y, z = _place_node(avatar, m, a, placed, scene)
+        x, y, z = place_node(avatar, m, a, placed, scene)
         radius = node_reach(avatar.radius[a], steps, extent)
         if nodes_meet(words, row, x - location.x, y - location.y, z - location.z, radius, threshold):
             for i in range(avatar.count[a]):
                 below[depth] = a_first + i
                 depth += 1
     return False
-
-
-@njit_no_refcount
-def _place_node(avatar, m, a, placed, scene):
-    """Place one node of the avatar: return x, y, z from the frame [steps], float32."""
-    per_step = 1.0 / scene.step
-    x, y, z = avatar.center[a, 0], avatar.center[a, 1], avatar.center[a, 2]
-    return (
-        np.float32(
-            (place(m, placed.shift, 0, x, y, z) - np.float64(placed.frame[0]) * scene.step) * per_step
-        ),
-        np.float32(
-            (place(m, placed.shift, 1, x, y, z) - np.float64(placed.frame[1]) * scene.step) * per_step
-        ),
-        np.float32(
-            (place(m, placed.shift, 2, x, y, z) - np.float64(placed.frame[2]) * scene.step) * per_step
-        ),
-    )
 
 
 @njit_no_refcount
@@ -377,20 +263,6 @@ def _collide_voxel(
                 depth += 1
             child += ROW_WORDS
     return False
-
-
-@njit_no_refcount
-def locate_voxel(scene, voxel, placed):
-    """Locate a resident voxel in the arena and relative to the frame."""
-    coordinates, where, frame = scene.coordinates, scene.where, placed.frame
-    return VoxelLocation(
-        where[voxel, 0],
-        where[voxel, 1],
-        where[voxel, 2],
-        np.float32(coordinates[voxel, 0] * scene.voxel_steps - frame[0]),
-        np.float32(coordinates[voxel, 1] * scene.voxel_steps - frame[1]),
-        np.float32(coordinates[voxel, 2] * scene.voxel_steps - frame[2]),
-    )
 
 
 @nb.njit(nogil=True, cache=True)

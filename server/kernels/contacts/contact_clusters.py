@@ -1,280 +1,32 @@
-"""Pairs in contact, accumulated: the deepest pairs, and the regions of scan points they touch.
+"""Clusters of touched cells: cells that share a face, an edge or a corner belong to one cluster.
 
-A pair is a record of integers that determines exactly which of two pairs is deeper, namely the one
-with the smaller separation of its spheres. No tree and no order of visits can therefore change the
-result. Touched scan points fall into cells of a uniform grid over the lattice. Cells that share a
-face, an edge or a corner belong to one cluster, found by union-find (Tarjan, "Efficiency of a good
-but not linear set union algorithm", 1975). Memory grows with the cells touched and the pairs
-listed, never with the pairs found.
+They are found by union-find (Tarjan, "Efficiency of a good but not linear set union algorithm",
+1975).
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import U32
-from ..core.separation_order import compare_separations
-from ..core.stop_flag_checks import ROWS_AT_ONCE, copy_rows, stopped
-
-# Columns of a record. The first ORDER of them determine which pair is deeper: |a - b|^2 [exact
-# units^2], and the largest radius minus that of the scan point [exact units]. Pairs of equal
-# separation compare, in turn: scan point x, y, z [lattice], avatar centre x, y, z [exact units],
-# row of the avatar's point, scan number.
-SQUARE, DEFICIT, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9, 10, 10, 11
-# A cluster is the record of its deepest pair, then the number of its pairs and the box of its
-# touched points. A cell is the same, followed by its place in the grid.
-PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 11, 12, 15, 18, 18, 21
-# Counters of `ContactState.sizes`: cells, pairs kept, pairs listed, clusters listed, the last cell
-# used.
-CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
-
-
-class ContactCells(NamedTuple):
-    """Grid cells touched under one pose: an open-addressing hash table.
-
-    table: (c, CELL) int64.
-    bound: (c,) float64 [steps]: a pair farther apart, the deficit of its sphere included, is not
-    the cell's deepest.
-    slots: (s,) int64, s a power of two, rows of `table` or -1; at most half of them are taken.
-    """
-
-    table: NDArray[np.int64]
-    bound: NDArray[np.float64]
-    slots: NDArray[np.int64]
-
-
-class ContactState(NamedTuple):
-    """Results and state of a request, so that it can be resumed; the kernels grow it.
-
-    cells: of the current pose.
-    heap: (limit, RECORD) int64, its deepest pairs, the least deep first.
-    sizes: (5,) int64, see above.
-    cursor: (3,) int64: position among the poses, position among the pose's voxels (-1: not begun),
-    depth of the stack.
-    stack: (STACK, 2) int64.
-    pairs: (p, RECORD), clusters: (c, CLUSTER) int64: those of the finished poses, followed by free
-    rows; a pair's TAG is its row among the pose's clusters.
-    """
-
-    cells: ContactCells
-    heap: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    cursor: NDArray[np.int64]
-    stack: NDArray[np.int64]
-    pairs: NDArray[np.int64]
-    clusters: NDArray[np.int64]
-
-
-@njit_no_refcount
-def deeper(a, i, b, j):
-    """Return whether record a[i] precedes record b[j]: the deeper pair precedes."""
-    if a[i, DEFICIT] != b[j, DEFICIT]:
-        order = compare_separations(a[i, SQUARE], -a[i, DEFICIT], b[j, SQUARE], -b[j, DEFICIT])
-        if order != 0:
-            return order < 0
-    elif a[i, SQUARE] != b[j, SQUARE]:
-        return a[i, SQUARE] < b[j, SQUARE]
-    for c in range(POINT, ORDER):
-        if a[i, c] != b[j, c]:
-            return a[i, c] < b[j, c]
-    return False
-
-
-@njit_no_refcount
-def _swap(rows, i, j):
-    for c in range(rows.shape[1]):
-        rows[i, c], rows[j, c] = rows[j, c], rows[i, c]
-
-
-@njit_no_refcount
-def _sift_down(rows, n, at):
-    """Restore the heap rows[:n], least deep first, below row `at`."""
-    while True:
-        child = 2 * at + 1
-        if child >= n:
-            return
-        if child + 1 < n and deeper(rows, child, rows, child + 1):
-            child += 1
-        if not deeper(rows, at, rows, child):
-            return
-        _swap(rows, at, child)
-        at = child
-
-
-@nb.njit(nogil=True, cache=True)
-def sort_rows(rows, n, stop):
-    """Sort rows[:n] deepest first, in place (Williams, heapsort), until the stop flag is set.
-
-    Once it is set, this does not access even the first row: there may be fewer than n rows.
-    """
-    for at in range(n // 2 - 1, -1, -1):
-        if stopped(stop):
-            return
-        _sift_down(rows, n, at)
-    for end in range(n - 1, 0, -1):
-        if stopped(stop):
-            return
-        _swap(rows, 0, end)
-        _sift_down(rows, end, 0)
-
-
-@njit_no_refcount
-def _copy(record, rows, at):
-    """Write record[0] to rows[at]."""
-    for c in range(rows.shape[1]):
-        rows[at, c] = record[0, c]
-
-
-@njit_no_refcount
-def keep_deepest(heap, kept, record):
-    """Insert record[0] into the `kept` deepest pairs if it belongs there; return the new number."""
-    if kept < heap.shape[0]:
-        _copy(record, heap, kept)
-        at = kept
-        while at > 0 and deeper(heap, (at - 1) // 2, heap, at):
-            _swap(heap, (at - 1) // 2, at)
-            at = (at - 1) // 2
-        return kept + 1
-    if kept > 0 and deeper(record, 0, heap, 0):
-        _copy(record, heap, 0)
-        _sift_down(heap, kept, 0)
-    return kept
-
-
-@njit_no_refcount
-def bound_after(record, at, units_per_step, error):
-    """Return the bound, as in `ContactCells`, set by record[at].
-
-    Every pair that is not deeper lies beyond it, whatever float32 rounds.
-    """
-    gap = np.sqrt(np.float64(record[at, SQUARE])) + np.float64(record[at, DEFICIT])
-    return gap / units_per_step * (1.0 + 2.0 * U32) + error
-
-
-@njit_no_refcount
-def square_below(bound, deficit_steps):
-    """Return the float32 square above which no pair with this deficit is within a bound.
-
-    deficit_steps: the deficit [steps]. The counterpart is `far` of make_thresholds.
-    """
-    above = bound - deficit_steps
-    # 8 as there, plus 2 for the rounding to float32: np.nextafter is a call, and this runs for
-    # every scan point in contact.
-    return np.float32(above * above * (1.0 + 10.0 * U32)) if above >= 0.0 else np.float32(-1.0)
-
-
-@njit_no_refcount
-def listing_bound(heap, kept, units_per_step, error):
-    """Return the bound, as in `ContactCells`, of pairs that may be among those listed.
-
-    kept: how many are listed so far.
-    """
-    if heap.shape[0] == 0:
-        return -1.0
-    if kept < heap.shape[0]:
-        return np.inf
-    return bound_after(heap, 0, units_per_step, error)
-
-
-@nb.njit(nogil=True, cache=True)
-def make_cells(count, stop):
-    """Allocate `count` cells, a power of two; the result is unusable once the stop flag is set."""
-    slots = np.empty(2 * count, np.int64)
-    for at in range(2 * count):
-        if at % (64 * ROWS_AT_ONCE) == 0 and stopped(stop):
-            break
-        slots[at] = -1
-    return ContactCells(np.empty((count, CELL), np.int64), np.empty(count), slots)
-
-
-@njit_no_refcount
-def find_slot(cells, x, y, z):
-    """Return the slot of cell (x, y, z), or the free slot where it belongs."""
-    # 21 bits of each, so that every product fits 63 bits.
-    h = ((x & 0x1FFFFF) * 73856093) ^ ((y & 0x1FFFFF) * 19349663) ^ ((z & 0x1FFFFF) * 83492791)
-    last = cells.slots.shape[0] - 1
-    slot = (h ^ (h >> 19)) & last
-    table = cells.table
-    while True:
-        row = cells.slots[slot]
-        if row < 0 or (table[row, PLACE] == x and table[row, PLACE + 1] == y and table[row, PLACE + 2] == z):
-            return slot
-        slot = (slot + 1) & last
-
-
-@njit_no_refcount
-def enter_cell(cells, used, x, y, z):
-    """Return the row of cell (x, y, z), created as row `used` if it is new.
-
-    There must be a free row.
-    """
-    slot = find_slot(cells, x, y, z)
-    row = cells.slots[slot]
-    if row < 0:
-        row = used
-        cells.slots[slot] = row
-        table = cells.table
-        table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2] = x, y, z
-        # Every pair is deeper than this one, whose root is 2^31.5: a reach plus a deficit is below
-        # 2^31.
-        table[row, SQUARE], table[row, DEFICIT], table[row, PAIRS] = np.iinfo(np.int64).max, 0, 0
-        for r in range(3):
-            table[row, LOW + r], table[row, HIGH + r] = np.iinfo(np.int64).max, np.iinfo(np.int64).min
-        cells.bound[row] = np.inf
-    return row
-
-
-@njit_no_refcount
-def cell_of(cells, sizes, record, edge):
-    """Return the row of the cell of the record's scan point.
-
-    There must be a free row for a new cell.
-    """
-    table, last = cells.table, sizes[LAST]
-    x, y, z = record[0, POINT], record[0, POINT + 1], record[0, POINT + 2]
-    if last >= 0:  # nearly always the last cell, and divisions are slow
-        x0, y0, z0 = table[last, PLACE] * edge, table[last, PLACE + 1] * edge, table[last, PLACE + 2] * edge
-        if x0 <= x < x0 + edge and y0 <= y < y0 + edge and z0 <= z < z0 + edge:
-            return last
-    cell = enter_cell(cells, sizes[CELLS], x // edge, y // edge, z // edge)
-    if cell == sizes[CELLS]:
-        sizes[CELLS] += 1
-    sizes[LAST] = cell
-    return cell
-
-
-@nb.njit(nogil=True, cache=True)
-def grow_cells(cells, used, stop):
-    """Return the same `used` cells with twice the capacity.
-
-    Returns the cells unchanged once the stop flag is set.
-    """
-    grown = make_cells(2 * cells.table.shape[0], stop)
-    copy_rows(cells.table, grown.table, used, stop)
-    for row in range(used):
-        if row % ROWS_AT_ONCE == 0 and stopped(stop):
-            return cells
-        table = grown.table
-        grown.bound[row] = cells.bound[row]
-        grown.slots[find_slot(grown, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = row
-    return grown
-
-
-@nb.njit(nogil=True, cache=True)
-def empty_cells(cells, used, stop):
-    """Remove all `used` cells, in time proportional to them and not to the capacity.
-
-    Ends early once the stop flag is set.
-    """
-    table = cells.table
-    # Last in, first out: the entries between a cell's hash and its slot were inserted before it.
-    for row in range(used - 1, -1, -1):
-        if row % ROWS_AT_ONCE == 0 and stopped(stop):
-            return
-        cells.slots[find_slot(cells, table[row, PLACE], table[row, PLACE + 1], table[row, PLACE + 2])] = -1
+from ..core.scene_arrays import copy_rows, stopped
+from .contact_cells import (
+    CELLS,
+    CLUSTER,
+    CLUSTERS,
+    HIGH,
+    KEPT,
+    LAST,
+    LISTED,
+    LOW,
+    ORDER,
+    PAIRS,
+    PLACE,
+    TAG,
+    ContactState,
+    deeper,
+    empty_cells,
+    find_slot,
+    sort_rows,
+)
 
 
 @nb.njit(nogil=True, cache=True)

@@ -16,66 +16,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..collide.collide_poses import nodes_meet
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import (
+from ..core.node_overlap import (
     ONE_SLACK,
     SLACK,
-    ClassThresholds,
     make_class_thresholds,
-    make_placed,
     make_thresholds,
-    place_block,
-    place_nodes,
+    nodes_meet,
     set_class_thresholds,
 )
-from ..core.pose_transform import MAX_REACH_UNITS, lattice_to_units, place, to_units
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
-from .contact_clusters import (
+from ..core.placed_avatar import make_placed, place_block, place_nodes
+from ..core.scene_arrays import (
+    COUNT,
+    COUNTED,
+    FIRST,
+    LANES,
+    ROW_WORDS,
+    node_class,
+    point_class,
+    scan_run,
+    stopped,
+)
+from .contact_cells import (
     CELLS,
-    CENTER,
-    DEFICIT,
-    HIGH,
     KEPT,
-    LOW,
-    ORDER,
-    PAIRS,
     POINT,
     RECORD,
-    ROW,
     SCAN,
-    SQUARE,
-    TAG,
+    ContactScratch,
     ContactState,
-    bound_after,
-    cell_of,
-    deeper,
+    gather_point,
     grow_cells,
-    keep_deepest,
-    list_pose,
     listing_bound,
-    square_below,
 )
-
-
-class ContactOptions(NamedTuple):
-    """Parameters of a request, in addition to the poses.
-
-    rows: (b, LANES) int32, the row of the avatar's point in each lane.
-    edges: (k,) int64, edge of a cell [steps].
-    with_scan: whether the arena holds scan numbers.
-    limit: number of pairs to list for each pose.
-    visits: node visits a pose; -1: time is up, examine nothing more.
-    cells: limit of the table of cells, a power of two.
-    """
-
-    rows: NDArray[np.int32]
-    edges: NDArray[np.int64]
-    with_scan: bool
-    limit: int
-    visits: int
-    cells: int
+from .contact_clusters import list_pose
 
 
 class ContactResults(NamedTuple):
@@ -90,105 +64,6 @@ class ContactResults(NamedTuple):
     pairs: NDArray[np.int64]
     cut: NDArray[np.bool_]
     runs: NDArray[np.int64]
-
-
-class ContactScratch(NamedTuple):
-    """Scratch of one call.
-
-    keep: (LANES,) bool.  avatar_lanes: (3, LANES), squares: (LANES,), off: (3,) float32.
-    bound: (1,) float64, as in `ContactCells`, of the pairs listed.  error: (1,) float64, that of
-    the pose's `Thresholds`.
-    record: (1, RECORD) int64.  by_class: the pose's thresholds.
-    """
-
-    keep: NDArray[np.bool_]
-    avatar_lanes: NDArray[np.float32]
-    squares: NDArray[np.float32]
-    off: NDArray[np.float32]
-    bound: NDArray[np.float64]
-    error: NDArray[np.float64]
-    record: NDArray[np.int64]
-    by_class: ClassThresholds
-
-
-@njit_no_refcount
-def _measure(avatar, m, block, lane, placed, scene, record):
-    """Write |a - b|^2 and the avatar's centre of one pair, exact units, into `record`.
-
-    record: holds the scan's point. Returns whether the square fits: False beyond any reach
-    (`placed.pair_square` makes the same test).
-    """
-    square = np.int64(0)
-    points = avatar.points
-    for r in range(3):
-        world = place(
-            m, placed.shift, r, points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
-        )
-        units = to_units(world)
-        record[0, CENTER + r] = units
-        difference = units - lattice_to_units(record[0, POINT + r], scene.units_per_step)
-        if abs(difference) > MAX_REACH_UNITS:
-            return False
-        square += difference * difference
-    record[0, SQUARE] = square
-    return True
-
-
-@njit_no_refcount
-def _gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch):
-    """Count the pairs of one scan point with the points of a block.
-
-    The scan point is in scratch.record, the float32 squares of the block's points in
-    scratch.squares.
-    own: the scan point's radius class. Returns how many are in contact.
-    """
-    record, squares, listing, rows = scratch.record, scratch.squares, scratch.bound, options.rows
-    cells, heap, sizes, per_step = state.cells, state.heap, state.sizes, scene.units_per_step
-    table, bounds, error = cells.table, cells.bound, scratch.error[0]
-    deficit, units = scene.radius_deficit[own], scratch.by_class.units[own]
-    near, far = scratch.by_class.near[own], scratch.by_class.far[own]
-    record[0, DEFICIT] = deficit
-    deficit_steps = np.float64(deficit) / per_step
-    listed, deepest = square_below(listing[0], deficit_steps), np.float32(np.inf)
-    cell, count = np.int64(-1), np.int64(0)
-    for lane in range(avatar.count[a]):
-        square = squares[lane]
-        if square > far:
-            continue
-        if square <= near:
-            if cell < 0:
-                cell = cell_of(cells, sizes, record, edge)
-                deepest = square_below(bounds[cell], deficit_steps)
-            count += 1
-            if square > deepest and square > listed:
-                continue
-            _measure(avatar, m, block, lane, placed, scene, record)
-        else:
-            if not _measure(avatar, m, block, lane, placed, scene, record):
-                continue
-            if record[0, SQUARE] > units * units:
-                continue
-            if cell < 0:
-                cell = cell_of(cells, sizes, record, edge)
-                deepest = square_below(bounds[cell], deficit_steps)
-            count += 1
-        record[0, ROW] = rows[block, lane]
-        record[0, TAG] = cell
-        if deeper(record, 0, table, cell):
-            for c in range(ORDER):
-                table[cell, c] = record[0, c]
-            bounds[cell] = bound_after(record, 0, per_step, error)
-            deepest = square_below(bounds[cell], deficit_steps)
-        if square <= listed:
-            sizes[KEPT] = keep_deepest(heap, sizes[KEPT], record)
-            listing[0] = listing_bound(heap, sizes[KEPT], per_step, error)
-            listed = square_below(listing[0], deficit_steps)
-    if count > 0:
-        table[cell, PAIRS] += count
-        for r in range(3):
-            table[cell, LOW + r] = min(table[cell, LOW + r], record[0, POINT + r])
-            table[cell, HIGH + r] = max(table[cell, HIGH + r], record[0, POINT + r])
-    return count
 
 
 @njit_no_refcount
@@ -237,11 +112,9 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         dz = np.float32(halves[lane_at + 2 * LANES + j]) - cz
         keep[j] = dx * dx + dy * dy + dz * dz <= square
     for j in range(LANES):
-        avatar_lanes[0, j], avatar_lanes[1, j], avatar_lanes[2, j] = (
-            lanes[block, 0, j] - lx,
-            lanes[block, 1, j] - ly,
-            lanes[block, 2, j] - lz,
-        )
+        avatar_lanes[0, j] = lanes[block, 0, j] - lx
+        avatar_lanes[1, j] = lanes[block, 1, j] - ly
+        avatar_lanes[2, j] = lanes[block, 2, j] - lz
     record, squares = scratch.record, scratch.squares
     coordinates, where, counts, pairs = scene.coordinates, scene.where, results.counts, results.pairs
     for j in range(ints[row + COUNT] & COUNTED):
@@ -266,7 +139,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
         record[0, SCAN] = -1
         if options.with_scan:
             record[0, SCAN] = halves[scan_run(where, voxel, scene.block_words) + scene_block * LANES + j]
-        pairs[i] += _gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch)
+        pairs[i] += gather_point(avatar, m, a, block, placed, scene, own, options, edge, state, scratch)
 
 
 @njit_no_refcount

@@ -1,5 +1,5 @@
 """What all kernels read: voxel layout, placed avatars, voxels in reach, stop flag.
 
 May import schemas.
-Begin with voxel_layout.py.
+Begin with scene_arrays.py.
 """

@@ -1,26 +1,65 @@
-"""Avatar under one pose, and the thresholds of one pose: the basis of every descent.
+"""Avatar under one pose: where the pose places its points and nodes. The formula of NUMERICS.md N5.
 
-Distances are in lattice steps from the frame, a lattice point near the avatar. Relative to it,
-scene coordinates are integers below 2^24 and therefore exact in float32. The placed avatar carries
-an error, which every bound includes. Where float32 cannot decide, the integers of NUMERICS.md N5
-do: `pair_square`.
+A placed coordinate is ((r0 p0 + r1 p1) + r2 p2) + (t - O), float64, in this order, without
+contraction. Multiplied by 2^26 (exact) and rounded half to even, it is the integer that decides.
+Compiled and interpreted code agree bit for bit.
+
+A placed avatar holds float32 distances in lattice steps from the frame, a lattice point near it.
+Relative to the frame, scene coordinates are integers below 2^24 and therefore exact in float32. The
+placed avatar carries an error, which every bound includes (node_overlap.py). Where float32 cannot
+decide, the integers do: `pair_square`.
+
+The front is one level of the avatar's tree as a flat list. A descent of two trees tests one pair of
+nodes at a time and branches after each test. Here only the scene's tree is descended. Each of its
+nodes is tested against the list of those front nodes that met its parent: 32 in a vector step, in
+the time of one or two single tests. For the figure of 3,617 points the front is its 114 leaf nodes.
+
+Indices are np.uint64 wherever vectorisation matters. LLVM assumes that a signed index may be
+negative; it then computes an address for each lane and loads each lane separately (six times
+slower, scripts/bench_engine's `collide`).
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
 from .kernel_decorators import njit_no_refcount
-from .pose_transform import MAX_REACH_UNITS, largest_term, lattice_to_units, place, to_units
-from .voxel_layout import LANES
+from .scene_arrays import LANES
 
-U32 = 2.0**-24  # half a unit in the last place of 1, float32
-# Relative slack of a float32 test: more than 16 U32, while the sums below need at most 8.
-SLACK = np.float32(1e-6)
-ONE_SLACK = np.float32(1.0 + 2e-6)
+U = np.uint64
+# Distances are compared in exact units whose squares must fit 63 bits (NUMERICS.md N5): 16 m.
+MAX_REACH_UNITS = 1 << 30
+# The front of a larger avatar consists of inner nodes. 256 are eight vector steps.
+MAX_FRONT = 256
+# One list is written for each level of the descent; none is longer than the list above it.
+LIST_CAPACITY = MAX_FRONT * (MAX_LEVELS + 2)
+# Coordinate that pads a list to whole vector steps: so far away that, with radius 0, no test keeps
+# it.
+FAR_AWAY = np.float32(1e30)
+
+
+class Avatar(NamedTuple):
+    """BSH of an avatar as the kernels read it; a nodes, b leaf nodes.
+
+    center: (a, 3), radius: (a,) float64, avatar frame [m], rounded outward.
+    first: (a,) int32, first child, or ~block for a leaf node.  count: (a,) int32, children or
+    points.
+    points: (b, 3, LANES) float64 [m], as the client sent them, the last one repeated.
+    front: (4, f) float64, x[], y[], z[], radius[] of one level of the tree, see placed_avatar.py.
+    front_first: its first node.
+    """
+
+    center: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]  # type: ignore[assignment]  # hides tuple.count, which nobody calls
+    points: NDArray[np.float64]
+    front: NDArray[np.float64]
+    front_first: int
 
 
 class PlacedAvatar(NamedTuple):
@@ -39,94 +78,54 @@ class PlacedAvatar(NamedTuple):
     shift: NDArray[np.float64]
 
 
-class Thresholds(NamedTuple):
-    """Thresholds of one pose.
+class AvatarFront(NamedTuple):
+    """Lists of placed front nodes, one after another; scratch of one call.
 
-    reach, error: [steps], float32, rounded up.  near, far: squares, float32. A pair below `near`
-    touches, a pair above `far` does not.
-    units: r_a + r_b + margin, exact units, int64.
+    bounds: (4, LIST_CAPACITY) float32: x[], y[], z[] from the frame, radius[] [steps], rounded
+    outward.
+    which: (LIST_CAPACITY,) int32, numbers in the front.
+    keep: (MAX_FRONT,) bool, marks; keep8: the same memory as uint64, eight marks each.
     """
 
-    reach: np.float32
-    error: np.float32
-    near: np.float32
-    far: np.float32
-    units: np.int64
-
-
-class ClassThresholds(NamedTuple):
-    """Thresholds of one pose by radius class; scratch of one call. As long as `radius_deficit`.
-
-    threshold: reach plus error, float32 [steps].  near, far, units: as in `Thresholds`.
-    mask: the number of classes minus one, uint64, for `node_class` and `point_class`.
-    """
-
-    threshold: NDArray[np.float32]
-    near: NDArray[np.float32]
-    far: NDArray[np.float32]
-    units: NDArray[np.int64]
-    mask: np.uint64
-
-
-@nb.njit(nogil=True, cache=True)
-def make_class_thresholds(deficit):
-    """Allocate scratch for the radius classes of `SceneArrays.radius_deficit`."""
-    n = deficit.shape[0]
-    threshold, near, far = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    return ClassThresholds(threshold, near, far, np.empty(n, np.int64), np.uint64(n - 1))
+    bounds: NDArray[np.float32]
+    which: NDArray[np.int32]
+    keep: NDArray[np.bool_]
+    keep8: NDArray[np.uint64]
 
 
 @njit_no_refcount
-def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farthest, voxel_steps):
-    """Compute the thresholds of one pose for each radius class.
+def place(m, shift, r, x, y, z):
+    """Return coordinate r of an avatar point placed by pose m, from the dataset's origin [m].
 
-    Arguments as for `make_thresholds`; `units` is for the largest radius.
+    shift: t - O (3,).
     """
-    for c in range(deficit.shape[0]):
-        thresholds = make_thresholds(units - deficit[c], units_per_step, extent, farthest, voxel_steps)
-        by_class.threshold[c] = thresholds.reach + thresholds.error
-        by_class.near[c], by_class.far[c], by_class.units[c] = (
-            thresholds.near,
-            thresholds.far,
-            thresholds.units,
-        )
+    return ((m[r, 0] * x + m[r, 1] * y) + m[r, 2] * z) + shift[r]
 
 
 @njit_no_refcount
-def make_thresholds(units, units_per_step, extent, farthest, voxel_steps):
-    """Compute the thresholds for a reach of `units`.
+def largest_term(m, shift, x, y, z):
+    """Return the largest sum of the absolute values of the terms of a placed coordinate [m].
 
-    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed
-    coordinate.
-    Errors of a coordinate difference, in steps:
-    - rounding to exact units: half a unit for each of the two points;
-    - float32 of the avatar's coordinate: U32 of its size, once relative to the frame and once
-      relative to the voxel or block. There a pair in reach is within the larger of voxel and block,
-      plus the reach (doubled, so that a pair beyond reach cannot pass as near);
-    - float64 rounding far from the origin: 4 half units in the last place for a placed centre, 4
-      for a point below it, 1 for the frame, 1 for the lattice point: 10 * 2^-53 of the largest
-      term.
+    2^-50 of it bounds the rounding of `place` for this point and for one next to it, also where
+    large terms cancel.
     """
-    reach = np.float64(units) / units_per_step
-    error = (
-        1.1 / units_per_step
-        + U32 * (extent + 2.0 * (max(65536.0, voxel_steps) + reach))
-        + farthest * 2.0**-49
-    )
-    around = math.sqrt(3.0) * error
-    below = max(reach * (1.0 - 2.0 * U32) - around, 0.0)
-    above = reach * (1.0 + 2.0 * U32) + around
-    near = np.float32(below * below * (1.0 - 8.0 * U32))
-    far = np.float32(above * above * (1.0 + 8.0 * U32))
-    # One float32 step outward covers the rounding to float32. At 0, nothing is certified near.
-    near = np.nextafter(near, np.float32(-1.0)) if below > 0.0 else np.float32(-1.0)
-    return Thresholds(
-        np.nextafter(np.float32(reach), np.float32(np.inf)),
-        np.nextafter(np.float32(around), np.float32(np.inf)),
-        near,
-        np.nextafter(far, np.float32(np.inf)),
-        np.int64(units),
-    )
+    largest = 0.0
+    for r in range(3):
+        size = abs(m[r, 0] * x) + abs(m[r, 1] * y) + abs(m[r, 2] * z) + abs(shift[r])
+        largest = max(largest, size)
+    return largest
+
+
+@njit_no_refcount
+def to_units(metres):
+    """Convert a placed coordinate to exact units: times 2^26, half to even, int64."""
+    return np.int64(np.rint(metres * UNITS_PER_METRE))
+
+
+@njit_no_refcount
+def lattice_to_units(steps, units_per_step):
+    """Convert a lattice coordinate to exact units: one float64 product, half to even, int64."""
+    return np.int64(np.rint(np.float64(steps) * units_per_step))
 
 
 @njit_no_refcount
@@ -177,6 +176,46 @@ def place_nodes(avatar, m, scale, placed, scene):
     return extent, farthest
 
 
+@nb.njit(nogil=True, cache=True)
+def make_front(avatar):
+    """Allocate scratch for one avatar (not empty); nothing is placed yet."""
+    which = np.empty(LIST_CAPACITY, np.int32)
+    for i in range(avatar.front.shape[1]):
+        which[i] = i
+    keep = np.zeros(MAX_FRONT, np.bool_)
+    return AvatarFront(np.empty((4, LIST_CAPACITY), np.float32), which, keep, keep.view(np.uint64))
+
+
+@njit_no_refcount
+def pad_list(bounds, begin, end):
+    """Fill entries [begin, end) of the lists with nodes that no test keeps."""
+    for i in range(begin, end):
+        bounds[0, U(i)] = FAR_AWAY
+        bounds[1, U(i)] = np.float32(0.0)
+        bounds[2, U(i)] = np.float32(0.0)
+        bounds[3, U(i)] = np.float32(0.0)
+
+
+@njit_no_refcount
+def place_front(avatar, m, scale, placed, scene, extent, bounds):
+    """Place the front, after `place_root`, as the first list of `bounds`. Returns its length."""
+    step = scene.step
+    per_step = 1.0 / step
+    front = avatar.front
+    n = front.shape[1]
+    for r in range(3):
+        base = np.float64(placed.frame[r]) * step
+        m0, m1, m2, shift = m[r, 0], m[r, 1], m[r, 2], placed.shift[r]
+        for i in range(n):
+            # The formula of `place`.
+            world = ((m0 * front[0, i] + m1 * front[1, i]) + m2 * front[2, i]) + shift
+            bounds[r, i] = np.float32((world - base) * per_step)
+    for i in range(n):
+        bounds[3, i] = node_reach(front[3, i], scale * per_step, extent)
+    pad_list(bounds, n, (n + LANES - 1) // LANES * LANES)
+    return n
+
+
 @njit_no_refcount
 def place_block(avatar, m, block, placed, scene):
     """Place the points of one leaf node of the avatar, all LANES at once."""
@@ -196,9 +235,35 @@ def place_lanes(points, m, block, lanes, shift, frame, step):
         m0, m1, m2, along = m[r, 0], m[r, 1], m[r, 2], shift[r]
         for lane in range(LANES):
             j = np.uint64(lane)
-            # The formula of placing.place.
+            # The formula of `place`.
             world = ((m0 * points[b, 0, j] + m1 * points[b, 1, j]) + m2 * points[b, 2, j]) + along
             lanes[b, r, j] = np.float32((world - base) * per_step)
+
+
+@njit_no_refcount
+def place_block_once(avatar, m, pose, block, placed, scene):
+    """Place a block of the avatar unless it is already placed for this pose."""
+    if placed.stamp[U(block)] != pose:
+        place_block(avatar, m, block, placed, scene)
+        placed.stamp[U(block)] = pose
+
+
+@njit_no_refcount
+def place_node(avatar, m, a, placed, scene):
+    """Place one node of the avatar: return x, y, z from the frame [steps], float32."""
+    per_step = 1.0 / scene.step
+    x, y, z = avatar.center[a, 0], avatar.center[a, 1], avatar.center[a, 2]
+    return (
+        np.float32(
+            (place(m, placed.shift, 0, x, y, z) - np.float64(placed.frame[0]) * scene.step) * per_step
+        ),
+        np.float32(
+            (place(m, placed.shift, 1, x, y, z) - np.float64(placed.frame[1]) * scene.step) * per_step
+        ),
+        np.float32(
+            (place(m, placed.shift, 2, x, y, z) - np.float64(placed.frame[2]) * scene.step) * per_step
+        ),
+    )
 
 
 @nb.njit(nogil=True, cache=True)
@@ -219,7 +284,7 @@ def pair_square(avatar, m, block, lane, placed, scene, voxel, lane_at, block_at,
     """Compute |a - b|^2 of one pair by the definition (NUMERICS.md N5), int64, exact units.
 
     block, lane: of the avatar's point.  block_at, lane_at, j: of the scan's point in `voxel`, see
-    voxel_layout.py.
+    scene_arrays.py.
     Returns -1 where the points are farther apart along an axis than any reach, MAX_REACH_UNITS;
     squares therefore fit 63 bits.
     """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from .stop_flag_checks import ROWS_AT_ONCE, stopped
+from .scene_arrays import ROWS_AT_ONCE, stopped
 
 FAN = 8
 # On each level, FAN - 1 siblings stay on the stack; 2^63 rows have 21 levels.

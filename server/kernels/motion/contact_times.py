@@ -9,9 +9,9 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import pair_square
-from ..core.pose_transform import SIMILARITY_TOLERANCE, lattice_to_units, place
-from ..core.voxel_layout import LANES, point_class
+from ..core.placed_avatar import lattice_to_units, pair_square, place
+from ..core.scene_arrays import LANES, point_class
+from ..core.voxels_in_reach import SIMILARITY_TOLERANCE
 from .screw_motion import pose_at
 
 INFINITE = np.inf

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..collide.collide_poses import STACK
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.pose_transform import Avatar, largest_term, place
-from ..core.voxel_layout import LANES, SceneArrays
+from ..core.node_overlap import STACK
+from ..core.placed_avatar import Avatar, largest_term, place
+from ..core.scene_arrays import LANES, SceneArrays
 from .screw_motion import ScrewMotion
 
 # Error of float32 sums along a chord: w + t d, with t from two dot products and a quotient, is off

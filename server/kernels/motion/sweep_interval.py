@@ -38,9 +38,8 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import ONE_SLACK, SLACK, make_thresholds
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
+from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
 from .contact_times import INFINITE, try_pair
 from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
 from .screw_motion import pose_at

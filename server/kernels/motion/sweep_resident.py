@@ -10,11 +10,11 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
-from ..core.pose_transform import SIMILARITY_TOLERANCE, VALID, check_poses
-from ..core.stop_flag_checks import MAX_RESIDENT_PATH_VISITS, stopped
-from ..core.voxel_layout import SceneArrays
+from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, SceneArrays, stopped
+from ..core.voxels_in_reach import SIMILARITY_TOLERANCE, VALID, check_poses
 from .screw_motion import make_motion, pose_at
-from .sweep_advance import SweepProgress, avatar_box, find_unknown_regions, plan_segments, sweep_segments
+from .sweep_advance import advance_segments
+from .sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -90,7 +90,7 @@ def sweep_resident(
     proved = 1.0
     if needed > 0:
         progress.lower[0] = progress.end[0]
-        sweep_segments(
+        advance_segments(
             box, first, last, avatar, radius, other_units, scales, units, np.zeros(1), from_zero, index, starts, rows,
             which, tolerance, progress, counts,
         )  # fmt: skip

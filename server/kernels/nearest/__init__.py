@@ -1,5 +1,5 @@
 """Nearest pairs: distance, distance by scan, search in order of distance.
 
-May import server.kernels.collide, server.kernels.core, schemas.
+May import server.kernels.core, schemas.
 Begin with nearest_search.py.
 """

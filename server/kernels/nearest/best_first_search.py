@@ -25,20 +25,19 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.radius_model import RIM_BIT
 from ....schemas.kernels import compiling as nb
-from ..collide.collide_poses import STACK
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import SLACK, PlacedAvatar, make_placed, place_block, place_nodes
-from ..core.pose_transform import MAX_REACH_UNITS
-from ..core.stop_flag_checks import NO_LIMIT, stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
+from ..core.node_overlap import STACK
+from ..core.placed_avatar import MAX_REACH_UNITS, PlacedAvatar, make_placed, place_block, place_nodes
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, NO_LIMIT, ROW_WORDS, node_class, stopped
 from .block_distances import any_near, mark_near
 from .nearest_pair import (
     BestPair,
     found_units,
-    lower_bound,
+    lower_bound_with_deficit,
     make_best_pair,
     search_lanes,
     set_cut,
+    upper_bound,
 )
 from .nearest_search import box_distance
 
@@ -165,23 +164,6 @@ def _pop_top(keys, pairs, size):
     keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
 
 
-@njit_no_refcount
-def _lower_bound_with_deficit(words, row, x, y, z, radius, deficit):
-    """Return `lower_bound`, at least 0, plus the deficit. No two centres are nearer than 0."""
-    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + deficit
-
-
-@njit_no_refcount
-def _upper_bound(words, row, x, y, z, radius):
-    """Return an upper bound of the distance of some sphere point from some node point.
-
-    Arguments as for `lower_bound`. The sphere and the node hold at least one point each.
-    """
-    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
-    both = np.sqrt(dx * dx + dy * dy + dz * dz) + (words[row + 3] + radius)
-    return both + SLACK * both
-
-
 @nb.njit(nogil=True, cache=True)
 def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, counts):
     """Start a search for pose i: all voxels in reach, with bounds from the index."""
@@ -255,14 +237,8 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
 
     budget: how many visits are allowed.
     """
-    words, ints, halves, where, coordinates = (
-        scene.words,
-        scene.ints,
-        scene.halves,
-        scene.where,
-        scene.coordinates,
-    )
-    placed, best = search.placed, search.best
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    where, coordinates, placed, best = scene.where, scene.coordinates, search.placed, search.best
     nodes, lanes, stamp, frame_at, shift = (
         placed.nodes,
         placed.lanes,
@@ -329,8 +305,8 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
         x, y, z = nodes[0, a] - off_x, nodes[1, a] - off_y, nodes[2, a] - off_z
         c = node_class(ints, base if row == NO_VOXEL else row, mask)
         if row == NO_VOXEL:
-            low = _lower_bound_with_deficit(words, base, x, y, z, nodes[3, a], deficits[0, c])
-            high = _upper_bound(words, base, x, y, z, nodes[3, a]) + deficits[1, c]
+            low = lower_bound_with_deficit(words, base, x, y, z, nodes[3, a], deficits[0, c])
+            high = upper_bound(words, base, x, y, z, nodes[3, a]) + deficits[1, c]
             _push_pair(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, base, voxel)
         elif leaves:
             block, scene_block = ~a_first, ~b_first
@@ -345,11 +321,8 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
             for lane in range(avatar_count[a]):
                 if not keep[lane]:
                     continue
-                px, py, pz = (
-                    lanes[block, 0, lane] - lx,
-                    lanes[block, 1, lane] - ly,
-                    lanes[block, 2, lane] - lz,
-                )
+                px, py = lanes[block, 0, lane] - lx, lanes[block, 1, lane] - ly
+                pz = lanes[block, 2, lane] - lz
                 counters[1] += LANES
                 if any_near(halves, lane_at, px, py, pz, far[c]):
                     search_lanes(
@@ -359,8 +332,8 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
         elif avatar_side:
             for child in range(a_first, a_first + cost):
                 x, y, z = nodes[0, child] - off_x, nodes[1, child] - off_y, nodes[2, child] - off_z
-                low = _lower_bound_with_deficit(words, row, x, y, z, nodes[3, child], deficits[0, c])
-                high = _upper_bound(words, row, x, y, z, nodes[3, child]) + deficits[1, c]
+                low = lower_bound_with_deficit(words, row, x, y, z, nodes[3, child], deficits[0, c])
+                high = upper_bound(words, row, x, y, z, nodes[3, child]) + deficits[1, c]
                 _push_pair(
                     keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, child, row, voxel
                 )
@@ -368,8 +341,8 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
             for number in range(cost):
                 child = base + (b_first + number) * ROW_WORDS
                 c = node_class(ints, child, mask)
-                low = _lower_bound_with_deficit(words, child, x, y, z, nodes[3, a], deficits[0, c])
-                high = _upper_bound(words, child, x, y, z, nodes[3, a]) + deficits[1, c]
+                low = lower_bound_with_deficit(words, child, x, y, z, nodes[3, a], deficits[0, c])
+                high = upper_bound(words, child, x, y, z, nodes[3, a]) + deficits[1, c]
                 _push_pair(keys, pairs, sizes, heap, spilling, limit, bounds, key, low, high, a, child, voxel)
 
 

@@ -8,10 +8,10 @@ block.
 import numpy as np
 
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.placed_avatar import ONE_SLACK, SLACK
-from ..core.voxel_layout import LANES
+from ..core.node_overlap import ONE_SLACK, SLACK
+from ..core.scene_arrays import LANES
 
-U = np.uint64  # see avatar_front.py
+U = np.uint64  # see placed_avatar.py
 
 
 @njit_inlined

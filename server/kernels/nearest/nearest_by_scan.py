@@ -15,19 +15,26 @@ from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
-from ..collide.collide_poses import STACK, nodes_meet
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import (
+from ..core.node_overlap import (
+    STACK,
     ClassThresholds,
     make_class_thresholds,
-    make_placed,
-    pair_square,
-    place_block,
-    place_nodes,
+    nodes_meet,
     set_class_thresholds,
 )
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, scan_run
+from ..core.placed_avatar import make_placed, pair_square, place_block, place_nodes
+from ..core.scene_arrays import (
+    COUNT,
+    COUNTED,
+    FIRST,
+    LANES,
+    ROW_WORDS,
+    node_class,
+    point_class,
+    scan_run,
+    stopped,
+)
 from .block_distances import mark_near
 from .nearest_pair import lower_bound, set_cut
 

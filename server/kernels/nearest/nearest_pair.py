@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import ONE_SLACK, SLACK, U32, make_thresholds
-from ..core.pose_transform import lattice_to_units, place, to_units
+from ..core.node_overlap import ONE_SLACK, SLACK, U32, make_thresholds
+from ..core.placed_avatar import lattice_to_units, place, to_units
+from ..core.scene_arrays import LANES, NO_LIMIT, point_class
 from ..core.separation_order import compare_separations
-from ..core.stop_flag_checks import NO_LIMIT
-from ..core.voxel_layout import LANES, point_class
 from .block_distances import write_squares
 
-U = np.uint64  # see avatar_front.py
+U = np.uint64  # see placed_avatar.py
 # Pairs that float32 cannot separate from the best. Coarse lattices have many ties; a full list is
 # settled.
 MAX_CANDIDATES = 64
@@ -117,6 +116,23 @@ def lower_bound(words, row, x, y, z, radius):
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.
     bound = max(apart - both, gap / words[at + U(7)] - radius)
     return bound - SLACK * (apart + both)
+
+
+@njit_no_refcount
+def lower_bound_with_deficit(words, row, x, y, z, radius, deficit):
+    """Return `lower_bound`, at least 0, plus the deficit. No two centres are nearer than 0."""
+    return max(lower_bound(words, row, x, y, z, radius), np.float32(0.0)) + deficit
+
+
+@njit_no_refcount
+def upper_bound(words, row, x, y, z, radius):
+    """Return an upper bound of the distance of some sphere point from some node point.
+
+    Arguments as for `lower_bound`. The sphere and the node hold at least one point each.
+    """
+    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+    both = np.sqrt(dx * dx + dy * dy + dz * dz) + (words[row + 3] + radius)
+    return both + SLACK * both
 
 
 @njit_no_refcount

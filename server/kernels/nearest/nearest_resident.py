@@ -13,9 +13,9 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.pose_transform import VALID, lattice_to_units
-from ..core.stop_flag_checks import MAX_RESIDENT_PATH_VISITS
-from ..core.voxels_in_reach import VoxelsInReach, find_reach
+from ..core.placed_avatar import lattice_to_units
+from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS
+from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
 from .nearest_pair import NearestPairs
 from .nearest_search import nearest_poses
 

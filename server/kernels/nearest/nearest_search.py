@@ -21,13 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from ..collide.collide_poses import BROAD, FLAT, STACK
-from ..core.avatar_front import compact_marked, copy_node, make_front, mark_meeting, pad_list, place_front
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.placed_avatar import ONE_SLACK, SLACK, make_placed, node_reach, place_lanes, place_root
-from ..core.pose_transform import place
-from ..core.stop_flag_checks import should_end, stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class
+from ..core.node_overlap import BROAD, FLAT, ONE_SLACK, SLACK, STACK, compact_marked, copy_node, mark_meeting
+from ..core.placed_avatar import (
+    make_front,
+    make_placed,
+    node_reach,
+    pad_list,
+    place,
+    place_front,
+    place_lanes,
+    place_root,
+)
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, should_end, stopped
 from .block_distances import mark_near, nearest_squares, unmark_beyond_box
 from .nearest_pair import (
     found_units,
@@ -38,7 +44,7 @@ from .nearest_pair import (
     take_candidates,
 )
 
-U = np.uint64  # see avatar_front.py
+U = np.uint64  # see placed_avatar.py
 
 
 class NearestScratch(NamedTuple):

@@ -30,10 +30,9 @@ from numpy.typing import NDArray
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import U32
-from ..core.pose_transform import lattice_to_units
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class
+from ..core.node_overlap import U32
+from ..core.placed_avatar import lattice_to_units
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
 
 # Siblings that a descent of one tree leaves on the stack.
 STACK = MAX_LEVELS * 15 + 16

@@ -11,7 +11,7 @@ from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
 from ....schemas.kernels.normal_codes import NO_NORMAL, normal_code
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
 from ..core.voxels_in_reach import find_key
 from .rays import STACK
 

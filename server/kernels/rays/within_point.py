@@ -16,10 +16,9 @@ import numpy as np
 
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import U32
-from ..core.pose_transform import MAX_REACH_UNITS, lattice_to_units
-from ..core.stop_flag_checks import stopped
-from ..core.voxel_layout import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
+from ..core.node_overlap import U32
+from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, stopped
 from .rays import STACK, is_less
 
 

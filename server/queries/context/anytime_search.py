@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.core.pose_transform import MAX_REACH_UNITS
+from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...kernels.nearest.best_first_search import (
     OPEN,

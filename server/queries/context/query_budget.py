@@ -19,9 +19,7 @@ from ....schemas.wire.answers import Cost
 from ....schemas.wire.columns import unknown
 from ....schemas.wire.questions import Question
 from ....schemas.wire.requests import QuestionOptions
-from ...kernels.core.stop_flag_checks import (
-    NO_LIMIT as NO_LIMIT,  # no budget: more node visits than any request could make
-)
+from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
 from ...residency.held_voxels import HeldVoxels
 from ...residency.voxel_cache import VoxelCache
 from ...runtime.deadlines import stop_at

@@ -20,8 +20,8 @@ from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ....schemas.wire.requests import make_poses
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.core import pose_transform as placing
-from ...kernels.core.voxel_layout import SceneArrays, block_words
+from ...kernels.core import voxels_in_reach as pose_checks
+from ...kernels.core.scene_arrays import SceneArrays, block_words
 from ...kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
 from ...residency.coarse_bounds import CoarseBounds
 from ...residency.held_voxels import HeldVoxels
@@ -37,24 +37,27 @@ MAX_ROWS = 1 << 24
 _ROWS_AT_ONCE = 1 << 18
 
 _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
-    placing.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
-    placing.BAD_LAST_ROW: (BadTransformError, "has a last row that is not 0 0 0 1: give row-major 4x4 poses"),
-    placing.MIRRORED: (
+    pose_checks.NOT_FINITE: (BadRequestError, "holds {}: expected finite numbers"),
+    pose_checks.BAD_LAST_ROW: (
+        BadTransformError,
+        "has a last row that is not 0 0 0 1: give row-major 4x4 poses",
+    ),
+    pose_checks.MIRRORED: (
         BadTransformError,
         "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
     ),
-    placing.SHEARED: (
+    pose_checks.SHEARED: (
         BadTransformError,
         "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
         "most, within 1e-9: renormalise it",
     ),
-    placing.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
-    placing.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
-    placing.LONG_REACH: (
+    pose_checks.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
+    pose_checks.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
+    pose_checks.LONG_REACH: (
         BadRequestError,
         "has radii and margin, or reach, that add up to {:g} m: expected at most 16 m: give a smaller one",
     ),
-    placing.LARGE_AVATAR: (
+    pose_checks.LARGE_AVATAR: (
         TooLargeError,
         "makes the avatar with its reach extend {:g} m: more than this scene's lattice can place exactly: split it",
     ),
@@ -182,7 +185,7 @@ def _empty_reach(k: int, rows: int) -> VoxelsInReach:
 
 def refuse(fault: int, pose: int, found: float) -> None:
     """Raise the error for a fault reported by `find_reach`; do nothing if there is none."""
-    if fault != placing.VALID:
+    if fault != pose_checks.VALID:
         error, text = _POSE_FAULTS[fault]
         raise error(f"pose {pose} {text.format(found)}")
 

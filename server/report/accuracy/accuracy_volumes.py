@@ -16,7 +16,7 @@ from ....schemas.archive.archive import Archive
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel import Links, VoxelData
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.core.voxel_layout import LANES
+from ...kernels.core.scene_arrays import LANES
 from ..kernels.plain_descent import (
     BOX,
     SLAB,

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ...kernels.core.kernel_decorators import njit_no_refcount
-from ...kernels.core.pose_transform import place
-from ...kernels.core.voxel_layout import LANES
+from ...kernels.core.placed_avatar import place
+from ...kernels.core.scene_arrays import LANES
 from .plain_pairs import (
     CUBES,
     Lanes,

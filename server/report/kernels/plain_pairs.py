@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ...kernels.core.kernel_decorators import njit_no_refcount
-from ...kernels.core.pose_transform import lattice_to_units, place, to_units
-from ...kernels.core.voxel_layout import LANES
+from ...kernels.core.placed_avatar import lattice_to_units, place, to_units
+from ...kernels.core.scene_arrays import LANES
 
 FLOAT32, FLOAT64, CERTIFIED, INTEGERS, FLOAT32_WORLD, CUBES = range(6)
 # Position to which FLOAT32_WORLD moves the dataset's origin [m]: UTM zone 32, central Europe.

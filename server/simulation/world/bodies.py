@@ -17,11 +17,10 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
 from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.bodies.body_pairs import CONTACT, touch_pairs
+from ...kernels.bodies.body_pairs import CONTACT, bound_body, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
-from ...kernels.bodies.near_bodies import bound_body
-from ...kernels.core.pose_transform import MAX_REACH_UNITS
-from ...kernels.core.stop_flag_checks import NO_LIMIT
+from ...kernels.core.placed_avatar import MAX_REACH_UNITS
+from ...kernels.core.scene_arrays import NO_LIMIT
 from ...queries.context.query_context import to_units
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .frame import Body, Pose, Vec

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel, make_avatar
+from ...kernels.bodies.body_pairs import find_near_bodies
 from ...kernels.bodies.body_sweep import sweep_bodies
-from ...kernels.bodies.near_bodies import find_near_bodies
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec

@@ -54,7 +54,7 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
         return found
 
     assert changed("server/kernels/collide/collide_poses.py") == {"server.kernels.collide.collide_poses"}
-    assert changed("server/kernels/core/pose_transform.py") == {
+    assert changed("server/kernels/core/placed_avatar.py") == {
         "server.kernels.collide.collide_poses",
         "server.kernels.motion.contact_times",
     }

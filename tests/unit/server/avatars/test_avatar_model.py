@@ -8,7 +8,7 @@ import synthetic_scans
 from solidcloud.schemas.errors import BadRequestError, TooLargeError
 from solidcloud.schemas.wire.messages import MAX_AVATAR_POINTS
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.kernels.core.scene_arrays import LANES
 
 pytestmark = pytest.mark.interpreted
 

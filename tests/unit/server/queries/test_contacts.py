@@ -19,7 +19,7 @@ from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
 from solidcloud.schemas.wire.requests import MAX_CONTACTS
 from solidcloud.server.archives.archive_info import describe
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.kernels.core.scene_arrays import LANES
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget

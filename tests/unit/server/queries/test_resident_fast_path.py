@@ -13,7 +13,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
+from solidcloud.server.kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE
 from solidcloud.server.kernels.motion import sweep_resident as kernel
 from solidcloud.server.queries import resident_fast_path as module
 from solidcloud.server.queries.collide import collide

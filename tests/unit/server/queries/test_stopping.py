@@ -16,7 +16,7 @@ import stopped_queries
 import synthetic_scans
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.collide import collide_poses
-from solidcloud.server.kernels.core import stop_flag_checks as stopping
+from solidcloud.server.kernels.core import scene_arrays as stopping
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.objects import find_pairs

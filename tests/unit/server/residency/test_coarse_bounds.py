@@ -18,7 +18,7 @@ from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, class_radii
 from solidcloud.schemas.errors import CorruptError
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.collide.coarse_clearance import MAX_SLOT_NODES
-from solidcloud.server.kernels.core.voxel_layout import CLASS_SHIFT, COUNT, COUNTED, FIRST
+from solidcloud.server.kernels.core.scene_arrays import CLASS_SHIFT, COUNT, COUNTED, FIRST
 from solidcloud.server.residency.coarse_bounds import SLOT_BYTES, CoarseBounds, drop_clear_pairs
 from solidcloud.server.residency.voxel_store import VoxelStore
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
-from solidcloud.server.kernels.core.voxel_layout import Arena
+from solidcloud.server.kernels.core.scene_arrays import Arena
 from solidcloud.server.residency.eviction import POLICIES
 from solidcloud.server.residency.held_voxels import HeldVoxels
 from solidcloud.server.residency.load_turns import LOADS_WITHOUT_TURN

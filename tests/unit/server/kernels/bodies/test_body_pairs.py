@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.bodies import body_pairs as kernel
-from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.kernels.core.scene_arrays import LANES
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 pytestmark = pytest.mark.interpreted

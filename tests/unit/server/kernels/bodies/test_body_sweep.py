@@ -11,9 +11,9 @@ import pytest
 from judged_sweeps import turned
 from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
+from solidcloud.server.kernels.bodies import body_pairs
 from solidcloud.server.kernels.bodies import body_sweep as kernel
 from solidcloud.server.kernels.bodies import moving_bodies as placed
-from solidcloud.server.kernels.bodies import near_bodies
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
@@ -210,7 +210,7 @@ def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float)
         )
         bounds = np.empty((n, 2, 3))
         for pose, bound in zip(poses, bounds, strict=True):
-            near_bodies.bound_body(box_of(b), pose, ORIGIN, b.radius, bound)
+            body_pairs.bound_body(box_of(b), pose, ORIGIN, b.radius, bound)
             points = (pose[:3, :3] @ b.points.T).T + pose[:3, 3] - ORIGIN
             assert (bound[0] <= points.min(axis=0) - b.radius).all()
             assert (bound[1] >= points.max(axis=0) + b.radius).all()
@@ -219,9 +219,7 @@ def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float)
             end[:3, 3] -= ORIGIN
         rows = np.empty(n, np.int64)
         for wanted, skip in ((7, -1), (4, 2)):
-            count = near_bodies.find_near_bodies(
-                box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows
-            )
+            count = body_pairs.find_near_bodies(box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows)
             named = rows[:count].tolist()
             assert named == sorted(named) and skip not in named
             assert all(kinds[row] & wanted for row in named)
@@ -259,7 +257,7 @@ def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> Non
     bound = np.empty((2, 3))
     for _ in range(20):
         pose = archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + rng.normal(size=3))
-        near_bodies.bound_body(box, pose, ORIGIN, 0.07, bound)
+        body_pairs.bound_body(box, pose, ORIGIN, 0.07, bound)
         placed_corners = corners @ pose[:3, :3].T + pose[:3, 3] - ORIGIN
         low, high = placed_corners.min(axis=0) - 0.07, placed_corners.max(axis=0) + 0.07
         assert ((bound[0] < low) & (low < bound[0] + 1e-6)).all()
@@ -277,10 +275,10 @@ def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> Non
             bounds[:, 0, axis] = [-9.0, -9.0, edges[2], edges[3]]
             bounds[:, 1, axis] = [edges[0], edges[1], 9.0, 9.0]
             rows = np.full(5, -7)
-            assert near_bodies.find_near_bodies(box, first, last, 0.07, bounds, kinds, 6, -1, rows) == 2
+            assert body_pairs.find_near_bodies(box, first, last, 0.07, bounds, kinds, 6, -1, rows) == 2
             assert rows.tolist() == [1, 2, -7, -7, -7]
-            assert near_bodies.find_near_bodies(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
-            assert near_bodies.find_near_bodies(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
+            assert body_pairs.find_near_bodies(box, first, last, 0.07, bounds, kinds, 5, -1, rows) == 0
+            assert body_pairs.find_near_bodies(box, first, last, 0.07, bounds, kinds, 2, 1, rows) == 1
             assert rows[0] == 2
 
 

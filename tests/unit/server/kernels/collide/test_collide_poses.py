@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.kernels.core.scene_arrays import LANES
 from solidcloud.server.scene import Scene
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.contacts.contact_clusters import find_slot, make_cells
+from solidcloud.server.kernels.contacts.contact_cells import find_slot, make_cells
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from naive_contacts import Pair, clusters_of, gap_key
-from solidcloud.server.kernels.contacts.contact_clusters import (
+from solidcloud.server.kernels.contacts.contact_cells import (
     CELLS,
     CLUSTER,
     DEFICIT,
@@ -22,10 +22,10 @@ from solidcloud.server.kernels.contacts.contact_clusters import (
     find_slot,
     grow_cells,
     keep_deepest,
-    list_pose,
     make_cells,
     sort_rows,
 )
+from solidcloud.server.kernels.contacts.contact_clusters import list_pose
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.kernels.core.voxel_layout import _outward
+from solidcloud.server.kernels.core.scene_arrays import _outward
 
 pytestmark = pytest.mark.interpreted
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core import placed_avatar as kernel
-from solidcloud.server.kernels.core.voxel_layout import LANES
+from solidcloud.server.kernels.core.scene_arrays import LANES
 
 pytestmark = pytest.mark.interpreted
 

@@ -6,7 +6,8 @@ import archive_cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core import pose_transform as placing
+from solidcloud.server.kernels.core import placed_avatar as placing
+from solidcloud.server.kernels.core import voxels_in_reach as pose_checks
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 pytestmark = pytest.mark.interpreted
@@ -30,7 +31,7 @@ def check(
 ) -> tuple[int, int, float]:
     """The fault, the pose that has it, and the figure found."""
     scales, units = np.full(len(poses), np.nan), np.zeros(len(poses), np.int64)
-    return placing.check_poses(poses, np.array([node_radius]), radius, others, LATTICE, scales, units)
+    return pose_checks.check_poses(poses, np.array([node_radius]), radius, others, LATTICE, scales, units)
 
 
 def entry(row: int, column: int, value: float) -> NDArray[np.float64]:
@@ -45,10 +46,10 @@ def test_a_mirrored_pose_is_told_whatever_its_axes(rng: np.random.Generator) -> 
         pose = archive_cases.pose_of(
             archive_cases.random_rotation(rng) * rng.uniform(0.1, 9), rng.uniform(-1, 1, 3)
         )
-        assert check(pose[None])[0] == placing.VALID
+        assert check(pose[None])[0] == pose_checks.VALID
         pose[:3, rng.integers(3)] *= -1
         fault, index, volume = check(pose[None])
-        assert (fault, index) == (placing.MIRRORED, 0)
+        assert (fault, index) == (pose_checks.MIRRORED, 0)
         assert volume == pytest.approx(np.linalg.det(pose[:3, :3]), rel=1e-12)
 
 
@@ -56,20 +57,24 @@ def test_a_mirrored_pose_is_told_whatever_its_axes(rng: np.random.Generator) -> 
 def test_every_entry_is_looked_at_and_the_figure_is_what_was_found(row: int, column: int) -> None:
     for value in (np.nan, np.inf, -np.inf):
         fault, index, found = check(entry(row, column, value))
-        assert (fault, index) == (placing.NOT_FINITE, 1) and str(found) == str(value)
+        assert (fault, index) == (pose_checks.NOT_FINITE, 1) and str(found) == str(value)
     if row == 3:
         given = 1.0 + 2.0**-52 if column == 3 else 5e-324
-        assert check(entry(row, column, given)) == (placing.BAD_LAST_ROW, 1, given if column == 3 else 1.0)
+        assert check(entry(row, column, given)) == (
+            pose_checks.BAD_LAST_ROW,
+            1,
+            given if column == 3 else 1.0,
+        )
     elif column == 3:
         for sign in (1.0, -1.0):
-            assert check(entry(row, column, sign * 1e9))[0] == placing.VALID
+            assert check(entry(row, column, sign * 1e9))[0] == pose_checks.VALID
             beyond = sign * np.nextafter(1e9, np.inf)
-            assert check(entry(row, column, beyond)) == (placing.TOO_FAR, 1, beyond)
+            assert check(entry(row, column, beyond)) == (pose_checks.TOO_FAR, 1, beyond)
     else:
         # Two thousand is what no entry of a pose of scale 1,000 can be; beyond it nothing more is computed.
         for value in (np.nextafter(2000.0, np.inf), -1e200):
-            assert check(entry(row, column, value)) == (placing.BAD_SCALE, 1, value)
-        assert check(entry(row, column, 1999.0))[0] in (placing.SHEARED, placing.BAD_SCALE)
+            assert check(entry(row, column, value)) == (pose_checks.BAD_SCALE, 1, value)
+        assert check(entry(row, column, 1999.0))[0] in (pose_checks.SHEARED, pose_checks.BAD_SCALE)
         assert check(entry(row, column, 1999.0))[2] != 1999.0
 
 
@@ -83,17 +88,17 @@ def test_a_shear_is_told_by_its_size(row: int, column: int) -> None:
         for scale in (1.0, 0.25):
             pose[1, :3, :3] *= scale
             fault, index, found = check(pose)
-            assert (fault, index) == (placing.SHEARED, 1)
+            assert (fault, index) == (pose_checks.SHEARED, 1)
             assert found == pytest.approx(np.abs(gram - np.eye(3) * square).max() / square, rel=1e-6)
     least, most = 0.95e-9 * (1.5 if row == column else 2), 1.05e-9 * (1.5 if row == column else 2)
-    assert check(entry(row, column, value + least))[0] == placing.VALID
-    assert check(entry(row, column, value + most))[0] == placing.SHEARED
+    assert check(entry(row, column, value + least))[0] == pose_checks.VALID
+    assert check(entry(row, column, value + most))[0] == pose_checks.SHEARED
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_a_scale_at_the_border_is_admitted_rounding_included(scale: float) -> None:
     sign = 1 if scale > 1 else -1
-    for by, fault in ((0.0, placing.VALID), (0.9e-9, placing.VALID), (1.1e-9, placing.BAD_SCALE)):
+    for by, fault in ((0.0, pose_checks.VALID), (0.9e-9, pose_checks.VALID), (1.1e-9, pose_checks.BAD_SCALE)):
         given = scale * (1 + sign * by)
         pose = np.diag([given] * 3 + [1.0])[None]
         assert check(pose, 1e-3)[0] == fault
@@ -104,32 +109,32 @@ def test_radii_scale_and_are_rounded_once() -> None:
     scales, units = np.empty(3), np.empty(3, np.int64)
     poses = np.stack([np.diag([s, s, s, 1.0]) for s in (1.0, 0.5, 3.0)])
     radius = (2**20 + 0.75) / UNITS
-    said = placing.check_poses(poses, np.ones(1), radius, 7, LATTICE, scales, units)
-    assert said == (placing.VALID, 0, 0.0)
+    said = pose_checks.check_poses(poses, np.ones(1), radius, 7, LATTICE, scales, units)
+    assert said == (pose_checks.VALID, 0, 0.0)
     assert scales.tolist() == [1.0, 0.5, 3.0]
     assert units.tolist() == [round(s * (2**20 + 0.75)) + 7 for s in (1.0, 0.5, 3.0)]
 
 
 def test_the_reach_ends_at_sixteen_metres_to_the_unit() -> None:
-    assert check(np.eye(4)[None], radius=15.0, others=1 << 26)[0] == placing.VALID
+    assert check(np.eye(4)[None], radius=15.0, others=1 << 26)[0] == pose_checks.VALID
     said = check(np.eye(4)[None], radius=15.0, others=(1 << 26) + 1)
-    assert said == (placing.LONG_REACH, 0, 16 + 1 / UNITS)
+    assert said == (pose_checks.LONG_REACH, 0, 16 + 1 / UNITS)
     doubled = np.diag([2.0, 2, 2, 1])[None]
-    assert check(doubled, radius=8.0)[0] == placing.VALID
-    assert check(doubled, radius=8.0, others=1)[0] == placing.LONG_REACH
+    assert check(doubled, radius=8.0)[0] == pose_checks.VALID
+    assert check(doubled, radius=8.0, others=1)[0] == pose_checks.LONG_REACH
 
 
 def test_an_avatar_ends_where_float32_does_to_the_step() -> None:
     """2^23 steps of 2^-13 m, less a voxel of 8 m, less a reach of 1 m: 1,015 m."""
-    assert check(np.eye(4)[None], 1015.0, 1.0)[0] == placing.VALID
+    assert check(np.eye(4)[None], 1015.0, 1.0)[0] == pose_checks.VALID
     said = check(np.eye(4)[None], 1015.0 + 2.0**-13, 1.0)
-    assert said == (placing.LARGE_AVATAR, 0, 1016.0 + 2.0**-13)
+    assert said == (pose_checks.LARGE_AVATAR, 0, 1016.0 + 2.0**-13)
     doubled = np.diag([2.0, 2, 2, 1])[None]
-    assert check(doubled, 507.5, 0.5)[0] == placing.VALID
-    assert check(doubled, 507.5 + 2.0**-13, 0.5)[0] == placing.LARGE_AVATAR
+    assert check(doubled, 507.5, 0.5)[0] == pose_checks.VALID
+    assert check(doubled, 507.5 + 2.0**-13, 0.5)[0] == pose_checks.LARGE_AVATAR
     scales, units = np.empty(1), np.empty(1, np.int64)
-    said = placing.check_poses(np.eye(4)[None], np.empty(0), 1.0, 0, LATTICE, scales, units)
-    assert said == (placing.VALID, 0, 0.0), "an avatar without nodes has no extent but its reach"
+    said = pose_checks.check_poses(np.eye(4)[None], np.empty(0), 1.0, 0, LATTICE, scales, units)
+    assert said == (pose_checks.VALID, 0, 0.0), "an avatar without nodes has no extent but its reach"
 
 
 def test_the_largest_term_is_that_of_the_row_with_the_largest_sum(rng: np.random.Generator) -> None:

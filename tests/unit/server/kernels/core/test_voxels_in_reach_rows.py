@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.voxel_grid import KEY_BIAS
 from solidcloud.schemas.kernels.morton import morton_encode
-from solidcloud.server.kernels.core import pose_transform as placing
+from solidcloud.server.kernels.core import voxels_in_reach as pose_checks
 from solidcloud.server.kernels.core.voxels_in_reach import (
     SceneIndex,
     VoxelsInReach,
@@ -162,12 +162,12 @@ def test_poses_are_checked_first() -> None:
     poses[:, :3, 3] = SCENE.origin
     reach = room(3, 50, -1, np.nan)
     fault, _, _, needed = find_reach(poses, AVATAR, 0.5, 7, SCENE, index, reach)
-    assert fault == placing.VALID and needed == reach.starts[-1] > 0
+    assert fault == pose_checks.VALID and needed == reach.starts[-1] > 0
     assert reach.units.tolist() == [2**25 + 7] * 3 and reach.scales.tolist() == [1.0] * 3
     poses[1, 0, 1] = 1.0
-    assert find_reach(poses, AVATAR, 0.5, 7, SCENE, index, room(3, 50, -1))[:2] == (placing.SHEARED, 1)
+    assert find_reach(poses, AVATAR, 0.5, 7, SCENE, index, room(3, 50, -1))[:2] == (pose_checks.SHEARED, 1)
     assert find_reach(poses, AVATAR, 0.5, 7, SCENE, index, room(3, 50, -1))[3] == 0
     nobody = Root(np.empty((0, 3)), np.empty(0))
     reach = room(3, 50, -1)
-    assert find_reach(poses[[0, 2]], nobody, 0.5, 7, SCENE, index, reach) == (placing.VALID, 0, 0.0, 0)
+    assert find_reach(poses[[0, 2]], nobody, 0.5, 7, SCENE, index, reach) == (pose_checks.VALID, 0, 0.0, 0)
     assert reach.starts[0] == -1

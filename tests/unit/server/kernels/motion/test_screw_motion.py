@@ -5,7 +5,7 @@ import naive_sweep
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core.pose_transform import SIMILARITY_TOLERANCE
+from solidcloud.server.kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE
 from solidcloud.server.kernels.motion.screw_motion import make_motion, poses_on, sine_cosine
 
 FRACTIONS = np.array([0.0, 1e-18, 1e-9, 0.1, 0.25, 0.5, 0.7, 1 - 1e-9, 1 - 2.0**-53, 1.0])

@@ -207,7 +207,7 @@ import sys
 from solidcloud.server.simulation.effects import pipeline, stop_effect, sweep_effect
 names = ["simulation.effects." + name for name in ("crowd_effect", "objects_effect")]
 names += ["simulation.world." + name for name in ("bodies", "body_obstacles")]
-names += ["kernels.bodies." + name for name in ("body_sweep", "moving_bodies", "near_bodies")]
+names += ["kernels.bodies." + name for name in ("body_sweep", "moving_bodies")]
 print([name for name in names if "solidcloud.server." + name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

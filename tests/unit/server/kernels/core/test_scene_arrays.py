@@ -9,7 +9,7 @@ import synthetic_scans
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
-from solidcloud.server.kernels.core.voxel_layout import (
+from solidcloud.server.kernels.core.scene_arrays import (
     BLOCK_WORDS,
     COUNT,
     FIRST,

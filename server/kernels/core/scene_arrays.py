@@ -1,4 +1,4 @@
-"""Layout of one voxel in the arena of resident voxels, as the overlap kernel reads it.
+"""Arrays of a scene that the kernels read: the layout of a voxel in the arena, and the stop flag.
 
 The arena is one buffer with three views: float32 words, int32 words and uint16 halfwords. A voxel
 takes three runs. It takes a fourth run where the archive keeps scan numbers (`--keep scan`), and
@@ -24,6 +24,10 @@ Scans take 2 more and radius classes 1.1 more, where kept.
 The radius class of a node (schemas/archive/radius_model.py) is the largest local class of the
 points below it, with RIM_BIT where all of them have it. It is the class of the largest sphere below
 the node under every radius model.
+
+Another thread sets a request's stop flag (server/runtime/stop_flag.py) while a kernel runs. The
+compiler may move an ordinary load out of a loop, but not an atomic one. An atomic load costs the
+same as an ordinary load.
 """
 
 from typing import NamedTuple
@@ -34,7 +38,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT
 from ....schemas.archive.voxel import MAX_LEAF
 from ....schemas.kernels import compiling as nb
-from .kernel_decorators import njit_no_refcount
+from .kernel_decorators import njit_inlined, njit_no_refcount
 
 # 32 uint16 lanes become 32 float32 in one vector loop. LLVM unrolls loops of 8 or 16 constant
 # iterations and then does not vectorise them, which costs several times as much a pair.
@@ -50,6 +54,13 @@ FIRST, COUNT = 10, 11  # columns of a row that hold int32
 COUNTED = 0xFF
 CLASS_SHIFT = 8
 LOCAL_MASK = LOCAL_CLASSES - 1
+# Largest number of node visits, for a search without a budget.
+NO_LIMIT = 1 << 62
+# Limit of node visits for a pose or a motion that is answered while the residency is locked: a few
+# milliseconds at most. A query that needs more is answered by the general path.
+MAX_RESIDENT_PATH_VISITS = 1 << 16
+# Rows copied, sorted or cleared between two checks of the stop flag: some hundred microseconds.
+ROWS_AT_ONCE = 512
 
 
 class Arena(NamedTuple):
@@ -63,7 +74,7 @@ class Arena(NamedTuple):
 class SceneArrays(NamedTuple):
     """Arrays of a scene that the kernels read.
 
-    words, ints, halves: the arena (voxel_layout.py).
+    words, ints, halves: the arena.
     where: (v, 3) int64, the starts of a voxel's rows, blocks and lanes in the arena; -1: not
     resident.
     coordinates: (v, 3) int64, voxel coordinates.
@@ -71,7 +82,7 @@ class SceneArrays(NamedTuple):
     block_words: words of a block, with or without radius classes.
     radius_deficit: (1,) or (RADIUS_CLASSES,) int64, the largest radius minus the radius of each
     class, exact units; one element where all spheres have the same radius.
-    stop: (1,) int64, the request's stop flag (stop_flag_checks.py).
+    stop: (1,) int64, the request's stop flag.
     """
 
     words: NDArray[np.float32]
@@ -86,6 +97,49 @@ class SceneArrays(NamedTuple):
     block_words: int
     radius_deficit: NDArray[np.int64]
     stop: NDArray[np.int64]
+
+
+@nb.intrinsic
+def _load(context, flag):  # type: ignore[no-untyped-def]
+    """Load the first element of an array (1,) int64 atomically."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        return builder.load_atomic(array.data, "monotonic", 8)
+
+    return nb.types.int64(flag), generate
+
+
+@njit_inlined
+def _stopped(flag):
+    return _load(flag) != 0  # type: ignore[call-arg]  # an intrinsic's first parameter is the compiler's
+
+
+def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
+    return flag[0] != 0
+
+
+# stopped(flag): return whether the flag (1,) int64 is set. Intrinsics cannot be interpreted.
+stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
+
+
+@njit_inlined
+def should_end(flag, visits, most):
+    """Return whether a search ends early.
+
+    It does once its request is stopped or it has cost more than `most` node visits.
+    """
+    return stopped(flag) or visits > most
+
+
+@nb.njit(nogil=True, cache=True)
+def copy_rows(rows, to, count, flag):
+    """Copy the first `count` rows of a table; end early once the stop flag is set."""
+    for begin in range(0, count, ROWS_AT_ONCE):
+        if stopped(flag):
+            return
+        end = min(begin + ROWS_AT_ONCE, count)
+        to[begin:end] = rows[begin:end]
 
 
 def block_words(radius_class: bool) -> int:

@@ -1,0 +1,292 @@
+"""Overlap of a placed avatar with a node of the scene's tree: thresholds of a pose, and the tests.
+
+A test compares float32 distances with a threshold that includes all errors: a node that holds a
+point in reach always passes. Pairs of points below `near` touch, pairs above `far` do not; pairs
+between them need integers (`pair_in_reach`).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.voxel import MAX_LEVELS
+from ....schemas.kernels import compiling as nb
+from .kernel_decorators import njit_inlined, njit_no_refcount
+from .placed_avatar import pad_list
+from .scene_arrays import LANES
+
+U = np.uint64  # see placed_avatar.py
+U32 = 2.0**-24  # half a unit in the last place of 1, float32
+# Relative slack of a float32 test: more than 16 U32, while the sums below need at most 8.
+SLACK = np.float32(1e-6)
+ONE_SLACK = np.float32(1.0 + 2e-6)
+# A pair is pushed for each child of one of its nodes: at most 15 a level stay behind on the stack.
+# This size holds two trees of MOST_LEVELS.
+STACK = 2 * MAX_LEVELS * 15 + 16
+# A scene node is called flat if its slab is thinner than this many radii of an avatar's leaf node;
+# the avatar's points are then tested against it at once. Values from 0.5 to 2 take the same time on
+# the walk; 8 takes a fifth more.
+FLAT = np.float32(1.0)
+# Most of the avatar's front meets a scene node of more than this many radii of the avatar's root;
+# only the root is tested against it.
+BROAD = np.float32(2.0)
+
+
+class Thresholds(NamedTuple):
+    """Thresholds of one pose.
+
+    reach, error: [steps], float32, rounded up.  near, far: squares, float32. A pair below `near`
+    touches, a pair above `far` does not.
+    units: r_a + r_b + margin, exact units, int64.
+    """
+
+    reach: np.float32
+    error: np.float32
+    near: np.float32
+    far: np.float32
+    units: np.int64
+
+
+class ClassThresholds(NamedTuple):
+    """Thresholds of one pose by radius class; scratch of one call. As long as `radius_deficit`.
+
+    threshold: reach plus error, float32 [steps].  near, far, units: as in `Thresholds`.
+    mask: the number of classes minus one, uint64, for `node_class` and `point_class`.
+    """
+
+    threshold: NDArray[np.float32]
+    near: NDArray[np.float32]
+    far: NDArray[np.float32]
+    units: NDArray[np.int64]
+    mask: np.uint64
+
+
+class VoxelLocation(NamedTuple):
+    """Location of one voxel.
+
+    rows, blocks, lanes: its first row, block and lane in the arena.
+    x, y, z: its low corner relative to the frame, float32.
+    """
+
+    rows: int
+    blocks: int
+    lanes: int
+    x: np.float32
+    y: np.float32
+    z: np.float32
+
+
+@nb.njit(nogil=True, cache=True)
+def make_class_thresholds(deficit):
+    """Allocate scratch for the radius classes of `SceneArrays.radius_deficit`."""
+    n = deficit.shape[0]
+    threshold, near, far = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    return ClassThresholds(threshold, near, far, np.empty(n, np.int64), np.uint64(n - 1))
+
+
+@njit_no_refcount
+def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farthest, voxel_steps):
+    """Compute the thresholds of one pose for each radius class.
+
+    Arguments as for `make_thresholds`; `units` is for the largest radius.
+    """
+    for c in range(deficit.shape[0]):
+        thresholds = make_thresholds(units - deficit[c], units_per_step, extent, farthest, voxel_steps)
+        by_class.threshold[c] = thresholds.reach + thresholds.error
+        by_class.near[c], by_class.far[c], by_class.units[c] = (
+            thresholds.near,
+            thresholds.far,
+            thresholds.units,
+        )
+
+
+@njit_no_refcount
+def make_thresholds(units, units_per_step, extent, farthest, voxel_steps):
+    """Compute the thresholds for a reach of `units`.
+
+    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed
+    coordinate.
+    Errors of a coordinate difference, in steps:
+    - rounding to exact units: half a unit for each of the two points;
+    - float32 of the avatar's coordinate: U32 of its size, once relative to the frame and once
+      relative to the voxel or block. There a pair in reach is within the larger of voxel and block,
+      plus the reach (doubled, so that a pair beyond reach cannot pass as near);
+    - float64 rounding far from the origin: 4 half units in the last place for a placed centre, 4
+      for a point below it, 1 for the frame, 1 for the lattice point: 10 * 2^-53 of the largest
+      term.
+    """
+    reach = np.float64(units) / units_per_step
+    error = (
+        1.1 / units_per_step
+        + U32 * (extent + 2.0 * (max(65536.0, voxel_steps) + reach))
+        + farthest * 2.0**-49
+    )
+    around = math.sqrt(3.0) * error
+    below = max(reach * (1.0 - 2.0 * U32) - around, 0.0)
+    above = reach * (1.0 + 2.0 * U32) + around
+    near = np.float32(below * below * (1.0 - 8.0 * U32))
+    far = np.float32(above * above * (1.0 + 8.0 * U32))
+    # One float32 step outward covers the rounding to float32. At 0, nothing is certified near.
+    near = np.nextafter(near, np.float32(-1.0)) if below > 0.0 else np.float32(-1.0)
+    return Thresholds(
+        np.nextafter(np.float32(reach), np.float32(np.inf)),
+        np.nextafter(np.float32(around), np.float32(np.inf)),
+        near,
+        np.nextafter(far, np.float32(np.inf)),
+        np.int64(units),
+    )
+
+
+@njit_no_refcount
+def nodes_meet(words, row, x, y, z, radius, threshold):
+    """Return whether a sphere may come within `threshold` of a node's points, by the node's bounds.
+
+    x, y, z: float32, relative to the voxel's low corner.  threshold: reach plus error. Tests the
+    sphere as in [Fig12] line 2, then the slab.
+    """
+    w = U(row)
+    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
+    span = radius + threshold
+    both = words[w + U(3)] + span
+    along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
+    # The sphere test decides beyond `both`; the rounding of `along` is therefore at most SLACK of
+    # it.
+    wide = words[w + U(7)] * (span + SLACK * both + SLACK * both)
+    # One branch on all three costs less than three branches that are hard to predict.
+    return (
+        (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
+        & (along <= words[w + U(9)] + wide)
+        & (along >= words[w + U(8)] - wide)
+    )
+
+
+@njit_inlined
+def mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, threshold, keep):
+    """Mark in `keep` the nodes of a list that meet the scene node `row`.
+
+    The test is that of `nodes_meet`: the sphere, then the slab.
+    at: the start of the list.  steps: its length in units of LANES nodes.  off: from the frame to
+    the voxel's low corner.  threshold: reach plus error. Returns whether any node meets.
+    """
+    w = U(row)
+    cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
+    radius = words[w + U(3)]
+    nx, ny, nz, length = words[w + U(4)], words[w + U(5)], words[w + U(6)], words[w + U(7)]
+    low, high = words[w + U(8)], words[w + U(9)]
+    any_meets = False
+    begin, to = U(at), U(0)
+    for _ in range(steps):
+        for j in range(LANES):
+            i = begin + U(j)
+            dx, dy, dz = bounds[0, i] - cx, bounds[1, i] - cy, bounds[2, i] - cz
+            span = bounds[3, i] + threshold
+            both = radius + span
+            along = nx * dx + ny * dy + nz * dz
+            wide = length * (span + (SLACK * both + SLACK * both))
+            meets = (
+                (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
+                & (along <= high + wide)
+                & (along >= low - wide)
+            )
+            keep[to + U(j)] = meets
+            any_meets |= meets
+        begin += U(LANES)
+        to += U(LANES)
+    return any_meets
+
+
+@njit_inlined
+def compact_marked(bounds, which, keep, keep8, at, steps, to):
+    """Write the marked nodes of the list at `at` as a new list at `to`. Returns its length."""
+    n = U(to)
+    for eight in range(4 * steps):
+        if keep8[U(eight)] == U(0):
+            continue
+        for j in range(8 * eight, 8 * eight + 8):
+            if keep[U(j)]:
+                copy_node(bounds, which, U(at) + U(j), n)
+                n += U(1)
+    count = np.int64(n) - to
+    pad_list(bounds, to + count, to + (count + LANES - 1) // LANES * LANES)
+    return count
+
+
+@njit_no_refcount
+def copy_node(bounds, which, at, to):
+    """Copy one node of the lists; at, to: uint64."""
+    bounds[0, to] = bounds[0, at]
+    bounds[1, to] = bounds[1, at]
+    bounds[2, to] = bounds[2, at]
+    bounds[3, to] = bounds[3, at]
+    which[to] = which[at]
+
+
+@njit_inlined
+def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
+    """Mark in `keep` the points of an avatar's block within `threshold` of a node's bounds.
+
+    lanes: relative to the frame.  threshold: reach plus error.  row: a scene node. Returns whether
+    any point is marked.
+    """
+    w = U(row)
+    cx, cy, cz = words[w] + off_x, words[w + U(1)] + off_y, words[w + U(2)] + off_z
+    nx, ny, nz = words[w + U(4)], words[w + U(5)], words[w + U(6)]
+    both = words[w + U(3)] + threshold
+    wide = words[w + U(7)] * (threshold + SLACK * both + SLACK * both)
+    low, high = words[w + U(8)] - wide, words[w + U(9)] + wide
+    square = both * both * ONE_SLACK
+    b = U(block)
+    any_meets = False
+    for j in range(LANES):
+        dx, dy, dz = lanes[b, 0, U(j)] - cx, lanes[b, 1, U(j)] - cy, lanes[b, 2, U(j)] - cz
+        along = nx * dx + ny * dy + nz * dz
+        meets = (dx * dx + dy * dy + dz * dz <= square) & (along <= high) & (along >= low)
+        keep[U(j)] = meets
+        any_meets |= meets
+    return any_meets
+
+
+@njit_no_refcount
+def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, keep8, begin):
+    """Find the first marked point, from `begin` on, that may be near a point of a scene block.
+
+    The points are those of an avatar's block.  lane_at: the scene block in `halves`.  low: its
+    corner, relative to the frame.  far: a square, see `Thresholds`. Returns (lane or -1, number of
+    points tested against the block).
+    """
+    h, b = U(lane_at), U(block)
+    tested = 0
+    for eight in range(begin // 8, LANES // 8):
+        if keep8[U(eight)] == U(0):
+            continue
+        for lane in range(8 * eight, 8 * eight + 8):
+            if lane < begin or not keep[U(lane)]:
+                continue
+            tested += 1
+            x, y, z = lanes[b, 0, U(lane)] - low_x, lanes[b, 1, U(lane)] - low_y, lanes[b, 2, U(lane)] - low_z
+            touched = False
+            for j in range(LANES):
+                i = h + U(j)
+                dx = np.float32(halves[i]) - x
+                dy = np.float32(halves[i + U(LANES)]) - y
+                dz = np.float32(halves[i + U(2 * LANES)]) - z
+                touched |= dx * dx + dy * dy + dz * dz <= far
+            if touched:
+                return lane, tested
+    return -1, tested
+
+
+@njit_no_refcount
+def locate_voxel(scene, voxel, placed):
+    """Locate a resident voxel in the arena and relative to the frame."""
+    coordinates, where, frame = scene.coordinates, scene.where, placed.frame
+    return VoxelLocation(
+        where[voxel, 0],
+        where[voxel, 1],
+        where[voxel, 2],
+        np.float32(coordinates[voxel, 0] * scene.voxel_steps - frame[0]),
+        np.float32(coordinates[voxel, 1] * scene.voxel_steps - frame[1]),
+        np.float32(coordinates[voxel, 2] * scene.voxel_steps - frame[2]),
+    )

@@ -253,7 +253,7 @@ def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.M
     store = FakeStore([1, 1, 1, 1, 2, 2])
     residency = VoxelCache(store, 4 * BLOCK)
     take(residency, [0, 1, 2, 3])
-    made = residency._allocator.make
+    made = residency._allocator.allocate
 
     def make(row: int, *what: object, **more: object) -> bool:
         """Room for the first, and no memory for the second."""
@@ -307,7 +307,7 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     # Reserved by one whose deadline comes before the load begins.
     residency._reserve([1], float("inf"), False, NO_STOP)
     residency._pin([1])  # another waits for it
-    residency._leave([1])
+    residency._abandon([1])
     residency._owed[1] = None
     assert residency.take_owed() is None, "who waits may load it"
     residency.release([1])

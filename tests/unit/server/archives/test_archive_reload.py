@@ -245,7 +245,7 @@ def test_warming_calls_the_kernel_of_coarse_bounds(place: Path, monkeypatch: pyt
         calls.append(len(arguments))
         return int(kernel(*arguments))
 
-    monkeypatch.setattr(coarse_bounds, "settle_pairs", counted)
+    monkeypatch.setattr(coarse_bounds, "copy_unproved_pairs", counted)
     with Scene.open(place, policy="lru+prefetch") as scene:
         scene.warm()
     assert calls

@@ -27,7 +27,7 @@ class Filled:
         """Make room for a row that is not there; `stays` neither go nor move."""
         room = self.room
         may = lambda other: other not in stays  # noqa: E731
-        if not room.make(row, may, may, self.gone.append, scan=False, most=most):
+        if not room.allocate(row, may, may, self.gone.append, scan=False, most=most):
             return False
         offset = room.offsets[row]
         self.where[row] = (offset // 4, offset // 4 + 1, offset // 2 + 3)
@@ -103,7 +103,7 @@ def test_a_load_costs_the_same_however_many_voxels_are_resident(
         if row in room.offsets:
             room.policy.used(row, scan=False)
             continue
-        assert room.make(row, may, may, filled.gone.append, scan=False)
+        assert room.allocate(row, may, may, filled.gone.append, scan=False)
         filled.where[row] = room.offsets[row] // 4
         loads += 1
     room.check()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core import node_overlap
 from solidcloud.server.kernels.core import placed_avatar as kernel
 from solidcloud.server.kernels.core.scene_arrays import LANES
 
@@ -56,7 +57,7 @@ def test_thresholds_are_outside_the_errors_documented_and_not_far(
 ) -> None:
     """Each term of the docstring weighs in one of the cases; thresholds lie beyond it by less than float32 tells."""
     units = round(reach * UNITS_PER_STEP)
-    found = kernel.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
+    found = node_overlap.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
     error = 1.1 / UNITS_PER_STEP
     error += U32 * (extent + 2 * (max(65_536, voxel_steps) + reach)) + farthest * 2.0**-49
     around = math.sqrt(3) * error
@@ -72,18 +73,18 @@ def test_thresholds_are_outside_the_errors_documented_and_not_far(
 
 
 def test_nothing_is_certainly_near_where_the_error_is_as_large_as_the_reach() -> None:
-    assert kernel.make_thresholds(0, UNITS_PER_STEP, 10.0, 10.0, VOXEL_STEPS).near < 0
-    assert kernel.make_thresholds(5, UNITS_PER_STEP, 10.0, 1e15, VOXEL_STEPS).near < 0
+    assert node_overlap.make_thresholds(0, UNITS_PER_STEP, 10.0, 10.0, VOXEL_STEPS).near < 0
+    assert node_overlap.make_thresholds(5, UNITS_PER_STEP, 10.0, 1e15, VOXEL_STEPS).near < 0
 
 
 def test_each_class_has_the_thresholds_of_its_own_reach() -> None:
     drop = np.array([0, 1000, 70_000, 5, 0, 9, 11, 123_456])
-    found = kernel.make_class_thresholds(drop)
-    kernel.set_class_thresholds(found, drop, 1_000_000, UNITS_PER_STEP, 30.0, 1e4, VOXEL_STEPS)
+    found = node_overlap.make_class_thresholds(drop)
+    node_overlap.set_class_thresholds(found, drop, 1_000_000, UNITS_PER_STEP, 30.0, 1e4, VOXEL_STEPS)
     for c, less in enumerate(drop.tolist()):
-        own = kernel.make_thresholds(1_000_000 - less, UNITS_PER_STEP, 30.0, 1e4, VOXEL_STEPS)
+        own = node_overlap.make_thresholds(1_000_000 - less, UNITS_PER_STEP, 30.0, 1e4, VOXEL_STEPS)
         assert (found.near[c], found.far[c], found.units[c]) == (own.near, own.far, own.units)
-        assert found.room[c] == own.reach + own.error
+        assert found.threshold[c] == own.reach + own.error
     assert found.mask == 7
 
 

@@ -108,7 +108,7 @@ class ArchiveGeneration:
             residency.on_loaded = lambda row, where: remember(row, arena, where)
         # Without room for all voxels, the room is for those that requests load.
         fill = _coarse_filling(coarse, store) if coarse is not None and coarse.has_room_for_all else None
-        self.prefetcher = Prefetcher(residency, around, ahead=ahead, idle=fill)
+        self.prefetcher = Prefetcher(residency, around, prefetch=ahead, idle=fill)
         figure = make_scene_data(store.archive, residency, bounds, coarse)
         data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
         self.data = data

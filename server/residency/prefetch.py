@@ -56,23 +56,18 @@ class Prefetcher:
         residency: VoxelCache,
         tracks: UserTracks,
         *,
-        ahead: bool = True,
+        prefetch: bool = True,
         idle: Callable[[], bool] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Make a prefetcher without a thread.
 
-        ahead: prefetch; if False, load only owed voxels and keep users' voxels.
+        prefetch: whether to prefetch; if False, load only owed voxels and keep users' voxels.
         idle: called repeatedly when there is nothing to load, until it returns False; each call
         does some milliseconds of work.
         clock: returns the time [s].
         """
-        self._residency, self._tracks, self._clock, self._ahead = (
-            residency,
-            tracks,
-            clock,
-            ahead,
-        )
+        self._residency, self._tracks, self._clock, self._prefetch = residency, tracks, clock, prefetch
         self._work = threading.Event()
         self._urgent = threading.Event()  # ends a rest
         self._lock = threading.Lock()  # guards starting and stopping
@@ -159,7 +154,7 @@ class Prefetcher:
             if self._seen and now >= due:
                 self._seen = False
                 need, due = self._planned(now)
-                queue = deque(need.items() if self._ahead else ())
+                queue = deque(need.items() if self._prefetch else ())
             if self._stopped:
                 return
             if self._step(queue, need):

@@ -1,5 +1,5 @@
-"""Residency against a model: whatever is held or loaded ahead in whatever order, what is promised is there and nothing
-is over."""
+"""Compare the voxel cache with a model, for holds and background loads in any order: promised voxels are resident, and
+the budget holds."""
 
 from contextlib import AbstractContextManager
 from typing import NamedTuple

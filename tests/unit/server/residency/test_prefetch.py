@@ -146,7 +146,7 @@ def test_a_user_who_turns_is_not_loaded_for_where_it_came_from() -> None:
 
 
 def test_what_came_too_late_for_a_request_is_loaded_after_it() -> None:
-    table = Table([1] * 3, 2, ahead=False)
+    table = Table([1] * 3, 2, prefetch=False)
     with table.prefetcher:
         with table.residency.hold([0, 2], deadline=0.0) as held:
             assert held.late == (0, 2)

@@ -1,0 +1,1 @@
+"""`scripts/test --quick`: the tests of what changed, within a time limit."""

@@ -179,6 +179,11 @@ TESTS: dict[str, tuple[str, ...]] = {
         SERVER + "residency/test_coarse_bounds.py::test_no_point_has_a_larger_sphere_than_its_node_says",
         SERVER + "kernels/collide/test_coarse_clearance.py",
     ),
+    "server/kernels/contacts/contact_cells.py": (
+        SERVER + "kernels/contacts/test_cell_hash.py",
+        *work("contacts", "contacts deep"),
+        *tangent("contacts"),
+    ),
     "server/kernels/contacts/contact_pairs.py": (*work("contacts", "contacts deep"), *tangent("contacts")),
     "server/kernels/core/node_overlap.py": (
         SERVER + "kernels/core/test_placed_avatar.py",

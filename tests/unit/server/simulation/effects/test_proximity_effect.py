@@ -109,7 +109,7 @@ def test_what_could_not_be_read_is_unknown_and_never_remembered(tmp_path: Path) 
     with Scene.open(case.archive, "scene") as scene:
         world = world_of(scene)
         found = report(runner, world, body, at(1.5, 0, 0.2))
-        assert found == ProximityReport(unknown=True) and CACHE_KEY not in body.kept
+        assert found == ProximityReport(unknown=True) and CACHE_KEY not in body.effect_state
         found = report(runner, world, body, at(0.7, 0, 0.2))
         assert found.unknown is False and found.distance == pytest.approx(0.09, abs=1e-3), (
             "nearer than it can be"

@@ -83,7 +83,7 @@ def test_an_archive_at_a_pose_is_met_where_it_lies_and_first_comes_first(tmp_pat
         assert world.collide(BALL, at(2, 0.1, 0.5)) == Verdict.CLEAR
         assert world.deepest(BALL, at(2, 0.1, 0.5)) is None
         assert world.nearest(np.array([2.0, 0.1, 0.5]), 0.05) is None
-        assert world.lowest() == pytest.approx(-0.8 - effect_rooms.RADIUS, abs=2e-3)
+        assert world.lowest_height() == pytest.approx(-0.8 - effect_rooms.RADIUS, abs=2e-3)
 
 
 @pytest.mark.interpreted

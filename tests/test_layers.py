@@ -134,7 +134,6 @@ LONG = {
     "builder/spool/spool.py": 427,
     "builder/voxel/dense_voxel.py": 438,
     "server/client.py": 522,
-    "server/residency/voxel_cache.py": 527,
     "server/zenoh_server/request_lanes.py": 403,
 }
 

@@ -35,13 +35,11 @@ class CacheStats:
         self.times: deque[float] = deque(maxlen=MAX_LOAD_TIMES)
         self._evicted_at: dict[int, float] = {}  # row -> time of its last eviction
 
-    def found(self, rows: Sequence[int]) -> None:
-        """Count requested voxels that are resident or being loaded."""
-        self.hits += len(rows)
-        if self.fresh:
-            known = self.fresh.intersection(rows)
-            self.fresh -= known
-            self.used += len(known)
+    def count_used(self, rows: Sequence[int]) -> None:
+        """Count the prefetched voxels among requested ones that no request has used before."""
+        known = self.fresh.intersection(rows)
+        self.fresh -= known
+        self.used += len(known)
 
     def missed(self, rows: Sequence[int]) -> None:
         """Count requested voxels that the request itself loads."""

@@ -204,7 +204,8 @@ class Prefetcher:
         try:
             owed = residency.take_owed()
             if owed is not None:
-                residency.load_in_background(owed, lambda _: True, owed=True)
+                row = owed
+                residency.load_in_background(row, lambda _: True, owed=True)
                 return True
             while queue:
                 row, at = queue.popleft()

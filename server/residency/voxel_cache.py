@@ -12,7 +12,6 @@ that each hold half of what the other needs therefore cannot deadlock.
 import math
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 
@@ -22,48 +21,24 @@ from numpy.typing import NDArray
 from ...schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
 from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
-from .allocator import VoxelAllocator
 from .arena import ArenaBuffer
-from .cache_stats import CacheStats
 from .eviction import EvictionPolicy, make_policy
-from .held_voxels import BackgroundLoad, HeldVoxels
+from .held_voxels import BackgroundLoad, HeldVoxels, Hold
 from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
+from .voxel_states import VoxelStates
 from .voxel_store import VoxelStore
-
-# Voxels examined to find room for a prefetched one.
-MOST_CANDIDATES = 256
-
-
-class Hold:
-    """Context manager of a hold on voxels. A generator would cost a request twice as much."""
-
-    __slots__ = ("_deadline", "_residency", "_rows", "_scan", "_stop")
-
-    def __init__(
-        self, residency: "VoxelCache", rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag
-    ) -> None:
-        """Make a hold; call `VoxelCache.hold` instead."""
-        self._residency, self._rows, self._deadline, self._scan = residency, rows, deadline, scan
-        self._stop = stop
-
-    def __enter__(self) -> HeldVoxels:
-        """Wait until all readable voxels are resident, or for the deadline."""
-        return self._residency.acquire(self._rows, self._deadline, scan=self._scan, stop=self._stop)
-
-    def __exit__(self, *_: object) -> None:
-        """Release the voxels."""
-        self._residency.release(self._rows)
 
 
 class VoxelCache:
     """Resident voxels of one scene. Thread-safe.
 
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
-    kept: rows at users' positions, evicted only if a request would not fit otherwise.
-    owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
-    loaded: called with the row and the runs of each loaded voxel, by the loading thread, before the
-    voxel is visible to other threads.  took: called afterwards with the duration of the load [s].
-    proved: called with the row of each loaded voxel, before it is visible to other threads.
+    on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
+    on_loaded: called with the row and the runs of each loaded voxel, by the loading thread, before
+    the voxel is visible to other threads.  on_load_time: called afterwards with the duration of the
+    load [s].
+    on_proved: called with the row of each loaded voxel, before it is visible to other threads.
+    stats: counts of the cache, written under its lock.
     misled: whether a loaded record has points that the index places elsewhere. The index selects
     the voxels of a query; once it is wrong, it is unknown which voxels it failed to select.
     """
@@ -79,7 +54,6 @@ class VoxelCache:
         self.budget_bytes = budget_bytes
         self.buffer = ArenaBuffer(budget_bytes)
         self.where = np.full((len(store.sizes), 3), -1, np.int64)
-        self.kept: frozenset[int] = frozenset()
         self.on_owed: Callable[[], None] | None = None
         self.on_loaded: Callable[[int, NDArray[np.int64]], None] | None = None
         self.on_load_time: Callable[[float], None] | None = None
@@ -88,65 +62,56 @@ class VoxelCache:
         self._store = store
         self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
         self.policy = policy or make_policy("lru", budget_bytes)
-        self._allocator = VoxelAllocator(self.buffer, self._sizes, self.where, self.policy)
+        self._states = VoxelStates(self.buffer, self._sizes, self.where, self.policy, store.archive.where)
+        self.stats = self._states.stats
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._turns = LoadTurns()
-        self._pins: dict[int, int] = {}
-        self._loading: set[int] = set()
-        self._faults: dict[int, str] = {}  # of corrupt records: permanent
-        # Temporary faults. A voxel with one is read again only after all holds on it have ended: it
-        # never becomes resident while a kernel runs that began without it.
-        self._temporary_faults: dict[int, str] = {}
-        # Rows in `_loading` left by a request at its deadline; one that waits takes over the load.
-        self._abandoned: set[int] = set()
-        self._owed: OrderedDict[int, None] = OrderedDict()
         self._waiting_requests = 0  # number of requests that wait
-        self._stats = CacheStats(self._sizes)
+
+    @property
+    def kept(self) -> frozenset[int]:
+        """Return the rows at users' positions; others are evicted before them."""
+        return self._states.kept
+
+    @kept.setter
+    def kept(self, rows: frozenset[int]) -> None:
+        self._states.kept = rows
 
     @property
     def resident(self) -> int:
         """Return the number of voxels resident or being loaded."""
-        return len(self._allocator.offsets)
+        return len(self._states.allocator.offsets)
 
     @property
     def resident_bytes(self) -> int:
         """Return the bytes of the voxels resident or being loaded."""
-        return self._allocator.used_bytes
-
-    @property
-    def hits(self) -> int:
-        """Return the number of requested voxels that were resident or being loaded."""
-        return self._stats.hits
-
-    @property
-    def misses(self) -> int:
-        """Return the number of requested voxels that were not resident."""
-        return self._stats.misses
+        return self._states.allocator.used_bytes
 
     @property
     def evictions(self) -> int:
         """Return the number of voxels evicted to make room for others."""
-        return self._allocator.evictions
+        return self._states.allocator.evictions
 
     def counters(self) -> Counters:
         """Return the statistics of the cache."""
         with self._lock:
-            return self._stats.counters(self._allocator.evictions, self._allocator.moved_bytes)
+            allocator = self._states.allocator
+            return self.stats.counters(allocator.evictions, allocator.moved_bytes)
 
     def load_times(self) -> list[float]:
         """Return the durations of the last loads [s], in no particular order."""
         with self._lock:
-            return list(self._stats.times)
+            return list(self.stats.times)
 
     def recent(self) -> list[int]:
         """Return the index rows of the resident voxels, in order of eviction."""
         with self._lock:
-            return [row for row in self.policy.victims() if row not in self._loading]
+            return [row for row in self.policy.victims() if row not in self._states.loading]
 
     def is_resident(self, row: int) -> bool:
         """Return whether a voxel is resident or being loaded."""
-        return row in self._allocator.offsets
+        return row in self._states.allocator.offsets
 
     def bytes_of(self, rows: Sequence[int]) -> int:
         """Return the bytes that these voxels take when resident."""
@@ -166,11 +131,9 @@ class VoxelCache:
         if part:
             yield part
 
-    # --- requests -----------------------------------------------------------------------------------------
-
     def hold(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
-    ) -> "Hold":
+    ) -> Hold:
         """Load the voxels of distinct rows; pin them inside a `with` that yields `HeldVoxels`.
 
         Together they must fit in the budget. Unreadable voxels stay at -1 in `where` and are named
@@ -187,25 +150,24 @@ class VoxelCache:
 
     def use(self, rows: Sequence[int], *, scan: bool = False) -> None:
         """Record a use of resident voxels; call it inside `frozen`."""
+        stats = self.stats
         for row in rows:
             self.policy.used(row, scan=scan)
-        self._stats.found(rows)
+        stats.hits += len(rows)
+        if stats.fresh:
+            stats.count_used(rows)
 
     def acquire(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
     ) -> HeldVoxels:
         """Begin a hold; the caller must call `release` unless this raises."""
         begin = time.perf_counter()
-        turn = self._take_turn(deadline, stop) if self._missing(rows) > LOADS_WITHOUT_TURN else None
+        many = len(self._states.missing(rows)) > LOADS_WITHOUT_TURN
+        turn = self._take_turn(deadline, stop) if many else None
         try:
             return self._acquire(rows, deadline, scan, stop, begin)
         finally:
             self._turns.give_back(turn)
-
-    def _missing(self, rows: Sequence[int]) -> int:
-        """Return how many rows are neither resident nor being loaded, and have no fault."""
-        offsets = self._allocator.offsets
-        return sum(row not in offsets and not self._fault(row) for row in rows)
 
     def _take_turn(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
         """Wait for a turn to load; `_waiting_requests` counts the request meanwhile."""
@@ -222,6 +184,7 @@ class VoxelCache:
         self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag, begin: float
     ) -> HeldVoxels:
         """Begin a hold. begin: time of the call of `acquire` on time.perf_counter()'s clock [s]."""
+        states = self._states
         mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
         if settled:
             return HeldVoxels(len(rows), 0, ())  # all are resident, and the pins keep them so
@@ -230,47 +193,49 @@ class VoxelCache:
             while True:
                 self._load(wanted, deadline, stop)
                 with self._changed:
-                    while not self._settled(rows) and self._wait(deadline, stop):
+                    while not states.settled(rows) and self._wait(deadline, stop):
                         pass
                     late_now = seconds_to(deadline, stop) == 0
-                    wanted = [] if late_now else [row for row in rows if row in self._abandoned]
+                    wanted = [] if late_now else [row for row in rows if row in states.abandoned]
                     if not wanted:
-                        faults = tuple(fault for row in rows if (fault := self._fault(row)))
-                        late = tuple(row for row in rows if not self._fault(row) and not self._is_loaded(row))
+                        faults = tuple(fault for row in rows if (fault := states.fault(row)))
+                        late = tuple(
+                            row for row in rows if not (states.fault(row) or states.is_resident(row))
+                        )
                         self._waiting_requests -= 1
-                        self._stats.late += len(late)
-                        owed = self.on_owed
+                        self.stats.late += len(late)
                         # A request that is stopped before its deadline needs nothing more.
-                        if owed is not None and time.perf_counter() >= deadline:
-                            self._owed.update(dict.fromkeys(late))
+                        if self.on_owed is not None and late and time.perf_counter() >= deadline:
+                            states.owed.update(dict.fromkeys(late))
+                        states.is_owed_free |= bool(late)
                         self._changed.notify_all()
                         break
-                    self._abandoned.difference_update(wanted)
+                    states.abandoned.difference_update(wanted)
         except BaseException:
             with self._changed:
                 self._waiting_requests -= 1
             self.release(rows)
             raise
-        if late and owed is not None:
-            owed()
+        if states.is_owed_free:
+            self._notify_owed()
         # If the only missing voxels have faults known before this call, the request did not wait.
         waited = time.perf_counter() - begin if mine or waits or late else 0.0
         return HeldVoxels(hits, len(mine), faults, late, waited)
 
-    def _is_loaded(self, row: int) -> bool:
-        """Return whether a voxel is resident and completely loaded."""
-        return row in self._allocator.offsets and row not in self._loading
-
-    def _settled(self, rows: Sequence[int]) -> bool:
-        """Return whether none of these is being loaded, or a load was left to this caller."""
-        loading = [row for row in rows if row in self._loading]
-        return not loading or any(row in self._abandoned for row in loading)
-
     def release(self, rows: Sequence[int]) -> None:
         """End a hold."""
         with self._changed:
-            self._unpin(rows)
+            self._states.unpin(rows)
             self._changed.notify_all()
+        if self._states.is_owed_free:
+            self._notify_owed()
+
+    def _notify_owed(self) -> None:
+        """Call `on_owed`, which may start a thread, without the lock."""
+        self._states.is_owed_free = False
+        on_owed = self.on_owed
+        if on_owed is not None:
+            on_owed()
 
     def _reserve(
         self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag
@@ -282,15 +247,14 @@ class VoxelCache:
         whether all are resident: if not, `_waiting_requests` counts this request. No pins if this
         raises.
         """
-        if self.bytes_of(rows) > self.buffer.total_bytes:
-            raise ValueError(
-                f"{len(rows)} voxels take {self.bytes_of(rows)} bytes, over the budget: ask in pieces"
-            )
-        offsets = self._allocator.offsets
+        taken = self.bytes_of(rows)
+        if taken > self.buffer.total_bytes:
+            raise ValueError(f"{len(rows)} voxels take {taken} bytes, over the budget: ask in pieces")
+        states, offsets = self._states, self._states.allocator.offsets
         with self._changed:
-            self._pin(rows)
-            mine = [row for row in rows if row not in offsets and not self._fault(row)]
-            settled = not mine and self._all_loaded(rows)
+            states.pin(rows)
+            mine = states.missing(rows)
+            settled = not mine and states.all_resident(rows)
             if not settled:
                 self._waiting_requests += 1
                 try:
@@ -301,22 +265,14 @@ class VoxelCache:
                     raise
             new = set(mine)
             there = [row for row in rows if row in offsets and row not in new] if not settled else rows
-            for row in there:
-                self.policy.used(row, scan=scan)
-            self._stats.found(there)
+            self.use(there, scan=scan)
             if settled:
                 return [], len(rows), False, True
-            self._stats.missed(mine)
-            self._stats.waited(there, self._loading)
-            waits = not self._loading.isdisjoint(there)
-            self._loading.update(mine)
+            self.stats.missed(mine)
+            self.stats.waited(there, states.loading)
+            waits = not states.loading.isdisjoint(there)
+            states.loading.update(mine)
             return mine, len(there), waits, False
-
-    def _all_loaded(self, rows: Sequence[int]) -> bool:
-        """Return whether all rows are resident. Each must have allocated bytes or a fault."""
-        if self._loading and not self._loading.isdisjoint(rows):
-            return False
-        return not (self._faults or self._temporary_faults) or not any(map(self._fault, rows))
 
     def _make_room(
         self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool, stop: StopFlag
@@ -326,23 +282,23 @@ class VoxelCache:
         Return the rows to load, none if the deadline comes before there is room. If this raises,
         the rows are no longer pinned.
         """
+        states = self._states
         while True:
             try:
-                if self._allocate_all(mine, scan):
+                if states.allocate_all(mine, scan):
                     return mine
             except BaseException:
-                self._unpin(rows)
+                states.unpin(rows)
                 raise
-            self._unpin(rows)
-            if self._pins or self._loading:
+            states.unpin(rows)
+            if states.pins or states.loading:
                 has_room = self._wait(deadline, stop)
             else:
-                # No other request holds anything, but the free runs lie between this caller's
-                # voxels.
-                self._allocator.evict_all_but(set(rows), self._stats.evicted)
+                # No other request holds anything: this caller's voxels lie between the free runs.
+                states.evict_all_but(rows)
                 has_room = True
-            self._pin(rows)
-            mine = [row for row in rows if row not in self._allocator.offsets and not self._fault(row)]
+            states.pin(rows)
+            mine = states.missing(rows)
             if not has_room:
                 return []
 
@@ -353,73 +309,14 @@ class VoxelCache:
                 break
         return seconds_to(deadline, stop) != 0
 
-    def _pin(self, rows: Sequence[int]) -> None:
-        for row in rows:
-            self._pins[row] = self._pins.get(row, 0) + 1
-
-    def _allocate_all(self, rows: list[int], scan: bool) -> bool:
-        """Make room for every row, or for none. Voxels at users' positions are evicted last."""
-        done = 0
-        try:
-            for row in rows:
-                if not self._make_one(row, scan):
-                    break
-                done += 1
-        finally:
-            if done < len(rows):
-                for row in rows[:done]:
-                    self._allocator.forget(row)
-        return done == len(rows)
-
-    def _make_one(self, row: int, scan: bool) -> bool:
-        evicted = self._stats.evicted
-        return any(
-            self._allocator.allocate(row, may_evict, self._free, evicted, scan=scan)
-            for may_evict in (self._idle, self._free)
-        )
-
-    def _free(self, row: int) -> bool:
-        """Return whether no thread uses or loads a voxel."""
-        return row not in self._pins and row not in self._loading
-
-    def _idle(self, row: int) -> bool:
-        """Return whether a voxel is free and not at a user's position."""
-        return row not in self._pins and row not in self._loading and row not in self.kept
-
-    def _unpin(self, rows: Sequence[int]) -> None:
-        for row in rows:
-            self._pins[row] -= 1
-            if not self._pins[row]:
-                del self._pins[row]
-                self._temporary_faults.pop(row, None)
-                if row in self._abandoned:
-                    self._drop_abandoned(row)
-
-    def _drop_abandoned(self, row: int) -> None:
-        """Release the bytes of a voxel whose load never began."""
-        self._abandoned.discard(row)
-        self._loading.discard(row)
-        self._allocator.forget(row)
-        if row in self._owed and self.on_owed is not None:
-            self.on_owed()
-
     def _abandon(self, rows: list[int]) -> None:
         """Leave loads that have not begun to the other requests that hold these rows."""
         with self._changed:
-            for row in rows:
-                self._abandoned.add(row)
-                if self._pins[row] == 1:  # only the caller holds it
-                    self._drop_abandoned(row)
+            self._states.abandon(rows)
             self._changed.notify_all()
 
-    def _fault(self, row: int) -> str:
-        """Return why a voxel cannot be read; "" if it has no fault."""
-        return self._faults.get(row, "") or self._temporary_faults.get(row, "")
-
-    # --- loads --------------------------------------------------------------------------------------------
-
     def _load(self, rows: list[int], deadline: float, stop: StopFlag) -> None:
-        """Load reserved rows: each leaves `_loading`, loaded or faulty, or is left to others."""
+        """Load reserved rows: each is resident or faulty afterwards, or is left to others."""
         for number, row in enumerate(rows):
             if seconds_to(deadline, stop) == 0:
                 self._abandon(rows[number:])
@@ -429,7 +326,7 @@ class VoxelCache:
             except BaseException as error:
                 with self._changed:
                     for left in rows[number + 1 :]:
-                        self._fail(left, f"not loaded ({error!r}): ask again")
+                        self._states.fail(left, f"not loaded ({error!r}): ask again")
                     self._changed.notify_all()
                 raise
 
@@ -437,7 +334,7 @@ class VoxelCache:
         """Load a voxel whose bytes are allocated; return whether it is resident then."""
         begin, where, fault, corrupt = time.perf_counter(), None, "", False
         try:
-            where = self._store.load(row, self.buffer.arena, self._allocator.offsets[row])
+            where = self._store.load(row, self.buffer.arena, self._states.allocator.offsets[row])
             if self.on_proved is not None:
                 self.on_proved(row)
             if self.on_loaded is not None:
@@ -449,41 +346,23 @@ class VoxelCache:
             fault = f"cannot be read ({error}): check the disk"
         except BaseException as error:
             with self._changed:
-                self._fail(row, f"not loaded ({error!r}): ask again")
+                self._states.fail(row, f"not loaded ({error!r}): ask again")
                 self._changed.notify_all()
             raise
         with self._changed:
             if where is None:
-                self._fail(row, fault, corrupt=corrupt)
+                self._states.fail(row, fault, corrupt=corrupt)
             else:
-                self.where[row] = where
-                self._loading.discard(row)
-                self._stats.times.append(seconds := time.perf_counter() - begin)
+                self._states.end_load(row, where, seconds := time.perf_counter() - begin)
             self._changed.notify_all()
         if where is not None and self.on_load_time is not None:
             self.on_load_time(seconds)
         return where is not None
 
-    def _fail(self, row: int, fault: str, *, corrupt: bool = False) -> None:
-        """Record a failed load: permanently if `corrupt`, else for requests that hold the row."""
-        self._stats.lost(row)
-        self._allocator.forget(row)
-        self._loading.discard(row)
-        if corrupt:
-            self._faults[row] = fault
-        elif row in self._pins:
-            self._temporary_faults[row] = f"{self._store.archive.where(row)}: {fault}"
-
     def take_owed(self) -> int | None:
         """Return the voxel whose load has been owed longest; None if no load is owed."""
         with self._lock:
-            for row in list(self._owed):
-                if row in self._abandoned:  # a waiting request may load it; if none does, it is owed again
-                    continue
-                del self._owed[row]
-                if row not in self._allocator.offsets and not self._fault(row):
-                    return row
-        return None
+            return self._states.take_owed()
 
     def wait_until_idle(self) -> None:
         """Wait until no request waits for voxels."""
@@ -502,26 +381,20 @@ class VoxelCache:
         with self._changed:
             if not owed:
                 self.wait_until_idle()
-            if row in self._allocator.offsets or self._fault(row):
-                return BackgroundLoad.RESIDENT if row in self._allocator.offsets else BackgroundLoad.FAILED
-            if not self._allocator.allocate(
-                row, lambda other: self._idle(other) and may_evict(other), self._free, self._stats.evicted, scan=False,
-                most=MOST_CANDIDATES,
-            ):  # fmt: skip
+            states = self._states
+            if row in states.allocator.offsets:
+                return BackgroundLoad.RESIDENT
+            if states.fault(row):
+                return BackgroundLoad.FAILED
+            if not states.allocate_for_prefetch(row, may_evict):
                 return BackgroundLoad.NO_ROOM
-            self._loading.add(row)
+            states.loading.add(row)
             if not owed:
-                self._stats.begun_ahead(row)
+                self.stats.begun_ahead(row)
         return BackgroundLoad.RESIDENT if self._load_one(row) else BackgroundLoad.FAILED
 
     def check(self) -> None:
-        """Assert the invariants: bytes add up, and runs neither overlap nor leave the buffer."""
+        """Assert the invariants of the states between two operations."""
         with self._changed:
-            self._allocator.check()
-            offsets = set(self._allocator.offsets)
-            resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
-            assert resident == offsets - self._loading
-            assert self._abandoned <= self._loading <= offsets and self._abandoned <= set(self._pins)
-            assert all(count > 0 for count in self._pins.values())
-            assert self._stats.fresh <= offsets and self._waiting_requests >= 0
-            self._stats.check()
+            self._states.check()
+            assert self._waiting_requests >= 0

@@ -160,7 +160,7 @@ def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np
     last[0, :3, :3] = turn_z(0.02)
     with judged_sweeps.opened(case) as data:
         wide = judged_sweeps.ask(data, body, 0.02, first, last)
-        loaded = data.residency.misses
+        loaded = data.residency.stats.misses
         judged_sweeps.judge(case, data, body, 0.02, first, last, wide)
     assert wide.verdict[0] == Verdict.CONTACT and 0.7 < wide.upper[0] < 0.9
     with Archive(case.archive) as archive:
@@ -173,7 +173,7 @@ def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np
     with judged_sweeps.opened(case) as data:
         found = judged_sweeps.ask(data, body, 0.02, last, at(-1.0, 1.0, 1.0))
         assert found.verdict[0] == Verdict.CONTACT and found.upper[0] < 0.2
-        assert data.residency.misses < 0.6 * loaded
+        assert data.residency.stats.misses < 0.6 * loaded
 
 
 @pytest.mark.case(21, "voxels that cannot be read: unknown from there on along the motion, exact before")

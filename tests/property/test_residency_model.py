@@ -148,7 +148,7 @@ class ResidencyMachine(RuleBasedStateMachine):
         """What is held is there and whole; the bytes add up and stay within the budget."""
         self.residency.check()
         assert self.residency.resident_bytes <= BUDGET * BLOCK
-        assert self.residency.hits + self.residency.misses == self.asked
+        assert self.residency.stats.hits + self.residency.stats.misses == self.asked
         for holding in self.open:
             for row in holding.good:
                 first = int(self.residency.where[row, 0])

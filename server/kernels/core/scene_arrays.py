@@ -219,8 +219,8 @@ def lay_out(voxel, links, arena, at_bytes, block_words, where):
     """Write the rows and blocks of a checked voxel into the arena, from byte `at_bytes` on.
 
     at_bytes: a multiple of 16.
-    voxel: (cells, nodes, top_shift) of schemas/archive/codec.py `DecompressedRecord`; center is therefore
-    (3, n).
+    voxel: (cells, nodes, top_shift) of schemas/archive/codec.py `DecompressedRecord`; center is
+    therefore (3, n).
     links: its Links without the height.
     Writes where (3,) int64: first row [words], first block [ints], first lane [halves]. The points
     belong at the first lane (schemas/archive/codec.py, `DecompressedRecord.read_points`).
@@ -273,8 +273,8 @@ def lay_out(voxel, links, arena, at_bytes, block_words, where):
 def lay_classes(links, classes, ints, where):
     """Write the radius classes of a voxel that `lay_out` wrote: of its points, then of its nodes.
 
-    links: as for `lay_out`.  classes: (b, LANES) uint8, from `DecompressedRecord.read_classes`, in the
-    order of the blocks.  where: (3,) int64, see `lay_out`.
+    links: as for `lay_out`.  classes: (b, LANES) uint8, from `DecompressedRecord.read_classes`, in
+    the order of the blocks.  where: (3,) int64, see `lay_out`.
     """
     first, is_leaf, _ = links
     block = classes.shape[0]

@@ -54,7 +54,7 @@ def test_a_corrupt_record_is_unknown_where_it_matters_and_nowhere_else(tmp_path:
             assert len(answers.faults) == 1 and answers.faults[0].startswith(where)
         assert scene.collide("long", at((1.5, 0, 0))).verdict.tolist() == [CONTACT]
         scene.residency.check()
-        assert scene.residency.misses == 3, "of four voxels the last is out of every reach"
+        assert scene.residency.stats.misses == 3, "of four voxels the last is out of every reach"
 
 
 def test_a_pose_over_the_budget_is_looked_at_in_pieces(tmp_path: Path, rng: np.random.Generator) -> None:

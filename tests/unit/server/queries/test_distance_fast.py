@@ -49,7 +49,7 @@ def test_what_is_resident_is_answered_in_one_call_and_counted_as_used(
         assert left.count == 1 and again.misses == 0 and again.hits == first.misses + first.hits
         assert again.signed_distance.tolist() == pytest.approx([0.19], abs=1e-6)
         assert again.witness_cloud[0].tolist() == pytest.approx([0.5, 0, 0], abs=1e-3)
-        assert scene.residency.hits == again.hits
+        assert scene.residency.stats.hits == again.hits
         scene.residency.check()
 
 

@@ -130,9 +130,9 @@ def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
     with judged_sweeps.opened(case) as data:
         same(probe, data, first, last)
         monkeypatch.setattr(module, "sweep", counted)
-        used = data.residency.hits
+        used = data.residency.stats.hits
         same(probe, data, first, last)
-        assert not left and data.residency.hits > used
+        assert not left and data.residency.stats.hits > used
         turned = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (6, 1, 1))
         turned[:, 0, 1], turned[:, 1, 0] = -1.0, 1.0
         turned[:, :3, 3] = first[:, :3, 3]

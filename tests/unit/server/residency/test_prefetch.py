@@ -24,7 +24,7 @@ class Wishes:
         self.gone: list[str] = []
         self.plans = 0
 
-    def saw(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
+    def record_pose(self, user: User, now: float, center: tuple[float, float, float], reach: float) -> bool:
         """Whether a user comes from nowhere is read off its reach."""
         return reach > 100.0
 
@@ -153,6 +153,22 @@ def test_what_came_too_late_for_a_request_is_loaded_after_it() -> None:
         assert until(lambda: table.resident() == [0, 2])
         counters = table.residency.counters()
         assert (counters.late, counters.prefetched, counters.used) == (2, 0, 0)
+    table.residency.check()
+
+
+def test_an_owed_load_that_raises_is_not_prefetched_soon_after() -> None:
+    table = Table([1] * 3, 3)
+    table.store.faults[1] = "out of memory"
+    with table.prefetcher:
+        with table.residency.hold([1], 0.0) as held:
+            assert held.late == (1,)
+        assert until(lambda: table.store.loads[1] == 1 and bool(table.prefetcher._failed))
+        assert list(table.prefetcher._failed) == [1]
+        table.store.faults.clear()
+        table.wishes.wanted = {1: 0.1, 2: 0.2}
+        table.see()
+        assert until(lambda: table.resident() == [2])
+        assert table.store.loads[1] == 1
     table.residency.check()
 
 

@@ -52,7 +52,7 @@ def test_the_least_recently_used_goes_first() -> None:
     for row in (0, 1, 2, 0, 3):
         take(residency, [row])
     assert resident(residency) == [0, 2, 3]
-    assert (residency.hits, residency.misses, residency.evictions) == (1, 4, 1)
+    assert (residency.stats.hits, residency.stats.misses, residency.evictions) == (1, 4, 1)
     assert take(residency, [2, 4]) == HeldVoxels(1, 1, ())
     assert resident(residency) == [2, 3, 4] and store.loads == {0: 1, 1: 1, 2: 1, 3: 1, 4: 1}
     assert residency.resident_bytes == 3 * BLOCK
@@ -178,7 +178,7 @@ def test_who_waits_for_a_load_that_raises_is_answered() -> None:
         first = pool.submit(take, residency, [0])
         assert store.wait_for_load(0, DEADLINE)
         second = pool.submit(take, residency, [0])
-        while residency._pins.get(0, 0) < 2:
+        while residency._states.pins.get(0, 0) < 2:
             pass
         store.gate.set()
         with pytest.raises(MemoryError):
@@ -193,15 +193,15 @@ def test_check_finds_what_is_broken(broken: str) -> None:
     take(residency, [0, 1])
     residency.check()
     if broken == "bytes":
-        residency._allocator.used_bytes += BLOCK
+        residency._states.allocator.used_bytes += BLOCK
     elif broken == "overlap":
-        residency._allocator.offsets[1] = residency._allocator.offsets[0]
+        residency._states.allocator.offsets[1] = residency._states.allocator.offsets[0]
     elif broken == "lost run":
         residency.buffer.allocate(BLOCK)
     elif broken == "where":
         residency.where[1] = -1
     else:
-        residency._pins[1] = 0
+        residency._states.pins[1] = 0
     with pytest.raises(AssertionError):
         residency.check()
 
@@ -243,7 +243,7 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
         assert stats.requests == len(parts) and stats.unknown == sum(unknown)
         assert sum(user.requests for user in stats.users) == stats.requests
         assert sum(user.misses for user in stats.users) <= stats.misses
-        assert stats.prefetched == stats.used + stats.wasted + len(scene.residency._stats.fresh)
+        assert stats.prefetched == stats.used + stats.wasted + len(scene.residency.stats.fresh)
         assert policy != "lru" or stats.prefetched == 0
     for part, verdict in zip(parts, verdicts, strict=True):
         assert verdict == expected[part].tolist()
@@ -253,7 +253,7 @@ def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.M
     store = FakeStore([1, 1, 1, 1, 2, 2])
     residency = VoxelCache(store, 4 * BLOCK)
     take(residency, [0, 1, 2, 3])
-    made = residency._allocator.allocate
+    made = residency._states.allocator.allocate
 
     def make(row: int, *what: object, **more: object) -> bool:
         """Room for the first, and no memory for the second."""
@@ -262,10 +262,10 @@ def test_an_error_while_room_is_made_leaves_nothing_pinned(monkeypatch: pytest.M
         return made(row, *what, **more)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patched:
-        patched.setattr(residency._allocator, "allocate", make)
+        patched.setattr(residency._states.allocator, "allocate", make)
         with pytest.raises(MemoryError), residency.hold([4, 5]):
             pass
-    assert not residency._pins and not residency._loading and residency._waiting_requests == 0
+    assert not residency._states.pins and not residency._states.loading and residency._waiting_requests == 0
     residency.check()
     assert take(residency, [4, 5]) == HeldVoxels(0, 2, ()) and store.loads[4] == 1
 
@@ -306,9 +306,9 @@ def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     residency.on_owed = lambda: told.append(None)
     # Reserved by one whose deadline comes before the load begins.
     residency._reserve([1], float("inf"), False, NO_STOP)
-    residency._pin([1])  # another waits for it
+    residency._states.pin([1])  # another waits for it
     residency._abandon([1])
-    residency._owed[1] = None
+    residency._states.owed[1] = None
     assert residency.take_owed() is None, "who waits may load it"
     residency.release([1])
     residency.release([1])

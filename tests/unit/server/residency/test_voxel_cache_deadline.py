@@ -12,7 +12,7 @@ from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
 from solidcloud.server.residency.held_voxels import HeldVoxels
 from solidcloud.server.residency.voxel_cache import VoxelCache
-from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, StopFlag
+from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, NO_STOP, StopFlag
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
@@ -88,7 +88,7 @@ def test_a_load_that_was_not_begun_is_taken_over_by_who_waits_for_it() -> None:
         hurried = pool.submit(take, residency, [0, 1], deadline)
         assert store.wait_for_load(0, PATIENCE)
         patient = pool.submit(take, residency, [1])
-        while residency._pins.get(1, 0) < 2 or time.perf_counter() < deadline:
+        while residency._states.pins.get(1, 0) < 2 or time.perf_counter() < deadline:
             time.sleep(0.001)
         store.gate.set()
         assert hurried.result(PATIENCE).late in ((1,), ()), "unless the other was faster to load it"
@@ -123,12 +123,37 @@ def test_a_stopped_request_is_owed_nothing() -> None:
     residency.check()
 
 
+def test_a_load_is_owed_without_the_lock() -> None:
+    """The callback may start a thread, and wait for it."""
+    residency = VoxelCache(FakeStore([1, 1]), 2 * BLOCK)
+    free: list[bool] = []
+
+    def try_the_lock() -> bool:
+        with ThreadPoolExecutor(1) as pool:
+            taken: bool = pool.submit(residency._lock.acquire, timeout=1.0).result()
+            if taken:
+                pool.submit(residency._lock.release).result()
+            return taken
+
+    residency.on_owed = lambda: free.append(try_the_lock())
+    with residency.hold([0], 0.0) as held:
+        assert held.late == (0,)
+    residency._reserve([1], float("inf"), False, NO_STOP)
+    residency._states.pin([1])  # another waits for it
+    residency._abandon([1])
+    residency._states.owed[1] = None
+    residency.release([1])
+    residency.release([1])
+    residency._waiting_requests -= 1
+    assert free == [True, True]
+
+
 def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
     residency = VoxelCache(FakeStore([1, 1, 1]), 2 * BLOCK)
     tries: list[list[int]] = []
-    allocate = residency._allocate_all
+    allocate = residency._states.allocate_all
     monkeypatch.setattr(
-        residency, "_allocate_all", lambda rows, scan: tries.append(rows) or allocate(rows, scan)
+        residency._states, "allocate_all", lambda rows, scan: tries.append(rows) or allocate(rows, scan)
     )
     stop = StopFlag()
     with ThreadPoolExecutor(1) as pool:
@@ -174,7 +199,7 @@ def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:
         for held, hurried in pool.map(one, range(600), timeout=10 * PATIENCE):
             assert hurried or not held.late
     residency.check()
-    assert not residency._pins and not residency._loading and not residency._abandoned
+    assert not residency._states.pins and not residency._states.loading and not residency._states.abandoned
 
 
 def test_a_kernel_does_not_see_what_comes_late(tmp_path: Path) -> None:

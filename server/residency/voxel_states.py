@@ -1,0 +1,192 @@
+"""States of the voxels of a cache: pinned, being loaded, abandoned, owed, faulty; bytes for a load.
+
+Not thread-safe: `VoxelCache` calls it under its lock.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .allocator import VoxelAllocator
+from .arena import ArenaBuffer
+from .cache_stats import CacheStats
+from .eviction import EvictionPolicy
+
+# Voxels examined to find room for a prefetched one.
+MAX_CANDIDATES = 256
+
+
+class VoxelStates:
+    """States of all voxels by index row.
+
+    A voxel whose bytes are allocated is resident, unless it is in `loading`.
+
+    pins: row -> number of holds, for held rows.  loading: rows whose load has not ended.
+    abandoned: rows in `loading` that a request left at its deadline; one that waits takes over the
+    load.  owed: rows that a request did not get by its deadline, the earliest first.
+    is_owed_free: whether the last hold on an abandoned voxel whose load is owed has ended.
+    kept: rows at users' positions, evicted only if a request would not fit otherwise.
+    where, policy: see `VoxelCache`.  sizes: bytes of each row in the arena.
+    """
+
+    def __init__(
+        self,
+        buffer: ArenaBuffer,
+        sizes: list[int],
+        where: NDArray[np.int64],
+        policy: EvictionPolicy,
+        describe: Callable[[int], str],
+    ) -> None:
+        """Begin with nothing resident. describe: returns file and voxel of a row, for faults."""
+        self.allocator = VoxelAllocator(buffer, sizes, where, policy)
+        self.stats = CacheStats(sizes)
+        self.where, self.sizes = where, sizes
+        self.pins: dict[int, int] = {}
+        self.loading: set[int] = set()
+        self.abandoned: set[int] = set()
+        self.owed: OrderedDict[int, None] = OrderedDict()
+        self.is_owed_free = False
+        self.kept: frozenset[int] = frozenset()
+        self._describe = describe
+        self._faults: dict[int, str] = {}  # of corrupt records: permanent
+        # Temporary faults. A voxel with one is read again only after all holds on it have ended: it
+        # never becomes resident while a kernel runs that began without it.
+        self._temporary_faults: dict[int, str] = {}
+
+    def fault(self, row: int) -> str:
+        """Return why a voxel cannot be read; "" if it has no fault."""
+        return self._faults.get(row, "") or self._temporary_faults.get(row, "")
+
+    def missing(self, rows: Iterable[int]) -> list[int]:
+        """Return the rows that are neither resident nor being loaded, and have no fault."""
+        offsets = self.allocator.offsets
+        return [row for row in rows if row not in offsets and not self.fault(row)]
+
+    def is_resident(self, row: int) -> bool:
+        """Return whether a voxel is resident and completely loaded."""
+        return row in self.allocator.offsets and row not in self.loading
+
+    def all_resident(self, rows: Sequence[int]) -> bool:
+        """Return whether all rows are resident. Each must have allocated bytes or a fault."""
+        if self.loading and not self.loading.isdisjoint(rows):
+            return False
+        return not (self._faults or self._temporary_faults) or not any(map(self.fault, rows))
+
+    def settled(self, rows: Sequence[int]) -> bool:
+        """Return whether none of these is being loaded, or a load was left to this caller."""
+        loading = [row for row in rows if row in self.loading]
+        return not loading or any(row in self.abandoned for row in loading)
+
+    # --- pins ---
+
+    def pin(self, rows: Sequence[int]) -> None:
+        """Begin a hold on rows."""
+        for row in rows:
+            self.pins[row] = self.pins.get(row, 0) + 1
+
+    def unpin(self, rows: Sequence[int]) -> None:
+        """End a hold on rows."""
+        for row in rows:
+            self.pins[row] -= 1
+            if not self.pins[row]:
+                del self.pins[row]
+                self._temporary_faults.pop(row, None)
+                if row in self.abandoned:
+                    self._drop_abandoned(row)
+
+    def abandon(self, rows: Sequence[int]) -> None:
+        """Leave loads that have not begun to the other requests that hold these rows."""
+        for row in rows:
+            self.abandoned.add(row)
+            if self.pins[row] == 1:  # only the caller holds it
+                self._drop_abandoned(row)
+
+    def _drop_abandoned(self, row: int) -> None:
+        """Release the bytes of a voxel whose load never began."""
+        self.abandoned.discard(row)
+        self.loading.discard(row)
+        self.allocator.forget(row)
+        self.is_owed_free |= row in self.owed
+
+    def take_owed(self) -> int | None:
+        """Return the voxel whose load has been owed longest; None if no load is owed."""
+        for row in list(self.owed):
+            if row in self.abandoned:  # a waiting request may load it; if none does, it is owed again
+                continue
+            del self.owed[row]
+            if row not in self.allocator.offsets and not self.fault(row):
+                return row
+        return None
+
+    # --- bytes ---
+
+    def allocate_all(self, rows: Sequence[int], scan: bool) -> bool:
+        """Make room for every row, or for none. Voxels at users' positions are evicted last."""
+        done = 0
+        try:
+            for row in rows:
+                if not self._allocate(row, scan):
+                    break
+                done += 1
+        finally:
+            if done < len(rows):
+                for row in rows[:done]:
+                    self.allocator.forget(row)
+        return done == len(rows)
+
+    def _allocate(self, row: int, scan: bool) -> bool:
+        evicted = self.stats.evicted
+        return any(
+            self.allocator.allocate(row, may_evict, self._is_free, evicted, scan=scan)
+            for may_evict in (self._is_unneeded, self._is_free)
+        )
+
+    def allocate_for_prefetch(self, row: int, may_evict: Callable[[int], bool]) -> bool:
+        """Make room for one row; see `VoxelCache.load_in_background`."""
+        return self.allocator.allocate(
+            row, lambda other: self._is_unneeded(other) and may_evict(other), self._is_free, self.stats.evicted,
+            scan=False, most=MAX_CANDIDATES,
+        )  # fmt: skip
+
+    def evict_all_but(self, rows: Sequence[int]) -> None:
+        """Evict all voxels but these and move these together; none may be in use or loading."""
+        self.allocator.evict_all_but(set(rows), self.stats.evicted)
+
+    def _is_free(self, row: int) -> bool:
+        """Return whether no thread uses or loads a voxel."""
+        return row not in self.pins and row not in self.loading
+
+    def _is_unneeded(self, row: int) -> bool:
+        """Return whether a voxel is free and not at a user's position."""
+        return row not in self.pins and row not in self.loading and row not in self.kept
+
+    # --- ends of loads ---
+
+    def end_load(self, row: int, where: NDArray[np.int64], seconds: float) -> None:
+        """Make a loaded voxel visible to others. seconds: the duration of the load [s]."""
+        self.where[row] = where
+        self.loading.discard(row)
+        self.stats.times.append(seconds)
+
+    def fail(self, row: int, fault: str, *, corrupt: bool = False) -> None:
+        """Record a failed load: permanently if `corrupt`, else for requests that hold the row."""
+        self.stats.lost(row)
+        self.allocator.forget(row)
+        self.loading.discard(row)
+        if corrupt:
+            self._faults[row] = fault
+        elif row in self.pins:
+            self._temporary_faults[row] = f"{self._describe(row)}: {fault}"
+
+    def check(self) -> None:
+        """Assert the invariants: bytes add up, and runs neither overlap nor leave the buffer."""
+        self.allocator.check()
+        offsets = set(self.allocator.offsets)
+        resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
+        assert resident == offsets - self.loading
+        assert self.abandoned <= self.loading <= offsets and self.abandoned <= set(self.pins)
+        assert all(count > 0 for count in self.pins.values())
+        assert self.stats.fresh <= offsets
+        self.stats.check()

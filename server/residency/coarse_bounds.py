@@ -188,7 +188,8 @@ def drop_clear_pairs(
     that `collide_poses` would find clear.
     """
     needed = reach.starts[-1]
-    if not len(coarse.count) or not any_with_coarse_bounds(arrays.where, coarse.slot, reach.rows, needed):
+    slot = coarse.slot
+    if not len(slot) or not any_with_coarse_bounds(arrays.where, slot, reach.rows, needed, arrays.stop):
         return reach, 0
     starts, rows = np.empty_like(reach.starts), np.empty(needed, np.int64)
     removed = copy_unproved_pairs(poses, avatar, arrays, coarse, reach, starts, rows)

@@ -22,7 +22,7 @@ from ..core.node_overlap import (
     set_class_thresholds,
 )
 from ..core.placed_avatar import MAX_FRONT, make_placed, place_block, place_front, place_root
-from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, stopped
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, ROWS_AT_ONCE, node_class, stopped
 
 # Nodes of a slot, 48 bytes each. Share of the clear pairs of pose and voxel that this many nodes
 # settle, on the walk through a generated town of 10^7 points (voxels of 8 m, mean 282 KB decoded):
@@ -93,10 +93,15 @@ def write_coarse_bounds(words, ints, root, assumed, out, number):
 
 
 @nb.njit(nogil=True, cache=True)
-def any_with_coarse_bounds(where, slot, rows, count):
-    """Return whether one of the first `count` voxel rows is not resident and has a slot."""
-    for row in rows[:count]:  # noqa: SIM110  `any` of a generator is not compiled
-        if where[row, 0] < 0 and slot[row] >= 0:
+def any_with_coarse_bounds(where, slot, rows, count, stop):
+    """Return whether one of the first `count` voxel rows is not resident and has a slot.
+
+    Returns False once the stop flag is set.
+    """
+    for at in range(count):
+        if at % ROWS_AT_ONCE == 0 and stopped(stop):
+            return False
+        if where[rows[at], 0] < 0 and slot[rows[at]] >= 0:
             return True
     return False
 
@@ -108,7 +113,8 @@ def copy_unproved_pairs(poses, avatar, scene, coarse, reach, starts, rows):
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
     (voxels_in_reach.py). A pair is a pose and a voxel. Writes starts (k + 1,) and rows, which are
     as long as those in `reach` and in the same order. It omits a voxel that is not resident, has a
-    slot, and has no node there whose bound comes within reach. Returns how many were omitted.
+    slot, and has no node there whose bound comes within reach. Returns how many were omitted; 0, with the output
+    incomplete, once the scene's stop flag is set.
     """
     placed, by_class = make_placed(avatar), make_class_thresholds(scene.radius_deficit)
     bounds = np.empty((4, MAX_FRONT), np.float32)
@@ -129,6 +135,8 @@ def _copy_unproved_pairs(
         starts[i] = left
         front = 0  # its length; not placed yet, as most poses never need it
         for at in range(reach.starts[i], reach.starts[i + 1]):
+            if at % ROWS_AT_ONCE == 0 and stopped(scene.stop):
+                return 0
             voxel = reach.rows[at]
             number = np.int64(coarse.slot[voxel])
             if number >= 0 and scene.where[voxel, 0] < 0 and not stopped(scene.stop):

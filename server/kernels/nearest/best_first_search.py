@@ -28,7 +28,17 @@ from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK
 from ..core.placed_avatar import MAX_REACH_UNITS, PlacedAvatar, make_placed, place_block, place_nodes
-from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, NO_LIMIT, ROW_WORDS, node_class, stopped
+from ..core.scene_arrays import (
+    COUNT,
+    COUNTED,
+    FIRST,
+    LANES,
+    NO_LIMIT,
+    ROW_WORDS,
+    ROWS_AT_ONCE,
+    node_class,
+    stopped,
+)
 from .block_distances import any_near, mark_near
 from .nearest_pair import (
     BestPair,
@@ -183,9 +193,12 @@ def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, 
     set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.deficit, within)
     search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
     keys, pairs = search.keys, search.pairs
+    root = avatar.radius[0] * reach.scales[i]
     for at in range(reach.starts[i], reach.starts[i + 1]):
+        if at % ROWS_AT_ONCE == 0 and stopped(scene.stop):
+            results.missing_bound[i] = 0.0  # as though the remaining voxels were missing
+            break
         voxel = reach.rows[at]
-        root = avatar.radius[0] * reach.scales[i]
         gap = box_distance(root, placed, best.frame[1], scene, index, voxel)
         if scene.where[voxel, 0] < 0:
             counts[0, i] += np.uint32(1)

@@ -15,8 +15,9 @@ import pytest
 import stopped_queries
 import synthetic_scans
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.collide import collide_poses
+from solidcloud.server.kernels.collide import coarse_clearance, collide_poses
 from solidcloud.server.kernels.core import scene_arrays as stopping
+from solidcloud.server.kernels.nearest import best_first_search
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.objects import find_pairs
@@ -125,6 +126,8 @@ def test_whichever_look_finds_the_flag_set_nothing_is_wrong(
             stop.set(WHY)
         return flag[0] != 0
 
+    for module in (best_first_search, coarse_clearance):
+        monkeypatch.setattr(module, "ROWS_AT_ONCE", 1)
     usual = stopping.stopped
     for name, module in list(sys.modules.items()):
         if name.startswith("solidcloud.server.kernels.") and getattr(module, "stopped", None) is usual:

@@ -11,10 +11,12 @@ from coarse_tops import ROOM, Made, open_made, rows_of, scattered
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.collide import coarse_clearance
 from solidcloud.server.kernels.collide.coarse_clearance import any_with_coarse_bounds
 from solidcloud.server.kernels.collide.collide_poses import CLEAR, CONTACT, collide_poses
 from solidcloud.server.queries.context.query_budget import NO_LIMIT
 from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs
+from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
 
 @pytest.fixture
@@ -127,8 +129,34 @@ def test_only_what_is_not_resident_and_has_a_slot_is_worth_asking() -> None:
     where = np.array([[-1, -1, -1], [0, 0, 0], [-1, -1, -1]])
     slot = np.array([0, 1, -1], np.int32)
     for rows, worth in (([0], True), ([1], False), ([2], False), ([1, 2], False), ([2, 1, 0], True)):
-        assert any_with_coarse_bounds(where, slot, np.array(rows), len(rows)) is worth
-    assert not any_with_coarse_bounds(where, slot, np.array([1, 0]), 1), "of the first alone"
+        assert any_with_coarse_bounds(where, slot, np.array(rows), len(rows), NO_STOP.flag) is worth
+    assert not any_with_coarse_bounds(where, slot, np.array([1, 0]), 1, NO_STOP.flag), "of the first alone"
+
+
+@pytest.mark.interpreted
+def test_a_stop_ends_the_search_for_pairs_to_drop(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The flag is read at least once every ROWS_AT_ONCE voxels, resident or not."""
+    made.fill()
+    rod = make_avatar(np.zeros((1, 3)), 0.01)
+    poses = shifted(*np.random.default_rng(6).uniform(0, 2, (60, 3)).tolist())
+    reach = made.reach(rod, poses, 1 << 22)
+    count, stop = int(reach.starts[-1]), StopFlag()
+    arrays = made.arrays._replace(stop=stop.flag)
+    resident = arrays._replace(where=np.zeros_like(arrays.where))
+    looks = []
+    usual = coarse_clearance.stopped
+    monkeypatch.setattr(coarse_clearance, "stopped", lambda flag: looks.append(flag) or usual(flag))
+    monkeypatch.setattr(coarse_clearance, "ROWS_AT_ONCE", 16)
+    assert count > 32
+    for state in (resident, arrays):
+        looks.clear()
+        drop_clear_pairs(state, made.coarse.arrays, rod.arrays, poses, reach)
+        assert len(looks) >= count // 16
+    assert drop_clear_pairs(arrays, made.coarse.arrays, rod.arrays, poses, reach)[1] > 0
+    stop.set("the test says so")
+    for state in (resident, arrays):
+        found, removed = drop_clear_pairs(state, made.coarse.arrays, rod.arrays, poses, reach)
+        assert found is reach and removed == 0
 
 
 @pytest.mark.interpreted

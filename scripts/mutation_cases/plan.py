@@ -224,6 +224,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("bounded deep", "collide bounded", "distance bounded"),
         *tangent("bounded"),
     ),
+    "server/kernels/nearest/pair_heap.py": work("bounded deep", "collide bounded", "distance bounded"),
     "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/motion/sweep_interval.py": work("sweep", "sweep bounded"),

@@ -50,6 +50,7 @@ from .nearest_pair import (
     upper_bound,
 )
 from .nearest_search import box_distance
+from .pair_heap import pop_top, sift_up
 
 # The search continues; no pair is open; the answer is known to the requested accuracy; the budget
 # of visits is spent.
@@ -138,42 +139,6 @@ def make_search(avatar, scene, heap):
     )  # fmt: skip
 
 
-@njit_no_refcount
-def _sift_up(keys, pairs, at):
-    """Move the pair at the end of a heap up to its place."""
-    key, tie, a, row, voxel = keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2]
-    while at > 0:
-        parent = (at - 1) // 2
-        if keys[parent, 0] < key or (keys[parent, 0] == key and keys[parent, 1] <= tie):
-            break
-        keys[at, 0], keys[at, 1] = keys[parent, 0], keys[parent, 1]
-        pairs[at, 0], pairs[at, 1], pairs[at, 2] = pairs[parent, 0], pairs[parent, 1], pairs[parent, 2]
-        at = parent
-    keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
-
-
-@njit_no_refcount
-def _pop_top(keys, pairs, size):
-    """Remove the top of a heap of `size` pairs."""
-    last = size - 1
-    key, tie, a, row, voxel = keys[last, 0], keys[last, 1], pairs[last, 0], pairs[last, 1], pairs[last, 2]
-    at = 0
-    while 2 * at + 1 < last:
-        child = 2 * at + 1
-        right = child + 1
-        if right < last and (
-            keys[right, 0] < keys[child, 0]
-            or (keys[right, 0] == keys[child, 0] and keys[right, 1] < keys[child, 1])
-        ):
-            child = right
-        if key < keys[child, 0] or (key == keys[child, 0] and tie <= keys[child, 1]):
-            break
-        keys[at, 0], keys[at, 1] = keys[child, 0], keys[child, 1]
-        pairs[at, 0], pairs[at, 1], pairs[at, 2] = pairs[child, 0], pairs[child, 1], pairs[child, 2]
-        at = child
-    keys[at, 0], keys[at, 1], pairs[at, 0], pairs[at, 1], pairs[at, 2] = key, tie, a, row, voxel
-
-
 @nb.njit(nogil=True, cache=True)
 def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, counts):
     """Start a search for pose i: all voxels in reach, with bounds from the index."""
@@ -208,7 +173,7 @@ def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, 
         deficit = search.deficits[0, node_class(scene.ints, scene.where[voxel, 0], best.mask)]
         keys[size, 0], keys[size, 1] = np.float32(gap * (1.0 - 1e-6)) + deficit, np.float32(np.inf)
         pairs[size, 0], pairs[size, 1], pairs[size, 2] = 0, NO_VOXEL, voxel
-        _sift_up(keys, pairs, size)
+        sift_up(keys, pairs, size)
         search.sizes[0] = size + 1
 
 
@@ -241,7 +206,7 @@ def _push_pair(keys, pairs, sizes, heap, spilling, cut, bounds, parent, low, hig
         sizes[1] += 1
     else:
         sizes[0] += 1
-        _sift_up(keys, pairs, at)
+        sift_up(keys, pairs, at)
 
 
 @njit_no_refcount
@@ -305,7 +270,7 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
             sizes[1] -= 1
         else:
             bounds[2] = np.float64(key)
-            _pop_top(keys, pairs, sizes[0])
+            pop_top(keys, pairs, sizes[0])
             sizes[0] -= 1
         if key > limit:
             continue

@@ -35,9 +35,8 @@ class VoxelCache:
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
     on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
     on_loaded: called with the row and the runs of each loaded voxel, by the loading thread, before
-    the voxel is visible to other threads.  on_load_time: called afterwards with the duration of the
-    load [s].
-    on_proved: called with the row of each loaded voxel, before it is visible to other threads.
+    the voxel is visible to other threads.  on_proved: called before that too, with the row.
+    on_load_time: called afterwards with the duration of the load [s].
     stats: counts of the cache, written under its lock.
     misled: whether a loaded record has points that the index places elsewhere. The index selects
     the voxels of a query; once it is wrong, it is unknown which voxels it failed to select.
@@ -167,7 +166,8 @@ class VoxelCache:
         try:
             return self._acquire(rows, deadline, scan, stop, begin)
         finally:
-            self._turns.give_back(turn)
+            if turn is not None:
+                self._turns.give_back(turn)
 
     def _take_turn(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
         """Wait for a turn to load; `_waiting_requests` counts the request meanwhile."""

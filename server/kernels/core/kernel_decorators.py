@@ -21,7 +21,7 @@ _NO_COUNTING: dict[str, Any] = {"_nrt": False}
 njit_no_refcount = nb.njit(nogil=True, cache=True, **_NO_COUNTING)
 
 # For functions that take arrays, have one or two callers and run ten or more times a pose: a call
-# passes six words for each array on the stack. With keep_near and three more inlined, distance took
+# passes six words for each array on the stack. With mark_near and three more inlined, distance took
 # 8.0 us a pose instead of 8.8; with mark_meeting, compact_marked and lanes_meet inlined, collide
 # took 3.5 instead of 4.0.
 njit_inlined = nb.njit(nogil=True, cache=True, forceinline=True, **_NO_COUNTING)

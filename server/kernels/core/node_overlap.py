@@ -23,7 +23,7 @@ U32 = 2.0**-24  # half a unit in the last place of 1, float32
 SLACK = np.float32(1e-6)
 ONE_SLACK = np.float32(1.0 + 2e-6)
 # A pair is pushed for each child of one of its nodes: at most 15 a level stay behind on the stack.
-# This size holds two trees of MOST_LEVELS.
+# This size holds two trees of MAX_LEVELS.
 STACK = 2 * MAX_LEVELS * 15 + 16
 # A scene node is called flat if its slab is thinner than this many radii of an avatar's leaf node;
 # the avatar's points are then tested against it at once. Values from 0.5 to 2 take the same time on
@@ -95,11 +95,8 @@ def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farth
     for c in range(deficit.shape[0]):
         thresholds = make_thresholds(units - deficit[c], units_per_step, extent, farthest, voxel_steps)
         by_class.threshold[c] = thresholds.reach + thresholds.error
-        by_class.near[c], by_class.far[c], by_class.units[c] = (
-            thresholds.near,
-            thresholds.far,
-            thresholds.units,
-        )
+        by_class.near[c], by_class.far[c] = thresholds.near, thresholds.far
+        by_class.units[c] = thresholds.units
 
 
 @njit_no_refcount

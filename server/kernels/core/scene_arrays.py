@@ -99,49 +99,6 @@ class SceneArrays(NamedTuple):
     stop: NDArray[np.int64]
 
 
-@nb.intrinsic
-def _load(context, flag):  # type: ignore[no-untyped-def]
-    """Load the first element of an array (1,) int64 atomically."""
-
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        return builder.load_atomic(array.data, "monotonic", 8)
-
-    return nb.types.int64(flag), generate
-
-
-@njit_inlined
-def _stopped(flag):
-    return _load(flag) != 0  # type: ignore[call-arg]  # an intrinsic's first parameter is the compiler's
-
-
-def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
-    return flag[0] != 0
-
-
-# stopped(flag): return whether the flag (1,) int64 is set. Intrinsics cannot be interpreted.
-stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
-
-
-@njit_inlined
-def should_end(flag, visits, most):
-    """Return whether a search ends early.
-
-    It does once its request is stopped or it has cost more than `most` node visits.
-    """
-    return stopped(flag) or visits > most
-
-
-@nb.njit(nogil=True, cache=True)
-def copy_rows(rows, to, count, flag):
-    """Copy the first `count` rows of a table; end early once the stop flag is set."""
-    for begin in range(0, count, ROWS_AT_ONCE):
-        if stopped(flag):
-            return
-        end = min(begin + ROWS_AT_ONCE, count)
-        to[begin:end] = rows[begin:end]
-
-
 def block_words(radius_class: bool) -> int:
     """Return the number of words of a block in an archive with or without radius classes."""
     return CLASSED_BLOCK_WORDS if radius_class else BLOCK_WORDS
@@ -297,3 +254,46 @@ def lay_classes(links, classes, ints, where):
                 own = np.int64(ints[where[0] + child * ROW_WORDS + COUNT]) >> CLASS_SHIFT
                 largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
         ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | ((largest | all_rim) << CLASS_SHIFT)
+
+
+@nb.intrinsic
+def _load(context, flag):  # type: ignore[no-untyped-def]
+    """Load the first element of an array (1,) int64 atomically."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        return builder.load_atomic(array.data, "monotonic", 8)
+
+    return nb.types.int64(flag), generate
+
+
+@njit_inlined
+def _stopped(flag):
+    return _load(flag) != 0  # type: ignore[call-arg]  # an intrinsic's first parameter is the compiler's
+
+
+def _stopped_interpreted(flag):  # type: ignore[no-untyped-def]
+    return flag[0] != 0
+
+
+# stopped(flag): return whether the flag (1,) int64 is set. Intrinsics cannot be interpreted.
+stopped = _stopped_interpreted if nb.config.DISABLE_JIT else _stopped
+
+
+@njit_inlined
+def should_end(flag, visits, most):
+    """Return whether a search ends early.
+
+    It does once its request is stopped or it has cost more than `most` node visits.
+    """
+    return stopped(flag) or visits > most
+
+
+@nb.njit(nogil=True, cache=True)
+def copy_rows(rows, to, count, flag):
+    """Copy the first `count` rows of a table; end early once the stop flag is set."""
+    for begin in range(0, count, ROWS_AT_ONCE):
+        if stopped(flag):
+            return
+        end = min(begin + ROWS_AT_ONCE, count)
+        to[begin:end] = rows[begin:end]

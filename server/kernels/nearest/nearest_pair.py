@@ -65,9 +65,9 @@ class BestPair(NamedTuple):
     units: (2,) int64, exact units: the reach, and an upper bound of the least |a - b| + deficit.
     counters: (4,) int64, node visits, point tests, candidates, and the largest number of visits of
     a pose.
-    candidates: (MOST_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
+    candidates: (MAX_CANDIDATES, 5) int64, points of the avatar that may belong to the nearest
     pair, and their place in the scene: block, lane, block_at, lane_at, class of the leaf node.
-    candidate_squares: (MOST_CANDIDATES,) float32, their least squares there.
+    candidate_squares: (MAX_CANDIDATES,) float32, their least squares there.
     """
 
     found: NDArray[np.int64]

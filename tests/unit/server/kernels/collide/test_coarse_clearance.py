@@ -173,7 +173,7 @@ def test_radii_of_a_model_are_those_of_the_nodes(tmp_path: Path) -> None:
     poses = shifted((0.5, 0.5, 0.1 - 0.02), (0.5, 0.5, 1.0 - 0.02))
     assert made.settled(avatar, poses) == ([[0], [0]], [[0], []])
     filled = made._replace(coarse=CoarseBounds(made.voxels, ROOM))  # knows no better than that all are large
-    filled.store_from_archive()
+    filled.fill()
     assert filled.settled(avatar, poses) == ([[0], [0]], [[], []])
     poses[:, 2, 3] -= 0.02
     assert filled.settled(avatar, poses[1:]) == ([[0]], [[0]])

@@ -71,12 +71,12 @@ def test_an_avatar_is_placed_at_both_ends(
     assert (wide >= size * U32).all() and wide.max() <= 3e-6 * size
     assert (found.stamp == -1).all()
     for block in range(len(avatar.points)):
-        found.lanes[:] = found.ways[:] = np.nan
+        found.lanes[:] = found.displacements[:] = np.nan
         kernel.place_block(avatar, block, found, SCENE)
         points = [
             avatar.points[block].T @ pose[:3, :3].T + shift for pose, shift in zip(ends, shifts, strict=True)
         ]
         lanes, moved = points[0] / STEP - found.frame, (points[1] - points[0]) / STEP
         assert np.abs(found.lanes[block].T - lanes).max() <= rounding
-        assert np.abs(found.ways[block, :3].T - moved).max() <= rounding
-        assert np.isnan(np.delete(found.ways, block, axis=0)).all()
+        assert np.abs(found.displacements[block, :3].T - moved).max() <= rounding
+        assert np.isnan(np.delete(found.displacements, block, axis=0)).all()

@@ -29,25 +29,21 @@ from ..schemas.errors import (
 )
 from ..schemas.wire import key_expressions
 from ..schemas.wire.answers import Part
-from ..schemas.wire.columns import as_part, check_answers, unknown
-from ..schemas.wire.messages import (
-    MAX_POSES,
-    MSGPACK,
+from ..schemas.wire.encoding import MSGPACK, decode_answer, encode
+from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_path_parameters
+from ..schemas.wire.question_rules import Question, check_answers, make_unknown
+from ..schemas.wire.questions import QUESTIONS
+from ..schemas.wire.request_limits import MAX_POSES
+from ..schemas.wire.requests import has_tolerance_or_budget, make_poses, make_positions
+from ..schemas.wire.scene_messages import (
     WIRE_VERSION,
     AvatarInfo,
     ErrorReply,
-    PathRequest,
     ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
-    StatsAnswer,
-    StatsRequest,
-    decode_answer,
-    encode,
 )
-from ..schemas.wire.path_request import check_path_parameters
-from ..schemas.wire.questions import QUESTIONS, Question
-from ..schemas.wire.requests import is_bounded, make_poses, make_positions
+from ..schemas.wire.stats import StatsAnswer, StatsRequest
 from .zenoh_client.added_avatars import Added, AddedAvatars
 from .zenoh_client.client_identity import OPEN_SECONDS, Identity
 from .zenoh_client.client_session import ClientSession, WishNumbers
@@ -231,7 +227,7 @@ class Client(BatchedQueries):
         request = PathRequest(name, array, op, **parameters)  # type: ignore[arg-type]
         question = QUESTIONS[op]
         total = question.items_along(len(array))
-        return self._parts(question, encode(request), name, total, is_bounded(parameters))
+        return self._parts(question, encode(request), name, total, has_tolerance_or_budget(parameters))
 
     def _parts(
         self, question: Question[Any], request: bytes, name: str, total: int, bounded: bool
@@ -240,8 +236,8 @@ class Client(BatchedQueries):
 
         def missing(stop: int) -> Part:
             self._note_unanswered(stop - expected)
-            none = unknown(question.answers, stop - expected, bounded=bounded)
-            part: Part = as_part(none, expected, total)
+            none = make_unknown(question.answers, stop - expected, bounded=bounded)
+            part: Part = answers_to_part(none, expected, total)
             return part
 
         expected, complete = 0, False

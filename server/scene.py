@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
 from ..schemas.wire.key_expressions import User, check_name
-from ..schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved
+from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
+from ..schemas.wire.stats import StatsAnswer
 from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats

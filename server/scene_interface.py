@@ -23,19 +23,12 @@ from ..schemas.wire.answers import (
     WithinAnswers,
 )
 from ..schemas.wire.key_expressions import User
-from ..schemas.wire.messages import AvatarInfo, ReloadAnswer, SceneInfo, StatsAnswer
 from ..schemas.wire.motion_messages import Moved, State, Wish
-from ..schemas.wire.questions import (
-    COLLIDE,
-    CONTACTS,
-    DISTANCE,
-    OBJECTS,
-    RAYCAST,
-    SWEEP,
-    WITHIN,
-    Question,
-)
+from ..schemas.wire.question_rules import Question
+from ..schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
 from ..schemas.wire.requests import QuestionOptions
+from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
+from ..schemas.wire.stats import StatsAnswer
 from .runtime.stop_flag import StopFlag
 
 _A = TypeVar("_A", bound=Cost)

@@ -6,9 +6,11 @@ Answers may contain infinities and NaN: as such in MessagePack, as null in JSON.
 them from the meaning of the field (`_of_null`).
 """
 
+import hashlib
 import inspect
 import math
 import re
+import struct
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -17,6 +19,7 @@ from typing import Any, TypeVar, get_type_hints
 import msgspec
 import numpy as np
 from msgspec.structs import asdict
+from numpy.typing import NDArray
 
 from ..errors import BadRequestError, InternalError
 from .arrays import ArrayType, array_fields
@@ -32,8 +35,7 @@ _LARGE_BIN = 1 << 18
 _LARGE_JSON, _JSON_PIECE = 1 << 17, 1 << 16
 _LISTED = 1 << 13
 
-# If this were raised, a peer of version 1 would drop the larger messages unread.
-MAX_MESSAGE_BYTES = 32 << 20
+_RADIUS = struct.Struct("<d")
 
 _M = TypeVar("_M")
 
@@ -81,6 +83,18 @@ def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M
         raise InternalError(
             f"{kind.__name__}: {error}: client and server may have different versions"
         ) from None
+
+
+def avatar_digest(points: NDArray[np.float64], radius: float) -> bytes:
+    """Return the SHA-256 that identifies an avatar by its content.
+
+    points: (n, 3) [m].  radius: of each point's sphere [m].
+    The hash covers the points, row by row, and the radius, each number as a little-endian float64;
+    -0.0 counts as 0.0.
+    """
+    found = hashlib.sha256(np.asarray(points + 0.0, "<f8").tobytes())
+    found.update(_RADIUS.pack(radius + 0.0))
+    return found.digest()
 
 
 def _of_null(name: str, tail: tuple[int, ...]) -> float:

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 from ..errors import BadRequestError
 from .questions import QUESTIONS
+from .request_limits import MAX_NAME_LENGTH
 
 # The 1 is WIRE.md's version: servers of two versions can run side by side, and neither receives the
 # other's messages.
 ROOT = "solidcloud/1"
 
-_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_NAME = re.compile(rf"[A-Za-z0-9._-]{{1,{MAX_NAME_LENGTH}}}")
 
 
 class Route(NamedTuple):

@@ -14,11 +14,11 @@ import numpy as np
 from ..errors import BadRequestError
 from .answers import Verdict
 from .arrays import Poses
+from .request_limits import MAX_FRAME_SECONDS
 from .requests import Count, Length, Name, Request, check_one_pose, make_poses
 
 Vector = tuple[float, float, float]
 
-LONGEST_SECONDS = 10.0
 # Default duration of a frame, 30 of which make a second [s].
 FRAME_SECONDS = 1 / 30
 
@@ -40,8 +40,8 @@ class MoveRequest(Request, frozen=True, kw_only=True):
         Request.__post_init__(self)
         check_one_pose("pose_from", self.pose_from)
         check_one_pose("pose_to", self.pose_to)
-        if self.seconds > LONGEST_SECONDS:
-            raise BadRequestError(f"seconds is {self.seconds}: expected {LONGEST_SECONDS:g} at most")
+        if self.seconds > MAX_FRAME_SECONDS:
+            raise BadRequestError(f"seconds is {self.seconds}: expected {MAX_FRAME_SECONDS:g} at most")
 
 
 class Wish(Request, frozen=True, kw_only=True):

@@ -15,25 +15,16 @@ import numpy as np
 from ..archive.radius_model import parse_radius_model
 from ..errors import BadRequestError, TooLargeError
 from .arrays import Poses, Positions
-
-# Limits of the protocol. They bound what one request can cost a server: 24 MB of points, 12.8 MB of
-# poses (a sweep's twice that), all below the largest message. If they were raised, a server of
-# version 1 would drop the larger messages unanswered.
-MAX_AVATAR_POINTS = 1_000_000
-MAX_POSES = 100_000
-# All pairs of this many objects fit into one answer: 19 MB.
-MAX_OBJECTS = 2048
-# Pairs listed for a pose. With this many, one pose's answer is 7 MB.
-MAX_CONTACTS = 10_000
+from .request_limits import MAX_AVATAR_POINTS, MAX_CONTACTS, MAX_NAME_LENGTH, MAX_OBJECTS
 
 ALL_GROUPS = 0xFFFFFFFF
 
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
 Length = Annotated[float, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0, description="milliseconds")]
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
-ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
 
 _FLOAT64 = np.dtype("<f8")
 
@@ -100,7 +91,7 @@ class QuestionOptions(TypedDict, total=False):
     radius_model: str | None
 
 
-def is_bounded(options: Mapping[str, Any]) -> bool:
+def has_tolerance_or_budget(options: Mapping[str, Any]) -> bool:
     """Return True if the options of a query allow anything but an exact answer."""
     return bool(options.get("tolerance")) or any(
         options.get(name) is not None for name in ("budget_ms", "budget_visits")
@@ -323,8 +314,10 @@ def _as_float64(name: str, values: Any) -> np.ndarray:
 
 def _check_name(_: str, name: str) -> None:
     """Raise BadRequestError for an avatar name that is empty or too long."""
-    if not 1 <= len(name) <= 64:
-        raise BadRequestError(f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to 64")
+    if not 1 <= len(name) <= MAX_NAME_LENGTH:
+        raise BadRequestError(
+            f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to {MAX_NAME_LENGTH}"
+        )
 
 
 def _check_model(_: str, text: str) -> None:

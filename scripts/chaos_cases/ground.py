@@ -165,9 +165,10 @@ def ask(scene: Any, op: str, arguments: tuple[Any, ...], parameters: dict[str, A
     """Ask a scene or a client one question; a path is answered by its parts, joined."""
     if op != "path":
         return getattr(scene, op)(*arguments, **parameters)
-    from solidcloud.schemas.wire.columns import join, without_part
+    from solidcloud.schemas.wire.path_messages import part_to_answers
+    from solidcloud.schemas.wire.question_rules import join_answers
 
-    return join([without_part(part) for part in scene.path(*arguments, **parameters)])
+    return join_answers([part_to_answers(part) for part in scene.path(*arguments, **parameters)])
 
 
 def near(rng: np.random.Generator, places: Arrays, count: int) -> Arrays:

@@ -16,14 +16,8 @@ import numpy as np
 import zenoh
 from rogues.tools import widths, zeros
 from solidcloud.schemas.wire import key_expressions
-from solidcloud.schemas.wire.messages import (
-    MSGPACK,
-    AddAvatarRequest,
-    CollideRequest,
-    ContactsRequest,
-    encode,
-)
-from solidcloud.schemas.wire.requests import make_poses
+from solidcloud.schemas.wire.encoding import MSGPACK, encode
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, ContactsRequest, make_poses
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
 from .ground import SCENE

@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.figure import figure_points
-from solidcloud.schemas.wire.messages import CollideRequest, encode
+from solidcloud.schemas.wire.encoding import encode
+from solidcloud.schemas.wire.requests import CollideRequest
 from solidcloud.server.client import Client
 
 from . import frames as results

@@ -20,7 +20,8 @@ import numpy as np
 import zenoh
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.wire.answers import CollideAnswers
-from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, decode_answer, encode
+from solidcloud.schemas.wire.encoding import MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.requests import CollideRequest
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.client import Client
 

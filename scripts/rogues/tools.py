@@ -23,10 +23,11 @@ from solidcloud.schemas.wire.answers import (
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.wire.columns import unknown
 from solidcloud.schemas.wire.encoding import decode_request, encode
-from solidcloud.schemas.wire.messages import AvatarInfo, CollideRequest, ErrorReply, ScenesAnswer
 from solidcloud.schemas.wire.motion_messages import State, Wish
+from solidcloud.schemas.wire.question_rules import make_unknown
+from solidcloud.schemas.wire.requests import CollideRequest
+from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply, ScenesAnswer
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_client.client_session import ClientSession
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
@@ -134,7 +135,7 @@ def zeros(query: zenoh.Query) -> bytes:
         return encode(CollidePart(none.astype(np.uint8), none > 0, none, none, none, first=0, total=rows))
     if operation not in _ANSWERS:
         return encode(State(pose=pose_at(9.0, 9.0)[None], seq=10**9, time=0.0, frame=1))
-    answers = unknown(_ANSWERS[operation], rows, bounded=False)
+    answers = make_unknown(_ANSWERS[operation], rows, bounded=False)
     return encode(msgspec.structs.replace(answers, verdict=np.zeros(rows, np.uint8), engine_seconds=1e-3))
 
 

@@ -8,7 +8,7 @@ from msgspec import structs
 from ...schemas.archive.index import Header
 from ...schemas.scene.effect_table import ORDER, effect_name
 from ...schemas.scene.scene_file import SceneFile, up_of
-from ...schemas.wire.messages import (
+from ...schemas.wire.scene_messages import (
     WIRE_VERSION,
     AvatarInfo,
     ObjectInfo,

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.wire.answers import ContactsAnswers, Cost, Part
-from ...schemas.wire.columns import join
-from ...schemas.wire.questions import QUESTIONS, Question
+from ...schemas.wire.question_rules import Question, join_answers
+from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stopped, make_budget
 from ..queries.context.query_context import SceneData, with_stop
@@ -101,7 +101,7 @@ def ask_within_budget(
     left = np.maximum(budget.visits - visits, 0)
     ends = [*(np.flatnonzero(np.diff(left)) + 1).tolist(), len(left)]
     starts = [0, *ends[:-1]]
-    return join(
+    return join_answers(
         [
             ask(data, budget._replace(visits=int(left[start])), slice(start, end))
             for start, end in zip(starts, ends, strict=True)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, BusyError, CorruptError
-from ...schemas.wire.messages import ReloadAnswer, SceneInfo
+from ...schemas.wire.scene_messages import ReloadAnswer, SceneInfo
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from ..queries.engines import warm_engines

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from ...schemas.wire.messages import SceneInfo, StatsAnswer
-from ...schemas.wire.stats import AvatarStats, Counters
+from ...schemas.wire.scene_messages import SceneInfo
+from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
 from ..observability.request_stats import RequestStats, times_of
 from .archive_info import listed_sources
 from .placed_archive import ArchiveGeneration

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ...builder.sources.scan_files import open_scans
 from ...schemas.errors import ScanError, TooLargeError
-from ...schemas.wire.messages import MAX_AVATAR_POINTS
+from ...schemas.wire.request_limits import MAX_AVATAR_POINTS
 
 
 def read_avatar(path: Path) -> NDArray[np.float64]:

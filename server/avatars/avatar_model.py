@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...builder.voxel.point_radius import build_local, mean_closest_distance
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
-from ...schemas.wire.messages import make_positions
+from ...schemas.wire.requests import make_positions
 from ..kernels.core.placed_avatar import MAX_FRONT, Avatar
 from ..kernels.core.scene_arrays import LANES
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
-from ...schemas.wire.messages import make_positions
-from ...schemas.wire.seals import avatar_digest
+from ...schemas.wire.encoding import avatar_digest
+from ...schemas.wire.requests import make_positions
 from ...schemas.wire.stats import AvatarStats
 from ..scene_interface import EVERYBODY, THIS_PROCESS, AvatarLimits, record_avatar
 from .avatar_model import AvatarModel, make_avatar

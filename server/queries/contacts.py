@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import ContactsAnswers, Verdict
-from ...schemas.wire.requests import MAX_CONTACTS
+from ...schemas.wire.request_limits import MAX_CONTACTS
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.contacts.contact_cells import (
     CELLS,

@@ -17,13 +17,11 @@ import numpy as np
 from ...schemas.errors import SolidcloudError
 from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.arrays import Poses
-from ...schemas.wire.columns import as_part, in_pieces
-from ...schemas.wire.path_request import check_path_parameters
+from ...schemas.wire.path_messages import answers_to_part, check_path_parameters, split_answers
 from ...schemas.wire.questions import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.voxels_in_reach import check_poses
-from ..runtime.deadlines import stop_at
-from ..runtime.stop_flag import NO_STOP, StopFlag
+from ..runtime.stop_flag import NO_STOP, StopFlag, stop_at
 from .context.query_budget import ask_until_stopped, make_budget, unknown_answers
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .engines import ENGINES
@@ -141,8 +139,8 @@ def path_parts(
             else:
                 first, future = waiting.popleft()
                 answers = future.result()
-            for piece in in_pieces(answers, _PART_BYTES):
-                yield as_part(piece, first, total)
+            for piece in split_answers(answers, _PART_BYTES):
+                yield answers_to_part(piece, first, total)
                 first += len(piece)  # type: ignore[arg-type]
             size = _next_size(size, answers, most)
     finally:

@@ -1,4 +1,4 @@
-"""Process-level helpers: stop flags, deadlines, threads, watchdog, heap.
+"""Process-level helpers: stop flags and deadlines, threads, heap.
 
 May import schemas.
 Begin with stop_flag.py.

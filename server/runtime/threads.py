@@ -7,8 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 
 PREFIX = "solidcloud-"
-# The longest thread name that Linux stores [bytes].
-_LONGEST = 15
+# Longest thread name that Linux stores.
+_MAX_NAME_BYTES = 15
 
 
 def start_thread(name: str, run: Callable[..., object], *arguments: object) -> threading.Thread:
@@ -31,4 +31,4 @@ def _name_for_system(name: str) -> None:
     if sys.platform == "linux":
         with suppress(OSError):
             file = Path(f"/proc/self/task/{threading.get_native_id()}/comm")
-            file.write_bytes(name.encode()[-_LONGEST:])
+            file.write_bytes(name.encode()[-_MAX_NAME_BYTES:])

@@ -19,7 +19,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.scene.effect_table import Crowd, Ground, Objects, Slide, Through, Uncertainty
 from ...schemas.scene.scene_file import SUFFIX, SceneFile
-from ...schemas.wire.messages import AvatarInfo, SceneInfo
+from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.archive_info import describe
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import make_avatar

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import Cost, Part
-from ...schemas.wire.questions import Question
+from ...schemas.wire.question_rules import Question
 from ...schemas.wire.requests import make_objects, make_poses, make_vectors
 from ..archives.ask_archives import PathParts, PreparedQuery, Rows, ask_along, ask_each, make_legs, rows_of
 from ..archives.merge_answers import limit_pairs

@@ -27,9 +27,9 @@ from ...schemas.errors import (
 from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
-from ...schemas.wire.messages import AvatarInfo, SceneInfo
 from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest, State, Wish
 from ...schemas.wire.requests import make_poses
+from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import QueryBudget

@@ -7,8 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ...schemas.errors import BadRequestError
-from ...schemas.wire.messages import AddAvatarRequest, AvatarInfo, Positions, decode_answer, encode
-from ...schemas.wire.seals import avatar_digest
+from ...schemas.wire.arrays import Positions
+from ...schemas.wire.encoding import avatar_digest, decode_answer, encode
+from ...schemas.wire.requests import AddAvatarRequest
+from ...schemas.wire.scene_messages import AvatarInfo
 
 
 class Added(NamedTuple):

@@ -19,8 +19,8 @@ import zenoh
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, UnknownAvatarError, error_from_code
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer, encode
-from ...schemas.wire.messages import ErrorReply
 from ...schemas.wire.motion_messages import State, Wish
+from ...schemas.wire.scene_messages import ErrorReply
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
 from ..zenoh_common.sealed_replies import OtherAvatarError, TrustAnchor

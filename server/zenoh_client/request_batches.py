@@ -11,12 +11,16 @@ import numpy as np
 
 from ...schemas.errors import TooLargeError
 from ...schemas.wire.answers import Cost, Verdict
-from ...schemas.wire.arguments import request_fields
-from ...schemas.wire.columns import check_answers, join, unknown
-from ...schemas.wire.messages import MoveRequest, decode_answer, encode
-from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved
-from ...schemas.wire.questions import Question
-from ...schemas.wire.requests import is_bounded, make_poses
+from ...schemas.wire.encoding import decode_answer, encode
+from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest
+from ...schemas.wire.question_rules import (
+    Question,
+    check_answers,
+    join_answers,
+    make_unknown,
+    request_fields,
+)
+from ...schemas.wire.requests import has_tolerance_or_budget, make_poses
 from ..scene_interface import QueryMethods
 
 # Poses in one request: 512 KiB, so that one client's long list does not keep others waiting for seconds, and
@@ -112,8 +116,10 @@ class BatchedQueries(QueryMethods):
             if payload is None:
                 # Not asked for the rest: a server that is frozen would cost a timeout for every batch.
                 self._note_unanswered(k - start)
-                parts.append(unknown(question.answers, k - start, bounded=is_bounded(options)))
+                parts.append(
+                    make_unknown(question.answers, k - start, bounded=has_tolerance_or_budget(options))
+                )
                 break
             parts.append(check_answers(decode_answer(question.answers, payload), stop - start))
             start = stop
-        return join(parts)
+        return join_answers(parts)

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...schemas.errors import BadRequestError
-from ...schemas.wire.seals import KEY_BYTES, parse_key
 from .endpoints import canonical
 
 log = logging.getLogger(__name__)
+
+KEY_BYTES = 32
+_HEX_KEY = re.compile(rf"[0-9a-fA-F]{{{2 * KEY_BYTES}}}")
 
 
 class KeyFile(NamedTuple):
@@ -118,6 +120,20 @@ def read_given_key(path: Path) -> bytes:
         raise BadRequestError(f"key file {path}: {error.strerror or error}") from None
 
 
+def _parse_key(text: str, where: str) -> bytes:
+    """Return the key in a key file's text.
+
+    where: the file, for the BadRequestError that says what is wrong with the key.
+    """
+    found = text.strip()
+    if not _HEX_KEY.fullmatch(found):
+        raise BadRequestError(
+            f"{where}: {len(found)} characters: expected a key of {2 * KEY_BYTES} hex digits: "
+            f"make one with: (umask 077; openssl rand -hex {KEY_BYTES} > {where})"
+        )
+    return bytes.fromhex(found)
+
+
 def _version(status: os.stat_result) -> tuple[int, int, int]:
     return status.st_mtime_ns, status.st_ino, status.st_dev
 
@@ -133,7 +149,7 @@ def _read(path: Path, *, private: bool) -> KeyFile:
             )
         if private and status.st_uid != os.getuid():
             raise BadRequestError(f"{path}: of another user (id {status.st_uid}): expected this user's own")
-        return KeyFile(parse_key(file.read(1024).decode("ascii", "replace"), str(path)), _version(status))
+        return KeyFile(_parse_key(file.read(1024).decode("ascii", "replace"), str(path)), _version(status))
 
 
 def _write(path: Path, key: bytes) -> None:

@@ -1,7 +1,16 @@
-"""Sealed replies to zenoh queries: sending and reading them."""
+"""Sealed replies: signatures that prove that a reply is the server's, to the client's own request.
 
+A *seal* is a keyed hash (WIRE.md, "Seals", has the layout and a worked example). A client sends a
+nonce with its query. Whoever has the server's key can hash nonce, key expression and request
+together with the reply and the avatars that it is about; nobody else can. The server seals its
+replies with `sealer_of` and `send_reply`; a client checks them with `SealedQuery`.
+"""
+
+import hashlib
+import hmac
 import logging
 import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,13 +19,93 @@ import zenoh
 
 from ...schemas.errors import UnknownAvatarError
 from ...schemas.wire.encoding import JSON, MSGPACK
-from ...schemas.wire.seals import NONCE_BYTES, Sealer, hash_of, is_about
 from ..scene_interface import EncodedReply
 from .key_files import KeyFile, find_key, read_given_key
 
 log = logging.getLogger(__name__)
 
 _ENCODINGS = {name: zenoh.Encoding(name) for name in (MSGPACK, JSON)}
+
+NONCE_BYTES = 16
+_HASH_BYTES = 32
+# A seal holds the number of the reply among the replies to its query, the SHA-256 of the digests of
+# its avatars, and the keyed hash.
+_NUMBER = struct.Struct("<Q")
+_ABOUT = slice(_NUMBER.size, _NUMBER.size + _HASH_BYTES)
+SEAL_BYTES = _ABOUT.stop + _HASH_BYTES
+_REPLY = struct.Struct("<QBQ")
+
+
+class Sealer:
+    """Seals of the replies to one query: a server makes them, a client checks them."""
+
+    __slots__ = ("_begun", "_key", "_name")
+
+    def __init__(self, key: bytes, nonce: bytes, key_expression: str, request: bytes) -> None:
+        """Store the parameters of one query.
+
+        key: the server's, KEY_BYTES.  nonce: the query's, NONCE_BYTES.
+        request: SHA-256 of the query's payload.
+        """
+        self._key, self._name = key, key_expression.encode()
+        self._begun = nonce + request
+
+    def seal(self, number: int, ok: bool, encoding: str, payload: bytes, about: bytes = b"") -> bytes:
+        """Return the seal of a reply, SEAL_BYTES.
+
+        number: of the reply among the replies to its query, counted from 0.  ok: it is not an
+        error.
+        about: the digests of the client's own avatars that answered (`avatar_digest`), in the
+        request's order, concatenated.
+        """
+        hashed = hash_of(about)
+        return _NUMBER.pack(number) + hashed + self._hash(number, ok, encoding, payload, hashed)
+
+    def number_of(self, seal: bytes, ok: bool, encoding: str, payload: bytes) -> int:
+        """Return the number in a seal; -1 if the seal is not that of this reply."""
+        if len(seal) != SEAL_BYTES:
+            return -1
+        number: int = _NUMBER.unpack_from(seal)[0]
+        expected = self._hash(number, ok, encoding, payload, seal[_ABOUT])
+        return number if hmac.compare_digest(seal[_ABOUT.stop :], expected) else -1
+
+    def _hash(self, number: int, ok: bool, encoding: str, payload: bytes, about: bytes) -> bytes:
+        """Hash one reply.
+
+        about: SHA-256 of the digests of its avatars.
+        """
+        text = b"".join(
+            (
+                self._begun,
+                _REPLY.pack(number, ok, len(self._name)),
+                self._name,
+                hash_of(payload),
+                about,
+                encoding.encode(),
+            )
+        )
+        return hashlib.blake2b(text, key=self._key, digest_size=_HASH_BYTES).digest()
+
+
+def is_about(seal: bytes, about: bytes) -> bool:
+    """Return True if a seal of the right length names these avatars.
+
+    about: as in `Sealer.seal`.
+    """
+    return seal[_ABOUT] == hash_of(about)
+
+
+def hash_of(payload: bytes) -> bytes:
+    """Return the SHA-256 of a payload.
+
+    It is twice as fast as BLAKE2b on processors that have instructions for it.
+    """
+    return hashlib.sha256(payload).digest()
+
+
+def encoding_of(query: zenoh.Query) -> str | None:
+    """Return the encoding that a query states, if any."""
+    return None if query.encoding is None else str(query.encoding)
 
 
 def sealer_of(query: zenoh.Query, key: bytes, key_expression: str, request: bytes) -> Sealer | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import zenoh
 
-from ...schemas.wire.encoding import MAX_MESSAGE_BYTES
+from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from .access_control import access_control, state_priority
 
 # Transport of motion commands; states use the same (access_control.state_priority).

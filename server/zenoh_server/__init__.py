@@ -2,5 +2,5 @@
 
 May import server.zenoh_common, server.observability, server.runtime, server/scene_interface.py,
 schemas.
-Begin with service.py; transport.py carries its bytes.
+Begin with serve_loop.py; transport.py carries the bytes, request_dispatcher.py interprets them.
 """

@@ -15,12 +15,13 @@ from typing import NamedTuple
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, TooLargeError
 from ...schemas.wire.encoding import MSGPACK, decode_request, encode, wire_encoding
 from ...schemas.wire.key_expressions import User
-from ...schemas.wire.messages import ErrorReply
 from ...schemas.wire.motion_messages import State, Wish
+from ...schemas.wire.request_limits import MAX_COMMAND_BYTES
+from ...schemas.wire.scene_messages import ErrorReply
 from ..runtime.stop_flag import StopFlag
 from ..runtime.threads import start_thread
-from ..runtime.watchdog import Watchdog
 from ..scene_interface import EncodedReply, FrameCommand, FrameResult, ServedSimulation
+from .watchdog import Watchdog
 
 log = logging.getLogger(__name__)
 
@@ -30,9 +31,6 @@ _BOXES_A_USER = 2
 # Interval at which the watchdog checks for long frames [s].
 _LOOK_SECONDS = 0.05
 _STOPS = "the server stops"
-# Largest motion command: 2,048 objects take less as MessagePack. A larger one is neither read nor
-# logged.
-_MOST_BYTES = 512 << 10
 
 
 class MailboxContents(NamedTuple):
@@ -70,7 +68,7 @@ class Mailboxes:
         """Make an empty set of mailboxes.
 
         most: mailboxes at a time.
-        turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
+        turn: returns the turn of a client (fair_queues.py); by default each has its own.
         """
         self._most, self._turn = most, turn
         self._boxes: dict[User, _Box] = {}
@@ -202,11 +200,11 @@ class FrameLoop:
 
     def fits(self, user: User, size: int, encoding: str | None) -> bool:
         """Return whether a motion command of `size` bytes is accepted; refuse it otherwise."""
-        if size > _MOST_BYTES:
+        if size > MAX_COMMAND_BYTES:
             self._send(
-                user, TooLargeError(f"motion command of {size} bytes: at most {_MOST_BYTES}"), encoding
+                user, TooLargeError(f"motion command of {size} bytes: at most {MAX_COMMAND_BYTES}"), encoding
             )
-        return size <= _MOST_BYTES
+        return size <= MAX_COMMAND_BYTES
 
     def leave(self, user: User) -> None:
         """Have a user leave the scene."""

@@ -1,4 +1,4 @@
-"""Fair queues of requests: one request of each client at a time, clients round-robin. No zenoh.
+"""Fair queues of requests: one request of each client at a time, clients round-robin.
 
 A request is *quick* until it has been running for longer than its watchdog allows, or *slow* from
 the start. Quick requests share the workers. Slow ones keep their client's turn but hold no worker;
@@ -9,6 +9,9 @@ import threading
 from collections import deque
 from enum import Enum
 from typing import Any, NamedTuple
+
+# Turn of all clients without a liveliness token; no client has this name.
+ANONYMOUS = ""
 
 
 class Offer(Enum):
@@ -154,7 +157,7 @@ class FairQueues:
             self._ready[True].append(again.turn)
             return self._start_waiting()
 
-    def slow(self, ticket: Ticket) -> list[Ticket] | None:
+    def move_to_slow(self, ticket: Ticket) -> list[Ticket] | None:
         """Move a request that has been computing for long to a slow place; it keeps its turn.
 
         Return the tickets to start; None if it has a slow place, does not run, or all slow places
@@ -167,7 +170,7 @@ class FairQueues:
             self._move(ticket, TicketState.SLOW)
             return self._start_waiting()
 
-    def waits(self, ticket: Ticket) -> list[Ticket] | None:
+    def move_to_waiting(self, ticket: Ticket) -> list[Ticket] | None:
         """Free the worker or slow place of a request that only waits; it keeps its turn.
 
         Return the tickets to start; None if it holds neither, or too many requests wait like this.
@@ -272,3 +275,49 @@ class FairQueues:
                 self._begin(ticket, turn)
                 started.append(ticket)
         return started
+
+
+class LivelinessTokens:
+    """Liveliness tokens of one scene's clients. One thread calls `here` and `gone`; any thread reads.
+
+    A client with a token has its own turn in the fair queues; all clients without a token share one.
+    zenoh does not report which session a query comes from: `Query.source_info` holds what the
+    sender put there, by default nothing.
+
+    Any process can declare any number of tokens, so their number is bounded: the first `most` are
+    heeded, and as many more wait until one of the heeded tokens disappears. A client whose token is
+    not heeded is treated as one without a token.
+    """
+
+    def __init__(self, most: int) -> None:
+        """Begin without tokens. most: tokens that are heeded at a time."""
+        self._most = most
+        self._heeded: dict[str, None] = {}
+        self._waiting: dict[str, None] = {}  # in order of arrival
+
+    def here(self, client: str) -> None:
+        """Record that the token of a client has appeared."""
+        if client in self._heeded or len(self._heeded) < self._most:
+            self._heeded[client] = None
+        elif len(self._waiting) < self._most:
+            self._waiting[client] = None
+
+    def gone(self, client: str) -> None:
+        """Record that the token of a client has disappeared."""
+        self._waiting.pop(client, None)
+        if client not in self._heeded:
+            return
+        del self._heeded[client]
+        if self._waiting:
+            following = next(iter(self._waiting))
+            del self._waiting[following]
+            self._heeded[following] = None
+
+    def turn(self, client: str) -> str:
+        """Return the turn of a client: its own name, or that of all clients without a token."""
+        return client if client in self._heeded else ANONYMOUS
+
+    @property
+    def heeded(self) -> frozenset[str]:
+        """Return the clients that have their own turn."""
+        return frozenset(self._heeded)

@@ -1,50 +1,93 @@
-"""Lanes: carry one scene's requests from a channel to the service and back. Without zenoh.
+"""Lanes: carry the requests about one scene from its queryable to the dispatcher, and the replies back.
 
-A fixed number of worker threads take queries from the channel and answer them. A request that runs
-for long, or whose answer its client does not accept, keeps its thread and its client's turn, but
-its thread is no longer a worker: a new thread replaces it, and the slow one ends after its request.
+A fixed number of worker threads take queries from zenoh's channel and answer them. A request that
+runs for long, or whose answer its client does not accept, keeps its thread and its client's turn,
+but its thread is no longer a worker: a new thread replaces it, and the slow one ends after its
+request (watchdog.py).
 """
 
 import logging
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
-from ..runtime.stop_flag import StopFlag
+import zenoh
+
+from ...schemas.errors import BadRequestError
+from ...schemas.wire import key_expressions
+from ...schemas.wire.encoding import JSON
+from ...schemas.wire.request_limits import FIRST_REQUEST_BYTES
 from ..runtime.threads import start_thread
-from ..runtime.watchdog import Watchdog, lower_priority
 from ..scene_interface import EncodedReply, LimitReached
-from .fair_queues import FairQueues, Offer, QueueLimits, Ticket, TicketState
-from .jobs import SLOW_SECONDS, ReceivedRequest, RequestJob, Wire
-from .liveliness_tokens import ANONYMOUS, Tokens
+from ..zenoh_common.sealed_replies import encoding_of, sealer_of, send_reply
+from .fair_queues import ANONYMOUS, FairQueues, LivelinessTokens, Offer, QueueLimits, Ticket
+from .request_dispatcher import RequestDispatcher
 from .server_config import ServerConfig
+from .watchdog import JobSupervisor, RequestJob, Watchdog, lower_priority
 
 log = logging.getLogger(__name__)
 
 # Most threads that wait without a worker, for a voxel, or for a client to accept a reply (zenoh
 # closes its link after `wait_before_close`).
-_MOST_WAITING = 64
+_MAX_WAITING = 64
 # Interval at which unused avatars are dropped [s].
 _DROP_SECONDS = 5.0
 # Interval at which a busy worker queues all queries in the channel [s], and how many at a time. If
 # it took them one by one, the query of a new client would wait behind all earlier ones.
 _EMPTY_SECONDS = 0.002
-_MOST_AT_HAND = 256
-# A client without requests in flight may always send one request of at most this size [bytes].
-_FIRST_BYTES = 1 << 16
+_MAX_TAKEN = 256
+# Payloads from this size on are slow [bytes]: building an avatar of 5,000 points takes 20 ms,
+# reading JSON 50 ns a byte. The second size is that of avatars and JSON.
+_SLOW_BYTES, _SLOW_AVATAR_BYTES = 1 << 20, 1 << 17
 
 
-class RequestHandler(Protocol):
-    """Service that answers the requests of a lane. No method raises: an error is an answer."""
+def take_waiting(channel: Any) -> Any:
+    """Take a query or sample from a zenoh channel without waiting.
 
-    def answer(
-        self, key: str, payload: bytes, encoding: str | None, stop: StopFlag
-    ) -> EncodedReply | Iterator[EncodedReply]: ...
-    def busy(self, encoding: str | None, full: LimitReached) -> EncodedReply: ...
-    def client_gone(self, scene: str, client: str) -> None: ...
-    def drop_unused(self, scene: str, alive: Collection[str]) -> None: ...
+    Return None when the channel is empty or has ended.
+    """
+    try:
+        return channel.try_recv()
+    except zenoh.ZError:
+        return None
+
+
+class ReceivedRequest:
+    """Query with its properties, read once: each access to a property of a query makes a copy."""
+
+    __slots__ = ("_key_expr", "_sealer", "client", "encoding", "key", "operation", "payload", "query")
+
+    def __init__(self, query: Any, server_key: bytes) -> None:
+        """Read a query. server_key: the key that seals its replies."""
+        self.query, self.encoding = query, encoding_of(query)
+        self._key_expr = query.key_expr
+        self.key = str(self._key_expr)
+        try:
+            route = key_expressions.parse_query_key(self.key)
+            self.client, self.operation = route.client, route.operation
+        except BadRequestError:
+            self.client = self.operation = ""  # no client: the dispatcher will refuse it
+        payload = query.payload
+        self.payload = b"" if payload is None else payload.to_bytes()
+        self._sealer = sealer_of(query, server_key, self.key, self.payload)
+
+    @property
+    def slow(self) -> bool:
+        """Return whether the request is slow because of its size."""
+        size = len(self.payload)
+        if size < _SLOW_AVATAR_BYTES:
+            return False
+        return size >= _SLOW_BYTES or self.operation == "add_avatar" or self.encoding == JSON
+
+    def send(self, reply: EncodedReply, number: int = 0) -> bool:
+        """Send one reply; return False if that fails. number: of the reply, increasing."""
+        return send_reply(self.query, self._key_expr, reply, self._sealer, number)
+
+    def end(self) -> None:
+        """Tell the client that no more replies come."""
+        with self.query:
+            pass
 
 
 class _ClientDisconnected(NamedTuple):
@@ -54,56 +97,52 @@ class _ClientDisconnected(NamedTuple):
 
 
 class Lane:
-    """Carrier of the requests about one scene, from the channel to the service and back.
-
-    queries: the channel.  at_hand: takes a query from it without waiting; None if there is none.
-    start: starts a named thread that runs a function with arguments.  tokens: of the clients.
-    """
+    """Carrier of the requests about one scene, from the channel to the dispatcher and back."""
 
     def __init__(
         self,
-        service: RequestHandler,
+        dispatcher: RequestDispatcher,
         scene: str,
         config: ServerConfig,
-        queries: Iterable[Any],
-        at_hand: Callable[[], Any | None],
+        queries: Any,
         start: Callable[..., None],
-        wire: Wire,
-        tokens: Tokens,
+        server_key: bytes,
+        tokens: LivelinessTokens,
     ) -> None:
-        """Make a lane that does not take queries yet."""
-        self._tokens = tokens
-        self._service, self._scene, self._config = service, scene, config
-        self._queries, self._at_hand, self._wire = queries, at_hand, wire
+        """Make a lane that does not take queries yet.
+
+        queries: the channel of zenoh's queries.  start: starts a named thread that runs a function
+        with arguments.  server_key: seals the replies.  tokens: of the scene's clients.
+        """
+        self._dispatcher, self._scene, self._config = dispatcher, scene, config
+        self._queries, self._server_key, self._tokens = queries, server_key, tokens
         self._start_thread = start
         self._queues = FairQueues(
             QueueLimits(
                 config.workers,
                 config.max_slow,
-                _MOST_WAITING,
+                _MAX_WAITING,
                 config.max_in_flight,
                 config.max_in_flight_bytes,
                 config.max_in_flight_by_client,
-                _FIRST_BYTES,
+                FIRST_REQUEST_BYTES,
             )
         )
-        self._lock = threading.Lock()
-        self._jobs: set[RequestJob] = set()  # running now
-        self._streaming: dict[
-            ReceivedRequest, RequestJob
-        ] = {}  # requests whose answers are being sent in parts
-        self._to_start: deque[tuple[str, Callable[..., object], tuple[Any, ...]]] = deque()
+        self._supervisor = JobSupervisor(
+            config.max_request_seconds, self._queues, start, self._start_worker, self._start
+        )
+        self._streaming: dict[ReceivedRequest, RequestJob] = {}  # whose answers are being sent in parts
         self._given_up = False
-        self._emptied = 0.0  # when a worker queued all queries at hand
+        self._emptied = 0.0  # when a worker queued all queries in the channel
         self._dropped = 0.0  # when unused avatars were looked for
-        self._watchdog = Watchdog(self._look)
+        self._watchdog = Watchdog(self._check)
 
     def start(self) -> None:
         """Start the threads."""
         # A stop does not wait for the watchdog's thread, which watches the others.
         self._watching = start_thread(f"{self._scene}-watchdog", self._watchdog.run)
         for _ in range(self._config.workers):
-            self._start_taker()
+            self._start_worker()
 
     def close(self) -> None:
         """End the watchdog, once all other threads have ended."""
@@ -113,22 +152,22 @@ class Lane:
     @property
     def in_flight(self) -> int:
         """Return the number of requests neither answered nor dropped, and of threads to start."""
-        return len(self._queues) + len(self._to_start)
+        return len(self._queues) + self._supervisor.threads_to_start
 
     def give_up(self) -> None:
         """Stop running requests and drop waiting ones, which their clients treat as unknown."""
         self._given_up = True
-        for job in [*self._jobs, *self._streaming.values()]:
+        for job in [*self._supervisor.jobs, *self._streaming.values()]:
             job.end("the server stops")
 
     def client_gone(self, client: str) -> None:
-        """Stop and drop all requests of a disconnected client, then have the service forget it."""
+        """Stop and drop all requests of a disconnected client, then have the dispatcher forget it."""
         dropped, started = self._queues.drop(client)
         self._start(started)
         for ticket in dropped:
             if isinstance(ticket.request, ReceivedRequest):
-                self._drop(ticket.request)
-        for job in [*self._jobs, *self._streaming.values()]:
+                ticket.request.end()
+        for job in [*self._supervisor.jobs, *self._streaming.values()]:
             if job.client == client:
                 job.end("its client is gone")
         for request in list(self._streaming):
@@ -140,7 +179,7 @@ class Lane:
 
     # --- threads ---------------------------------------------------------------------------------------------
 
-    def _start_taker(self) -> None:
+    def _start_worker(self) -> None:
         self._start_thread(self._scene, self._take_all)
 
     def _start(self, tickets: Iterable[Ticket]) -> None:
@@ -148,12 +187,9 @@ class Lane:
         for ticket in tickets:
             self._start_thread(self._scene, self._run, ticket)
 
-    def _hand_over(self, name: str, run: Callable[..., object], *arguments: Any) -> None:
-        """Have the watchdog start a thread: a slow thread would pass on its low priority.
-
-        The watchdog retries while the system has no thread left.
-        """
-        self._to_start.append((name, run, arguments))
+    def _start_later(self, name: str, run: Callable[..., object], *arguments: Any) -> None:
+        """Have the watchdog start a thread: a slow thread would pass on its low priority."""
+        self._supervisor.start_later(name, run, *arguments)
         self._watchdog.wake()
 
     def _take_all(self) -> None:
@@ -181,7 +217,7 @@ class Lane:
 
         Return its ticket if this thread is to run it, and whether this thread is still a worker.
         """
-        request = ReceivedRequest(query, self._wire)
+        request = ReceivedRequest(query, self._server_key)
         client = request.client
         turn = self._tokens.turn(client)
         ticket = Ticket(client, request, len(request.payload), turn=turn, slow=request.slow)
@@ -201,7 +237,7 @@ class Lane:
         this thread is still a worker.
         """
         takes, number = True, 0
-        while takes and number < _MOST_AT_HAND and (query := self._at_hand()) is not None:
+        while takes and number < _MAX_TAKEN and (query := take_waiting(self._queries)) is not None:
             number += 1
             try:
                 ticket, takes = self._accept(query)
@@ -218,21 +254,15 @@ class Lane:
     def _refuse(self, request: ReceivedRequest, offer: Offer) -> bool:
         """Answer `busy`; return whether this thread is still a worker."""
         full = LimitReached.OWN_REQUESTS if offer is Offer.FULL_TURN else LimitReached.REQUESTS
-        busy = self._service.busy(request.encoding, full)
+        busy = self._dispatcher.busy(request.encoding, full)
         job = RequestJob(None, takes=True, sending=True)
         self._enter(job)
         try:
-            with request.query as query:
-                self._wire.reply(query, request.key_expr, busy, request.sealer, 0)
+            with request.query:
+                request.send(busy)
         finally:
-            with self._lock:
-                self._jobs.discard(job)
+            self._supervisor.remove(job)
         return not job.left
-
-    def _drop(self, request: ReceivedRequest) -> None:
-        """Leave a query without an answer."""
-        with request.query:
-            pass
 
     # --- requests --------------------------------------------------------------------------------------------
 
@@ -246,7 +276,7 @@ class Lane:
             left, started = self._carry_out(following, takes)
             if left:
                 for each in started:
-                    self._hand_over(self._scene, self._run, each)
+                    self._start_later(self._scene, self._run, each)
                 return False
             following = next((each for each in started if not each.slow), None)
             self._start(each for each in started if each is not following)
@@ -261,17 +291,16 @@ class Lane:
         parts = None
         try:
             if isinstance(ticket.request, _ClientDisconnected):
-                self._service.client_gone(self._scene, ticket.client)
+                self._dispatcher.client_gone(self._scene, ticket.client)
             else:
                 parts = self._answer(ticket.request, job)
         except Exception:
             log.exception("a request of client %s of scene %s failed", ticket.client, self._scene)
         finally:
-            with self._lock:
-                self._jobs.discard(job)
+            self._supervisor.remove(job)
             if parts is not None:
                 started = self._queues.detach(ticket)
-                self._hand_over(f"{self._scene}-parts", self._stream, ticket, parts)
+                self._start_later(f"{self._scene}-parts", self._stream, ticket, parts)
             elif job.again:
                 started = self._queues.put_back(ticket)
             else:
@@ -279,19 +308,18 @@ class Lane:
         return ticket.left, started
 
     def _enter(self, job: RequestJob) -> None:
-        """Have the watchdog watch a job."""
-        with self._lock:
-            self._jobs.add(job)
+        """Have the watchdog supervise a job."""
+        self._supervisor.add(job)
         if self._watchdog.asleep:
             self._watchdog.wake()
 
     def _answer(self, request: ReceivedRequest, job: RequestJob) -> Iterator[EncodedReply] | None:
         """Answer one query. Return an answer in parts, which a separate thread is to send."""
         if self._given_up:
-            self._drop(request)
+            request.end()
             return None
-        answer = self._service.answer(request.key, request.payload, request.encoding, job.stop)
-        with self._lock:
+        answer = self._dispatcher.answer(request.key, request.payload, request.encoding, job.stop)
+        with self._supervisor.lock:
             if job.again and not job.ended:
                 return None
             job.again = False
@@ -300,13 +328,13 @@ class Lane:
             if self._has_room(job):
                 self._streaming[request] = job
                 return answer
-            answer = self._service.busy(request.encoding, LimitReached.PATHS)
+            answer = self._dispatcher.busy(request.encoding, LimitReached.PATHS)
         if job.ticket is not None and job.ticket.left:
-            for ticket in self._queues.waits(job.ticket) or []:
-                self._hand_over(self._scene, self._run, ticket)
+            for ticket in self._queues.move_to_waiting(job.ticket) or []:
+                self._start_later(self._scene, self._run, ticket)
         # Leaving `with query` tells the client that no more replies come.
-        with request.query as query:
-            self._wire.reply(query, request.key_expr, answer, request.sealer, 0)
+        with request.query:
+            request.send(answer)
         return None
 
     def _has_room(self, job: RequestJob) -> bool:
@@ -322,10 +350,10 @@ class Lane:
         """Send the parts of an answer. Runs in a thread."""
         request = ticket.request
         try:
-            with request.query as query:
+            with request.query:
                 for number, answer in enumerate(answers):
                     left = self._given_up or request not in self._streaming
-                    if left or not self._wire.reply(query, request.key_expr, answer, request.sealer, number):
+                    if left or not request.send(answer, number):
                         break
         except Exception:
             log.exception("sending parts to client %s of scene %s failed", request.client, self._scene)
@@ -335,22 +363,15 @@ class Lane:
 
     # --- the watchdog ----------------------------------------------------------------------------------------
 
-    def _look(self, now: float) -> bool:
-        """Check all jobs; return whether there are any."""
-        while self._to_start:
-            name, run, arguments = self._to_start[0]
-            self._start_thread(name, run, *arguments)
-            self._to_start.popleft()
-        jobs = list(self._jobs)
-        for job in jobs:
-            if now - job.begun >= SLOW_SECONDS:
-                self._look_at(job, now)
+    def _check(self, now: float) -> bool:
+        """Check all jobs and paths; return whether there are any jobs."""
+        running = self._supervisor.check(now)
         for job in list(self._streaming.values()):
             self._end_unheard(job, now)
         if now - self._dropped >= _DROP_SECONDS:
             self._dropped = now
-            self._service.drop_unused(self._scene, self._tokens.heeded)
-        return bool(jobs)
+            self._dispatcher.drop_unused(self._scene, self._tokens.heeded)
+        return running
 
     def _end_unheard(self, job: RequestJob, now: float) -> None:
         """Stop a path of a client without a token after the time for which its avatars are kept.
@@ -362,42 +383,3 @@ class Lane:
             job.stop.set(
                 f"the path took longer than {most:g} s, the most for a client without a liveliness token"
             )
-
-    def _look_at(self, job: RequestJob, now: float) -> None:
-        """Replace the worker of a job that takes long, and stop a job whose time is up."""
-        most = self._config.max_request_seconds
-        if job.ticket is None:
-            with self._lock:
-                replace = job in self._jobs and not job.left
-                job.left = job.left or replace
-            if replace and job.takes:
-                self._start_taker()
-            return
-        if not job.low:
-            self._replace(job, job.ticket)
-        if not job.sending and now - job.begun >= most:
-            job.stop.set(f"the request took longer than {most:g} s, the most that this server spends on one")
-
-    def _replace(self, job: RequestJob, ticket: Ticket) -> None:
-        """Start a new thread in place of the job's thread.
-
-        A job that waits for a voxel, a client or a processor occupies only its thread; one that
-        computes occupies a slow place.
-        """
-        left, works = ticket.left, not job.sending and job.works
-        if left and not works:
-            return
-        started = self._queues.slow(ticket) if works else self._queues.waits(ticket)
-        if started is not None:
-            if works:
-                job.low = True
-                lower_priority(job.thread_id)
-            if job.takes and not left:
-                self._start_taker()
-            self._start(started)
-        elif works and not job.stop and ticket.state in (TicketState.WORKING, TicketState.WAITS):
-            # All slow places are taken: the request waits for one without a worker, and restarts.
-            with self._lock:
-                job.again = not job.sending
-            if job.again:
-                job.stop.set("more slow requests than the server takes at a time")

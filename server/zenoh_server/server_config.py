@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...schemas.errors import BadRequestError
-from ...schemas.wire.messages import MAX_AVATAR_POINTS, MAX_POSES
+from ...schemas.wire.request_limits import MAX_AVATAR_POINTS, MAX_POSES
 from ..scene_interface import AvatarLimits
 from ..zenoh_common.endpoints import DEFAULT_ENDPOINT, check_endpoint, is_loopback
 

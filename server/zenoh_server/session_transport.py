@@ -8,18 +8,18 @@ mailboxes, one opens streams of states, and another simulates frames and sends t
 
 import logging
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
 from ...schemas.errors import BadRequestError
 from ...schemas.wire import key_expressions
-from ...schemas.wire.seals import Sealer
 from ..scene_interface import EncodedReply, LimitReached
-from ..zenoh_common.channels import take_at_hand
-from ..zenoh_common.sealed_replies import send_reply
+from ..zenoh_common.sealed_replies import encoding_of, sealer_of, send_reply
 from .command_mailboxes import FrameLoop
-from .liveliness_tokens import Tokens
+from .fair_queues import LivelinessTokens
+from .request_dispatcher import RequestDispatcher
+from .request_lanes import take_waiting
 from .state_streams import StateStreams
 from .waiting_commands import WaitingCommands
 
@@ -29,18 +29,6 @@ log = logging.getLogger(__name__)
 _CHANNEL = 1024
 # Open queries for states, for each user that a scene has room for.
 _STREAMS_A_USER = 2
-
-
-class Sessions(Protocol):
-    """Service that simulates the frames of scenes."""
-
-    def frames(
-        self,
-        scene: str,
-        publish: Callable[[key_expressions.User, EncodedReply], None],
-        turn: Callable[[str], str],
-    ) -> FrameLoop | None: ...
-    def busy(self, encoding: str | None, full: LimitReached) -> EncodedReply: ...
 
 
 class SceneSessions:
@@ -53,19 +41,19 @@ class SceneSessions:
         self,
         session: zenoh.Session,
         scene: str,
-        service: Sessions,
+        dispatcher: RequestDispatcher,
         start: Callable[..., None],
-        sealer: Callable[[zenoh.Query, str, bytes], Sealer | None],
-        tokens: Tokens,
+        server_key: bytes,
+        tokens: LivelinessTokens,
     ) -> None:
         """Declare the sessions and start their threads, if the scene simulates.
 
-        start: starts a named thread that runs a function with arguments.  sealer: as in `Wire`.
-        tokens: those of the scene's clients.
+        start: starts a named thread that runs a function with arguments.  server_key: seals
+        the replies.  tokens: of the scene's clients.
         """
         self.declared: list[Any] = []
-        self._service, self._sealer, self._tokens = service, sealer, tokens
-        self._frames = frames = service.frames(scene, self._send, tokens.turn)
+        self._dispatcher, self._server_key, self._tokens = dispatcher, server_key, tokens
+        self._frames = frames = dispatcher.frames(scene, self._send, tokens.turn)
         self._streams = StateStreams(
             0 if frames is None else _STREAMS_A_USER * frames.most_users, tokens.turn
         )
@@ -119,11 +107,11 @@ class SceneSessions:
             query.drop()
             return
         payload = query.payload
-        sealer = self._sealer(query, key, b"" if payload is None else payload.to_bytes())
+        sealer = sealer_of(query, self._server_key, key, b"" if payload is None else payload.to_bytes())
         if not self._streams.open(user, query, sealer):
             with query:
-                encoding = None if query.encoding is None else str(query.encoding)
-                send_reply(query, query.key_expr, self._service.busy(encoding, LimitReached.STATES), sealer)
+                busy = self._dispatcher.busy(encoding_of(query), LimitReached.STATES)
+                send_reply(query, query.key_expr, busy, sealer)
 
     def _take_wishes(self, samples: Any, frames: FrameLoop) -> None:
         """Take motion commands until they end, then end the frames. Runs in a thread.
@@ -138,7 +126,7 @@ class SceneSessions:
                 while (following := waiting.take()) is not None:
                     self._take_wish(*following, frames)
                     for _ in range(_CHANNEL):
-                        if (more := take_at_hand(samples)) is None:
+                        if (more := take_waiting(samples)) is None:
                             break
                         self._sort(more, waiting, frames)
         finally:

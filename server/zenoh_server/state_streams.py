@@ -12,9 +12,8 @@ from collections.abc import Callable
 import zenoh
 
 from ...schemas.wire.key_expressions import User
-from ...schemas.wire.seals import Sealer
 from ..scene_interface import EncodedReply
-from ..zenoh_common.sealed_replies import send_reply
+from ..zenoh_common.sealed_replies import Sealer, send_reply
 
 # A query without a reply for this long may be ended to make room for another one [s].
 IDLE_SECONDS = 60.0
@@ -53,7 +52,7 @@ class StateStreams:
         """Begin without open queries.
 
         most: queries that are open at a time; one turn has at most half of them.
-        turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
+        turn: returns the turn of a client (fair_queues.py); by default each has its own.
         """
         self._most, self._turn = most, turn
         self._streams: OrderedDict[User, _Stream] = OrderedDict()  # the most recently used last

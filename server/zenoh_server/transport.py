@@ -1,4 +1,4 @@
-"""Transport of bytes over zenoh; the service interprets them.
+"""Transport of bytes over zenoh; the dispatcher interprets them.
 
 zenoh passes queries to a bounded channel, from which the server's threads take them, because a
 zenoh callback must not block. request_lanes.py holds the work of these threads.
@@ -10,27 +10,23 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from functools import partial
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import zenoh
 
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire import key_expressions
-from ...schemas.wire.seals import Sealer
 from ..runtime.threads import start_thread
-from ..scene_interface import EncodedReply
-from ..zenoh_common.channels import take_at_hand
 from ..zenoh_common.endpoints import zenoh_words
 from ..zenoh_common.key_files import published_key
-from ..zenoh_common.sealed_replies import sealer_of, send_reply
+from ..zenoh_common.sealed_replies import encoding_of, sealer_of, send_reply
 from ..zenoh_common.zenoh_settings import session_config
-from .jobs import Wire
-from .liveliness_tokens import Tokens
-from .request_lanes import Lane, RequestHandler
+from .fair_queues import LivelinessTokens
+from .request_dispatcher import RequestDispatcher
+from .request_lanes import Lane
 from .server_config import ServerConfig
-from .session_transport import SceneSessions, Sessions
+from .session_transport import SceneSessions
 
 log = logging.getLogger(__name__)
 
@@ -50,22 +46,16 @@ _NEXT_SECONDS = 0.001
 _RUNTIME = "(tx: (worker_threads: 16))"
 
 
-class ServiceLike(Sessions, RequestHandler, Protocol):
-    """Service that a transport carries requests to. No method raises: an error is an answer."""
-
-    def scenes(self, encoding: str | None) -> EncodedReply: ...
-
-
 class Transport:
-    """Carries requests to a service and its answers back, from `__enter__` until `__exit__`.
+    """Carrier of requests to a dispatcher and of its answers back, from `__enter__` until `__exit__`.
 
     Entering raises SolidcloudError if the server cannot listen on the endpoint. Leaving stops
     accepting requests, answers the accepted ones for up to `config.stop_seconds`, stops the rest
     and closes.
     """
 
-    def __init__(self, scenes: Sequence[str], service: ServiceLike, config: ServerConfig) -> None:
-        self._scenes, self._service, self._config = tuple(scenes), service, config
+    def __init__(self, scenes: Sequence[str], dispatcher: RequestDispatcher, config: ServerConfig) -> None:
+        self._scenes, self._dispatcher, self._config = tuple(scenes), dispatcher, config
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._declared: list[Any] = []
@@ -147,19 +137,10 @@ class Transport:
             key_expressions.all_queries_key(scene), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
         )
         self._declared.append(queryable)
-        tokens = Tokens(self._config.max_in_flight)
-        lane = Lane(
-            self._service,
-            scene,
-            self._config,
-            queryable.handler,
-            partial(take_at_hand, queryable.handler),
-            self._start,
-            Wire(_encoding, self._sealer, send_reply),
-            tokens,
-        )
+        tokens = LivelinessTokens(self._config.max_in_flight)
+        lane = Lane(self._dispatcher, scene, self._config, queryable.handler, self._start, self._key, tokens)
         self._lanes.append(lane)
-        sessions = SceneSessions(session, scene, self._service, self._start, self._sealer, tokens)
+        sessions = SceneSessions(session, scene, self._dispatcher, self._start, self._key, tokens)
         self._sessions.append(sessions)
         self._declared += sessions.declared
         self._start(f"{scene}-watch", _watch, watch.handler, tokens, lane, sessions)
@@ -179,21 +160,17 @@ class Transport:
                     with query:
                         # Reply under the exact key: a wildcard that matches is not the server's
                         # key.
-                        sealer = self._sealer(query, key_expressions.scenes_key(), b"")
+                        sealer = sealer_of(query, self._key, key_expressions.scenes_key(), b"")
                         send_reply(
                             query,
                             key_expressions.scenes_key(),
-                            self._service.scenes(_encoding(query)),
+                            self._dispatcher.scenes(encoding_of(query)),
                             sealer,
                         )
                 except Exception:  # affects this query only
                     log.exception("a query for the scenes failed")
 
         self._start("scenes", take, queryable.handler)
-
-    def _sealer(self, query: zenoh.Query, key_expression: str, request: bytes) -> Sealer | None:
-        """Return the sealer of the replies to a query, with this server's key."""
-        return sealer_of(query, self._key, key_expression, request)
 
     def _start(self, name: str, run: Callable[..., None], *arguments: Any) -> None:
         """Start a thread that `__exit__` waits for."""
@@ -202,7 +179,7 @@ class Transport:
             self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 
 
-def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) -> None:
+def _watch(samples: Any, tokens: LivelinessTokens, lane: Lane, sessions: SceneSessions) -> None:
     """Tell a lane and its scene's sessions which clients come and go. Runs in a thread."""
     for sample in samples:
         try:
@@ -219,8 +196,3 @@ def _watch(samples: Any, tokens: Tokens, lane: Lane, sessions: SceneSessions) ->
                 tokens.here(client)
         except Exception:  # affects this client only
             log.exception("client %s", client)
-
-
-def _encoding(query: zenoh.Query) -> str | None:
-    """Return the encoding that a query states, if any."""
-    return None if query.encoding is None else str(query.encoding)

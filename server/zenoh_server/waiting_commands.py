@@ -23,7 +23,7 @@ class WaitingCommands:
     """
 
     def __init__(self, turn: Callable[[str], str]) -> None:
-        """Begin empty. turn: returns the turn of a client (liveliness_tokens.py)."""
+        """Begin empty. turn: returns the turn of a client (fair_queues.py)."""
         self._turn = turn
         self._queues: OrderedDict[str, deque[_Wish]] = OrderedDict()  # the next turn first
         self._sizes: dict[str, int] = {}

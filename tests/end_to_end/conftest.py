@@ -5,8 +5,8 @@ import socket
 import pytest
 from fake_server import FloorScene
 from solidcloud.server.client import Client
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 
 def _free_endpoint():

@@ -18,7 +18,7 @@ from solidcloud.schemas.wire.answers import (
     WithinAnswers,
 )
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.messages import (
+from solidcloud.schemas.wire.requests import (
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
@@ -26,13 +26,13 @@ from solidcloud.schemas.wire.messages import (
     RaycastRequest,
     SweepRequest,
     WithinRequest,
+    make_objects,
 )
-from solidcloud.schemas.wire.requests import make_objects
 from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0], [0.05, 0.05, 0.3]])
 POINTS = synthetic_scans.make_scan("corner", 4, 300)

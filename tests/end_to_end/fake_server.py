@@ -20,26 +20,27 @@ from solidcloud.schemas.wire.answers import (
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.wire.columns import as_part, unknown
+from solidcloud.schemas.wire.encoding import avatar_digest
 from solidcloud.schemas.wire.key_expressions import User
-from solidcloud.schemas.wire.messages import (
+from solidcloud.schemas.wire.motion_messages import Moved, Touched
+from solidcloud.schemas.wire.path_messages import answers_to_part
+from solidcloud.schemas.wire.question_rules import make_unknown
+from solidcloud.schemas.wire.scene_messages import (
     WIRE_VERSION,
     AvatarInfo,
     ReloadAnswer,
     SceneInfo,
     SourceInfo,
-    StatsAnswer,
 )
-from solidcloud.schemas.wire.motion_messages import Moved, Touched
-from solidcloud.schemas.wire.seals import avatar_digest
+from solidcloud.schemas.wire.stats import StatsAnswer
 from solidcloud.server.archives.archive_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene_interface import record_avatar
 from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import Begin, FrameLog
 from solidcloud.server.simulation.simulation import Simulation
+from solidcloud.server.zenoh_server.serve_loop import serve
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serve
 
 PART = 10  # poses in a part of a path
 
@@ -238,7 +239,7 @@ class FloorScene:
                 ones = np.ones(len(part), np.uint32)
                 self.parts += 1
                 answers = CollideAnswers(verdict, ones > 1, ones * 0, ones, ones * 2)
-                yield as_part(answers, first, len(poses))
+                yield answers_to_part(answers, first, len(poses))
 
         return parts()
 
@@ -254,7 +255,7 @@ class FloorScene:
 
     def keep(self, kind, k, operation, asked, effort):
         self.asked.append((operation, asked, effort))
-        return unknown(kind, k)
+        return make_unknown(kind, k)
 
     def limit_avatars(self, limits):
         self.limits = limits

@@ -17,8 +17,8 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 from test_reload import endpoint as endpoint  # the fixture
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0.1]])

@@ -14,14 +14,14 @@ from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
-from solidcloud.schemas.wire.messages import AvatarInfo, ErrorReply
 from solidcloud.schemas.wire.motion_messages import State
-from solidcloud.schemas.wire.seals import Sealer, hash_of
+from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply
 from solidcloud.server.client import Client, scenes_at
 from solidcloud.server.zenoh_common.key_files import find_key, key_paths
+from solidcloud.server.zenoh_common.sealed_replies import Sealer, hash_of
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at
 
 POSES = heights([-1.0, -2.0])

@@ -16,13 +16,13 @@ from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
-from solidcloud.schemas.wire.messages import AddAvatarRequest
 from solidcloud.schemas.wire.motion_messages import Wish
+from solidcloud.schemas.wire.requests import AddAvatarRequest
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])

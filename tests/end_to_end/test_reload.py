@@ -20,13 +20,13 @@ from frozen_processes import freeze
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import ReloadAnswer
+from solidcloud.schemas.wire.scene_messages import ReloadAnswer
 from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
 from solidcloud.server.zenoh_client.client_identity import OPEN_SECONDS
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_server import FloorScene

@@ -11,8 +11,8 @@ from floor import eventually
 from rogues.tools import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
 from solidcloud.server.client import Client
 from solidcloud.server.scene_interface import EVERYBODY
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"

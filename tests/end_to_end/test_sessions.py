@@ -17,13 +17,13 @@ from solidcloud.schemas.errors import (
 )
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
-from solidcloud.schemas.wire.messages import ErrorReply
 from solidcloud.schemas.wire.motion_messages import State, Wish
+from solidcloud.schemas.wire.scene_messages import ErrorReply
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 from solidcloud.server.zenoh_server import state_streams
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 from walkers import REST, outcome, pose_at, walking
 
 

@@ -18,8 +18,8 @@ from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.client import Client
 from solidcloud.server.simulation.replay import replay
 from solidcloud.server.simulation.replay_log import FrameRecord, read_log
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 from walkers import pose_at, walking
 
 

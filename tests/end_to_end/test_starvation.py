@@ -9,12 +9,15 @@ import numpy as np
 import zenoh
 from floor import DEADLINE, POINTS, eventually, heights
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import CollideRequest, ErrorReply, decode_answer, encode
+from solidcloud.schemas.wire.encoding import decode_answer, encode
+from solidcloud.schemas.wire.requests import CollideRequest
+from solidcloud.schemas.wire.scene_messages import ErrorReply
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 from solidcloud.server.zenoh_server import request_lanes as lanes_module
+from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import Service, serving
 from solidcloud.server.zenoh_server.transport import Transport
 
 ASKED = 50
@@ -42,7 +45,7 @@ class Light:
             assert self.client.collide("al", heights([-1.0, 1.0])).verdict.tolist() == TRUTH
 
 
-class StoppableService(Service):
+class StoppableService(RequestDispatcher):
     """Answers `info` when the request is stopped, or the gate is opened. began: how often; reasons: of each stop."""
 
     def __init__(self, scene, config):

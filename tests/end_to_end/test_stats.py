@@ -21,22 +21,17 @@ import pytest
 import synthetic_scans
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.key_expressions import public_id, query_key
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
-    ErrorReply,
-    StatsAnswer,
-    StatsRequest,
-    decode_answer,
-    encode,
-)
+from solidcloud.schemas.wire.scene_messages import ErrorReply
+from solidcloud.schemas.wire.stats import StatsAnswer, StatsRequest
 from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client, scenes_at
 from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import Service, serving
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_server import FloorScene
@@ -61,12 +56,12 @@ def endpoint() -> str:
 
 
 @pytest.fixture
-def service() -> Service:
-    return Service([FloorScene()], ServerConfig())
+def service() -> RequestDispatcher:
+    return RequestDispatcher([FloorScene()], ServerConfig())
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
-def test_stats_name_voxels_only_where_asked(service: Service, encoding: str) -> None:
+def test_stats_name_voxels_only_where_asked(service: RequestDispatcher, encoding: str) -> None:
     for payload, keys in (
         (b"", None),
         (encode(StatsRequest(), encoding), None),
@@ -79,7 +74,7 @@ def test_stats_name_voxels_only_where_asked(service: Service, encoding: str) -> 
 
 
 @pytest.mark.parametrize("payload", [{"key": True}, {"keys": 1}, []])
-def test_a_request_that_is_none_is_refused(service: Service, payload: object) -> None:
+def test_a_request_that_is_none_is_refused(service: RequestDispatcher, payload: object) -> None:
     answer = service.answer(KEY, msgspec.msgpack.encode(payload), MSGPACK)
     assert not isinstance(answer, Iterator) and not answer.ok
     assert decode_answer(ErrorReply, answer.payload).code == "bad_request"

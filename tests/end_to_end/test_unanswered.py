@@ -14,8 +14,8 @@ from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.cli.main import run
 from solidcloud.server.zenoh_client import request_batches as questions_module
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 OPS = [
     "collide",

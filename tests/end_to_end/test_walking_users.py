@@ -24,8 +24,8 @@ from solidcloud.server.scene_interface import FrameCommand
 from solidcloud.server.simulation.make_simulation import make_simulation
 from solidcloud.server.simulation.replay import recorded, replay
 from solidcloud.server.simulation.replay_log import MAGIC, FrameRecord, read_log
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 # A body of a metre and a half, of three spheres.
 BODY = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.8], [0.0, 0.0, 1.3]])

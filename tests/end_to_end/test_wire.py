@@ -17,21 +17,14 @@ from solidcloud.schemas.errors import (
     UnknownSceneError,
 )
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
-    AvatarInfo,
-    CollideRequest,
-    ErrorReply,
-    ScenesAnswer,
-    decode_answer,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.requests import CollideRequest
+from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply, ScenesAnswer
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_client import request_batches as questions_module
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 
 def test_client_answers_as_the_judge_does(client):

@@ -12,13 +12,11 @@ from solidcloud.schemas.errors import (
     UnknownSceneError,
 )
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import (
-    AvatarInfo,
-)
+from solidcloud.schemas.wire.scene_messages import AvatarInfo
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_client import request_batches as questions_module
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 
 def test_nobody_there_is_unknown_until_a_server_comes(scene, endpoint):

@@ -16,15 +16,13 @@ from solidcloud.schemas.errors import (
     UnknownAvatarError,
 )
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import (
-    PathRequest,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import encode
+from solidcloud.schemas.wire.path_messages import PathRequest
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 from solidcloud.server.zenoh_server import request_lanes as lanes_module
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 
 def test_a_path_comes_in_parts_and_in_order(client):

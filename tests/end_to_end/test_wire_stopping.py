@@ -10,14 +10,12 @@ import zenoh
 from fake_server import FloorScene
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import (
-    CollideRequest,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import encode
+from solidcloud.schemas.wire.requests import CollideRequest
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
+from solidcloud.server.zenoh_server.serve_loop import serve, serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serve, serving
 
 
 def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):

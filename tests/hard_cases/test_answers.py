@@ -16,7 +16,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import TooLargeError
-from solidcloud.schemas.wire.messages import MAX_AVATAR_POINTS
+from solidcloud.schemas.wire.request_limits import MAX_AVATAR_POINTS
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"

@@ -19,11 +19,12 @@ import same_answers
 import synthetic_scans
 from solidcloud.schemas.scene.effect_table import ORDER
 from solidcloud.schemas.scene.scene_file import SceneFile
-from solidcloud.schemas.wire.messages import MSGPACK, CollideRequest, encode
+from solidcloud.schemas.wire.encoding import MSGPACK, encode
+from solidcloud.schemas.wire.requests import CollideRequest
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.make_simulation import make_simulation
+from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import Service
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
@@ -77,7 +78,7 @@ FRAMES = """
 import json, os, pathlib, sys
 import msgspec
 import numpy as np
-from solidcloud.schemas.wire.messages import encode, JSON
+from solidcloud.schemas.wire.encoding import encode, JSON
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.simulation.world import collision_world as world
 from solidcloud.server.simulation.effects import pipeline
@@ -219,7 +220,7 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
                     assert moved.simulated == [name for name in ORDER if name != "objects"]
             scene.add_avatar("body", body, 0.01, client="c")
             found = scene.collide("body", poses, client="c")
-            service = Service([scene], ServerConfig())
+            service = RequestDispatcher([scene], ServerConfig())
             payload = encode(CollideRequest("body", poses), MSGPACK)
             answer = service.answer("solidcloud/1/scene/scene/c/collide", payload, MSGPACK)
             assert answer.ok

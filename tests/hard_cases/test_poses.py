@@ -11,7 +11,8 @@ import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
-from solidcloud.schemas.wire.messages import JSON, MSGPACK, SceneInfo, decode_answer, encode
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.scene_messages import SceneInfo
 from solidcloud.server.cli.input.pose_file import read_poses
 from solidcloud.server.scene import Scene
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Cost
 from solidcloud.schemas.wire.arrays import Positions
-from solidcloud.schemas.wire.questions import ColumnRules, Merge, Question
+from solidcloud.schemas.wire.question_rules import ColumnRules, Merge, Question
 from solidcloud.schemas.wire.requests import Length, QuestionRequest
 
 

@@ -16,8 +16,8 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import serving
 
 WALKING = ("stop", "sweep", "slide", "step", "ground")
 FRAME = 1 / 30

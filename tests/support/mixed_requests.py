@@ -25,23 +25,22 @@ from solidcloud.schemas.wire.answers import (
     SweepAnswers,
     WithinAnswers,
 )
-from solidcloud.schemas.wire.messages import (
-    MSGPACK,
+from solidcloud.schemas.wire.encoding import MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
+    ObjectEntry,
     ObjectsRequest,
+    QuestionRequest,
     RaycastRequest,
     SweepRequest,
     WithinRequest,
-    decode_answer,
-    encode,
 )
-from solidcloud.schemas.wire.requests import ObjectEntry, QuestionRequest
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import Service
 
 SCAN = ("corner", 21, 500)
 MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")
@@ -111,7 +110,7 @@ def checksums(
 ) -> list[str]:
     """A checksum of each reply's bytes, costs aside; the first request is answered before the others."""
     with Scene.open(archive, "scene", budget_bytes=budget_bytes) as scene:
-        service = Service([scene], ServerConfig())
+        service = RequestDispatcher([scene], ServerConfig())
 
         def reply(request: tuple[str, bytes]) -> str:
             op, payload = request

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.questions import COMMON, Question, Rows
+from solidcloud.schemas.wire.question_rules import COMMON, Question, Rows
 
 
 def faults(question: Question[Any], text: str) -> list[str]:

@@ -85,8 +85,8 @@ def serve(
     from ...scene import Scene
     from ...simulation.replay import recorded
     from ...zenoh_common.key_files import read_given_key
+    from ...zenoh_server.serve_loop import serve as serve_scenes
     from ...zenoh_server.server_config import ServerConfig
-    from ...zenoh_server.service import serve as serve_scenes
     from .kernel_rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")

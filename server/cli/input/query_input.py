@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
-from ....schemas.wire.columns import join, without_part
-from ....schemas.wire.motion_messages import LONGEST_SECONDS, Moved
-from ....schemas.wire.questions import OBJECTS, QUESTIONS, Question, path_questions
+from ....schemas.wire.motion_messages import Moved
+from ....schemas.wire.path_messages import part_to_answers
+from ....schemas.wire.question_rules import Question, join_answers
+from ....schemas.wire.questions import OBJECTS, QUESTIONS, path_questions
+from ....schemas.wire.request_limits import MAX_FRAME_SECONDS
 from ....schemas.wire.requests import QuestionRequest
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import BodyPlaces, Places, PointPlaces, RayPlaces, box_of
@@ -138,7 +140,7 @@ def ask(scene: QueryTarget, query: Query, read_points: ReadPoints) -> Iterator[A
     if query.op == "path":
         for part in scene.path("avatar", poses, question.name, **parameters):
             which = slice(part.first, part.first + len(part))
-            yield AnswerPart(labels[which], begins[which], without_part(part), places)
+            yield AnswerPart(labels[which], begins[which], part_to_answers(part), places)
     else:
         ends = (poses[:-1], poses[1:]) if moving else (poses,)
         yield AnswerPart(labels, begins, scene.ask(question, "avatar", *ends, **parameters), places)
@@ -159,7 +161,7 @@ def ask_moves(
     def frames() -> Iterator[tuple[str, Moved]]:
         for number, (label, seconds) in enumerate(zip(labels, np.diff(times).tolist(), strict=True)):
             pose_from, pose_to = poses[number : number + 1], poses[number + 1 : number + 2]
-            yield label, scene.move("avatar", pose_from, pose_to, min(seconds, LONGEST_SECONDS))
+            yield label, scene.move("avatar", pose_from, pose_to, min(seconds, MAX_FRAME_SECONDS))
 
     return places, frames()
 
@@ -168,7 +170,7 @@ def joined(found: list[AnswerPart]) -> AnswerPart:
     """Join the parts of one query's answers."""
     labels = [label for part in found for label in part.labels]
     times = [time for part in found for time in part.times]
-    return AnswerPart(labels, times, join([part.answers for part in found]), found[0].places)
+    return AnswerPart(labels, times, join_answers([part.answers for part in found]), found[0].places)
 
 
 def _add_body(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
-from ....schemas.wire.messages import SceneInfo
+from ....schemas.wire.scene_messages import SceneInfo
 
 Vec = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
     from ....builder.pipeline import BuildSummary
     from ....schemas.archive.radius_model import RadiusDistribution
-    from ....schemas.wire.messages import SceneInfo
+    from ....schemas.wire.scene_messages import SceneInfo
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:

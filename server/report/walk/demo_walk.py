@@ -23,7 +23,7 @@ from ....builder.pipeline import build_archive
 from ....builder.synthetic.figure import figure_points
 from ....schemas.errors import SolidcloudError
 from ....schemas.wire.answers import CollideAnswers, Verdict
-from ....schemas.wire.messages import SceneInfo
+from ....schemas.wire.scene_messages import SceneInfo
 from ...cli.output.console import bytes_text, print_build, print_facts
 from ...cli.output.progress_display import progress_listener
 from ...client import Client

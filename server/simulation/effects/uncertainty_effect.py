@@ -35,8 +35,8 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError
 from ....schemas.scene.effect_table import Uncertainty
-from ....schemas.wire.messages import SceneInfo, SourceInfo
 from ....schemas.wire.motion_messages import UncertaintyReport
+from ....schemas.wire.scene_messages import SceneInfo, SourceInfo
 from ...archives.rigid_transform import transform_poses
 from ...avatars.avatar_model import make_avatar
 from ...queries.context.query_context import SceneData

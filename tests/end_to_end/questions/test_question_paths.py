@@ -7,14 +7,9 @@ from corner import POSES, same
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.columns import join, without_part
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
-    PathRequest,
-    decode_answer,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.path_messages import PathRequest, part_to_answers
+from solidcloud.schemas.wire.question_rules import join_answers
 from solidcloud.schemas.wire.questions import QUESTIONS
 from solidcloud.server.queries import path as path_module
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
@@ -48,7 +43,7 @@ def test_a_path_is_its_question_in_parts(scene, client, op, parameters, monkeypa
         stops = np.cumsum([len(part) for part in parts]).tolist()
         assert [part.first for part in parts] == [0, *stops[:-1]]
         assert {part.total for part in parts} == {stops[-1]} == {len(expected)}
-        same(join([without_part(part) for part in parts]), expected)
+        same(join_answers([part_to_answers(part) for part in parts]), expected)
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
@@ -65,8 +60,8 @@ def test_plain_zenoh_gets_the_parts_of_a_path(scene, endpoint, op, parameters, e
     assert len(replies) > 3
     parts = [decode_answer(QUESTIONS[op].part, reply, encoding) for reply in replies]
     same(
-        join([without_part(part) for part in parts]),
-        join([without_part(part) for part in expected]),
+        join_answers([part_to_answers(part) for part in parts]),
+        join_answers([part_to_answers(part) for part in expected]),
     )
 
 

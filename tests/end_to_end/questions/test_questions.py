@@ -22,14 +22,9 @@ from corner import (
 )
 from solidcloud.schemas.errors import TooLargeError
 from solidcloud.schemas.wire import key_expressions
-from solidcloud.schemas.wire.columns import join, without_part
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
-    check_answers,
-    decode_answer,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.path_messages import part_to_answers
+from solidcloud.schemas.wire.question_rules import check_answers, join_answers
 from solidcloud.server import kernels
 from solidcloud.server.client import Client
 from solidcloud.server.queries import path as path_module
@@ -70,18 +65,18 @@ def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkey
 
 def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monkeypatch):
     """Clusters are not bounded by `limit`: here there are many of them, and messages are small."""
-    from solidcloud.server.zenoh_server import service as app_module
+    from solidcloud.server.zenoh_server import request_dispatcher as dispatcher_module
 
     parameters = {"limit": 0, "margin": 0.5, "cluster_distance": 0.0}
     expected = scene.contacts("al", POSES, **parameters)
     most = 116 * int(np.diff(expected.cluster_starts).max())
     assert most > 1000 and 116 * expected.cluster_starts[-1] > 3 * most
-    monkeypatch.setattr(app_module, "MAX_MESSAGE_BYTES", (1 << 16) + most + 5000)
+    monkeypatch.setattr(dispatcher_module, "MAX_MESSAGE_BYTES", (1 << 16) + most + 5000)
     monkeypatch.setattr(path_module, "_PART_BYTES", most)
     same(client.contacts("al", POSES, **parameters), expected)
-    parts = [without_part(part) for part in client.path("al", POSES, "contacts", **parameters)]
-    same(join(parts), expected)
-    monkeypatch.setattr(app_module, "MAX_MESSAGE_BYTES", (1 << 16) + 1000)
+    parts = [part_to_answers(part) for part in client.path("al", POSES, "contacts", **parameters)]
+    same(join_answers(parts), expected)
+    monkeypatch.setattr(dispatcher_module, "MAX_MESSAGE_BYTES", (1 << 16) + 1000)
     with pytest.raises(TooLargeError, match="a message holds"):
         client.contacts("al", POSES, **parameters)
 

@@ -22,10 +22,10 @@ from solidcloud.schemas.wire.answers import (
     Verdict,
     WithinAnswers,
 )
-from solidcloud.schemas.wire.columns import check_answers, unknown
 from solidcloud.schemas.wire.encoding import decode_answer, encode
-from solidcloud.schemas.wire.messages import CollideRequest, WithinRequest
 from solidcloud.schemas.wire.motion_messages import Moved
+from solidcloud.schemas.wire.question_rules import check_answers, make_unknown
+from solidcloud.schemas.wire.requests import CollideRequest, WithinRequest
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_a_false_clear_is_told_from_a_false_contact() -> None:
     truth = collided(Verdict.CONTACT, Verdict.CLEAR, Verdict.CONTACT)
     found = judge(collided(Verdict.CLEAR, Verdict.CONTACT, Verdict.UNKNOWN), [truth])
     assert (len(found.faults), found.false_clear, found.right, found.unknown) == (2, 1, 0, 1)
-    assert not judge(unknown(CollideAnswers, 3, bounded=False), [truth]).faults
+    assert not judge(make_unknown(CollideAnswers, 3, bounded=False), [truth]).faults
 
 
 def test_an_answer_may_be_that_of_any_generation_that_may_be_served() -> None:

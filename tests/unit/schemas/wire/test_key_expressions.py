@@ -3,7 +3,7 @@
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire import key_expressions
-from solidcloud.schemas.wire.messages import WIRE_VERSION
+from solidcloud.schemas.wire.scene_messages import WIRE_VERSION
 
 
 def test_keys_look_as_in_the_document():

@@ -5,21 +5,20 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_request, encode
+from solidcloud.schemas.wire.path_messages import PathRequest
+from solidcloud.schemas.wire.request_limits import MAX_OBJECTS
+from solidcloud.schemas.wire.requests import (
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
+    ObjectEntry,
     ObjectsRequest,
-    PathRequest,
     RaycastRequest,
     SweepRequest,
     WithinRequest,
-    decode_request,
-    encode,
+    make_objects,
 )
-from solidcloud.schemas.wire.requests import MAX_OBJECTS, ObjectEntry, make_objects
 
 POSES = np.tile(np.eye(4), (3, 1, 1))
 VECTORS = np.arange(9.0).reshape(3, 3)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from solidcloud.builder.voxel.point_radius import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.effect_table import ThroughBox
-from solidcloud.schemas.wire.columns import array_fields
+from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.archives.masked_archive import MaskedArchive
 from solidcloud.server.scene import Scene
 

@@ -13,7 +13,7 @@ from solidcloud.schemas.wire.answers import (
     Verdict,
 )
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.columns import unknown
+from solidcloud.schemas.wire.question_rules import make_unknown
 from solidcloud.server.archives.merge_answers import answers_in_world, limit_pairs, merge_answers
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in Verdict)
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.interpreted
 
 def answers(kind: Any, k: int, **columns: Any) -> Any:
     """Answers of k poses, unknown but for what is given."""
-    blank = unknown(kind, k)
+    blank = make_unknown(kind, k)
     types = array_fields(kind)
     given = {
         name: np.array(values, types[name].dtype) if name in types else values

@@ -19,8 +19,8 @@ from solidcloud.server.archives.rigid_transform import (
     transform_poses,
 )
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import Service
 from split_scans import BODY, COUNT, OPTIONS, RADIUS, STEP, Built, exact_pose, near, several
 
 
@@ -147,7 +147,7 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
         with pytest.raises(UnknownAvatarError):
             scene.collide("bo", poses, client="me")
         scene.warm()
-        service = Service([scene], ServerConfig())
+        service = RequestDispatcher([scene], ServerConfig())
         assert service.scenes(None).ok
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from solidcloud.schemas.errors import BadRequestError, TooLargeError
-from solidcloud.schemas.wire.messages import MAX_AVATAR_POINTS
+from solidcloud.schemas.wire.request_limits import MAX_AVATAR_POINTS
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.core.scene_arrays import LANES
 

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
-from solidcloud.schemas.wire.seals import avatar_digest
+from solidcloud.schemas.wire.encoding import avatar_digest
 from solidcloud.server.avatars import client_avatars as avatars_module
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.avatars.client_avatars import Avatars, bytes_of

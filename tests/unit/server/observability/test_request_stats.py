@@ -11,7 +11,7 @@ import pytest
 from solidcloud.schemas.wire.answers import CollideAnswers, Cost
 from solidcloud.schemas.wire.key_expressions import public_id
 from solidcloud.schemas.wire.stats import TIME_BOUNDS, Times, UserStats
-from solidcloud.server.observability import request_stats as metrics_module
+from solidcloud.server.observability import request_stats as stats_module
 from solidcloud.server.observability.request_stats import BOUNDS, Histogram, RequestStats, times_of
 
 
@@ -155,7 +155,7 @@ def test_a_client_that_went_is_forgotten_and_counts_in_all(metrics: RequestStats
 def test_the_longest_silent_is_forgotten_for_a_new_one(
     metrics: RequestStats, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(metrics_module, "MAX_USERS", 3)
+    monkeypatch.setattr(stats_module, "MAX_USERS", 3)
     for client in "abcadae":
         metrics.answered(client, "al", answers(0, hits=1))
     total, users = metrics.snapshot()
@@ -198,7 +198,7 @@ def run_all(work: Callable[[int], None], count: int) -> None:
 
 
 def test_nothing_is_lost_between_threads(metrics: RequestStats, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics_module, "MAX_USERS", 3)
+    monkeypatch.setattr(stats_module, "MAX_USERS", 3)
     torn = []
 
     def work(number: int) -> None:

@@ -16,7 +16,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
-from solidcloud.schemas.wire.requests import MAX_CONTACTS
+from solidcloud.schemas.wire.request_limits import MAX_CONTACTS
 from solidcloud.server.archives.archive_info import describe
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.scene_arrays import LANES

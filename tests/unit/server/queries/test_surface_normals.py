@@ -265,7 +265,7 @@ def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_p
 def test_nobody_imports_it_but_who_asks() -> None:
     """A scene that calls for no normals has none of their code in memory."""
     code = (
-        "import sys; import solidcloud.server.scene, solidcloud.server.zenoh_server.service; "
+        "import sys; import solidcloud.server.scene, solidcloud.server.zenoh_server.serve_loop; "
         "print([name for name in sys.modules if name.startswith('solidcloud') and 'normals' in name])"
     )
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

@@ -18,16 +18,8 @@ from solidcloud.schemas.errors import (
 )
 from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
-    AvatarInfo,
-    ObjectInfo,
-    SceneInfo,
-    SpawnInfo,
-    decode_answer,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.scene_messages import AvatarInfo, ObjectInfo, SceneInfo, SpawnInfo
 from solidcloud.server import scene as scene_module
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.cli.main import run

@@ -9,8 +9,8 @@ from fake_server import floor_simulation
 from solidcloud.schemas.errors import BusyError
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.key_expressions import User
-from solidcloud.schemas.wire.messages import ErrorReply
 from solidcloud.schemas.wire.motion_messages import State, Wish
+from solidcloud.schemas.wire.scene_messages import ErrorReply
 from solidcloud.server.zenoh_server.command_mailboxes import FrameLoop, Mailboxes
 
 pytestmark = pytest.mark.interpreted

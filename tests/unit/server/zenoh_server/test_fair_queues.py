@@ -8,7 +8,15 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from solidcloud.server.zenoh_server.fair_queues import FairQueues, Offer, QueueLimits, Ticket, TicketState
+from solidcloud.server.zenoh_server.fair_queues import (
+    ANONYMOUS,
+    FairQueues,
+    LivelinessTokens,
+    Offer,
+    QueueLimits,
+    Ticket,
+    TicketState,
+)
 
 BOUNDS = QueueLimits(workers=2, slow=1, waits=4, requests=100, size=1000, by_turn=50, first=0)
 
@@ -94,7 +102,7 @@ def test_a_slow_request_gives_up_its_worker_and_keeps_its_turn():
     heavy, _ = offered(queues, "heavy", 1)
     other, offer = offered(queues, "other", 2)
     assert offer is Offer.WAIT
-    assert queues.slow(heavy) == [other] and heavy.left
+    assert queues.move_to_slow(heavy) == [other] and heavy.left
     again, offer = offered(queues, "heavy", 3)
     assert offer is Offer.WAIT, "the turn is kept"
     assert queues.finished(other) == []
@@ -105,18 +113,20 @@ def test_slow_requests_are_bounded():
     queues = make(workers=2, slow=1)
     first, _ = offered(queues, "a", 1)
     second, _ = offered(queues, "b", 2)
-    assert queues.slow(first) == []
-    assert queues.slow(first) is None, "it is slow already"
-    assert queues.slow(second) is None, "no place"
+    assert queues.move_to_slow(first) == []
+    assert queues.move_to_slow(first) is None, "it is slow already"
+    assert queues.move_to_slow(second) is None, "no place"
     assert queues.put_back(second) == [], "it waits for a place and holds no worker"
     third, offer = offered(queues, "c", 3)
     assert offer is Offer.RUN
     assert second.state is TicketState.DONE and not second.left
     [again] = queues.finished(first)
     assert again.request == 2 and again.state is TicketState.SLOW and again.left
-    assert queues.waits(second) is None and again.state is TicketState.SLOW, "the old ticket is over"
+    assert queues.move_to_waiting(second) is None and again.state is TicketState.SLOW, (
+        "the old ticket is over"
+    )
     assert queues.finished(third) == queues.finished(again) == []
-    assert queues.slow(again) is None, "it is answered"
+    assert queues.move_to_slow(again) is None, "it is answered"
     assert len(queues) == 0
 
 
@@ -146,11 +156,11 @@ def test_what_is_put_back_comes_before_what_its_client_asked_after():
 def test_an_answer_on_its_way_holds_neither_worker_nor_slow_place():
     queues = make(workers=1, slow=1, waits=2)
     first, _ = offered(queues, "a", 1)
-    assert queues.waits(first) == []
+    assert queues.move_to_waiting(first) == []
     second, _ = offered(queues, "b", 2, slow=True)
     third, _ = offered(queues, "c", 3, slow=True)
-    assert queues.waits(second) == [third]
-    assert queues.waits(third) is None, "bounded"
+    assert queues.move_to_waiting(second) == [third]
+    assert queues.move_to_waiting(third) is None, "bounded"
     assert offered(queues, "a", 4)[1] is Offer.WAIT, "the turn is kept"
     assert [ticket.request for ticket in queues.finished(first)] == [4]
 
@@ -158,11 +168,11 @@ def test_an_answer_on_its_way_holds_neither_worker_nor_slow_place():
 def test_a_request_that_waited_takes_a_slow_place_once_it_computes():
     queues = make(workers=1, slow=1)
     first, _ = offered(queues, "a", 1)
-    assert queues.waits(first) == []
-    assert queues.slow(first) == [] and first.state is TicketState.SLOW
+    assert queues.move_to_waiting(first) == []
+    assert queues.move_to_slow(first) == [] and first.state is TicketState.SLOW
     second, _ = offered(queues, "b", 2)
-    assert queues.waits(second) == []
-    assert queues.slow(second) is None, "no place"
+    assert queues.move_to_waiting(second) == []
+    assert queues.move_to_slow(second) is None, "no place"
     assert queues.put_back(second) == [] and second.left, "whoever carried it out has no worker"
     assert [ticket.request for ticket in queues.finished(first)] == [2]
 
@@ -279,13 +289,13 @@ class AnyOrder(RuleBasedStateMachine):
     @precondition(lambda self: self.at_work)
     @rule(data=st.data())
     def slow(self, data):
-        started = self.queues.slow(data.draw(st.sampled_from(self.at_work)))
+        started = self.queues.move_to_slow(data.draw(st.sampled_from(self.at_work)))
         self.started(started or [])
 
     @precondition(lambda self: self.at_work)
     @rule(data=st.data())
     def send(self, data):
-        started = self.queues.waits(data.draw(st.sampled_from(self.at_work)))
+        started = self.queues.move_to_waiting(data.draw(st.sampled_from(self.at_work)))
         self.started(started or [])
 
     @precondition(lambda self: self.at_work)
@@ -375,9 +385,9 @@ def test_nothing_is_forgotten_by_several_threads(seed):
                 at_work.add(ticket.turn)
                 seen.append(ticket)
             if ticket.request % 5 == 0:
-                start(queues.slow(ticket) or [])
+                start(queues.move_to_slow(ticket) or [])
             if ticket.request % 11 == 0:
-                start(queues.waits(ticket) or [])
+                start(queues.move_to_waiting(ticket) or [])
             with lock:
                 at_work.remove(ticket.turn)
             if ticket.request % 7 == 0:  # its answer goes on in a thread of its own
@@ -409,3 +419,26 @@ def test_nothing_is_forgotten_by_several_threads(seed):
     for client in {ticket.client for ticket in seen}:
         requests = [ticket.request for ticket in seen if ticket.client == client]
         assert requests == sorted(requests)
+
+
+def test_clients_with_a_token_have_a_turn_and_all_others_share_one():
+    tokens = LivelinessTokens(2)
+    tokens.here("a")
+    assert [tokens.turn(client) for client in "abc"] == ["a", ANONYMOUS, ANONYMOUS]
+    tokens.gone("a")
+    tokens.gone("nobody")
+    assert tokens.turn("a") == ANONYMOUS and not tokens.heeded
+
+
+def test_so_many_tokens_are_heeded_and_the_next_once_one_goes():
+    tokens = LivelinessTokens(2)
+    for client in "abcdefg":
+        tokens.here(client)
+    assert tokens.heeded == {"a", "b"} and tokens.turn("c") == ANONYMOUS
+    tokens.gone("d")
+    tokens.gone("a")
+    assert tokens.heeded == {"b", "c"}
+    tokens.gone("b")
+    assert tokens.heeded == {"c"}, "e came when as many waited as are remembered"
+    tokens.here("e")
+    assert tokens.turn("e") == "e"

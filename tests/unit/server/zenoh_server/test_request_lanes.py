@@ -1,4 +1,4 @@
-"""The threads of a lane, without zenoh: queries come from a queue, the service and the wire are fakes."""
+"""The threads of a lane, without zenoh: queries come from a queue; queries and dispatcher are fakes."""
 
 import os
 import queue
@@ -8,18 +8,17 @@ import time
 from contextlib import contextmanager, suppress
 
 import pytest
+from solidcloud.schemas.wire.encoding import MSGPACK
 from solidcloud.server.runtime.threads import start_thread
-from solidcloud.server.runtime.watchdog import lower_priority
 from solidcloud.server.scene_interface import EncodedReply, LimitReached
 from solidcloud.server.zenoh_server import request_lanes as lanes_module
-from solidcloud.server.zenoh_server.fair_queues import Offer, Ticket
-from solidcloud.server.zenoh_server.jobs import Wire
-from solidcloud.server.zenoh_server.liveliness_tokens import Tokens
-from solidcloud.server.zenoh_server.request_lanes import Lane
+from solidcloud.server.zenoh_server.fair_queues import LivelinessTokens, Offer, Ticket
+from solidcloud.server.zenoh_server.request_lanes import Lane, ReceivedRequest
 from solidcloud.server.zenoh_server.server_config import ServerConfig
+from solidcloud.server.zenoh_server.watchdog import lower_priority
 
 DEADLINE = 20.0
-ANSWER = EncodedReply(b"", "msgpack", True)
+ANSWER = EncodedReply(b"", MSGPACK, True)
 
 
 def eventually(condition):
@@ -35,6 +34,7 @@ class Query:
     def __init__(self, client, operation="collide"):
         self.key_expr, self.payload = f"solidcloud/1/scene/hall/{client}/{operation}", None
         self.client, self.operation = client, operation
+        self.encoding = self.attachment = None
         self.replies, self.ended = [], threading.Event()
 
     def __enter__(self):
@@ -43,9 +43,12 @@ class Query:
     def __exit__(self, *error):
         self.ended.set()
 
+    def reply(self, key, payload, encoding, attachment):
+        self.replies.append(payload)
+
 
 class Fake:
-    """A service that answers with what `answers` makes of a query. busy: what there was no room for, in order."""
+    """A dispatcher that answers with what `answers` makes of a query. busy: what there was no room for, in order."""
 
     def __init__(self, answers):
         self.answers, self.full, self.unused = answers, [], []
@@ -65,39 +68,33 @@ class Fake:
         self.unused.append(alive)
 
 
-def reply(query, key, answer, sealer, number):
-    query.replies.append(answer)
-    return True
+class Channel(queue.SimpleQueue):
+    """Queries; None, once for each worker, ends them."""
+
+    def __iter__(self):
+        return iter(self.get, None)
+
+    def try_recv(self):
+        with suppress(queue.Empty):
+            query = self.get_nowait()
+            if query is not None:
+                return query
+            self.put(None)
+        return None
 
 
 class Hall:
-    """A lane that takes what is put into `queries`; None, once for each taker, ends them."""
+    """A lane that takes what is put into `queries`."""
 
     def __init__(self, answers, start=start_thread, **config):
-        self.queries, self.threads, self.service = queue.SimpleQueue(), [], Fake(answers)
-        self.tokens = Tokens(64)
+        self.queries, self.threads, self.service = Channel(), [], Fake(answers)
+        self.tokens = LivelinessTokens(64)
 
         def started(name, run, *arguments):
             self.threads.append(start(name, run, *arguments))
 
-        self.lane = Lane(
-            self.service,
-            "hall",
-            ServerConfig(**config),
-            iter(self.queries.get, None),
-            self.at_hand,
-            started,
-            Wire(lambda query: None, lambda *_: None, reply),
-            self.tokens,
-        )
-
-    def at_hand(self):
-        with suppress(queue.Empty):
-            query = self.queries.get_nowait()
-            if query is not None:
-                return query
-            self.queries.put(None)
-        return None
+        config = ServerConfig(**config)
+        self.lane = Lane(self.service, "hall", config, self.queries, started, b"", self.tokens)
 
     def ask(self, client, operation="collide"):
         self.queries.put(query := Query(client, operation))
@@ -198,12 +195,12 @@ def test_a_request_that_is_made_slow_while_it_is_put_back_leaves_no_worker_behin
     """The watchdog finds a slow place for a request at the moment at which its thread puts it back."""
     hall = Hall(lambda *_: ANSWER)
     lane = hall.lane
-    ticket = Ticket("a", lanes_module.ReceivedRequest(Query("a"), lane._wire), 0)
+    ticket = Ticket("a", ReceivedRequest(Query("a"), b""), 0)
     assert lane._queues.offer(ticket) is Offer.RUN
     put_back = lane._queues.put_back
 
     def late(ticket):
-        assert lane._queues.slow(ticket) == []
+        assert lane._queues.move_to_slow(ticket) == []
         return put_back(ticket)
 
     lane._queues.put_back = late

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import zenoh
-from solidcloud.server.zenoh_server.liveliness_tokens import Tokens
+from solidcloud.server.zenoh_server.fair_queues import LivelinessTokens
 from solidcloud.server.zenoh_server.session_transport import SceneSessions
 
 pytestmark = pytest.mark.interpreted
@@ -71,7 +71,7 @@ def sample(client, size=10, kind=zenoh.SampleKind.PUT):
 
 
 def taken(samples, *known):
-    frames, tokens = Frames(), Tokens(8)
+    frames, tokens = Frames(), LivelinessTokens(8)
     for client in known:
         tokens.here(client)
     service = SimpleNamespace(frames=lambda *_: None)

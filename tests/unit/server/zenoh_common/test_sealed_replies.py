@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import solidcloud.schemas
-from solidcloud.schemas.wire.seals import Sealer, avatar_digest, hash_of, is_about
+from solidcloud.schemas.wire.encoding import avatar_digest
+from solidcloud.server.zenoh_common.sealed_replies import Sealer, hash_of, is_about
 
 KEY, NONCE = bytes(range(32)), bytes(range(100, 116))
 NAME = "solidcloud/1/scene/hall/c1/collide"

@@ -14,8 +14,9 @@ from solidcloud.schemas.wire.answers import (
     Verdict,
 )
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.columns import as_part, check_answers, in_pieces, join, unknown, without_part
-from solidcloud.schemas.wire.messages import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.path_messages import answers_to_part, part_to_answers, split_answers
+from solidcloud.schemas.wire.question_rules import check_answers, join_answers, make_unknown
 from solidcloud.schemas.wire.questions import QUESTIONS, path_questions
 
 KINDS = [question.answers for question in QUESTIONS.values()]
@@ -28,7 +29,7 @@ def some(kind, k, seed=1, pairs=(2, 0, 3)):
     columns = {}
     for name, (dtype, tail, _) in array_fields(kind).items():
         rows = k
-        if kind is ContactsAnswers and not len(getattr(unknown(kind, 1), name)):
+        if kind is ContactsAnswers and not len(getattr(make_unknown(kind, 1), name)):
             rows = int(starts[-1])
         if name in ("pairs", "pair_verdict"):
             rows = 3 if k else 0
@@ -54,7 +55,7 @@ def same(one, other):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("k", [0, 1, 5])
 def test_answers_of_all_kinds_arrive_as_sent(kind, k, encoding):
-    for sent in (some(kind, k), unknown(kind, k)):
+    for sent in (some(kind, k), make_unknown(kind, k)):
         got = check_answers(decode_answer(kind, encode(sent, encoding), encoding), k)
         same(got, sent)
         assert (got.engine_seconds, got.hits, got.faults) == (sent.engine_seconds, sent.hits, sent.faults)
@@ -62,16 +63,16 @@ def test_answers_of_all_kinds_arrive_as_sent(kind, k, encoding):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_nobody_answered_is_never_clear(kind):
-    answers = unknown(kind, 3)
+    answers = make_unknown(kind, 3)
     assert answers.verdict.tolist() == [Verdict.UNKNOWN] * 3
     assert not any(getattr(answers, "exact", []))
     if kind not in (ContactsAnswers, ObjectsAnswers):
         assert np.isinf(answers.upper).all() and (answers.lower <= 0).all()
-    assert len(unknown(CollideAnswers, 3, bounded=False).lower) == 0
+    assert len(make_unknown(CollideAnswers, 3, bounded=False).lower) == 0
 
 
 def test_every_pair_of_objects_that_nobody_answered_is_unknown():
-    answers = unknown(ObjectsAnswers, 4)
+    answers = make_unknown(ObjectsAnswers, 4)
     assert answers.pairs.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
     assert answers.pair_verdict.tolist() == [Verdict.UNKNOWN] * 6
 
@@ -79,7 +80,7 @@ def test_every_pair_of_objects_that_nobody_answered_is_unknown():
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not ObjectsAnswers])
 def test_joined_answers_are_those_of_all(kind):
     parts = [some(kind, k, seed) for seed, k in enumerate((3, 0, 5, 1))]
-    whole = check_answers(join(parts), 9)
+    whole = check_answers(join_answers(parts), 9)
     for name in array_fields(kind):
         if not name.endswith("_starts"):
             assert np.array_equal(
@@ -95,13 +96,13 @@ def test_joined_answers_are_those_of_all(kind):
 def test_a_part_says_where_it_belongs(question):
     kind = question.answers
     answers = some(kind, 4)
-    part = as_part(answers, 7, 20)
+    part = answers_to_part(answers, 7, 20)
     for encoding in (MSGPACK, JSON):
         got = decode_answer(question.part, encode(part, encoding), encoding)
         assert (got.first, got.total, len(check_answers(got, 4))) == (7, 20, 4)
         same(got, part)
     assert isinstance(part, kind)
-    same(without_part(part), answers)
+    same(part_to_answers(part), answers)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -135,7 +136,7 @@ def test_pairs_of_objects_that_were_not_asked_about_are_an_internal_error():
 
 
 def test_null_says_least_in_json():
-    text = encode(unknown(DistanceAnswers, 1), JSON)
+    text = encode(make_unknown(DistanceAnswers, 1), JSON)
     assert text.count(b"null") == 12 and b"NaN" not in text and b"Infinity" not in text
     got = decode_answer(DistanceAnswers, text, JSON)
     assert (got.lower[0], got.upper[0], got.signed_distance[0]) == (-np.inf, np.inf, np.inf)
@@ -161,7 +162,7 @@ def test_null_says_least_in_json():
     ],
 )
 def test_what_is_no_column_in_json_is_an_internal_error(old, new):
-    text = encode(unknown(DistanceAnswers, 1), JSON)
+    text = encode(make_unknown(DistanceAnswers, 1), JSON)
     assert old in text
     with pytest.raises(InternalError):
         decode_answer(DistanceAnswers, text.replace(old, new), JSON)
@@ -180,11 +181,11 @@ def test_json_integers_beyond_int32_are_refused(value):
 @pytest.mark.parametrize("most", [0, 2 * 184, 5 * 184 + 100, 1 << 20])
 def test_contacts_in_pieces_are_joined_again(k, most):
     whole = some(ContactsAnswers, k)
-    pieces = list(in_pieces(whole, most))
+    pieces = list(split_answers(whole, most))
     for piece in pieces:
         check_answers(piece, len(piece))
         assert len(piece) == 1 or 184 * int(piece.pair_starts[-1]) <= most or not k
-    same(join(pieces), whole)
+    same(join_answers(pieces), whole)
     # None could have taken the next one's first pose.
     for piece, following in pairwise(pieces):
         assert 184 * int(piece.pair_starts[-1] + following.pair_starts[1]) > most

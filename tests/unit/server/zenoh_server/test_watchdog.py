@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from solidcloud.server.runtime.watchdog import Watchdog, cpu_seconds, lower_priority
+from solidcloud.server.zenoh_server.watchdog import Watchdog, cpu_seconds, lower_priority
 
 DEADLINE = 20.0
 

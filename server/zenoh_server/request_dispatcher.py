@@ -1,15 +1,8 @@
-"""Assembly of a server: build its parts, warm them up, start them and stop them.
-
-`Service` connects the bytes of the wire with the scenes; the command runs `serve`.
-"""
+"""Dispatch of requests: from the bytes of a request to the scene that answers it, and back to bytes."""
 
 import logging
-import signal
-import socket
-import sys
-import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -22,31 +15,19 @@ from ...schemas.errors import (
     UnknownSceneError,
 )
 from ...schemas.wire import key_expressions
-from ...schemas.wire.messages import (
-    MAX_MESSAGE_BYTES,
-    MSGPACK,
-    WIRE_VERSION,
-    AddAvatarRequest,
-    ErrorReply,
-    MoveRequest,
-    PathRequest,
-    ReloadAnswer,
-    ScenesAnswer,
-    StatsRequest,
-    decode_request,
-    encode,
-    wire_encoding,
-)
-from ...schemas.wire.questions import QUESTIONS, Question
-from ...schemas.wire.requests import QuestionRequest
-from ..runtime.deadlines import start_deadlines
-from ..runtime.process_heap import give_back_large_blocks
-from ..runtime.stop_flag import NO_STOP, StopFlag
-from ..runtime.threads import start_thread
+from ...schemas.wire.encoding import MSGPACK, decode_request, encode, wire_encoding
+from ...schemas.wire.motion_messages import MoveRequest
+from ...schemas.wire.path_messages import PathRequest
+from ...schemas.wire.question_rules import Question
+from ...schemas.wire.questions import QUESTIONS
+from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
+from ...schemas.wire.requests import AddAvatarRequest, QuestionRequest
+from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ReloadAnswer, ScenesAnswer
+from ...schemas.wire.stats import StatsRequest
+from ..runtime.stop_flag import NO_STOP, StopFlag, start_deadlines
 from ..scene_interface import EncodedReply, LimitReached, ServedScene, recording_avatars
 from .command_mailboxes import FrameLoop
 from .server_config import ServerConfig
-from .transport import Transport
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +78,7 @@ def _operation(name: str) -> _Operation | None:
     return _Operation(own.request, own.counted, ask)
 
 
-class Service:
+class RequestDispatcher:
     """Answers requests on the wire from scenes. Thread-safe; never raises: errors are answers."""
 
     def __init__(self, scenes: Sequence[ServedScene], config: ServerConfig) -> None:
@@ -208,7 +189,7 @@ class Service:
     ) -> FrameLoop | None:
         """Return the sessions of a scene, which send states with `publish`; None if it has none.
 
-        turn: returns the turn of a client (liveliness_tokens.py); by default each has its own.
+        turn: returns the turn of a client (fair_queues.py); by default each has its own.
         """
         if (simulation := self._scenes[scene].simulation) is None:
             return None
@@ -282,97 +263,3 @@ class Service:
         except BadRequestError:
             stated = MSGPACK
         return EncodedReply(encode(ErrorReply(code, message), stated), stated, False)
-
-
-@contextmanager
-def serving(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[Service]:
-    """Serve scenes inside a `with`; the caller closes them afterwards.
-
-    Everything is warm and reachable once entered. SolidcloudError: a scene or endpoint is unusable.
-    """
-    service = Service(scenes, config)
-    service.warm()
-    transport = Transport([scene.name for scene in scenes], service, config)
-    try:
-        with transport:
-            yield service
-    finally:
-        service.left_at_work = transport.left_at_work
-
-
-def serve(
-    scenes: Sequence[ServedScene], config: ServerConfig, ready: Callable[[], object] = lambda: None
-) -> bool:
-    """Serve scenes until SIGTERM or SIGINT, then answer accepted requests. Main thread only.
-
-    Return whether all requests have ended; if not, closing their scene waits for them.
-    ready: called once all is warm and reachable.  SIGHUP: reload all scenes, see `Scene.reload`.
-    """
-    give_back_large_blocks()
-    # By default, a pure Python thread may hold the interpreter's lock for 5 ms while a reply waits.
-    sys.setswitchinterval(0.0005)
-    if config.insecure:
-        log.warning("--insecure: every client that reaches %s may send requests", config.listen)
-    with (
-        _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
-        _metrics(scenes, config),
-        serving(scenes, config) as service,
-        _reloader(service) as wanted,
-    ):
-        ready()
-        print(f"serving {', '.join(scene.name for scene in scenes)} at {config.listen}", flush=True)
-        while signals.recv(1)[0] == signal.SIGHUP:
-            wanted.set()
-    return not service.left_at_work
-
-
-@contextmanager
-def _metrics(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[None]:
-    """Serve the metrics of scenes if configured; from the start, so that errors show early."""
-    if not config.metrics_port:
-        yield
-        return
-    from ..observability.prometheus_metrics import metrics_served  # its library is an extra
-
-    with metrics_served(scenes, config.metrics_host, config.metrics_port) as where:
-        log.info("metrics at %s", where)
-        yield
-
-
-@contextmanager
-def _reloader(service: Service) -> Iterator[threading.Event]:
-    """Run a thread that reloads all scenes when the event is set; a stop does not wait for it."""
-    wanted, ended = threading.Event(), threading.Event()
-
-    def run() -> None:
-        while wanted.wait() and not ended.is_set():
-            wanted.clear()
-            service.reload()
-
-    # A reload that is running at the end is abandoned when its scene closes (`Scene.close` waits).
-    start_thread("reload", run)
-    try:
-        yield wanted
-    finally:
-        ended.set()
-        wanted.set()
-
-
-@contextmanager
-def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
-    """Replace the signals' handlers and yield a socket that becomes readable when a signal arrives.
-
-    An event set by a handler would not do: the system may deliver the signal to one of zenoh's
-    threads, and a main thread that waits for a lock is not woken then to run the handler.
-    """
-    reader, writer = socket.socketpair()
-    with reader, writer:
-        writer.setblocking(False)
-        before = {number: signal.signal(number, lambda *_: None) for number in numbers}
-        descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-        try:
-            yield reader
-        finally:
-            signal.set_wakeup_fd(descriptor)
-            for number, handler in before.items():
-                signal.signal(number, handler)

@@ -17,37 +17,34 @@ from solidcloud.schemas.wire.answers import (
     SweepAnswers,
     WithinAnswers,
 )
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.key_expressions import User
-from solidcloud.schemas.wire.messages import (
-    JSON,
-    MSGPACK,
+from solidcloud.schemas.wire.motion_messages import Moved, MoveRequest, Wish
+from solidcloud.schemas.wire.path_messages import PathRequest
+from solidcloud.schemas.wire.question_rules import check_answers
+from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
-    AvatarInfo,
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
-    ErrorReply,
-    Moved,
-    MoveRequest,
+    ObjectEntry,
     ObjectsRequest,
-    PathRequest,
     RaycastRequest,
+    SweepRequest,
+    WithinRequest,
+)
+from solidcloud.schemas.wire.scene_messages import (
+    AvatarInfo,
+    ErrorReply,
     ReloadAnswer,
     SceneInfo,
     ScenesAnswer,
-    SweepRequest,
-    Wish,
-    WithinRequest,
-    check_answers,
-    decode_answer,
-    encode,
 )
-from solidcloud.schemas.wire.requests import ObjectEntry
 from solidcloud.server.runtime.stop_flag import StopFlag
 from solidcloud.server.scene_interface import LimitReached
-from solidcloud.server.zenoh_server import service as app_module
+from solidcloud.server.zenoh_server import request_dispatcher as dispatcher_module
+from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.service import Service
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "end_to_end"))
 from fake_server import FloorScene, floor_simulation, floor_verdicts
@@ -66,7 +63,7 @@ def scene():
 
 @pytest.fixture
 def service(scene):
-    return Service([scene], ServerConfig(max_poses=5, max_avatar_points=4, max_in_flight=7))
+    return RequestDispatcher([scene], ServerConfig(max_poses=5, max_avatar_points=4, max_in_flight=7))
 
 
 # What ends every request of these tests early: it has to reach the scene.
@@ -165,7 +162,7 @@ def test_a_scene_that_simulates_nothing_has_no_sessions(service, scene):
 
 def test_the_sessions_of_a_client_that_is_gone_end():
     scene = floor_simulation()
-    service = Service([scene.scene], ServerConfig())
+    service = RequestDispatcher([scene.scene], ServerConfig())
     sent = []
     frames = service.frames("floor", lambda user, answer: sent.append((user, answer.ok)))
     for client in ("c", "d"):
@@ -180,13 +177,13 @@ def test_the_sessions_of_a_client_that_is_gone_end():
 
 def test_warming_warms_the_frames_too(scene):
     simulation = floor_simulation()
-    Service([simulation.scene], ServerConfig()).warm()
+    RequestDispatcher([simulation.scene], ServerConfig()).warm()
     assert simulation.scene.warmed == 1 and simulation._pipeline.frames > 0
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
 def test_a_path_is_answered_in_parts(scene, encoding):
-    service = Service([scene], ServerConfig())
+    service = RequestDispatcher([scene], ServerConfig())
     ask(service, "add_avatar", AddAvatarRequest("al", POINTS, 0.25))
     poses = np.tile(np.eye(4), (25, 1, 1))
     poses[:, 2, 3] = np.linspace(-0.4, 0.0, 25)
@@ -200,7 +197,7 @@ def test_a_path_is_answered_in_parts(scene, encoding):
 
 
 def test_what_ends_a_path_early_is_its_last_answer(scene, caplog):
-    service = Service([scene], ServerConfig())
+    service = RequestDispatcher([scene], ServerConfig())
     poses = np.tile(np.eye(4), (25, 1, 1))
     for name, code in {"crash": "internal", "refuse": "bad_transform"}.items():
         ask(service, "add_avatar", AddAvatarRequest(name, POINTS))
@@ -211,7 +208,7 @@ def test_what_ends_a_path_early_is_its_last_answer(scene, caplog):
 
 def test_an_answer_that_no_message_holds_is_too_large(service, monkeypatch):
     ask(service, "add_avatar", AddAvatarRequest("al", POINTS))
-    monkeypatch.setattr(app_module, "MAX_MESSAGE_BYTES", (1 << 16) + 100)
+    monkeypatch.setattr(dispatcher_module, "MAX_MESSAGE_BYTES", (1 << 16) + 100)
     reply = error(ask(service, "collide", CollideRequest("al", np.eye(4)[None])))
     assert reply.code == "too_large" and "ask for less" in reply.message
 
@@ -296,7 +293,7 @@ def test_avatars_are_their_clients(service, scene):
 def test_warming_warms_every_scene(service, scene, monkeypatch):
     """It starts the deadlines' thread too: a slow request that started it would give it its low priority."""
     started = []
-    monkeypatch.setattr(app_module, "start_deadlines", lambda: started.append(1))
+    monkeypatch.setattr(dispatcher_module, "start_deadlines", lambda: started.append(1))
     service.warm()
     assert scene.warmed == 1 and not scene.avatars and started == [1]
 
@@ -305,7 +302,10 @@ def test_busy_says_how_many(service):
     assert error(service.busy(JSON, LimitReached.REQUESTS), JSON).code == "busy"
     assert "7 requests" in error(service.busy(None, LimitReached.REQUESTS)).message
     config = ServerConfig()
-    said = {full: error(Service([FloorScene()], config).busy(None, full)).message for full in LimitReached}
+    said = {
+        full: error(RequestDispatcher([FloorScene()], config).busy(None, full)).message
+        for full in LimitReached
+    }
     assert "64 requests of this client" in said[LimitReached.OWN_REQUESTS]
     assert "16 paths" in said[LimitReached.PATHS] and "8 of one client" in said[LimitReached.PATHS]
     assert "queries for states" in said[LimitReached.STATES]
@@ -313,12 +313,12 @@ def test_busy_says_how_many(service):
 
 def test_two_scenes_of_one_name_are_refused():
     with pytest.raises(BadRequestError, match="a name of its own"):
-        Service([FloorScene(), FloorScene()], ServerConfig())
+        RequestDispatcher([FloorScene(), FloorScene()], ServerConfig())
 
 
 def test_a_scene_whose_name_no_key_can_hold_is_refused():
     with pytest.raises(BadRequestError, match="expected 1 to 64"):
-        Service([FloorScene("a/b")], ServerConfig())
+        RequestDispatcher([FloorScene("a/b")], ServerConfig())
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
@@ -348,5 +348,5 @@ def test_a_reload_takes_no_payload_and_a_scene_that_is_served(service):
 def test_all_scenes_are_reloaded_where_one_cannot_be():
     scenes = [FloorScene("cellar"), FloorScene("floor"), FloorScene("attic")]
     scenes[1].refuses = FormatError("no archive here")
-    Service(scenes, ServerConfig()).reload()
+    RequestDispatcher(scenes, ServerConfig()).reload()
     assert [scene.reloaded for scene in scenes] == [1, 0, 1]

@@ -5,9 +5,8 @@ import time
 import weakref
 
 import pytest
-from solidcloud.server.runtime import deadlines as deadlines_module
-from solidcloud.server.runtime.deadlines import Deadlines
-from solidcloud.server.runtime.stop_flag import StopFlag
+from solidcloud.server.runtime import stop_flag as stop_module
+from solidcloud.server.runtime.stop_flag import Deadlines, StopFlag
 
 pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0
@@ -68,13 +67,13 @@ def test_entries_of_requests_that_ended_do_not_pile_up():
     for _ in range(10_000):
         deadlines.add(StopFlag(), now + FAR, "gone")
         deadlines.add(ended, now + FAR, "set")
-    assert len(deadlines._heap) <= 2 * deadlines_module._LEAST_ENTRIES
+    assert len(deadlines._heap) <= 2 * stop_module._LEAST_ENTRIES
     left = [entry[2]() for entry in deadlines._heap]
     assert all(any(stop is other for other in left) for stop in kept)
 
 
 def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monkeypatch):
-    deadlines, start, failures = Deadlines(), deadlines_module.start_thread, [1]
+    deadlines, start, failures = Deadlines(), stop_module.start_thread, [1]
 
     def starting(*what):
         if failures:
@@ -82,7 +81,7 @@ def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monk
             raise RuntimeError("can't start new thread")
         return start(*what)
 
-    monkeypatch.setattr(deadlines_module, "start_thread", starting)
+    monkeypatch.setattr(stop_module, "start_thread", starting)
     first, second = StopFlag(), StopFlag()
     with pytest.raises(RuntimeError, match="can't start"):
         deadlines.add(first, time.perf_counter(), "first")

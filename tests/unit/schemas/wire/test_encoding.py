@@ -10,31 +10,34 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, InternalError, TooLargeError
 from solidcloud.schemas.scene.scene_file import json_schema
-from solidcloud.schemas.wire import messages
+from solidcloud.schemas.wire import scene_messages
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
-from solidcloud.schemas.wire.columns import unknown
-from solidcloud.schemas.wire.messages import (
+from solidcloud.schemas.wire.encoding import (
     JSON,
     MSGPACK,
+    decode_answer,
+    decode_request,
+    encode,
+    wire_encoding,
+)
+from solidcloud.schemas.wire.question_rules import check_answers, make_unknown
+from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
-    AvatarInfo,
     CollideRequest,
+    Request,
+    make_poses,
+    make_positions,
+)
+from solidcloud.schemas.wire.scene_messages import (
+    AvatarInfo,
     ErrorReply,
     ObjectInfo,
     SceneInfo,
     ScenesAnswer,
     SpawnInfo,
-    check_answers,
-    decode_answer,
-    decode_request,
-    encode,
-    make_poses,
-    make_positions,
-    wire_encoding,
 )
-from solidcloud.schemas.wire.requests import Request
 
-SCHEMAS = Path(messages.__file__).parents[1]
+SCHEMAS = Path(scene_messages.__file__).parents[1]
 
 
 def some_poses(k, seed=3):
@@ -256,7 +259,7 @@ def test_answers_that_are_none_are_internal_errors_never_guesses():
 
 
 def test_json_counts_beyond_uint32_are_refused():
-    text = encode(unknown(CollideAnswers, 1), JSON).replace(
+    text = encode(make_unknown(CollideAnswers, 1), JSON).replace(
         b'"node_visits":[0]', b'"node_visits":[4294967296]'
     )
     with pytest.raises(InternalError, match="uint32"):
@@ -293,7 +296,7 @@ def test_points_that_are_none_are_refused_before_they_are_sent(points):
 
 def test_too_many_points_are_refused_before_they_are_sent():
     with pytest.raises(TooLargeError, match="1000001"):
-        make_positions(np.zeros((messages.MAX_AVATAR_POINTS + 1, 3)))
+        make_positions(np.zeros((scene_messages.MAX_AVATAR_POINTS + 1, 3)))
 
 
 @pytest.mark.parametrize("poses", [np.eye(4), np.zeros((2, 3, 4)), "text", [[1, 2], [3]]])
@@ -303,13 +306,13 @@ def test_poses_of_the_wrong_shape_are_refused_before_they_are_sent(poses):
 
 
 def test_schemas_on_disk_are_current():
-    expected = {**messages.json_schemas(), "Scene": json_schema()}
+    expected = {**scene_messages.json_schemas(), "Scene": json_schema()}
     found = {path.stem: path.read_text() for path in (SCHEMAS / "json").glob("*.json")}
     assert found == expected, "run scripts/make_schemas"
 
 
 def test_schema_of_an_array_says_its_shape():
-    schema = json.loads(messages.json_schemas()["CollideRequest"])["$defs"]["CollideRequest"]
+    schema = json.loads(scene_messages.json_schemas()["CollideRequest"])["$defs"]["CollideRequest"]
     row = schema["properties"]["poses"]["items"]["items"]
     assert (row["minItems"], row["maxItems"], row["items"]["type"]) == (4, 4, "number")
     assert schema["additionalProperties"] is False
@@ -323,12 +326,12 @@ def worked_examples():
 
 def test_there_are_worked_examples():
     names = {example.values[0] for example in worked_examples()}
-    assert names == {kind.__name__ for kind in messages.MESSAGES} - {"SceneInfo"}
+    assert names == {kind.__name__ for kind in scene_messages.MESSAGES} - {"SceneInfo"}
 
 
 @pytest.mark.parametrize("name, text, digits", worked_examples())
 def test_worked_example(name, text, digits):
-    kind = {kind.__name__: kind for kind in messages.MESSAGES}[name]
+    kind = {kind.__name__: kind for kind in scene_messages.MESSAGES}[name]
     decode = decode_request if issubclass(kind, Request) else decode_answer
     bits = bytes.fromhex(digits)
     for message in (decode(kind, text.encode(), JSON), decode(kind, bits, MSGPACK)):
@@ -338,8 +341,8 @@ def test_worked_example(name, text, digits):
 
 def test_wire_version_is_the_documents():
     first = (SCHEMAS / "WIRE.md").read_text().splitlines()[0]
-    assert first == f"# The wire, version {messages.WIRE_VERSION}"
-    assert ScenesAnswer([]).wire_version == messages.WIRE_VERSION
+    assert first == f"# The wire, version {scene_messages.WIRE_VERSION}"
+    assert ScenesAnswer([]).wire_version == scene_messages.WIRE_VERSION
 
 
 def test_error_reply_keeps_codes_it_does_not_know():
@@ -367,7 +370,7 @@ def test_large_messages_in_json_are_read_in_pieces_and_are_the_same(k, space):
 
 @pytest.mark.parametrize("k", [20_000])
 def test_large_answers_in_json_keep_nulls_and_empty_columns(k):
-    answers = unknown(CollideAnswers, k)
+    answers = make_unknown(CollideAnswers, k)
     found = decode_answer(CollideAnswers, encode(answers, JSON), JSON)
     for name in CollideAnswers.__struct_fields__:
         assert np.array_equal(getattr(found, name), getattr(answers, name)), name

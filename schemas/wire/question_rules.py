@@ -1,0 +1,377 @@
+"""What a question is: its request, the rules of its answers' columns, and what is generic over questions.
+
+questions.py declares the questions. Everything generic reads the declarations: checks, unknown
+answers, joining, merging over archives, requests in batches, dispatch, the command line and the
+tests of WIRE.md. No numba here. The functions that answer are in server/queries.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import cache, cached_property
+from itertools import pairwise
+from typing import Any, Generic, NamedTuple, TypeVar, get_type_hints
+
+import numpy as np
+from msgspec.structs import fields as struct_fields
+from numpy.typing import NDArray
+
+from ..errors import BadRequestError, InternalError
+from .answers import Cost, Verdict
+from .arrays import ArrayType, Poses, array_fields
+from .requests import Length, QuestionRequest, make_objects, make_poses, make_vectors
+
+A = TypeVar("A", bound=Cost)
+
+_LAST_VERDICT = int(max(Verdict))
+
+
+class Rows(Enum):
+    """Number of rows of a column."""
+
+    ITEMS = auto()  # one per item: pose, motion, ray, point or object
+    BOUNDED = auto()  # one per item, or none: if neither a tolerance nor a budget was given
+    STARTS = auto()  # one more than items: item i has the rows [starts[i], starts[i + 1])
+    LISTED = auto()  # as many as the column of starts `ColumnRules.of` says
+    PAIRS = auto()  # one per listed pair of items
+
+
+class Merge(Enum):
+    """How the values of several archives become one. server/archives/merge_answers.py has each."""
+
+    VERDICT = auto()  # contact with any is contact; clear is what is clear of all
+    ALL = auto()  # true if it is true of every archive
+    SUM = auto()  # at most the largest number of the column's type
+    LEAST = auto()
+    NEAREST = auto()  # the value of the archive that `Question.nearest` selects
+    FIRST = auto()  # the value of the first archive, which alone was asked
+    LISTED = auto()  # rows of all archives, deepest first
+    EXACT_VERDICT = auto()  # an exact contact with one archive, or exact answers of all
+    EXACT_NEAREST = auto()  # the nearest is exact, and no archive may hold a nearer one
+    EXACT_INTERVAL = auto()  # an exact contact that begins first, or clear of all
+
+
+class ColumnFrame(Enum):
+    """What the values of an archive at a pose are, and so how they are carried to the world."""
+
+    NONE = auto()  # the same in every frame
+    POINT = auto()
+    DIRECTION = auto()
+    BOX_LOW = auto()  # corners of boxes; the column of BOX_HIGH comes next
+    BOX_HIGH = auto()
+    SCAN = auto()  # rows of the archive's scans, -1: not known
+
+
+class ColumnRules(NamedTuple):
+    """Rules of one column of answers.
+
+    merge, frame, rows: see there.  of: column of starts of a column with `Rows.LISTED`.
+    unknown: value that means that nothing is known; vectors of floats are NaN then.
+    """
+
+    merge: Merge
+    frame: ColumnFrame = ColumnFrame.NONE
+    rows: Rows = Rows.ITEMS
+    of: str = ""
+    unknown: float = 0
+
+
+# Columns that every answer has.
+COMMON: dict[str, ColumnRules] = {
+    "verdict": ColumnRules(Merge.VERDICT, unknown=Verdict.UNKNOWN),
+    "outside": ColumnRules(Merge.ALL),
+    "voxels_missing": ColumnRules(Merge.SUM),
+    "node_visits": ColumnRules(Merge.SUM),
+    "point_tests": ColumnRules(Merge.SUM),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Question(Generic[A]):
+    """One question.
+
+    name: on the wire, of the methods and on the command line.
+    request, answers: message types.  part: type of the answers' parts along a path; None: the
+    question is not asked along paths.
+    items: plural noun for what a request has several of.
+    columns: rules of the answers' array fields, besides `COMMON`.
+    nearest: the column with whose least value an archive is the nearest, and the columns of points
+    that decide among equals; None: no column has `Merge.NEAREST`.
+    slow: an item may take milliseconds, and batches are small.
+    whole: all items are asked about in one request, because they depend on one another.
+    directions: array fields of the request whose vectors are directions, and not points.
+    listed: the request's field that limits the rows listed per item, and the bytes of one; None.
+    """
+
+    name: str
+    request: type[QuestionRequest]
+    answers: type[A]
+    items: str
+    columns: Mapping[str, ColumnRules]
+    nearest: tuple[str, tuple[str, ...]] | None = None
+    part: Any = None
+    slow: bool = False
+    whole: bool = False
+    directions: tuple[str, ...] = ()
+    listed: tuple[str, int] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", COMMON | dict(self.columns))
+        expected = set(array_fields(self.answers))
+        if set(self.columns) != expected:
+            odd = ", ".join(sorted(expected ^ set(self.columns)))
+            raise TypeError(f"{self.name}: {odd}: expected a rule for each array field, and for no other")
+        _BY_ANSWERS.setdefault(self.answers, self)
+
+    @cached_property
+    def arrays(self) -> dict[str, ArrayType]:
+        """Return the array fields of the request; each has one element per item."""
+        return array_fields(self.request)
+
+    @cached_property
+    def counted(self) -> str:
+        """Return the request's first array field, whose length is the number of items."""
+        return next(iter(self.arrays))
+
+    @cached_property
+    def fields(self) -> tuple[str, ...]:
+        """Return the fields that only this question's request has."""
+        options = QuestionRequest.__struct_fields__
+        return tuple(name for name in self.request.__struct_fields__ if name not in options)
+
+    @cached_property
+    def arguments(self) -> tuple[str, ...]:
+        """Return the arguments of the question's method; `objects` come with their poses."""
+        return tuple(name for name in self.fields if not (name == "poses" and "objects" in self.fields))
+
+    @cached_property
+    def _defaults(self) -> dict[str, Any]:
+        """Return the defaults of the request's fields."""
+        return {field.name: field.default for field in struct_fields(self.request) if not field.required}
+
+    @cached_property
+    def other_defaults(self) -> dict[str, Any]:
+        """Return the defaults that differ from those of `QuestionRequest`."""
+        usual = {field.name: field.default for field in struct_fields(QuestionRequest)}
+        return {name: self._defaults[name] for name in usual if self._defaults[name] != usual[name]}
+
+    @cached_property
+    def required(self) -> tuple[str, ...]:
+        """Return those of `fields` that have no default."""
+        return tuple(name for name in self.fields if name not in self._defaults)
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Return those of `fields` that are the same for all items: neither arrays nor avatars."""
+        return tuple(name for name in self.fields if name not in (*self.arrays, "avatar", "objects"))
+
+    @cached_property
+    def about_avatars(self) -> bool:
+        """Return whether a request names avatars of its client."""
+        return "avatar" in self.fields or "objects" in self.fields
+
+    @cached_property
+    def moving(self) -> bool:
+        """Return whether items are motions of an avatar, each from one pose to another."""
+        return self.about_avatars and len(self.arrays) == 2
+
+    def items_along(self, poses: int) -> int:
+        """Return the number of items along a path of so many poses."""
+        return max(0, poses - 1) if self.moving else poses
+
+    @cached_property
+    def with_rows(self) -> dict[Rows, tuple[str, ...]]:
+        """Return the columns with each number of rows."""
+        return {
+            rows: tuple(name for name, column in self.columns.items() if column.rows is rows)
+            for rows in {column.rows for column in self.columns.values()}
+        }
+
+    def all_arguments(self, given: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
+        """Return all arguments of the method: those given, then those by name or their defaults.
+
+        named: arguments and options by name; the arguments are removed. TypeError for too many or
+        too few.
+        """
+        names = self.arguments
+        if len(given) == len(names):
+            return given
+        rest = [named.pop(name, self._defaults.get(name, given)) for name in names[len(given) :]]
+        if len(given) > len(names) or any(value is given for value in rest):
+            raise TypeError(f"{self.name}: expected the arguments {', '.join(names)}")
+        return (*given, *rest)
+
+    @cached_property
+    def around(self) -> int | None:
+        """Return which argument says how far from an avatar the scene matters; None: no argument."""
+        return next((i for i, name in enumerate(self.arguments) if name in ("margin", "reach")), None)
+
+    def rows_of(self, starts: str) -> tuple[str, ...]:
+        """Return the columns whose row ranges a column of starts has."""
+        return tuple(name for name, column in self.columns.items() if column.of == starts)
+
+    def most_items(self, most: int, most_bytes: int, given: Mapping[str, Any]) -> int:
+        """Return how many items, at most `most`, fit into an answer of `most_bytes`.
+
+        given: fields of the request by name; a missing one has its default.
+        """
+        if self.listed is None:
+            return most
+        name, row_bytes = self.listed
+        rows = given.get(name)
+        if rows is None:
+            rows = self._defaults[name]
+        return min(most, max(1, most_bytes // (row_bytes * max(1, rows))))
+
+
+# Questions by the type of their answers.
+_BY_ANSWERS: dict[type, Question[Any]] = {}
+
+
+@cache
+def question_of(kind: type[Any]) -> Question[Any]:
+    """Return the question to which a type of answers, or of their parts along a path, belongs."""
+    return next(_BY_ANSWERS[base] for base in kind.__mro__ if base in _BY_ANSWERS)
+
+
+def request_fields(
+    question: Question[Any], arguments: tuple[Any, ...], named: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the fields of a question's request for the arguments of its method, by name.
+
+    arguments, named: as `Question.all_arguments` takes them. Arrays become what the wire has, with
+    equally many elements each.
+    Raises BadRequestError for an invalid argument, TypeError for one too many or too few.
+    """
+    fields = dict(zip(question.arguments, question.all_arguments(arguments, named), strict=True))
+    if "objects" in fields:
+        fields["objects"], fields["poses"] = make_objects(fields["objects"])
+    for name, convert in _conversions(question.request):
+        fields[name] = convert(fields[name], name)
+    for first, second in pairwise(question.arrays):
+        a, b = len(fields[first]), len(fields[second])
+        if a != b:
+            raise BadRequestError(f"{a} {first} and {b} {second}: expected as many of each")
+    return fields
+
+
+@cache
+def _conversions(kind: type[QuestionRequest]) -> tuple[tuple[str, Callable[[Any, str], Any]], ...]:
+    """Return how each argument becomes a field, by the field's type; others stay as they are."""
+    found: list[tuple[str, Callable[[Any, str], Any]]] = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if hint == Poses:
+            found.append((name, make_poses))
+        elif name in QuestionRequest.__struct_fields__:
+            continue
+        elif hint == Length:
+            found.append((name, lambda value, _: float(value)))
+        elif str(hint).startswith("numpy.ndarray"):
+            found.append((name, make_vectors))
+    return tuple(found)
+
+
+def make_unknown(kind: type[A], k: int, *, bounded: bool = True) -> A:
+    """Return answers of one type for k poses (rays, points, motions, objects), all `UNKNOWN`.
+
+    They stand for a request that nobody answered.
+    bounded: whether columns with `Rows.BOUNDED` have values, as they do if a tolerance or a budget
+    was given.
+    """
+    rows = {
+        Rows.ITEMS: k,
+        Rows.BOUNDED: k if bounded else 0,
+        Rows.STARTS: k + 1,
+        Rows.LISTED: 0,
+        Rows.PAIRS: k * (k - 1) // 2,
+    }
+    columns: dict[str, Any] = {}
+    rules = question_of(kind).columns
+    for name, (dtype, tail, _) in array_fields(kind).items():
+        rule = rules[name]
+        if rule.rows is Rows.PAIRS and tail:
+            columns[name] = np.column_stack(np.triu_indices(k, 1)).astype(dtype)
+            continue
+        filling = np.nan if tail and dtype.kind == "f" else rule.unknown
+        columns[name] = np.full((rows[rule.rows], *tail), filling, dtype)
+    return kind(**columns)
+
+
+def join_answers(parts: Sequence[A]) -> A:
+    """Join the answers of several requests, in order, into the answers of one.
+
+    Residency is that after the last answered request.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    kind = type(parts[0])
+    answered = [part for part in parts if part.resident or part.hits or part.misses] or parts
+    fields: dict[str, Any] = {}
+    for name, rule in question_of(kind).columns.items():
+        columns = [getattr(part, name) for part in parts]
+        fields[name] = _joined_starts(columns) if rule.rows is Rows.STARTS else np.concatenate(columns)
+    return kind(
+        **fields,
+        engine_seconds=sum(part.engine_seconds for part in parts),
+        hits=sum(part.hits for part in parts),
+        misses=sum(part.misses for part in parts),
+        resident=answered[-1].resident,
+        resident_bytes=answered[-1].resident_bytes,
+        faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
+        wait_seconds=sum(part.wait_seconds for part in parts),
+        late=tuple(dict.fromkeys(key for part in parts for key in part.late)),
+        stopped=next((part.stopped for part in parts if part.stopped), ""),
+    )
+
+
+def check_answers(answers: A, k: int) -> A:
+    """Return the answers if they are valid answers to k poses; raise InternalError otherwise."""
+    kind = type(answers)
+    for name, verdict, rule in _checks(kind):
+        column = getattr(answers, name)
+        expected = k if rule is None else _expected_rows(answers, rule, k)
+        if len(column) != expected:
+            raise InternalError(
+                f"{kind.__name__}: {len(column)} values in {name!r}, expected {expected}, for {k} requested"
+            )
+        if verdict and expected and max(column.tobytes()) > _LAST_VERDICT:
+            raise InternalError(
+                f"{kind.__name__}: verdict {column.max()}, expected at most {_LAST_VERDICT}: upgrade the client"
+            )
+        if rule is None:
+            continue
+        if rule.rows is Rows.STARTS and (column[0] != 0 or (np.diff(column) < 0).any()):
+            raise InternalError(f"{kind.__name__}: {name!r} does not rise from 0")
+        if rule.rows is Rows.PAIRS and column.ndim == 2 and not ((column >= 0) & (column < k)).all():
+            raise InternalError(f"{kind.__name__}: pairs with objects that were not requested, of {k}")
+    return answers
+
+
+@cache
+def _checks(kind: type) -> tuple[tuple[str, bool, ColumnRules | None], ...]:
+    """Return each column's name, whether it has verdicts, and its rules; None for one row per item."""
+    rules = question_of(kind).columns
+    return tuple(
+        (name, name.endswith("verdict"), None if rules[name].rows is Rows.ITEMS else rules[name])
+        for name in array_fields(kind)
+    )
+
+
+def _expected_rows(answers: Cost, rule: ColumnRules, k: int) -> int:
+    """Return how many rows a column of answers to k poses has, where they are not one per pose."""
+    if rule.rows is Rows.STARTS:
+        return k + 1
+    if rule.rows is Rows.LISTED:
+        starts = getattr(answers, rule.of)
+        return int(starts[-1]) if len(starts) else 0
+    first = len(getattr(answers, question_of(type(answers)).with_rows[rule.rows][0]))
+    return first if rule.rows is Rows.PAIRS else k if first else 0
+
+
+def _joined_starts(columns: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Join columns of starts, each rising from 0, into one."""
+    total, joined = 0, [np.zeros(1, np.int64)]
+    for column in columns:
+        joined.append(column[1:] + total)
+        total += int(column[-1])
+    return np.concatenate(joined)

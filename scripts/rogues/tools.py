@@ -188,7 +188,7 @@ def _token(rogue: Rogue, width: str, victim: Victim) -> list[str]:
     time.sleep(0.005)  # the server receives tokens on a separate channel
     request = encode(CollideRequest(AVATAR, pose_at(0.0, -1.0)[None]))
     try:
-        victim.client._ask("collide", request, [AVATAR])
+        victim.client._connection.ask("collide", request, [AVATAR])
     except SolidcloudError as error:
         _asked(victim)  # adds the avatar again
         return [f"{type(error).__name__}: {error}"]

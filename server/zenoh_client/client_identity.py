@@ -1,41 +1,53 @@
-"""Who a client is to its server: an id, its liveliness token, and what asks its questions under keys with the id."""
+"""What a client is to its server: an id with a liveliness token, and the avatars that it added."""
 
+import threading
 import uuid
+from collections.abc import Sequence
 from contextlib import ExitStack
+from typing import NamedTuple
 
+import numpy as np
 import zenoh
 
+from ...schemas.errors import BadRequestError
 from ...schemas.wire import key_expressions
+from ...schemas.wire.arrays import Positions
+from ...schemas.wire.encoding import avatar_digest, decode_answer, encode
+from ...schemas.wire.requests import AddAvatarRequest
+from ...schemas.wire.scene_messages import AvatarInfo
 
-# How long some queries are kept open [s]. Of a path; how long a part of it may take is the client's timeout. A reload
-# opens an archive and fills a cache, at some 100 MB/s.
+# How long the queries of some operations are kept open [s]: that of a path, whose parts must each
+# arrive within the client's timeout; and that of a reload, which opens an archive and fills a cache
+# at some 100 MB/s.
 OPEN_SECONDS = {"path": 3600.0, "reload": 600.0}
 
 
-class Identity:
-    """One id of a client, declared until `close`.
+class ClientIdentity:
+    """One id of a client, declared until `close`, with the queriers of its operations.
 
-    id: a secret of 122 random bits: whoever knows it may ask and wish in the client's name, and add avatars to a server
-    that has just started. A client takes another where it finds that somebody did.
+    id: a secret of 122 random bits. Whoever knows it may send queries and motion commands in the
+    client's name, and add avatars to a server that has just started. A client that notices this
+    takes another id.
     """
 
     def __init__(self, session: zenoh.Session, scene: str, timeout: float) -> None:
-        """Take a fresh id and declare it. timeout: of a question [s]."""
+        """Make an id and declare it. timeout: time limit of a request [s]."""
         self.id = uuid.uuid4().hex
         self.keys = {
             operation: key_expressions.query_key(scene, self.id, operation)
             for operation in key_expressions.operations()
         }
         with ExitStack() as stack:
-            # Gone with this process, however it ends: then the server forgets our avatars.
+            # The token disappears with this process, however it ends: the server then drops the
+            # client's avatars.
             token = key_expressions.client_token_key(scene, self.id)
             stack.enter_context(session.liveliness().declare_token(token))
-            # Declared once: a querier's route is known, an ad hoc `get` looks for it every time.
+            # Declared once: the route of a querier is known, an ad hoc `get` looks it up every time.
             self.queriers = {
                 operation: stack.enter_context(
                     session.declare_querier(
                         key,
-                        # By default zenoh keeps a reply back until the server has said that no other comes.
+                        # By default, zenoh holds a reply back until the server has ended the query.
                         consolidation=zenoh.ConsolidationMode.NONE,
                         timeout=max(timeout, OPEN_SECONDS.get(operation, 0.0)),
                     )
@@ -45,9 +57,86 @@ class Identity:
             self._stack = stack.pop_all()
 
     def close(self) -> None:
-        """Have the server forget the id and its avatars."""
+        """Undeclare the id; the server then drops it and its avatars."""
         self._stack.close()
 
-    def asked(self, key_expression: str) -> bool:
-        """Return whether a key expression has this id."""
+    def is_in(self, key_expression: str) -> bool:
+        """Return whether a key expression contains this id."""
         return self.id in key_expression.split("/")
+
+
+class AddedAvatar(NamedTuple):
+    """Avatar as it was added.
+
+    points: (n, 3) [m].  radius: as requested [m]; None: the server derives it from the points.
+    """
+
+    points: Positions
+    radius: float | None
+
+    def request(self, name: str) -> bytes:
+        """Return the request that adds the avatar."""
+        return encode(AddAvatarRequest(name, self.points, self.radius))
+
+    def is_same(self, other: "AddedAvatar") -> bool:
+        """Return whether two avatars are equal."""
+        return self.radius == other.radius and np.array_equal(self.points, other.points)
+
+
+class AddedAvatars:
+    """Avatars that a client added, by name: to add them again and to tell them from others. Thread-safe."""
+
+    def __init__(self) -> None:
+        """Begin without avatars."""
+        self._lock = threading.Lock()
+        self._avatars: dict[str, AddedAvatar] = {}
+        self._digests: dict[str, bytes] = {}  # of those whose radius is known
+
+    def add(self, name: str, avatar: AddedAvatar) -> bool:
+        """Store an avatar; return whether it is new.
+
+        Raise BadRequestError if another avatar has the name.
+        """
+        digest = None if avatar.radius is None else avatar_digest(avatar.points, avatar.radius)
+        with self._lock:
+            known = self._avatars.setdefault(name, avatar)
+            if known is avatar and digest is not None:
+                self._digests[name] = digest
+        if not known.is_same(avatar):
+            raise BadRequestError(
+                f"avatar {name!r} was added with other points or another radius: choose another name"
+            )
+        return known is avatar
+
+    def remove(self, name: str) -> None:
+        """Remove an avatar."""
+        with self._lock:
+            self._avatars.pop(name, None)
+            self._digests.pop(name, None)
+
+    def accepted(self, name: str, answer: bytes) -> AvatarInfo:
+        """Return the server's answer to the request that added an avatar, and store the radius."""
+        info = decode_answer(AvatarInfo, answer)
+        avatar = self._avatars.get(name)
+        if avatar is not None and name not in self._digests and info.radius is not None:
+            self._digests[name] = avatar_digest(avatar.points, info.radius)
+        return info
+
+    def known(self, names: Sequence[str]) -> dict[str, AddedAvatar]:
+        """Return the avatars of those of these names that were added."""
+        with self._lock:
+            return {name: self._avatars[name] for name in names if name in self._avatars}
+
+    def digests(self, names: Sequence[str]) -> bytes | None:
+        """Return the joined digests of avatars in the order of the names, without unknown names.
+
+        Return None if the radius of one is not known yet.
+        """
+        found = []
+        for name in names:
+            digest = self._digests.get(name)
+            if digest is not None:
+                found.append(digest)
+            elif name in self._avatars:
+                return None
+        return b"".join(found)

@@ -1,13 +1,14 @@
-"""A session: one avatar of a client that wishes many times a second, and hears where it got to.
+"""Session of one avatar: sends many motion commands a second and receives the resulting states.
 
-Over zenoh, beside the questions of `Client`: wishes go out and states come in without anybody waiting for an answer.
+Motion commands (`Wish` on the wire) are published, and states arrive as replies to one long query
+(state_query.py). No call waits for an answer, except `wait` and `states`.
 """
 
 import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
@@ -16,96 +17,105 @@ from typing import Any, Self
 import numpy as np
 import zenoh
 
-from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, UnknownAvatarError, error_from_code
+from ...schemas.errors import (
+    BadRequestError,
+    BusyError,
+    SolidcloudError,
+    UnknownAvatarError,
+    error_from_code,
+)
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer, encode
 from ...schemas.wire.motion_messages import State, Wish
 from ...schemas.wire.scene_messages import ErrorReply
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
-from ..zenoh_common.sealed_replies import OtherAvatarError, TrustAnchor
+from ..zenoh_common.sealed_replies import OtherAvatarError
 from ..zenoh_common.zenoh_settings import FRAME_QOS
+from .server_connection import ServerConnection
 from .state_query import StateQuery
 
 log = logging.getLogger(__name__)
 
-# States kept for whoever asks for each of them: some ten seconds; of more, the oldest go.
-_KEPT = 1024
-# Numbers beyond this are not followed: a wish's is an int64 in most programs.
-_MOST_NUMBER = 1 << 62
-# How long a wish may be without a state before it is sent once more, and how long it is worth sending [s].
-_PATIENCE, _MOST_PATIENCE = 1.0, 5.0
-# Refusals in a row that a server is told of an avatar again for: one that refuses it all the same is at fault.
-_MOST_AGAIN = 100
+# States stored for `states`: some ten seconds. The oldest are dropped.
+_MAX_STATES = 1024
+# Largest number of a motion command that is followed: it is an int64 in most programs.
+_MAX_NUMBER = 1 << 62
+# How long a motion command may be without a state before it is sent again, and how long it is sent
+# again [s].
+_REPEAT_SECONDS, _MAX_REPEAT_SECONDS = 1.0, 5.0
+# How often in a row the avatar is added again to a server that refuses its motion commands.
+_MAX_REFUSALS = 100
 
 
-class WishNumbers:
-    """The numbers of one user's wishes, growing. Thread-safe."""
+class CommandNumbers:
+    """Increasing numbers of one user's motion commands. Thread-safe."""
 
     def __init__(self) -> None:
         self._last = 0
         self._lock = threading.Lock()
 
     def next(self) -> int:
-        """Return a number above all before."""
+        """Return a number above all previous ones."""
         with self._lock:
             self._last += 1
             return self._last
 
     def follow(self, seq: int) -> None:
-        """Go on above a number that the server has had, from another program of the same client perhaps.
+        """Continue above a number that the server has received, perhaps from another program.
 
-        The server drops a wish whose number is no greater than the last one's.
+        The server drops a motion command whose number is not greater than the last one's.
         """
         with self._lock:
-            if self._last < seq < _MOST_NUMBER:
+            if self._last < seq < _MAX_NUMBER:
                 self._last = seq
 
 
 class ClientSession:
-    """One avatar's session; made by `Client.session`, a context manager, thread-safe.
+    """Session of one avatar, made by `Client.session`; a context manager, thread-safe.
 
-    What the server says comes to `states`, each in its order, and to `latest`. While no server answers there are none,
-    and `latest` grows old; once there is one again, it goes on from where the last state left the avatar.
+    `states` yields the server's states and errors in order, `latest` returns the last one. Without a
+    server no states arrive, and the age of `latest` grows. When a server answers again, the session
+    continues at the pose of the last state.
     """
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        scene: str,
-        user: Callable[[], key_expressions.User],
-        numbers: "WishNumbers",
-        anchor: TrustAnchor,
-        about: Callable[[], bytes | None],
-        add_again: Callable[[UnknownAvatarError], bool],
+        self, connection: ServerConnection, scene: str, avatar: str, numbers: CommandNumbers
     ) -> None:
         """Make a session; entering it begins it.
 
-        user: returns who wishes: the client may take another id.  numbers: of wishes, growing over all sessions of this
-        user.  about: as in `SealedQuery`.  add_again: adds the avatar to a server that does not know it; False: nobody
-        answered; raises what it is given where this client has not added it either.
+        numbers: of motion commands, increasing over all sessions of this avatar.
         """
-        self._session, self._scene, self._user_now, self._user = session, scene, user, user()
-        self._numbers, self._add_again = numbers, add_again
-        self._states = StateQuery(session, key_expressions.state_key(scene, self._user), anchor, about)
-        self._publishing = threading.Lock()  # so that wishes leave in the order of their numbers
-        self._aim: Any = None  # the pose last wished, until a velocity goes on from a state
+        self._connection, self._scene, self._avatar, self._numbers = connection, scene, avatar, numbers
+        self._session, self._user = connection.session, self._present_user()
+        self._states = StateQuery(
+            connection.session,
+            key_expressions.state_key(scene, self._user),
+            connection.anchor,
+            lambda: connection.avatars.digests([avatar]),
+        )
+        self._publishing = threading.Lock()  # so that motion commands are sent in the order of their numbers
+        self._target: Any = None  # the pose last commanded, until a velocity continues from a state
         self._time = 0.0
-        self._wished = -math.inf  # when, on the monotonic clock
+        self._published = -math.inf  # time of the last one, on the monotonic clock
         self._last: Wish | None = None  # as it was sent
-        self._sent = -math.inf  # when, for the first time
-        self._answered = 0  # the number of the last wish that the server said something of
+        self._sent = -math.inf  # time at which it was first sent
+        self._answered = 0  # number of the last motion command that the server replied to
         self._changed = threading.Condition()
-        self._kept: deque[State | SolidcloudError] = deque(maxlen=_KEPT)
+        self._kept: deque[State | SolidcloudError] = deque(maxlen=_MAX_STATES)
         self._latest: State | None = None
         self._error: SolidcloudError | None = None  # newer than `_latest`
-        self._when = -math.inf
-        self._again = 0
+        self._received = -math.inf  # time of `_latest`
+        self._refusals = 0
         self._stack: ExitStack | None = None
+
+    def _present_user(self) -> key_expressions.User:
+        """Return the user of this session; its client may take another id."""
+        return key_expressions.User(self._connection.client_id, self._avatar)
 
     def __enter__(self) -> Self:
         thread = threading.Thread(
-            target=self._hear, name=f"solidcloud-session-{self._user.avatar}", daemon=True
+            target=self._receive, name=f"solidcloud-session-{self._avatar}", daemon=True
         )
         with ExitStack() as stack:
             try:
@@ -115,18 +125,18 @@ class ClientSession:
                 stack.callback(self._undeclare_publisher)
             except zenoh.ZError as error:
                 raise BadRequestError(
-                    f"session of avatar {self._user.avatar!r} in scene {self._scene!r}: {zenoh_words(error)}: expected "
+                    f"session of avatar {self._avatar!r} in scene {self._scene!r}: {zenoh_words(error)}: expected "
                     "an open client: begin it inside `with Client(...) as scene`"
                 ) from None
             thread.start()
-            # The thread ends once it has heard what came until the end.
+            # The thread ends after it has taken everything that arrived before the end.
             stack.callback(thread.join)
             stack.callback(self._states.end)
             self._stack = stack.pop_all()
         return self
 
     def _declare_publisher(self) -> zenoh.Publisher:
-        """Return what publishes the wishes of the present user."""
+        """Return a publisher of the present user's motion commands."""
         return self._session.declare_publisher(
             key_expressions.command_key(self._scene, self._user), encoding=MSGPACK, **FRAME_QOS
         )
@@ -138,15 +148,15 @@ class ClientSession:
             log.debug("leaving: %s", error)
 
     def _follow_client(self) -> None:
-        """Wish and hear under the client's id, where it took another. Work of the thread that hears."""
-        user = self._user_now()
+        """Continue under the client's id if the client has taken another. Runs in the receiving thread."""
+        user = self._present_user()
         if user == self._user:
             return
         try:
             with self._publishing:
                 if self._stack is None:
                     return
-                self._publisher.delete()  # others may walk where the avatar stood
+                self._publisher.delete()  # ends the avatar's body under the old id
                 self._undeclare_publisher()
                 self._user = user
                 self._publisher = self._declare_publisher()
@@ -160,13 +170,13 @@ class ClientSession:
         self.close()
 
     def close(self) -> None:
-        """Leave the scene: others may walk where the avatar stood. Closing twice is allowed."""
+        """Leave the scene: the server removes the avatar's body. Closing twice is allowed."""
         with self._publishing:
             stack, self._stack = self._stack, None
             if stack is not None:
                 try:
                     self._publisher.delete()
-                except zenoh.ZError as error:  # the client was closed before: the server sees that by itself
+                except zenoh.ZError as error:  # the client was closed before, which the server notices
                     log.debug("leaving: %s", error)
         if stack is not None:
             stack.close()
@@ -182,13 +192,14 @@ class ClientSession:
         objects: dict[str, list[list[float]]] | None = None,
         time: float | None = None,
     ) -> int:
-        """Wish to be at a pose, (4, 4) or (1, 4, 4) float64, or to go at a velocity (3,) [m/s]; one of the two.
+        """Send a motion command with either a pose or a velocity; return its number.
 
-        Returns the number of the wish, which its state has as `seq`. turn: with a velocity, about the scene's up axis
-        [rad/s].  objects: poses of the scene's objects that this user moves.  time: of the wish, on a clock of the
-        caller's that does not go back [s]; None: this process's. What no server hears is lost, and nothing says so but
-        that no states come: wish on. The last wish is sent again each second, for 5 s at most, until a state of it
-        comes. BadRequestError: what is no wish, or the session is closed.
+        pose: (4, 4) or (1, 4, 4) float64.  velocity: (3,) [m/s].  turn: with a velocity, about the
+        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves.
+        time: of the command, on a clock that does not go backwards [s]; None: this process's clock.
+        The state that results has the number as `seq`. Without a server, the command is lost and no
+        states arrive. The last command is sent again every second, for at most 5 s, until its state
+        arrives. Raise BadRequestError for an invalid command, or if the session is closed.
         """
         array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
         speed = None if velocity is None else tuple(float(part) for part in velocity)
@@ -204,42 +215,46 @@ class ClientSession:
                 objects=objects or {},
             )
             self._publish(wish)
-            self._sent, self._time = self._wished, wish.time
+            self._sent, self._time = self._published, wish.time
             if len(wish.pose):
-                self._aim = wish.pose
+                self._target = wish.pose
             elif self._latest is not None:
-                self._aim = None
+                self._target = None
         return wish.seq
 
     def _publish(self, wish: Wish) -> None:
-        """Send a wish. To be called with `_publishing` held."""
+        """Publish a motion command. The caller holds `_publishing`."""
         if self._stack is None:
             raise BadRequestError("this session is closed: wish inside `with client.session(...) as session`")
         self._publisher.put(encode(wish))
-        self._wished, self._last = monotonic(), wish
+        self._published, self._last = monotonic(), wish
 
-    def _wish_again(self) -> None:
-        """Send the last wish once more where nothing came of it: it, or its state, was dropped on the way."""
+    def _repeat(self) -> None:
+        """Send the last motion command again if it, or its state, was dropped on the way."""
         with self._publishing:
             last, now = self._last, monotonic()
             if last is None or last.seq <= self._answered or self._stack is None:
                 return
-            if now - self._wished >= _PATIENCE and now - self._sent < _MOST_PATIENCE:
+            if now - self._published >= _REPEAT_SECONDS and now - self._sent < _MAX_REPEAT_SECONDS:
                 try:
                     self._publish(last)
                 except zenoh.ZError as error:  # the client was closed before
-                    log.debug("wishing again: %s", error)
+                    log.debug("sending again: %s", error)
 
     def latest(self) -> LatestState | None:
-        """The last state that came, and its age; None: none came yet. Raises, once, what the server refused since."""
+        """Return the last state and its age; None before the first one.
+
+        Raise, once, the last error since that state.
+        """
         with self._changed:
             self._raise_error()
-            return None if self._latest is None else LatestState(self._latest, monotonic() - self._when)
+            return None if self._latest is None else LatestState(self._latest, monotonic() - self._received)
 
     def wait(self, seq: int, timeout: float = 5.0) -> State:
-        """The state of a wish, or of a newer one, waited for. BusyError: none came within `timeout` [s].
+        """Wait for the state of a motion command or of a newer one, and return it.
 
-        Raises, once, what the server refused since the last state.
+        Raise BusyError if none arrives within `timeout` [s]. Raise, once, the last error since the
+        last state.
         """
         with self._changed:
             self._changed.wait_for(
@@ -248,116 +263,114 @@ class ClientSession:
             self._raise_error()
             if self._latest is None or self._latest.seq < seq:
                 raise BusyError(
-                    f"no state of wish {seq} of avatar {self._user.avatar!r} in scene {self._scene!r} within "
+                    f"no state of wish {seq} of avatar {self._avatar!r} in scene {self._scene!r} within "
                     f"{timeout:g} s: no server heard it, or it is behind: wish on"
                 )
             return self._latest
 
     def _raise_error(self) -> None:
-        """Raise, once, what the server refused since the last state. To be called with `_changed` held."""
+        """Raise, once, the last error since the last state. The caller holds `_changed`."""
         error, self._error = self._error, None
         if error is not None:
             raise error
 
     def _reached(self, seq: int) -> bool:
-        """Whether the state of a wish came. To be called with `_changed` held."""
+        """Return whether the state of a motion command has arrived. The caller holds `_changed`."""
         return self._latest is not None and self._latest.seq >= seq
 
     def states(self, timeout: float = 5.0) -> Iterator[State]:
-        """Each state as it comes, in order, until none came for `timeout` [s] or the session is closed.
+        """Yield states in order, until none arrives for `timeout` [s] or the session is closed.
 
-        Of more than 1,024 that nobody took, the oldest are left out. Raises what the server refused, where it stands
-        among them.
+        Of more than 1,024 states not taken, the oldest are dropped. Raise an error of the server at
+        its place among the states.
         """
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: bool(self._kept) or self._stack is None, timeout)
                 if not self._kept:
                     return
-                said = self._kept.popleft()
-            if isinstance(said, SolidcloudError):
-                raise said
-            yield said
+                found = self._kept.popleft()
+            if isinstance(found, SolidcloudError):
+                raise found
+            yield found
 
-    def _hear(self) -> None:
-        """Take what comes. A thread's work."""
-        while (came := self._states.take(lambda: self._wished)) is not None:
+    def _receive(self) -> None:
+        """Take states and errors until the session ends. Runs in a thread."""
+        while (replies := self._states.take(lambda: self._published)) is not None:
             unknown: UnknownAvatarError | None = None
-            for each in came:
-                said = _said(each)
-                if isinstance(said, UnknownAvatarError):
-                    unknown = said
+            for reply in replies:
+                found = _decoded(reply)
+                if isinstance(found, UnknownAvatarError):
+                    unknown = found
                 else:
-                    self._keep(said)
+                    self._keep(found)
             if unknown is not None:
                 self._begin_again(unknown)
             self._follow_client()
-            self._wish_again()
+            self._repeat()
 
-    def _keep(self, said: State | SolidcloudError) -> None:
-        """Have what the server says where it is asked for."""
+    def _keep(self, found: State | SolidcloudError) -> None:
+        """Store a state or an error for the methods that return it."""
         with self._changed:
-            if isinstance(said, SolidcloudError):
-                self._error = said
+            if isinstance(found, SolidcloudError):
+                self._error = found
                 self._answered = 0 if self._last is None else self._last.seq
-            elif self._latest is not None and _same(said, self._latest):
-                return  # sent once more
+            elif self._latest is not None and _is_same(found, self._latest):
+                return  # repeated by the server
             else:
-                self._answered = max(self._answered, said.seq)
-                self._latest, self._error = said, None
-                self._numbers.follow(said.seq)
-                self._when, self._again = monotonic(), 0
-            self._kept.append(said)
+                self._answered = max(self._answered, found.seq)
+                self._latest, self._error = found, None
+                self._numbers.follow(found.seq)
+                self._received, self._refusals = monotonic(), 0
+            self._kept.append(found)
             self._changed.notify_all()
 
     def _begin_again(self, unknown: UnknownAvatarError) -> None:
-        """Come to a server that does not know the avatar, or where it is, or that has another of its name.
+        """Add the avatar again, and send its pose, to a server that does not know one of them.
 
-        It was restarted, took us for gone, or a velocity took the place of the pose that was to be the first wish.
+        The server was restarted, has dropped this client's avatars or has another avatar of the
+        name; or a velocity replaced the pose that was to be the first motion command.
         """
-        self._again += 1
+        self._refusals += 1
         try:
             try:
-                if not self._add_again(unknown):
-                    return  # nobody answered; the next wish asks again
+                if not self._connection.add_again([self._avatar], unknown):
+                    return  # no server answers; the next motion command causes another attempt
                 self._follow_client()
             except UnknownAvatarError:
-                if self._latest is None:  # neither this client's nor the scene's
+                if self._latest is None:  # neither this client's avatar nor the scene's
                     raise
             with self._publishing:
-                pose = self._where()
-                if pose is None or self._again > _MOST_AGAIN:
+                pose = self._last_pose()
+                if pose is None or self._refusals > _MAX_REFUSALS:
                     raise unknown
                 if self._stack is not None:
-                    # Alone: a velocity behind it might take its place once more. It is one frame's way.
+                    # Without a velocity, which might replace the pose again; one frame's motion is lost.
                     self._publish(Wish(seq=self._numbers.next(), time=self._time, pose=pose))
         except SolidcloudError as error:
             self._keep(error)
 
-    def _where(self) -> Any:
-        """The pose (1, 4, 4) last wished, or where the avatar was when the server last said so; None: neither."""
-        if self._aim is not None:
-            return self._aim
+    def _last_pose(self) -> Any:
+        """Return the pose (1, 4, 4) last commanded, or of the last state; None if there is neither."""
+        if self._target is not None:
+            return self._target
         return None if self._latest is None else self._latest.pose.copy()
 
 
-def _same(one: State, other: State) -> bool:
-    """Return whether two states are of the same frame of the same wish."""
+def _is_same(one: State, other: State) -> bool:
+    """Return whether two states are of the same frame of the same motion command."""
     return (one.seq, one.time, one.frame) == (other.seq, other.time, other.frame)
 
 
-def _said(came: tuple[bool, bytes] | OtherAvatarError) -> State | SolidcloudError:
-    """Return what the server says; an error where it cannot be read."""
-    if isinstance(came, OtherAvatarError):
-        return came
-    ok, payload = came
+def _decoded(reply: tuple[bool, bytes] | OtherAvatarError) -> State | SolidcloudError:
+    """Return the state or error of a reply; an InternalError if it cannot be decoded."""
+    if isinstance(reply, OtherAvatarError):
+        return reply
+    ok, payload = reply
     try:
-        return decode_answer(State, payload) if ok else _error_of(payload)
+        if ok:
+            return decode_answer(State, payload)
+        refusal = decode_answer(ErrorReply, payload)
+        return error_from_code(refusal.code, refusal.message)
     except SolidcloudError as error:
         return error
-
-
-def _error_of(payload: bytes) -> SolidcloudError:
-    """What a refusal says."""
-    reply = decode_answer(ErrorReply, payload)
-    return error_from_code(reply.code, reply.message)

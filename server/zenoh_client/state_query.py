@@ -1,4 +1,4 @@
-"""The client's side of states: one long query, answered with many replies, asked again whenever it ends."""
+"""Query for the states of one user: one long query with many replies, sent again when it ends."""
 
 import logging
 import queue
@@ -13,127 +13,128 @@ from ..zenoh_common.sealed_replies import OtherAvatarError, SealedQuery, TrustAn
 
 log = logging.getLogger(__name__)
 
-# How long the query may be silent while wishes go out before it is asked again [s].
+# How long the query may have no replies, although motion commands are sent, before it is sent again
+# [s].
 _SILENCE = 1.0
-# How long to wait before asking again after a query that brought nothing [s]: the first time, and at most.
-_PAUSE, _MOST_PAUSE = 0.01, 0.2
+# Pause before the query is sent again after one without replies [s]: the first, and the longest.
+_PAUSE, _MAX_PAUSE = 0.01, 0.2
 # How long one query is kept open [s].
 _QUERY_SECONDS = 3600.0
 
 
 class StateQuery:
-    """The query for one user's states. One thread takes what comes; `end` may be called by another."""
+    """The query for one user's states. One thread calls `take`; another may call `end`."""
 
     def __init__(
         self, session: zenoh.Session, key: str, anchor: TrustAnchor, about: Callable[[], bytes | None]
     ) -> None:
-        """Ask nothing yet. key: of the user's states.  about: as in `SealedQuery`."""
+        """Make a query that is not sent yet. key: of the user's states.  about: as in `SealedQuery`."""
         self._session, self._key, self._anchor, self._about = session, key, anchor, about
-        # Without bound: what is heard is taken at once, but for the moments in which an avatar is added again.
-        self._came: queue.SimpleQueue[tuple[SealedQuery, Any] | None] = queue.SimpleQueue()
-        self._asked_now: SealedQuery | None = None  # the query that is open, or was last
+        # Unbounded: replies are taken at once, except while an avatar is added again.
+        self._arrived: queue.SimpleQueue[tuple[SealedQuery, Any] | None] = queue.SimpleQueue()
+        self._query: SealedQuery | None = None  # the open one, or the last one
         self._open = self._over = False
-        self._asked = self._heard = 0.0  # when, on the monotonic clock
+        self._sent = self._received = 0.0  # times on the monotonic clock
         self._pause = _PAUSE
         self._cancel = zenoh.CancellationToken()
 
     def open(self) -> None:
-        """Ask for the first time."""
+        """Send the query for the first time."""
         self._declare()
-        self._ask()
+        self._send()
 
     def move(self, key: str) -> None:
-        """Ask for the states of another user from now on. key: of them."""
+        """Query for the states of another user from now on. key: of these states."""
         self.close()
         self._key, self._pause = key, _PAUSE
         self._declare()
-        self._ask()
+        self._send()
 
     def _declare(self) -> None:
         self._querier = self._session.declare_querier(
             self._key,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=_QUERY_SECONDS,
-            # As wishes travel, so that the query is not behind the first of them.
+            # As motion commands have it, so that the query is not behind the first of them.
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
         )
 
     def end(self) -> None:
-        """Have `take` return None once it has returned what came so far."""
-        self._came.put(None)
+        """Have `take` return None after the replies that have arrived."""
+        self._arrived.put(None)
 
     def close(self) -> None:
-        """Give up the query."""
+        """End the query."""
         try:
             self._cancel.cancel()
             self._querier.undeclare()
         except zenoh.ZError as error:  # the zenoh session was closed before
             log.debug("closing %s: %s", self._key, error)
 
-    def take(self, wished: Callable[[], float]) -> list[tuple[bool, bytes] | OtherAvatarError] | None:
-        """Wait a while for replies; return states as (True, payload), errors as (False, payload); None: it is over.
+    def take(self, published: Callable[[], float]) -> list[tuple[bool, bytes] | OtherAvatarError] | None:
+        """Wait a while for replies and return them; return None after the end.
 
-        A state of another avatar is returned as OtherAvatarError.
-        wished: returns when the user wished last, on the monotonic clock [s].
+        A state is (True, payload), an error (False, payload), a state of another avatar an
+        OtherAvatarError. published: returns the time of the last motion command, on the monotonic
+        clock [s].
         """
         if self._over:
             return None
         try:
-            came = [self._came.get(timeout=self._patience())]
+            arrived = [self._arrived.get(timeout=self._patience())]
         except queue.Empty:
-            now = monotonic()
-            if not self._open or (now - max(self._heard, self._asked) > _SILENCE and wished() > self._heard):
-                self._ask()
+            silent = monotonic() - max(self._received, self._sent) > _SILENCE
+            if not self._open or (silent and published() > self._received):
+                self._send()
             return []
-        while not self._came.empty():
-            came.append(self._came.get())
+        while not self._arrived.empty():
+            arrived.append(self._arrived.get())
         found: list[tuple[bool, bytes] | OtherAvatarError] = []
-        for item in came:
+        for item in arrived:
             if item is None:
                 self._over = True
                 break
-            asked, reply = item
-            if asked is not self._asked_now:
-                continue  # of a query before this one
+            query, reply = item
+            if query is not self._query:
+                continue  # of an earlier query
             if reply is None:
                 self._open = False
-            elif (said := _read(asked, reply)) is not None:
-                found.append(said)
-                self._heard = monotonic()
-                if not isinstance(said, OtherAvatarError) and said[0]:
-                    self._pause = (
-                        _PAUSE  # after an error, `busy` say, the server is not asked faster than before
-                    )
+            elif (state := _read(query, reply)) is not None:
+                found.append(state)
+                self._received = monotonic()
+                # An error such as `busy` does not reset the pause.
+                if not isinstance(state, OtherAvatarError) and state[0]:
+                    self._pause = _PAUSE
         return found
 
     def _patience(self) -> float:
         """Return how long to wait for a reply [s]."""
-        return _SILENCE if self._open else max(0.0, self._asked + self._pause - monotonic())
+        return _SILENCE if self._open else max(0.0, self._sent + self._pause - monotonic())
 
-    def _ask(self) -> None:
-        """Ask, in place of an earlier query."""
-        self._asked_now = asked = SealedQuery(self._anchor, self._key, about=self._about)
-        self._pause = min(2 * self._pause, _MOST_PAUSE)
-        self._asked, self._open = monotonic(), True
-        # zenoh calls these: they may not block, nor use zenoh.
+    def _send(self) -> None:
+        """Send the query in place of an earlier one."""
+        self._query = query = SealedQuery(self._anchor, self._key, about=self._about)
+        self._pause = min(2 * self._pause, _MAX_PAUSE)
+        self._sent, self._open = monotonic(), True
+        # zenoh calls these functions: they must neither block nor use zenoh.
         handler: Any = zenoh.handlers.Callback(
-            lambda reply: self._came.put((asked, reply)), lambda: self._came.put((asked, None))
+            lambda reply: self._arrived.put((query, reply)), lambda: self._arrived.put((query, None))
         )
         try:
             self._cancel.cancel()
             self._cancel = zenoh.CancellationToken()
             self._querier.get(
-                handler, encoding=MSGPACK, attachment=asked.nonce, cancellation_token=self._cancel
+                handler, encoding=MSGPACK, attachment=query.nonce, cancellation_token=self._cancel
             )
         except zenoh.ZError as error:  # the zenoh session is closed
             self._open = False
-            log.debug("asking %s: %s", self._key, error)
+            log.debug("querying %s: %s", self._key, error)
 
 
-def _read(asked: SealedQuery, reply: Any) -> tuple[bool, bytes] | OtherAvatarError | None:
-    """Return what a reply says; None where the server did not send it."""
+def _read(query: SealedQuery, reply: Any) -> tuple[bool, bytes] | OtherAvatarError | None:
+    """Return the content of a reply; None if the server did not send it."""
     try:
-        return asked.read(reply)
+        return query.read(reply)
     except OtherAvatarError as error:
         return error

@@ -16,7 +16,8 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
 from solidcloud.schemas.wire.motion_messages import State
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply
-from solidcloud.server.client import Client, scenes_at
+from solidcloud.server.client import Client
+from solidcloud.server.zenoh_client.server_connection import scenes_at
 from solidcloud.server.zenoh_common.key_files import find_key, key_paths
 from solidcloud.server.zenoh_common.sealed_replies import Sealer, hash_of
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
@@ -87,8 +88,10 @@ def test_a_rogue_at_a_dead_servers_port_is_never_believed(endpoint, seal, caplog
 
 def seal_of_the_server(client):
     """A seal as the server gives it, for another question."""
-    replies = client._session.get(
-        key_expressions.query_key("floor", client._id, "info"), attachment=bytes(16), encoding=MSGPACK
+    replies = client._connection.session.get(
+        key_expressions.query_key("floor", client._connection.client_id, "info"),
+        attachment=bytes(16),
+        encoding=MSGPACK,
     )
     return next(iter(replies)).ok.attachment.to_bytes()
 
@@ -145,7 +148,7 @@ def test_a_key_may_be_handed_out(scene, endpoint, tmp_path, monkeypatch):
 def error_of(client):
     """An error reply is sealed too."""
     try:
-        client._ask("collide", b"\xc1")
+        client._connection.ask("collide", b"\xc1")
     except BadRequestError as error:
         raise BadRequestError("names none") from error
 

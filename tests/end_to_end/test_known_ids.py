@@ -64,7 +64,7 @@ def known_by_a_rogue(archive, endpoint, radius=0.125):
         with Impostor(endpoint) as impostor:
             eventually(lambda: client.collide("al", POSES) is not None and "collide" in impostor.asked)
             heard = {key.split("/")[4] for key in impostor.keys if "/scene/" in key}
-        assert heard == {client._id}
+        assert heard == {client._connection.client_id}
         yield client, heard.pop()
 
 
@@ -117,7 +117,7 @@ def test_answers_about_an_avatar_that_somebody_else_added_are_not_believed(archi
     ):
         add(rogue, known, *LIES[lie])
         assert Verdict.CLEAR not in verdicts_until_right(client, kind)
-        assert client._id != known, "the id that somebody knows is not used any more"
+        assert client._connection.client_id != known, "the id that somebody knows is not used any more"
 
 
 def test_a_radius_that_the_server_makes_is_known_by_what_it_said(archive, endpoint):
@@ -137,14 +137,14 @@ def test_an_avatar_that_somebody_else_added_first_does_not_keep_the_own_one_out(
         served(archive, endpoint),
         rogue_session(endpoint) as rogue,
     ):
-        ask, added = client._ask, []
+        ask, added = client._connection.ask, []
 
         def asking(operation, request, names=()):
             if operation == "add_avatar" and not added:
                 added.append(add(rogue, known, *LIES["high"]))
             return ask(operation, request, names)
 
-        client._ask = asking
+        client._connection.ask = asking
         assert Verdict.CLEAR not in verdicts_until_right(client, "collide") and added
 
 
@@ -180,7 +180,7 @@ def test_a_session_does_not_walk_as_an_avatar_that_somebody_else_added(archive, 
                 for height in (1.0, -1.0):
                     found = states_after(session, 20, height)
                     assert not [each for each in found if not isinstance(each, str) and each < -0.2], found
-                assert client._id != known
+                assert client._connection.client_id != known
 
 
 def test_a_session_goes_on_when_a_question_found_out(archive, endpoint):

@@ -33,7 +33,7 @@ def victim(endpoint):
         client.add_avatar(AVATAR, POINTS, 0.125)
         with client.session(AVATAR) as session:
             session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
-            yield Victim(client, session, client._id)
+            yield Victim(client, session, client._connection.client_id)
 
 
 @pytest.fixture(scope="module", params=MODES)
@@ -52,7 +52,7 @@ def test_no_tool_of_a_rogue_has_a_success(rogue, victim, tool):
 
 
 def test_a_rogue_is_not_gossiped_to_clients(rogue, victim):
-    session = victim.client._session
+    session = victim.client._connection.session
     assert len(list(session.info.peers_zid())) + len(list(session.info.routers_zid())) == 1
 
 

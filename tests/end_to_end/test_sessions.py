@@ -321,12 +321,12 @@ def test_a_large_number_locks_nobody_out(served, endpoint):
             session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
             (user,) = served.users
             far = Wish(seq=10**9, time=1.0, pose=pose_at(0.0, 5.0)[None])
-            client._session.put(key_expressions.command_key("floor", user), encode(far))
+            client._connection.session.put(key_expressions.command_key("floor", user), encode(far))
             session.wait(10**9, DEADLINE)
             # The session counts on above what it heard.
             seq = session.wish(pose_at(0.0, 2.0))
             assert seq > 10**9 and session.wait(seq, DEADLINE).pose[0, 2, 3] == 2.0
-            client._session.put(
+            client._connection.session.put(
                 key_expressions.command_key("floor", user), encode(msgspec.structs.replace(far, seq=2**62))
             )
             eventually(lambda: session.latest().state.seq == 2**62)

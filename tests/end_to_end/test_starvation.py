@@ -245,7 +245,7 @@ def test_avatars_of_clients_with_a_token_are_kept(scene, endpoint, monkeypatch):
     with serving([scene], config):
         assert scene.limits.bytes == 10**6
         with Light(endpoint) as light:
-            name = light.client._id
+            name = light.client._connection.client_id
             eventually(lambda: any(name in alive for alive, _ in scene.unused))
         eventually(lambda: name not in scene.unused[-1][0])
     assert {seconds for _, seconds in scene.unused} == {3.0}

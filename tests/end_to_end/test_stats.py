@@ -26,9 +26,10 @@ from solidcloud.schemas.wire.key_expressions import public_id, query_key
 from solidcloud.schemas.wire.scene_messages import ErrorReply
 from solidcloud.schemas.wire.stats import StatsAnswer, StatsRequest
 from solidcloud.server.cli.main import run
-from solidcloud.server.client import Client, scenes_at
+from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import free_port
 from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_client.server_connection import scenes_at
 from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
@@ -112,7 +113,11 @@ def test_a_server_says_what_was_asked_of_it(archive: Path, endpoint: str) -> Non
         now = client.stats(keys=True)
         asked = [*answers, *parts]
         (user,) = now.users
-        assert (user.client, user.avatar, user.requests) == (public_id(client._id), "al", len(asked))
+        assert (user.client, user.avatar, user.requests) == (
+            public_id(client._connection.client_id),
+            "al",
+            len(asked),
+        )
         assert now.requests == user.requests and now.answers == user.answers == 6 + 2 + 6
         assert now.unknown == sum((answer.verdict == Verdict.UNKNOWN).sum() for answer in asked) == 0
         assert user.hits == sum(answer.hits for answer in asked) > 0
@@ -194,12 +199,18 @@ def test_the_command_serves_metrics_and_top_shows_them(
             text = reply.read().decode()
         assert 'solidcloud_requests_total{scene="hall"} 3.0' in text
         assert 'solidcloud_scene_info{policy="s3fifo",scene="hall"} 1.0' in text
-        assert f'client="{public_id(client._id)}"' in text and client._id not in text
+        assert (
+            f'client="{public_id(client._connection.client_id)}"' in text
+            and client._connection.client_id not in text
+        )
         # All that are served, one by name, and as JSON.
         for more in ([], ["--scene", "hall"]):
             assert run(["top", "--connect", endpoint, "--once", *more]) == 0
             shown = capsys.readouterr().out
-            assert "hall, policy s3fifo" in shown and f"{public_id(client._id)[:6]} al" in shown
+            assert (
+                "hall, policy s3fifo" in shown
+                and f"{public_id(client._connection.client_id)[:6]} al" in shown
+            )
             assert re.search(r"^requests +3 ", shown, re.MULTILINE)
         assert run(["top", "--connect", endpoint, "--json"]) == 0
         (told,) = json.loads(capsys.readouterr().out)

@@ -12,8 +12,8 @@ import pytest
 from fake_server import FloorScene, floor_simulation
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
+from solidcloud.server import client as client_module
 from solidcloud.server.cli.main import run
-from solidcloud.server.zenoh_client import request_batches as questions_module
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
@@ -132,7 +132,7 @@ def test_where_some_answers_do_not_come_the_others_are_printed(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(questions_module, "BATCH_POSES", 2)
+    monkeypatch.setattr(client_module, "BATCH_POSES", 2)
     scene = Stalls()
     with serving([scene], ServerConfig(listen=endpoint)):
         try:

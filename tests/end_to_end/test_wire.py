@@ -20,8 +20,8 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.requests import CollideRequest
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply, ScenesAnswer
+from solidcloud.server import client as client_module
 from solidcloud.server.client import Client
-from solidcloud.server.zenoh_client import request_batches as questions_module
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
@@ -39,7 +39,7 @@ def test_client_answers_as_the_judge_does(client):
 
 
 def test_long_lists_are_split_and_joined_in_order(client, monkeypatch):
-    monkeypatch.setattr(questions_module, "BATCH_POSES", 7)
+    monkeypatch.setattr(client_module, "BATCH_POSES", 7)
     poses = heights(np.random.default_rng(3).normal(-0.5, 0.3, 40))
     poses[:, 0, 3] = np.arange(40) % 3
     client.add_avatar("al", POINTS, 0.125)
@@ -196,7 +196,7 @@ def test_an_avatar_over_the_cap_is_an_error_and_poses_over_it_are_asked_in_halve
     with pytest.raises(TooLargeError):
         client.add_avatar("huge", np.zeros((1_000_001, 3)))
     # The server refuses so many at once (test_service.py); the client asks for them in halves.
-    monkeypatch.setattr(questions_module, "BATCH_POSES", 10**6)
+    monkeypatch.setattr(client_module, "BATCH_POSES", 10**6)
     verdict = client.collide("al", np.tile(np.eye(4), (100_001, 1, 1))).verdict
     assert len(verdict) == 100_001 and len(set(verdict.tolist())) == 1
     assert client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT]

@@ -13,8 +13,8 @@ from solidcloud.schemas.errors import (
 )
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.scene_messages import AvatarInfo
+from solidcloud.server import client as client_module
 from solidcloud.server.client import Client
-from solidcloud.server.zenoh_client import request_batches as questions_module
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
@@ -54,7 +54,7 @@ def test_a_killed_server_is_unknown_and_its_successor_right(endpoint):
 
 
 def test_a_frozen_server_is_unknown_after_the_timeout(endpoint, monkeypatch):
-    monkeypatch.setattr(questions_module, "BATCH_POSES", 1)
+    monkeypatch.setattr(client_module, "BATCH_POSES", 1)
     poses = heights([-1.0, 1.0, 1.0])
     with server_process(endpoint) as process, Client(endpoint, scene="floor", timeout=0.3) as client:
         client.add_avatar("al", POINTS, 0.1)

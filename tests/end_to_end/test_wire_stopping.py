@@ -62,7 +62,7 @@ def test_terminated_server_answers_what_it_accepted_and_exits_0(endpoint, delay,
         ):
             client.add_avatar("al", POINTS, 0.1)
             payload = encode(CollideRequest("al", heights([-1.0])))
-            key = f"solidcloud/1/scene/floor/{client._id}/collide"
+            key = f"solidcloud/1/scene/floor/{client._connection.client_id}/collide"
             asked = [session.get(key, payload=payload, timeout=DEADLINE) for _ in range(count)]
             # Answered by the other worker, and asked after the others on the same link: all have arrived.
             assert next(iter(session.get("solidcloud/1/scene/floor/other/info"))).ok

@@ -20,7 +20,8 @@ def top(
     import msgspec
 
     from ....schemas.errors import BadRequestError
-    from ...client import Client, scenes_at
+    from ...client import Client
+    from ...zenoh_client.server_connection import scenes_at
     from ..output.top_display import watch
 
     if not 0.1 <= interval <= 3600:

@@ -16,10 +16,10 @@ from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.questions import QUESTIONS
+from solidcloud.server import client as client_module
 from solidcloud.server.cli.main import run
 from solidcloud.server.queries.engines import ENGINES
 from solidcloud.server.scene import Scene
-from solidcloud.server.zenoh_client import request_batches
 from split_scans import STEP, Built, exact_pose, several
 
 REACH = 0.3
@@ -84,7 +84,7 @@ def test_it_is_asked_over_zenoh(scene: Scene, built: Built, monkeypatch: pytest.
     expected = judged(np.vstack(built.points), points)
     with served(scene) as endpoint, client_of(endpoint) as client:
         assert client.ask(COUNT_WITHIN, points, REACH).count.tolist() == expected
-        monkeypatch.setattr(request_batches, "BATCH_POSES", 7)
+        monkeypatch.setattr(client_module, "BATCH_POSES", 7)
         found = client.ask(COUNT_WITHIN, points, reach=REACH, tolerance=0.0)
         assert found.count.tolist() == expected and len(found.verdict) == len(points)
         with pytest.raises(BadRequestError, match="reach is -1"):

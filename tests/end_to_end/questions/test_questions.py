@@ -55,10 +55,10 @@ def test_plain_zenoh_is_answered_as_the_scene_does(scene, endpoint, question, en
 
 @pytest.mark.parametrize("question", QUESTIONS)
 def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkeypatch):
-    from solidcloud.server.zenoh_client import request_batches as questions_module
+    from solidcloud.server import client as client_module
 
-    monkeypatch.setattr(questions_module, "BATCH_POSES", 7)
-    monkeypatch.setattr(questions_module, "SLOW_BATCH", 7)
+    monkeypatch.setattr(client_module, "BATCH_POSES", 7)
+    monkeypatch.setattr(client_module, "SLOW_BATCH", 7)
     ask, _, _, _ = QUESTIONS[question]
     same(ask(client), ask(scene))
 

@@ -114,7 +114,7 @@ DOORS = {
     "tomli_w": ("builder/sources/scan_list.py",),
     "trimesh": ("builder/sources/surface_samples.py", "builder/synthetic/"),
     "embreex": ("builder/synthetic/scanner.py",),
-    "prometheus_client": ("server/observability/prometheus_metrics.py",),
+    "prometheus_client": ("server/observability/prometheus_export.py",),
     "distributed": ("builder/run/dask_cluster.py",),
     "dask": ("builder/run/dask_cluster.py",),
     "matplotlib": ("server/report/",),

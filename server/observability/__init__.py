@@ -1,5 +1,5 @@
-"""Counters of a scene, and their export as Prometheus metrics.
+"""Metrics: statistics of requests, the list of metrics and their export to Prometheus.
 
 May import schemas.
-Begin with request_stats.py.
+Begin with metric_list.py.
 """

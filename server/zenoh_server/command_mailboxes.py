@@ -1,6 +1,7 @@
-"""Mailboxes of motion commands, and the thread that simulates frames. Independent of zenoh.
+"""Motion commands on a server: queues of received ones, mailboxes, and the thread that simulates frames.
 
-A mailbox for each user holds its latest motion command (`Wish` on the wire). A thread empties all
+Received motion commands (`Wish` on the wire) wait in `WaitingCommands` until they are decoded. A
+mailbox for each user then holds its latest one. A thread empties all
 mailboxes, has one frame simulated and publishes the resulting states. It waits while there are no
 motion commands, so frames come at most as fast as motion commands do.
 """
@@ -9,8 +10,9 @@ import logging
 import math
 import threading
 import time
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, TooLargeError
 from ...schemas.wire.encoding import MSGPACK, decode_request, encode, wire_encoding
@@ -31,6 +33,55 @@ _BOXES_A_USER = 2
 # Interval at which the watchdog checks for long frames [s].
 _LOOK_SECONDS = 0.05
 _STOPS = "the server stops"
+# Limits of one turn and of all turns [bytes]. Beyond them, the oldest motion commands of a turn are
+# dropped, except its last one.
+_MAX_BYTES_A_TURN, _MAX_BYTES = 1 << 20, 16 << 20
+# Size of a motion command without its payload [bytes].
+_OVERHEAD = 256
+
+_WaitingCommand = tuple[User, Any, int]
+
+
+class WaitingCommands:
+    """Queue of motion commands for each turn. Not thread-safe.
+
+    If a turn exceeds its bytes, its oldest motion commands are dropped: newer ones replace them
+    anyway.
+    """
+
+    def __init__(self, turn: Callable[[str], str]) -> None:
+        """Begin empty. turn: returns the turn of a client (fair_queues.py)."""
+        self._turn = turn
+        self._queues: OrderedDict[str, deque[_WaitingCommand]] = OrderedDict()  # the next turn first
+        self._sizes: dict[str, int] = {}
+        self._size = 0
+
+    def put(self, user: User, wish: Any, size: int) -> None:
+        """Add a motion command. size: of its payload [bytes]."""
+        turn = self._turn(user.client)
+        self._queues.setdefault(turn, deque()).append((user, wish, size + _OVERHEAD))
+        self._count(turn, size + _OVERHEAD)
+        queue = self._queues[turn]
+        while len(queue) > 1 and (self._sizes[turn] > _MAX_BYTES_A_TURN or self._size > _MAX_BYTES):
+            self._count(turn, -queue.popleft()[2])
+
+    def take(self) -> tuple[User, Any] | None:
+        """Remove and return the next motion command with its user; None if there is none."""
+        if not self._queues:
+            return None
+        turn, queue = self._queues.popitem(last=False)
+        user, wish, size = queue.popleft()
+        self._count(turn, -size)
+        if queue:
+            self._queues[turn] = queue
+        else:
+            del self._sizes[turn]
+        return user, wish
+
+    def _count(self, turn: str, size: int) -> None:
+        """Add `size` bytes to the counts."""
+        self._sizes[turn] = self._sizes.get(turn, 0) + size
+        self._size += size
 
 
 class MailboxContents(NamedTuple):

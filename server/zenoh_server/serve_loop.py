@@ -69,7 +69,7 @@ def _metrics(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[No
     if not config.metrics_port:
         yield
         return
-    from ..observability.prometheus_metrics import metrics_served  # its library is an extra
+    from ..observability.prometheus_export import metrics_served  # its library is an extra
 
     with metrics_served(scenes, config.metrics_host, config.metrics_port) as where:
         log.info("metrics at %s", where)

@@ -16,12 +16,11 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire import key_expressions
 from ..scene_interface import EncodedReply, LimitReached
 from ..zenoh_common.sealed_replies import encoding_of, sealer_of, send_reply
-from .command_mailboxes import FrameLoop
+from .command_mailboxes import FrameLoop, WaitingCommands
 from .fair_queues import LivelinessTokens
 from .request_dispatcher import RequestDispatcher
 from .request_lanes import take_waiting
 from .state_streams import StateStreams
-from .waiting_commands import WaitingCommands
 
 log = logging.getLogger(__name__)
 

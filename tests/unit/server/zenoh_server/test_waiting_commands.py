@@ -2,8 +2,8 @@
 
 import pytest
 from solidcloud.schemas.wire.key_expressions import User
-from solidcloud.server.zenoh_server import waiting_commands as waiting_wishes
-from solidcloud.server.zenoh_server.waiting_commands import WaitingCommands
+from solidcloud.server.zenoh_server import command_mailboxes as waiting_wishes
+from solidcloud.server.zenoh_server.command_mailboxes import WaitingCommands
 
 pytestmark = pytest.mark.interpreted
 
@@ -33,7 +33,7 @@ def test_the_oldest_of_a_turn_are_dropped_where_it_has_too_many_bytes():
 
 
 def test_all_together_are_bounded_and_everybody_may_have_one(monkeypatch):
-    monkeypatch.setattr(waiting_wishes, "_MOST_BYTES", 5000)
+    monkeypatch.setattr(waiting_wishes, "_MAX_BYTES", 5000)
     waiting = WaitingCommands(str)
     for number in range(20):
         for client in "abc":

@@ -14,7 +14,7 @@ pytest.importorskip("prometheus_client")
 from prometheus_client.parser import text_string_to_metric_families
 from solidcloud.schemas.errors import BadRequestError, SolidcloudError
 from solidcloud.schemas.wire.stats import StatsAnswer, Times, UserStats
-from solidcloud.server.observability.prometheus_metrics import FEW_USERS, metrics_served
+from solidcloud.server.observability.prometheus_export import MAX_USERS_LISTED, metrics_served
 from solidcloud.server.observability.request_stats import Histogram
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
@@ -99,14 +99,14 @@ def test_times_are_histograms() -> None:
 
 
 def test_users_are_told_apart_where_they_are_few() -> None:
-    few = [UserStats(f"c{number}", 'a"\\l\n', requests=5, late=number) for number in range(FEW_USERS)]
+    few = [UserStats(f"c{number}", 'a"\\l\n', requests=5, late=number) for number in range(MAX_USERS_LISTED)]
     found = read(CountedScene("hall", users=few), CountedScene("attic", users=[*few, UserStats("d", "al")]))
     users = {
         labels["client"]: (labels, value)
         for name, labels, value in found
         if name == "solidcloud_user_voxel_late_total"
     }
-    assert len(users) == FEW_USERS
+    assert len(users) == MAX_USERS_LISTED
     assert users["c3"] == ({"scene": "hall", "client": "c3", "avatar": 'a"\\l\n'}, 3.0)
 
 
@@ -154,10 +154,10 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
             raise ModuleNotFoundError(f"No module named {name!r}", name="prometheus_client")
         return real(name, *arguments, **more)
 
-    monkeypatch.delitem(sys.modules, "solidcloud.server.observability.prometheus_metrics")
+    monkeypatch.delitem(sys.modules, "solidcloud.server.observability.prometheus_export")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(SolidcloudError, match=r"prometheus_client.*pip install 'solidcloud\[metrics\]'"):
-        importlib.import_module("solidcloud.server.observability.prometheus_metrics")
+        importlib.import_module("solidcloud.server.observability.prometheus_export")
 
 
 def test_times_that_say_nothing_have_all_buckets() -> None:

@@ -116,9 +116,9 @@ class Client(QueryMethods):
         return decode_answer(ReloadAnswer, self._connection.require("reload"))
 
     def stats(self, keys: bool = False) -> StatsAnswer:
-        """Return the statistics of the scene's cache and users. Raise BusyError if no server answers.
+        """Return the statistics of the scene's cache and users.
 
-        keys: also list the resident voxels.
+        Raise BusyError if no server answers. keys: also list the resident voxels.
         """
         return decode_answer(StatsAnswer, self._connection.require("stats", encode(StatsRequest(keys))))
 

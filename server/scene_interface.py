@@ -1,4 +1,4 @@
-"""Interface of a scene: the query methods of `Scene` and `Client`, and what a server requires of a scene.
+"""Interface of a scene: the query methods of `Scene` and `Client`, and what a server requires.
 
 `QueryMethods` are the methods that both implement. `ServedScene` is the scene that a server serves;
 the types it exchanges with the server follow. No zenoh and no numba here.
@@ -85,7 +85,7 @@ class QueryMethods:
         cluster_distance: float | None = None,
         **options: Unpack[QueryOptions],
     ) -> ContactsAnswers:
-        """List for k poses the pairs of points in contact: the deepest `limit` of each, all clusters."""
+        """List for k poses the pairs in contact: the deepest `limit` of each, and all clusters."""
         return self.ask(CONTACTS, name, poses, limit, margin, cluster_distance, **options)
 
     def sweep(
@@ -102,7 +102,7 @@ class QueryMethods:
     def raycast(
         self, origins: Any, directions: Any, reach: float, **options: Unpack[QueryOptions]
     ) -> RaycastAnswers:
-        """Find for k rays, (k, 3) and (k, 3), the first scan point whose sphere they hit within `reach`."""
+        """Find for k rays, (k, 3) and (k, 3), the first scan point whose sphere each hits."""
         return self.ask(RAYCAST, origins, directions, reach, **options)
 
     def within(self, points: Any, reach: float, **options: Unpack[QueryOptions]) -> WithinAnswers:
@@ -115,7 +115,7 @@ class QueryMethods:
         margin: float = 0.0,
         **options: Unpack[QueryOptions],
     ) -> ObjectsAnswers:
-        """Test several avatars (name, pose, group = 1, mask = all) against the scene and each other."""
+        """Test avatars (name, pose, group = 1, mask = all) against the scene and each other."""
         return self.ask(OBJECTS, objects, margin, **options)
 
 

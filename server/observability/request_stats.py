@@ -181,7 +181,7 @@ class StatsTotals(NamedTuple):
 class RequestStats:
     """Counters of one scene. Thread-safe.
 
-    At most MOST_USERS users have counters of their own. A new user replaces the least recently
+    At most MAX_USERS users have counters of their own. A new user replaces the least recently
     active one, whose counts remain in the total.
     """
 

@@ -3,7 +3,6 @@
 import threading
 import uuid
 from collections.abc import Sequence
-from contextlib import ExitStack
 from typing import NamedTuple
 
 import numpy as np
@@ -37,28 +36,25 @@ class ClientIdentity:
             operation: key_expressions.query_key(scene, self.id, operation)
             for operation in key_expressions.operations()
         }
-        with ExitStack() as stack:
-            # The token disappears with this process, however it ends: the server then drops the
-            # client's avatars.
-            token = key_expressions.client_token_key(scene, self.id)
-            stack.enter_context(session.liveliness().declare_token(token))
-            # Declared once: the route of a querier is known, an ad hoc `get` looks it up every time.
-            self.queriers = {
-                operation: stack.enter_context(
-                    session.declare_querier(
-                        key,
-                        # By default, zenoh holds a reply back until the server has ended the query.
-                        consolidation=zenoh.ConsolidationMode.NONE,
-                        timeout=max(timeout, OPEN_SECONDS.get(operation, 0.0)),
-                    )
-                )
-                for operation, key in self.keys.items()
-            }
-            self._stack = stack.pop_all()
+        # Declared once: the route of a querier is known, an ad hoc `get` looks it up every time. They
+        # are never undeclared, because another thread may be using one: that raises "Already
+        # borrowed". zenoh undeclares each when its last reference is dropped.
+        self.queriers = {
+            operation: session.declare_querier(
+                key,
+                # By default, zenoh holds a reply back until the server has ended the query.
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=max(timeout, OPEN_SECONDS.get(operation, 0.0)),
+            )
+            for operation, key in self.keys.items()
+        }
+        # The token disappears with this process, however it ends: the server then drops the client's
+        # avatars.
+        self._token = session.liveliness().declare_token(key_expressions.client_token_key(scene, self.id))
 
     def close(self) -> None:
-        """Undeclare the id; the server then drops it and its avatars."""
-        self._stack.close()
+        """Undeclare the id: the server then drops it and its avatars."""
+        self._token.undeclare()
 
     def is_in(self, key_expression: str) -> bool:
         """Return whether a key expression contains this id."""
@@ -84,7 +80,7 @@ class AddedAvatar(NamedTuple):
 
 
 class AddedAvatars:
-    """Avatars that a client added, by name: to add them again and to tell them from others. Thread-safe."""
+    """Avatars that a client added, by name: to add them again and to recognize them. Thread-safe."""
 
     def __init__(self) -> None:
         """Begin without avatars."""

@@ -148,7 +148,7 @@ class ClientSession:
             log.debug("leaving: %s", error)
 
     def _follow_client(self) -> None:
-        """Continue under the client's id if the client has taken another. Runs in the receiving thread."""
+        """Continue under the client's id if it has taken another. Runs in the receiving thread."""
         user = self._present_user()
         if user == self._user:
             return
@@ -345,13 +345,13 @@ class ClientSession:
                 if pose is None or self._refusals > _MAX_REFUSALS:
                     raise unknown
                 if self._stack is not None:
-                    # Without a velocity, which might replace the pose again; one frame's motion is lost.
+                    # Without a velocity, which might replace the pose again.
                     self._publish(Wish(seq=self._numbers.next(), time=self._time, pose=pose))
         except SolidcloudError as error:
             self._keep(error)
 
     def _last_pose(self) -> Any:
-        """Return the pose (1, 4, 4) last commanded, or of the last state; None if there is neither."""
+        """Return the pose (1, 4, 4) last commanded, or of the last state; None without both."""
         if self._target is not None:
             return self._target
         return None if self._latest is None else self._latest.pose.copy()

@@ -111,7 +111,7 @@ class ServerConnection:
         return None
 
     def require(self, operation: str, request: bytes = b"") -> bytes:
-        """Return the answer to a request about the scene itself; raise BusyError if there is none."""
+        """Return the answer to a request about the scene itself; raise BusyError without one."""
         seconds = max(self.timeout, OPEN_SECONDS["reload"]) if operation == "reload" else self.timeout
         begin = time.monotonic()
         payload = self.ask(operation, request)
@@ -120,7 +120,7 @@ class ServerConnection:
         return payload
 
     def stream(self, operation: str, request: bytes, names: Sequence[str]) -> Iterator[bytes]:
-        """Send a request and yield its answers, until the last or until none arrives for `timeout`."""
+        """Send a request and yield its answers; end if none arrives for `timeout`."""
         # Unbounded: a full channel would block everything that arrives over this session.
         arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         handler = zenoh.handlers.Callback(arrived.put, lambda: arrived.put(None))
@@ -146,7 +146,7 @@ class ServerConnection:
     def _query(
         self, operation: str, request: bytes, names: Sequence[str]
     ) -> tuple[zenoh.Querier, SealedQuery]:
-        """Return the querier of an operation under the present id, and the reader of its replies."""
+        """Return an operation's querier under the present id, and the reader of its replies."""
         self.check_open()
         identity = self._identity
         query = SealedQuery(
@@ -255,9 +255,9 @@ class ServerConnection:
         return f"solidcloud serve ARCHIVE --name {self._scene} --listen {self._endpoint}"
 
     def _explain_silence(self, operation: str, seconds: float, waited: float) -> str:
-        """Return why a request may not have been answered. seconds: the longest that it could wait."""
+        """Return why a request may not have been answered. seconds: the longest wait."""
         where = f"scene {self._scene!r} at {self._endpoint}"
-        # A query that reaches no server ends at once; one whose server dies ends when that is noticed.
+        # A query that reaches no server ends at once, and one whose server dies soon after.
         if self._answered and waited > _NEARLY * seconds:
             then = ", and its log says when it is done" if operation == "reload" else ""
             return (
@@ -289,7 +289,10 @@ class ServerConnection:
 def scenes_at(
     endpoint: str = DEFAULT_ENDPOINT, timeout: float = 5.0, key_file: Path | str | None = None
 ) -> list[str]:
-    """Return the sorted names of the scenes served at an endpoint; raise BusyError without a reply."""
+    """Return the sorted names of the scenes served at an endpoint.
+
+    Raise BusyError if no server answers.
+    """
     anchor = TrustAnchor(endpoint, key_file)
     with _open_session(endpoint) as session:
         served, versions = _ask_scenes(session, timeout, anchor)

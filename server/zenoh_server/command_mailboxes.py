@@ -1,9 +1,9 @@
-"""Motion commands on a server: queues of received ones, mailboxes, and the thread that simulates frames.
+"""Motion commands on a server: queues, mailboxes and the thread that simulates frames.
 
 Received motion commands (`Wish` on the wire) wait in `WaitingCommands` until they are decoded. A
-mailbox for each user then holds its latest one. A thread empties all
-mailboxes, has one frame simulated and publishes the resulting states. It waits while there are no
-motion commands, so frames come at most as fast as motion commands do.
+mailbox for each user then holds its latest one. A thread empties all mailboxes, has one frame
+simulated and publishes the resulting states. It waits while there are no motion commands, so frames
+come at most as fast as motion commands do.
 """
 
 import logging

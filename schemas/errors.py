@@ -2,7 +2,8 @@
 
 Every message says where the error is, what was found, what was expected and what to do.
 A client on the wire receives `code` beside that sentence (WIRE.md, "Errors"). The command line
-returns `exit_code`.
+returns `exit_code`. To add an error code, add it to `ErrorCode`, to `_BY_CODE` with its exception,
+and to WIRE.md.
 """
 
 from enum import StrEnum

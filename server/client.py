@@ -20,13 +20,7 @@ from ..schemas.wire.answers import Cost, Part, Verdict
 from ..schemas.wire.encoding import decode_answer, encode
 from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest
 from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_path_parameters
-from ..schemas.wire.question_rules import (
-    Question,
-    check_answers,
-    join_answers,
-    make_unknown,
-    request_fields,
-)
+from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.questions import QUESTIONS
 from ..schemas.wire.request_limits import MAX_POSES
 from ..schemas.wire.requests import has_tolerance_or_budget, make_poses, make_positions
@@ -196,11 +190,11 @@ class Client(QueryMethods):
                 # The rest is not asked: a frozen server would cost a timeout for every batch.
                 self._count_unanswered(k - start)
                 bounded = has_tolerance_or_budget(options)
-                parts.append(make_unknown(question.answers, k - start, bounded=bounded))
+                parts.append(question.unknown(k - start, bounded=bounded))
                 break
-            parts.append(check_answers(decode_answer(question.answers, payload), stop - start))
+            parts.append(question.check(decode_answer(question.answers, payload), stop - start))
             start = stop
-        return join_answers(parts)
+        return question.join(parts)
 
     def _count_unanswered(self, count: int) -> None:
         """Count items that no server answered."""
@@ -251,14 +245,14 @@ class Client(QueryMethods):
 
         def missing(stop: int) -> Part:
             self._count_unanswered(stop - expected)
-            none = make_unknown(question.answers, stop - expected, bounded=bounded)
+            none = question.unknown(stop - expected, bounded=bounded)
             part: Part = answers_to_part(none, expected, total)
             return part
 
         expected, complete = 0, False
         for payload in self._connection.stream_about("path", request, [name]):
             part = decode_answer(question.part, payload)
-            check_answers(part, len(part))
+            question.check(part, len(part))
             if part.total != total or part.first < 0 or part.first + len(part) > total:
                 raise InternalError(
                     f"part of a path for {part.first} to {part.first + len(part)} of {part.total}: "

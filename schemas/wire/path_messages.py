@@ -10,8 +10,8 @@ from msgspec.structs import asdict
 from ..errors import BadRequestError
 from .answers import Cost
 from .arrays import Poses, array_fields
-from .question_rules import Rows, question_of
-from .questions import path_questions
+from .question_rules import Rows
+from .questions import path_questions, question_of
 from .request_limits import MAX_CONTACTS
 from .requests import Count, Duration, Length, ModelName, Name, QuestionRequest, Request
 
@@ -80,8 +80,8 @@ def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
 def split_answers(answers: _A, most_bytes: int) -> Iterator[_A]:
     """Split answers into pieces of one item, or of at most `most_bytes` of listed rows.
 
-    `join_answers` undoes the split. The first piece carries the cost of the request. Answers that list no
-    rows are one piece.
+    `join_answers` undoes the split. The first piece carries the cost of the request. Answers that
+    list no rows are one piece.
     """
     kind: type[_A] = type(answers)
     question = question_of(kind)

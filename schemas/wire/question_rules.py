@@ -121,7 +121,6 @@ class Question(Generic[A]):
         if set(self.columns) != expected:
             odd = ", ".join(sorted(expected ^ set(self.columns)))
             raise TypeError(f"{self.name}: {odd}: expected a rule for each array field, and for no other")
-        _BY_ANSWERS.setdefault(self.answers, self)
 
     @cached_property
     def arrays(self) -> dict[str, ArrayType]:
@@ -223,15 +222,95 @@ class Question(Generic[A]):
             rows = self._defaults[name]
         return min(most, max(1, most_bytes // (row_bytes * max(1, rows))))
 
+    def unknown(self, k: int, *, bounded: bool = True) -> A:
+        """Return answers for k items (poses, rays, points, motions, objects), all `UNKNOWN`.
 
-# Questions by the type of their answers.
-_BY_ANSWERS: dict[type, Question[Any]] = {}
+        They stand for a request that was not answered.
+        bounded: whether columns with `Rows.BOUNDED` have values, as they do if a tolerance or a
+        budget was given.
+        """
+        rows = {
+            Rows.ITEMS: k,
+            Rows.BOUNDED: k if bounded else 0,
+            Rows.STARTS: k + 1,
+            Rows.LISTED: 0,
+            Rows.PAIRS: k * (k - 1) // 2,
+        }
+        columns: dict[str, Any] = {}
+        for name, (dtype, tail, _) in array_fields(self.answers).items():
+            rule = self.columns[name]
+            if rule.rows is Rows.PAIRS and tail:
+                columns[name] = np.column_stack(np.triu_indices(k, 1)).astype(dtype)
+                continue
+            filling = np.nan if tail and dtype.kind == "f" else rule.unknown
+            columns[name] = np.full((rows[rule.rows], *tail), filling, dtype)
+        return self.answers(**columns)
 
+    def join(self, parts: Sequence[A]) -> A:
+        """Join the answers of several requests, in order, into the answers of one.
 
-@cache
-def question_of(kind: type[Any]) -> Question[Any]:
-    """Return the question to which a type of answers, or of their parts along a path, belongs."""
-    return next(_BY_ANSWERS[base] for base in kind.__mro__ if base in _BY_ANSWERS)
+        Residency is that after the last answered request.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        answered = [part for part in parts if part.resident or part.hits or part.misses] or parts
+        fields: dict[str, Any] = {}
+        for name, rule in self.columns.items():
+            columns = [getattr(part, name) for part in parts]
+            fields[name] = _joined_starts(columns) if rule.rows is Rows.STARTS else np.concatenate(columns)
+        return self.answers(
+            **fields,
+            engine_seconds=sum(part.engine_seconds for part in parts),
+            hits=sum(part.hits for part in parts),
+            misses=sum(part.misses for part in parts),
+            resident=answered[-1].resident,
+            resident_bytes=answered[-1].resident_bytes,
+            faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
+            wait_seconds=sum(part.wait_seconds for part in parts),
+            late=tuple(dict.fromkeys(key for part in parts for key in part.late)),
+            stopped=next((part.stopped for part in parts if part.stopped), ""),
+        )
+
+    def check(self, answers: A, k: int) -> A:
+        """Return the answers if they are valid answers to k items; raise InternalError otherwise."""
+        kind = type(answers).__name__
+        for name, verdict, rule in self._checks:
+            column = getattr(answers, name)
+            expected = k if rule is None else self._expected_rows(answers, rule, k)
+            if len(column) != expected:
+                raise InternalError(
+                    f"{kind}: {len(column)} values in {name!r}, expected {expected}, for {k} requested"
+                )
+            if verdict and expected and max(column.tobytes()) > _LAST_VERDICT:
+                raise InternalError(
+                    f"{kind}: verdict {column.max()}, expected at most {_LAST_VERDICT}: upgrade the client"
+                )
+            if rule is None:
+                continue
+            if rule.rows is Rows.STARTS and (column[0] != 0 or (np.diff(column) < 0).any()):
+                raise InternalError(f"{kind}: {name!r} does not rise from 0")
+            if rule.rows is Rows.PAIRS and column.ndim == 2 and not ((column >= 0) & (column < k)).all():
+                raise InternalError(f"{kind}: pairs with objects that were not requested, of {k}")
+        return answers
+
+    @cached_property
+    def _checks(self) -> tuple[tuple[str, bool, ColumnRules | None], ...]:
+        """Return each column's name, whether it has verdicts, and its rules; None: a row per item."""
+        rules = self.columns
+        return tuple(
+            (name, name.endswith("verdict"), None if rules[name].rows is Rows.ITEMS else rules[name])
+            for name in array_fields(self.answers)
+        )
+
+    def _expected_rows(self, answers: A, rule: ColumnRules, k: int) -> int:
+        """Return how many rows a column of answers to k items has, if not one per item."""
+        if rule.rows is Rows.STARTS:
+            return k + 1
+        if rule.rows is Rows.LISTED:
+            starts = getattr(answers, rule.of)
+            return int(starts[-1]) if len(starts) else 0
+        first = len(getattr(answers, self.with_rows[rule.rows][0]))
+        return first if rule.rows is Rows.PAIRS else k if first else 0
 
 
 def request_fields(
@@ -269,103 +348,6 @@ def _conversions(kind: type[QuestionRequest]) -> tuple[tuple[str, Callable[[Any,
         elif str(hint).startswith("numpy.ndarray"):
             found.append((name, make_vectors))
     return tuple(found)
-
-
-def make_unknown(kind: type[A], k: int, *, bounded: bool = True) -> A:
-    """Return answers of one type for k poses (rays, points, motions, objects), all `UNKNOWN`.
-
-    They stand for a request that nobody answered.
-    bounded: whether columns with `Rows.BOUNDED` have values, as they do if a tolerance or a budget
-    was given.
-    """
-    rows = {
-        Rows.ITEMS: k,
-        Rows.BOUNDED: k if bounded else 0,
-        Rows.STARTS: k + 1,
-        Rows.LISTED: 0,
-        Rows.PAIRS: k * (k - 1) // 2,
-    }
-    columns: dict[str, Any] = {}
-    rules = question_of(kind).columns
-    for name, (dtype, tail, _) in array_fields(kind).items():
-        rule = rules[name]
-        if rule.rows is Rows.PAIRS and tail:
-            columns[name] = np.column_stack(np.triu_indices(k, 1)).astype(dtype)
-            continue
-        filling = np.nan if tail and dtype.kind == "f" else rule.unknown
-        columns[name] = np.full((rows[rule.rows], *tail), filling, dtype)
-    return kind(**columns)
-
-
-def join_answers(parts: Sequence[A]) -> A:
-    """Join the answers of several requests, in order, into the answers of one.
-
-    Residency is that after the last answered request.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    kind = type(parts[0])
-    answered = [part for part in parts if part.resident or part.hits or part.misses] or parts
-    fields: dict[str, Any] = {}
-    for name, rule in question_of(kind).columns.items():
-        columns = [getattr(part, name) for part in parts]
-        fields[name] = _joined_starts(columns) if rule.rows is Rows.STARTS else np.concatenate(columns)
-    return kind(
-        **fields,
-        engine_seconds=sum(part.engine_seconds for part in parts),
-        hits=sum(part.hits for part in parts),
-        misses=sum(part.misses for part in parts),
-        resident=answered[-1].resident,
-        resident_bytes=answered[-1].resident_bytes,
-        faults=tuple(dict.fromkeys(fault for part in parts for fault in part.faults)),
-        wait_seconds=sum(part.wait_seconds for part in parts),
-        late=tuple(dict.fromkeys(key for part in parts for key in part.late)),
-        stopped=next((part.stopped for part in parts if part.stopped), ""),
-    )
-
-
-def check_answers(answers: A, k: int) -> A:
-    """Return the answers if they are valid answers to k poses; raise InternalError otherwise."""
-    kind = type(answers)
-    for name, verdict, rule in _checks(kind):
-        column = getattr(answers, name)
-        expected = k if rule is None else _expected_rows(answers, rule, k)
-        if len(column) != expected:
-            raise InternalError(
-                f"{kind.__name__}: {len(column)} values in {name!r}, expected {expected}, for {k} requested"
-            )
-        if verdict and expected and max(column.tobytes()) > _LAST_VERDICT:
-            raise InternalError(
-                f"{kind.__name__}: verdict {column.max()}, expected at most {_LAST_VERDICT}: upgrade the client"
-            )
-        if rule is None:
-            continue
-        if rule.rows is Rows.STARTS and (column[0] != 0 or (np.diff(column) < 0).any()):
-            raise InternalError(f"{kind.__name__}: {name!r} does not rise from 0")
-        if rule.rows is Rows.PAIRS and column.ndim == 2 and not ((column >= 0) & (column < k)).all():
-            raise InternalError(f"{kind.__name__}: pairs with objects that were not requested, of {k}")
-    return answers
-
-
-@cache
-def _checks(kind: type) -> tuple[tuple[str, bool, ColumnRules | None], ...]:
-    """Return each column's name, whether it has verdicts, and its rules; None for one row per item."""
-    rules = question_of(kind).columns
-    return tuple(
-        (name, name.endswith("verdict"), None if rules[name].rows is Rows.ITEMS else rules[name])
-        for name in array_fields(kind)
-    )
-
-
-def _expected_rows(answers: Cost, rule: ColumnRules, k: int) -> int:
-    """Return how many rows a column of answers to k poses has, where they are not one per pose."""
-    if rule.rows is Rows.STARTS:
-        return k + 1
-    if rule.rows is Rows.LISTED:
-        starts = getattr(answers, rule.of)
-        return int(starts[-1]) if len(starts) else 0
-    first = len(getattr(answers, question_of(type(answers)).with_rows[rule.rows][0]))
-    return first if rule.rows is Rows.PAIRS else k if first else 0
 
 
 def _joined_starts(columns: list[NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -1,13 +1,19 @@
-"""Declarations of the questions: the types of each, and the rules of each column of its answers."""
+"""Declarations of the questions: the types of each, and the rules of each column of its answers.
 
+question_rules.py says what a rule means. Adding a declaration to `QUESTIONS` makes a question known
+to everything generic.
+"""
+
+from collections.abc import Sequence
 from math import inf
-from typing import Any
+from typing import Any, TypeVar
 
 from .answers import (
     CollideAnswers,
     CollidePart,
     ContactsAnswers,
     ContactsPart,
+    Cost,
     DistanceAnswers,
     DistancePart,
     ObjectsAnswers,
@@ -27,6 +33,8 @@ from .requests import (
     SweepRequest,
     WithinRequest,
 )
+
+A = TypeVar("A", bound=Cost)
 
 _POINT = ColumnRules(Merge.NEAREST, ColumnFrame.POINT)
 _DIRECTION = ColumnRules(Merge.NEAREST, ColumnFrame.DIRECTION)
@@ -154,3 +162,33 @@ QUESTIONS: dict[str, Question[Any]] = {
 def path_questions() -> dict[str, Question[Any]]:
     """Return the questions that are asked along paths, by name."""
     return {name: question for name, question in QUESTIONS.items() if question.part is not None}
+
+
+_BY_TYPE: dict[type, Question[Any]] = {}
+
+
+def question_of(kind: type[Any]) -> Question[Any]:
+    """Return the question to which a type of answers, or of their parts along a path, belongs."""
+    found = _BY_TYPE.get(kind)
+    if found is None:
+        found = next(question for question in QUESTIONS.values() if issubclass(kind, question.answers))
+        _BY_TYPE[kind] = found
+    return found
+
+
+def make_unknown(kind: type[A], k: int, *, bounded: bool = True) -> A:
+    """Return `Question.unknown` for a type of answers."""
+    answers: A = question_of(kind).unknown(k, bounded=bounded)
+    return answers
+
+
+def join_answers(parts: Sequence[A]) -> A:
+    """Return `Question.join` of answers of one type."""
+    answers: A = question_of(type(parts[0])).join(parts)
+    return answers
+
+
+def check_answers(answers: A, k: int) -> A:
+    """Return `Question.check` of answers."""
+    checked: A = question_of(type(answers)).check(answers, k)
+    return checked

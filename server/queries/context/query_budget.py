@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
-from ....schemas.wire.question_rules import Question, make_unknown
+from ....schemas.wire.question_rules import Question
 from ....schemas.wire.requests import QuestionOptions
 from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
 from ...residency.held_voxels import HeldVoxels
@@ -171,6 +171,6 @@ def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: 
 
 
 def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
-    """Return `make_unknown` for the k items of a stopped request, with the reason of the stop."""
-    answers = make_unknown(question.answers, k, bounded=budget.limited or budget.tolerance > 0.0)
+    """Return `Question.unknown` for the k items of a stopped request, with the reason of the stop."""
+    answers = question.unknown(k, bounded=budget.limited or budget.tolerance > 0.0)
     return structs.replace(answers, stopped=budget.stop.reason)

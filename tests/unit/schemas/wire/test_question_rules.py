@@ -16,8 +16,13 @@ from solidcloud.schemas.wire.answers import (
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.path_messages import answers_to_part, part_to_answers, split_answers
-from solidcloud.schemas.wire.question_rules import check_answers, join_answers, make_unknown
-from solidcloud.schemas.wire.questions import QUESTIONS, path_questions
+from solidcloud.schemas.wire.questions import (
+    QUESTIONS,
+    check_answers,
+    join_answers,
+    make_unknown,
+    path_questions,
+)
 
 KINDS = [question.answers for question in QUESTIONS.values()]
 

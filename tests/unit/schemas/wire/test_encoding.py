@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, InternalError, TooLargeError
 from solidcloud.schemas.scene.scene_file import json_schema
-from solidcloud.schemas.wire import scene_messages
+from solidcloud.schemas.wire import json_schemas, request_limits, scene_messages
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
 from solidcloud.schemas.wire.encoding import (
     JSON,
@@ -296,7 +296,7 @@ def test_points_that_are_none_are_refused_before_they_are_sent(points):
 
 def test_too_many_points_are_refused_before_they_are_sent():
     with pytest.raises(TooLargeError, match="1000001"):
-        make_positions(np.zeros((scene_messages.MAX_AVATAR_POINTS + 1, 3)))
+        make_positions(np.zeros((request_limits.MAX_AVATAR_POINTS + 1, 3)))
 
 
 @pytest.mark.parametrize("poses", [np.eye(4), np.zeros((2, 3, 4)), "text", [[1, 2], [3]]])
@@ -306,13 +306,13 @@ def test_poses_of_the_wrong_shape_are_refused_before_they_are_sent(poses):
 
 
 def test_schemas_on_disk_are_current():
-    expected = {**scene_messages.json_schemas(), "Scene": json_schema()}
+    expected = {**json_schemas.json_schemas(), "Scene": json_schema()}
     found = {path.stem: path.read_text() for path in (SCHEMAS / "json").glob("*.json")}
     assert found == expected, "run scripts/make_schemas"
 
 
 def test_schema_of_an_array_says_its_shape():
-    schema = json.loads(scene_messages.json_schemas()["CollideRequest"])["$defs"]["CollideRequest"]
+    schema = json.loads(json_schemas.json_schemas()["CollideRequest"])["$defs"]["CollideRequest"]
     row = schema["properties"]["poses"]["items"]["items"]
     assert (row["minItems"], row["maxItems"], row["items"]["type"]) == (4, 4, "number")
     assert schema["additionalProperties"] is False
@@ -326,12 +326,12 @@ def worked_examples():
 
 def test_there_are_worked_examples():
     names = {example.values[0] for example in worked_examples()}
-    assert names == {kind.__name__ for kind in scene_messages.MESSAGES} - {"SceneInfo"}
+    assert names == {kind.__name__ for kind in json_schemas.MESSAGES} - {"SceneInfo"}
 
 
 @pytest.mark.parametrize("name, text, digits", worked_examples())
 def test_worked_example(name, text, digits):
-    kind = {kind.__name__: kind for kind in scene_messages.MESSAGES}[name]
+    kind = {kind.__name__: kind for kind in json_schemas.MESSAGES}[name]
     decode = decode_request if issubclass(kind, Request) else decode_answer
     bits = bytes.fromhex(digits)
     for message in (decode(kind, text.encode(), JSON), decode(kind, bits, MSGPACK)):

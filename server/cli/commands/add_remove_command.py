@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, KeyFile, parse_bytes, print_json
-from .interruptible import interruptible
+from .command_options import ArchivePath, AsJson, KeyFile, interruptible, parse_bytes, print_json
 
 if TYPE_CHECKING:
     from ....builder.edit.rebuild_voxels import ChangeSummary

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ....builder.sources.format_table import FORMATS
-from .command_options import AsJson, parse_bytes, print_json
-from .interruptible import interruptible
+from .command_options import AsJson, interruptible, parse_bytes, print_json
 
 if TYPE_CHECKING:
     from ....builder.config import BuildConfig

@@ -1,9 +1,9 @@
-"""Helpers that the verbs share: common options, sizes in bytes, missing libraries, errors, JSON."""
+"""Helpers of the commands: common options, sizes in bytes, missing libraries, errors, JSON, interrupts."""
 
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +11,13 @@ from typing import Annotated, Any
 import typer
 
 from ....schemas.errors import BadRequestError, SolidcloudError
+from ....schemas.process.interrupts import (
+    Interrupted,
+    check_interrupt,
+    deferring_interrupts,
+    interrupt_pending,
+    stop_insisting,
+)
 
 ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
 KeyFile = Annotated[
@@ -55,3 +62,23 @@ def print_error(message: str, code: int) -> int:
 
 def print_json(value: Any) -> None:
     print(json.dumps(value, indent=1, allow_nan=False))
+
+
+@contextmanager
+def interruptible(describe_remains: Callable[[], str] | None = None) -> Iterator[None]:
+    """Let SIGINT and SIGTERM end the work in this block.
+
+    describe_remains: returns a sentence about what the work has left behind; None: it leaves nothing.
+    Raises Interrupted with that sentence as its text.
+    """
+    with deferring_interrupts():
+        try:
+            yield
+            check_interrupt()
+        except BaseException as error:
+            if not isinstance(error, KeyboardInterrupt) and not (
+                interrupt_pending() and isinstance(error, Exception)
+            ):
+                raise
+            stop_insisting()
+            raise Interrupted(describe_remains() if describe_remains else "") from None

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, needs_extra, print_json
-from .interruptible import interruptible
+from .command_options import ArchivePath, AsJson, interruptible, needs_extra, print_json
 
 
 def export(

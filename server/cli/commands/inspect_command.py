@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, print_error, print_json
-from .interruptible import interruptible
+from .command_options import AsJson, interruptible, print_error, print_json
 
 if TYPE_CHECKING:
     from ....builder.sources.scan_list import ScanEntry

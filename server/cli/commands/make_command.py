@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import needs_extra
-from .interruptible import interruptible
+from .command_options import interruptible, needs_extra
 
 ScanOutput = Annotated[
     Path,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .command_options import AsJson, parse_bytes, print_json
-from .interruptible import interruptible
+from .command_options import AsJson, interruptible, parse_bytes, print_json
 
 if TYPE_CHECKING:
     from ....builder.plan.build_plan import Limit, Plan

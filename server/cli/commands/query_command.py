@@ -1,4 +1,8 @@
-"""`solidcloud query`: send collision queries to a server."""
+"""`solidcloud query`: send collision queries to a server.
+
+The options of questions are written out here and not read from schemas/wire/questions.py: typer
+builds the options of all commands at each start, which importing the declarations would double.
+"""
 
 import sys
 from pathlib import Path

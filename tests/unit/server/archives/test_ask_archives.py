@@ -23,8 +23,8 @@ def flags(monkeypatch):
         return ask, len(poses)
 
     monkeypatch.setattr(ask_archives, "path_question", question)
-    monkeypatch.setattr(ask_archives, "carried", lambda found, *_: found)
-    monkeypatch.setattr(ask_archives, "merged", lambda answers: answers)
+    monkeypatch.setattr(ask_archives, "answers_in_world", lambda found, *_: found)
+    monkeypatch.setattr(ask_archives, "merge_answers", lambda answers: answers)
     return asked
 
 

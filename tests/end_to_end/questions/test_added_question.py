@@ -94,7 +94,7 @@ def test_it_is_asked_over_zenoh(scene: Scene, built: Built, monkeypatch: pytest.
 def test_what_nobody_answers_is_unknown(scene: Scene, built: Built, monkeypatch: pytest.MonkeyPatch) -> None:
     points = places(built)
     with served(scene) as endpoint, client_of(endpoint) as client:
-        monkeypatch.setattr(client, "_ask_about", lambda *_: None)
+        monkeypatch.setattr(client._connection, "ask_about", lambda *_: None)
         found = client.ask(COUNT_WITHIN, points, REACH)
     assert set(found.verdict.tolist()) == {Verdict.UNKNOWN}
     assert not found.count.any() and not found.exact.any()

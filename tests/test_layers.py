@@ -49,7 +49,6 @@ ALLOWED = {
     "server/zenoh_server": "observability runtime scene_interface.py zenoh_common",
     "server/avatars": "kernels scene_interface.py",
     "server/client.py": "scene_interface.py zenoh_common zenoh_client",
-    "server/report/kernels": "kernels",
     "server/residency": "kernels runtime",
     "server/cli/output": "residency",
     "server/queries/context": "kernels runtime avatars residency",
@@ -71,7 +70,7 @@ ALLOWED = {
     ),
     "server/report/common": "cli/input avatars scene.py",
     "server/cli/scene_files": "residency archives scenes",
-    "server/report/accuracy": "kernels avatars report/kernels residency scene.py report/common",
+    "server/report/accuracy": "avatars residency scene.py report/common",
     "server/report/walk": "client.py residency cli/output scene.py report/common",
     "server/cli/commands": (
         "cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency cli/output "

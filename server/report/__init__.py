@@ -1,5 +1,5 @@
 """Reports: `solidcloud accuracy` and the demo.
 
 May import builder, schemas.
-Begin with accuracy/accuracy.py or walk/demo_walk.py.
+Begin with accuracy/accuracy_report.py or walk/demo_walk.py.
 """

@@ -27,9 +27,9 @@ def accuracy(
     from ....schemas.process.os_errors import naming_write_errors
 
     with needs_extra("made"):
-        from ...report.accuracy.accuracy import run as measure
-    from ...report.accuracy.accuracy_plan import BRIEF, FULL
-    from ...report.accuracy.accuracy_words import findings
+        from ...report.accuracy.accuracy_report import run as measure
+    from ...report.accuracy.measurement_plan import BRIEF, FULL
+    from ...report.accuracy.page_texts import findings
     from ..output.progress_display import progress_listener
 
     with (

@@ -23,13 +23,13 @@ from ...scene import Scene
 # half a millimetre.
 FINEST = 0.00025
 # Distance of poses along the passage [m]. Between two poses, the contact of two spheres is missed
-# by up to ALONG² / 8 divided by the sum of their radii: 0.15 mm with those of figure and façade.
-ALONG = 0.005
+# by up to POSE_SPACING² / 8 divided by the sum of their radii: 0.15 mm with those of figure and façade.
+POSE_SPACING = 0.005
 # Heights of the soles above the sill [m]. They are large because a jamb, not the floor, must stop
 # the figure: spheres thicken the floor as well, and under a tolerance of 10 cm the figure would be
 # in contact with it. The result is the mean over several heights: the widest parts of the figure
 # meet random points of the jambs, which makes a difference of 5 mm from one height to the next.
-LIFTS = (0.24, 0.28, 0.32, 0.36)
+SOLE_HEIGHTS = (0.24, 0.28, 0.32, 0.36)
 # The search on each side begins this far before the true jamb [m].
 OUTSIDE = 0.05
 # The search ends this far past the true jamb [m]. It is the limit of a negative error on one side,
@@ -97,13 +97,13 @@ def doorway_error(
 
     width = float(np.ptp(figure[:, 0])) + 2 * radius
     play = 0.0
-    for lift in LIFTS:
+    for lift in SOLE_HEIGHTS:
         poses = passage(frame, lift, facade_truth.origin, figure)
         if stops(poses, 0.0).any():
             return Doorway(math.inf, width, math.inf)
         for side in (-1, 1):
             true_play = frame.width / 2 - float((side * figure[:, 0]).max()) - radius
-            play += _play(stops, poses, side, true_play) / len(LIFTS)
+            play += _play(stops, poses, side, true_play) / len(SOLE_HEIGHTS)
     narrowest = frame.width - play
     return Doorway(narrowest, width, (narrowest - width) * 1000)
 
@@ -137,10 +137,12 @@ def passage(
 ) -> NDArray[np.float64]:
     """Return poses (k, 4, 4) along the door's middle, from in front of the jambs to behind them.
 
-    The poses are ALONG apart.
+    The poses are POSE_SPACING apart.
     lift: height of the soles above the sill [m].  origin: of the façade.
     """
-    y = np.arange(door.y_front - figure[:, 1].max(), door.y_back - figure[:, 1].min() + ALONG, ALONG)
+    y = np.arange(
+        door.y_front - figure[:, 1].max(), door.y_back - figure[:, 1].min() + POSE_SPACING, POSE_SPACING
+    )
     poses = np.tile(np.eye(4), (len(y), 1, 1))
     poses[:, 0, 3] = (door.x_left + door.x_right) / 2 + origin[0]
     poses[:, 1, 3] = y + origin[1]

@@ -15,7 +15,7 @@ LIGHT = np.array([-0.45, 0.55, 0.70])
 WIDTH = 1800
 
 
-class Spheres(NamedTuple):
+class LevelSpheres(NamedTuple):
     """The s spheres of one level.
 
     center: (s, 3) float64, world frame [m].  radius: (s,) float64 [m], including the radius of the
@@ -31,7 +31,7 @@ class Spheres(NamedTuple):
     ended: NDArray[np.bool_]
 
 
-def level_spheres(folder: Path, level: int) -> Spheres:
+def level_spheres(folder: Path, level: int) -> LevelSpheres:
     """Return the spheres of one level of every leaf cell's BSH (the paper's partition).
 
     A tree that ends earlier contributes its leaf nodes. The top BSH, over the cells, is not
@@ -62,7 +62,7 @@ def level_spheres(folder: Path, level: int) -> Spheres:
             rows = np.concatenate([ended, chosen])
             low = voxel.cells.low[links.cell[rows]] + coordinate * lattice.voxel_steps
             parts.append(
-                Spheres(
+                LevelSpheres(
                     lattice.to_world(voxel.nodes.center[rows] + low),
                     voxel.nodes.radius[rows] * lattice.step + radius,
                     links.cell[rows] + cells,
@@ -70,7 +70,7 @@ def level_spheres(folder: Path, level: int) -> Spheres:
                 )
             )
             cells += len(voxel.cells.nodes)
-    return Spheres(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return LevelSpheres(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _view() -> NDArray[np.float64]:
@@ -92,7 +92,7 @@ def _colours(partition: NDArray[np.int64]) -> NDArray[np.float64]:
     return colours
 
 
-def render_spheres(spheres: Spheres, width: int = WIDTH) -> NDArray[np.float64]:
+def render_spheres(spheres: LevelSpheres, width: int = WIDTH) -> NDArray[np.float64]:
     """Render the spheres as lit balls in parallel projection to an image (h, width, 3).
 
     Each pixel shows the nearest sphere.
@@ -127,7 +127,7 @@ def render_spheres(spheres: Spheres, width: int = WIDTH) -> NDArray[np.float64]:
     return image
 
 
-def draw_spheres(spheres: Spheres, title: str, target: Path) -> None:
+def draw_spheres(spheres: LevelSpheres, title: str, target: Path) -> None:
     """Write the picture of the spheres as PNG. Raises SolidcloudError if matplotlib is missing."""
     pyplot = load_pyplot()
     image = render_spheres(spheres)

@@ -30,7 +30,7 @@ from ...client import Client
 from ..common.floor_walk import floor_walk
 from ..common.thinned_points import read_thinned
 from .server_process import served
-from .walk_frames import Frames, Walk
+from .walk_answers import Walk, WalkAnswers
 
 # Number of points read again from the scans, for the picture and to detect a floor in scans without
 # ground truth.
@@ -101,7 +101,7 @@ def make_scan(out: Path) -> Path:
         return make_facade(out / "facade.laz", progress=bars.made).truth
 
 
-def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
+def take_walk(client: Client, walk: Walk, *, realtime: bool) -> WalkAnswers:
     """Query one pose after another, as a viewer does for each of its frames.
 
     There is no progress bar: its thread would hold the interpreter for milliseconds, which would
@@ -116,7 +116,7 @@ def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
         asked = time.perf_counter()
         answers.append(client.collide("figure", walk.poses[k : k + 1]))
         round_trip[k] = time.perf_counter() - asked
-    return Frames(
+    return WalkAnswers(
         np.concatenate([answer.verdict for answer in answers]),
         np.array([answer.engine_seconds for answer in answers]),
         round_trip,
@@ -127,7 +127,7 @@ def take_walk(client: Client, walk: Walk, *, realtime: bool) -> Frames:
     )
 
 
-def make_report(walk: Walk, frames: Frames, info: SceneInfo, avatar_points: int) -> dict[str, Any]:
+def make_report(walk: Walk, frames: WalkAnswers, info: SceneInfo, avatar_points: int) -> dict[str, Any]:
     """Return the content of walk.json: a summary and each frame. Time names end in their unit."""
     names = [verdict.name.lower() for verdict in Verdict]
     summary = {

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
-from .walk_frames import Frames, Walk
+from .walk_answers import Walk, WalkAnswers
 
 COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
 PAPER, INK = "#fbfaf7", "#2f2a26"
@@ -25,7 +25,7 @@ PIXELS = 700
 PLAN_LOW, PLAN_HIGH = 0.15, 2.2
 
 
-def draw_walk(path: Path, walk: Walk, frames: Frames, avatar: NDArray[np.float64]) -> None:
+def draw_walk(path: Path, walk: Walk, frames: WalkAnswers, avatar: NDArray[np.float64]) -> None:
     """Draw a walk as a PNG: plan from above, elevation, and the times of every frame.
 
     avatar: (n, 3) [m], drawn at its pose in a few frames, in the longest contacts if there are any.
@@ -74,7 +74,7 @@ def _stops(verdict: NDArray[np.uint8]) -> list[int]:
     return sorted(stops)
 
 
-def _draw_plan(axes: Any, walk: Walk, frames: Frames, stops: list[int]) -> None:
+def _draw_plan(axes: Any, walk: Walk, frames: WalkAnswers, stops: list[int]) -> None:
     """Draw the scan from above, and the path coloured by verdict."""
     floor = np.median(walk.poses[:, 2, 3])
     heights = walk.points[:, 2] - floor
@@ -100,7 +100,7 @@ def _draw_plan(axes: Any, walk: Walk, frames: Frames, stops: list[int]) -> None:
 
 
 def _draw_elevation(
-    axes: Any, walk: Walk, frames: Frames, avatar: NDArray[np.float64], stops: list[int]
+    axes: Any, walk: Walk, frames: WalkAnswers, avatar: NDArray[np.float64], stops: list[int]
 ) -> None:
     """Draw the scan from the side, and the figure in some frames."""
     across = walk.elevation
@@ -161,7 +161,7 @@ def _draw_points(
     axes.set_facecolor(PAPER)
 
 
-def _draw_times(axes: Any, walk: Walk, frames: Frames) -> None:
+def _draw_times(axes: Any, walk: Walk, frames: WalkAnswers) -> None:
     """Draw the engine and round-trip times of every frame, with contacts and loads marked."""
     for start, end in _runs(frames.verdict == Verdict.CONTACT):
         axes.axvspan(

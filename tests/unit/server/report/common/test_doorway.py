@@ -42,7 +42,7 @@ def narrowest(points: NDArray[np.float64], radius: float, figure_radius: float) 
     reach = radius + figure_radius
     middle = (DOOR.x_left + DOOR.x_right) / 2
     play = 0.0
-    for lift in doorway.LIFTS:
+    for lift in doorway.SOLE_HEIGHTS:
         for side in (-1, 1):
             jamb = points[side * (points[:, 0] - middle) > 0]
             best = math.inf
@@ -52,7 +52,7 @@ def narrowest(points: NDArray[np.float64], radius: float, figure_radius: float) 
                 if near.any():
                     gap = side * (jamb[near, 0] - middle) - side * x - np.sqrt(under[near])
                     best = min(best, float(gap.min()))
-            play += best / len(doorway.LIFTS)
+            play += best / len(doorway.SOLE_HEIGHTS)
     return DOOR.width - play
 
 
@@ -76,7 +76,7 @@ def test_narrowest_door_is_that_of_brute_force(
     own = scene.add_avatar("figure", FIGURE).radius
     judged = narrowest(points, radius, own)
     # Bisection says a door too wide, by a quarter of a millimetre a side; steps of 5 mm one too narrow, by as little.
-    missed = 2 * doorway.ALONG**2 / 8 / (radius + own)
+    missed = 2 * doorway.POSE_SPACING**2 / 8 / (radius + own)
     assert judged - missed - 1e-4 <= found.narrowest <= judged + 2 * doorway.FINEST
     assert found.width == pytest.approx(np.ptp(FIGURE[:, 0]) + 2 * own, abs=1e-12)
     assert found.error == pytest.approx(1000 * (found.narrowest - found.width), abs=1e-9)

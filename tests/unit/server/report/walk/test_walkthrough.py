@@ -13,7 +13,7 @@ from solidcloud.schemas.errors import BadRequestError, InternalError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.input.pose_file import write_poses
 from solidcloud.server.report.common.paper_case import Case, archive_points, given_case
-from solidcloud.server.report.common.sphere_pictures import Spheres, level_spheres, render_spheres
+from solidcloud.server.report.common.sphere_pictures import LevelSpheres, level_spheres, render_spheres
 from solidcloud.server.report.walk import walkthrough
 from solidcloud.server.report.walk.path_figure import contact_spans, rolling_median
 from solidcloud.server.report.walk.walkthrough import PLAIN, SLAB, Structure
@@ -155,9 +155,9 @@ def test_level_zero_is_refused(archive: Path) -> None:
 
 def test_nearer_sphere_hides_the_one_behind() -> None:
     centers = np.array([[0.0, 0.0, 0.0], [0.0, -5.0, 1.5]])  # the second stands before the first
-    pair = Spheres(centers, np.array([1.0, 1.0]), np.array([0, 1]), np.zeros(2, bool))
+    pair = LevelSpheres(centers, np.array([1.0, 1.0]), np.array([0, 1]), np.zeros(2, bool))
     image = render_spheres(pair, 120)
-    swapped = render_spheres(Spheres(*(column[::-1] for column in pair)), 120)
+    swapped = render_spheres(LevelSpheres(*(column[::-1] for column in pair)), 120)
     assert np.array_equal(image, swapped)
     assert (image[0, 0] == 1).all() and (image != 1).any()
 

@@ -1,9 +1,9 @@
-"""Row of the accuracy report: one setting of one knob, with its cost and its errors."""
+"""Results of the accuracy report: a row for each setting of a knob, with its cost and its errors."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-# Measured with the server's engine, or with the plain descent of report/kernels/plain_descent.py.
-# The times of the two are not comparable.
-ENGINE, PLAIN = "engine", "plain descent"
-
-# Knobs of the server's engine.
+# Knobs: the settings that are varied, one at a time.
 TOLERANCE, BUDGET, RADIUS = "tolerance", "budget", "radius model"
 SHEET = "radius model, a thin sheet with a door"
 STEP, DEGREE, LEAF, NODES = "lattice step", "degree", "leaf size", "bounding volume"
@@ -32,18 +28,18 @@ class Row:
 
     knob, setting: the parameter that is varied, and its value.
     value: the setting as a number, if it is one.  default: it is the server's default.
-    by: ENGINE or PLAIN.  scene: where it was measured.
+    scene: where it was measured.
     factor: of a radius model, on its radii; of a fixed radius, its approximate ratio to the mean
     radius.
-    mean_us, p50_us, p99_us: time per pose [us], see accuracy_timing.py.
-    times: ratio of mean_us to that of the default setting timed with it.  noise: see Timed.
+    mean_us, p50_us, p99_us: time per pose [us], see interleaved_timing.py.
+    times: ratio of mean_us to that of the default setting timed with it.  noise: see TimedSetting.
     poses: number of judged poses.  early: of these, contact where the exact answer is clear.
     late: clear where the exact answer is contact.  unknown: not answered.
     tangent, tangent_early, tangent_late, tangent_unknown: the same for near-tangent poses.
     distance_max_mm, distance_mean_mm: |distance - exact distance| [mm].
     distance_missing: poses where no pair was found although one is in reach.
     doorway_mm: see doorway.py; inf: the figure cannot even stand in the door.
-    made_doorway_mm: doorway error measured on generated doors, see made_doorway.py.
+    made_doorway_mm: doorway error measured on generated doors, see measured_doorway.py.
     leak_p50_mm, leak_p99_mm, leak_worst_mm, leak_share: see leak.py.
     archive_bytes, decode_ms: of a build.  node_tests, pair_tests: means over poses.
     front: the errors for which this row is on the Pareto front of the settings in the charts.
@@ -54,7 +50,6 @@ class Row:
     setting: str
     value: float | None = None
     default: bool = False
-    by: str = ENGINE
     scene: str = ""
     factor: float | None = None
     mean_us: float | None = None
@@ -109,6 +104,18 @@ class Row:
         }
 
 
+class Report(NamedTuple):
+    """Results of all measurements.
+
+    scene: description of the measured scene.
+    facts: numbers about the scene and the machine, for JSON and the page.
+    """
+
+    scene: str
+    rows: list[Row]
+    facts: dict[str, Any]
+
+
 COLUMNS = (*(field.name for field in fields(Row)), "wrong_share")
 
 # Name of an error -> axis label, and attribute of a row.
@@ -120,14 +127,16 @@ ERRORS = {
 }
 
 
-FELT_ERRORS = ("doorway", "leak")
+USER_ERRORS = ("doorway", "leak")
 
 # Times that differ by less than this factor count as equal: times of one archive built twice
 # differed by 6 % on a busy machine.
-ALIKE = 1.1
+TIME_TOLERANCE = 1.1
 
 
-def judge_verdicts(row: Row, contact: Bools, unknown: Bools, exact: Bools, *, tangent: bool = False) -> None:
+def compare_verdicts(
+    row: Row, contact: Bools, unknown: Bools, exact: Bools, *, tangent: bool = False
+) -> None:
     """Enter into the row how many verdicts (k,) differ from the exact ones."""
     early = int((contact & ~exact & ~unknown).sum())
     late = int((~contact & exact & ~unknown).sum())
@@ -138,7 +147,7 @@ def judge_verdicts(row: Row, contact: Bools, unknown: Bools, exact: Bools, *, ta
         row.poses, row.early, row.late, row.unknown = len(exact), early, late, int(unknown.sum())
 
 
-def judge_distances(row: Row, found: Floats, exact: Floats) -> None:
+def compare_distances(row: Row, found: Floats, exact: Floats) -> None:
     """Enter into the row the errors of distances (k,) [m].
 
     Infinite distances, where no pair was found, are left out.
@@ -168,30 +177,30 @@ def error_of(row: Row, error: str) -> float | None:
     return max(float(value), 0.0) if error == "leak" else abs(float(value))
 
 
-def unbeaten(places: Sequence[tuple[float, ...]]) -> list[bool]:
+def pareto_front(places: Sequence[tuple[float, ...]]) -> list[bool]:
     """Return which (time, error, ...) are on the Pareto front.
 
     One tuple beats another if it is as fast, as good in every error, and better in at least one of
-    all. Times within the factor ALIKE of each other count as equal: such differences are noise.
+    all. Times within the factor TIME_TOLERANCE of each other count as equal: such differences are noise.
     """
 
     def beats(other: tuple[float, ...], one: tuple[float, ...]) -> bool:
         as_good = all(bad <= size for bad, size in zip(other[1:], one[1:], strict=True))
-        better = other[0] * ALIKE < one[0] or other[1:] != one[1:]
-        return as_good and better and other[0] <= one[0] * ALIKE
+        better = other[0] * TIME_TOLERANCE < one[0] or other[1:] != one[1:]
+        return as_good and better and other[0] <= one[0] * TIME_TOLERANCE
 
     return [not any(beats(other, one) for other in places) for one in places]
 
 
-def mark_front(rows: Sequence[Row], knobs: Sequence[str]) -> None:
-    """Mark the rows of `knobs` on the Pareto front of each error, and of both FELT_ERRORS."""
-    for name, errors in (*((error, (error,)) for error in ERRORS), ("doorway and leak", FELT_ERRORS)):
+def mark_pareto_fronts(rows: Sequence[Row], knobs: Sequence[str]) -> None:
+    """Mark the rows of `knobs` on the Pareto front of each error, and of both USER_ERRORS."""
+    for name, errors in (*((error, (error,)) for error in ERRORS), ("doorway and leak", USER_ERRORS)):
         known = []
         for row in rows:
             sizes = [error_of(row, error) for error in errors]
             if row.knob in knobs and row.mean_us is not None and None not in sizes:
                 known.append((row, (row.mean_us, *(size for size in sizes if size is not None))))
-        for (row, _), best in zip(known, unbeaten([place for _, place in known]), strict=True):
+        for (row, _), best in zip(known, pareto_front([place for _, place in known]), strict=True):
             if best:
                 row.front = (*row.front, name)
 

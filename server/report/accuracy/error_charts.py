@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..common.sphere_pictures import load_pyplot
-from .accuracy_arithmetic import VOLUME
-from .accuracy_bars import MODEL_COLOURS, draw_bars, draw_knob, draw_sheet, draw_volumes, save_picture
-from .accuracy_labels import place_labels
-from .accuracy_row import (
+from .bar_charts import MODEL_COLOURS, draw_knob, draw_sheet, save_picture
+from .chart_labels import place_labels
+from .setting_results import (
     ALONE,
     BUDGET,
-    ENGINE,
     ERRORS,
     NODES,
     RADIUS,
@@ -23,7 +21,7 @@ from .accuracy_row import (
     Row,
     error_of,
     knobs,
-    unbeaten,
+    pareto_front,
 )
 
 INK, FRONT = "#2f2a26", "#1b7f3b"
@@ -66,10 +64,10 @@ class Point(NamedTuple):
     label: str
 
 
-def draw_charts(rows: Sequence[Row], ground: str, out: Path) -> dict[str, Path]:
+def draw_charts(rows: Sequence[Row], scene_name: str, out: Path) -> dict[str, Path]:
     """Write all charts into `out`.
 
-    Returns name -> file: "main", "verdicts" (with ground truth only), "volumes", and one per knob.
+    Returns name -> file: "main", "verdicts" (with ground truth only), and one per knob.
     """
     pyplot = load_pyplot()
     pyplot.rcParams.update(
@@ -78,10 +76,9 @@ def draw_charts(rows: Sequence[Row], ground: str, out: Path) -> dict[str, Path]:
     charts = {}
     errors: tuple[str, ...] = ("wrong", "distance")
     if points_of(rows, "doorway") and points_of(rows, "leak"):
-        charts["verdicts"] = draw_scatter(rows, errors, ground, out / "accuracy_verdicts.png")
+        charts["verdicts"] = draw_scatter(rows, errors, scene_name, out / "accuracy_verdicts.png")
         errors = ("doorway", "leak")
-    charts["main"] = draw_scatter(rows, errors, ground, out / "accuracy.png")
-    charts["volumes"] = draw_volumes(rows, out / "accuracy_volumes.png")
+    charts["main"] = draw_scatter(rows, errors, scene_name, out / "accuracy.png")
     for knob in knobs(rows):
         name = "".join(letter if letter.isalnum() else "_" for letter in knob)
         own = [row for row in rows if row.knob == knob]
@@ -93,14 +90,14 @@ def draw_charts(rows: Sequence[Row], ground: str, out: Path) -> dict[str, Path]:
 def points_of(rows: Sequence[Row], error: str) -> list[Point]:
     """Return the points of a chart of time against an error.
 
-    They are the engine's settings, with the default once and first.
+    They contain the default once and first.
     Radius models are included without factors: a factor trades one felt error for the other, which
     another panel shows.
     """
     found: list[Point] = []
     for row in sorted(rows, key=lambda r: not r.default):
         size = error_of(row, error)
-        if row.by != ENGINE or row.knob not in SHOWN or row.mean_us is None or size is None:
+        if row.knob not in SHOWN or row.mean_us is None or size is None:
             continue
         if row.default and any(point.row.default for point in found):
             continue
@@ -125,23 +122,21 @@ def label_of(row: Row) -> str:
     return f"lattice {row.setting}" if row.knob == STEP else row.setting
 
 
-def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], ground: str, target: Path) -> Path:
+def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], scene_name: str, target: Path) -> Path:
     """Draw time against two errors.
 
-    For the felt errors, also draw one against the other, and the times of bounding volumes.
+    For the errors that users notice, also draw one against the other.
     """
     pyplot = load_pyplot()
     felt = "leak" in errors
-    figure, panels = pyplot.subplots(
-        1 + felt, 2, figsize=(11.2, 9.6 if felt else 5.6), squeeze=False, layout="constrained"
-    )
+    figure = pyplot.figure(figsize=(11.2, 9.6 if felt else 5.6), layout="constrained")
+    panels = figure.subplot_mosaic([list(errors), ["radius", "radius"]] if felt else [list(errors)])
     wanted: list[tuple[Any, Wanted]] = []
-    for panel, error in zip(panels[0], errors, strict=True):
-        wanted.append((panel, _scatter(panel, points_of(rows, error), error)))
+    for error in errors:
+        wanted.append((panels[error], _scatter(panels[error], points_of(rows, error), error)))
     if felt:
-        wanted.append((panels[1][0], _trade(panels[1][0], [r for r in rows if r.knob == RADIUS])))
-        draw_bars(panels[1][1], rows, VOLUME)
-        panels[1][1].legend(frameon=False, fontsize=9, loc="lower right")
+        radius_rows = [row for row in rows if row.knob == RADIUS]
+        wanted.append((panels["radius"], _trade(panels["radius"], radius_rows)))
     shown = {p.row.knob for error in errors for p in points_of(rows, error) if not p.row.default}
     handles = [
         pyplot.Line2D([], [], color="black", marker="*", linestyle="", markersize=13, label="default: exact, mean"),
@@ -156,7 +151,7 @@ def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], ground: str, targ
         ),
     ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(f"Cost and errors of a collision test: {ground}", fontsize=13)
+    figure.suptitle(f"Cost and errors of a collision test: {scene_name}", fontsize=13)
     # Labels last: the layout moves the panels.
     figure.canvas.draw()
     for panel, labels in wanted:
@@ -202,7 +197,7 @@ def _scatter(panel: Any, points: list[Point], error: str) -> Wanted:
     panel.grid(alpha=0.25)
     for point in points:
         _mark(panel, point.time, point.error, point.row)
-    best = unbeaten([(p.time, error_of(p.row, error) or 0.0) for p in points])
+    best = pareto_front([(p.time, error_of(p.row, error) or 0.0) for p in points])
     _front(panel, [(p.time, p.error) for p, free in zip(points, best, strict=True) if free])
     panel.set_title(TITLES[error], fontsize=10.5, loc="left")
     if stuck:
@@ -272,7 +267,9 @@ def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
             anchors.append(place)
             labels.append(f"{row.setting}, default" if row.default else row.setting)
             colours.append(colour)
-    best = unbeaten([(1.0, x, max(y, 0.0)) for x, y in anchors])  # times are ignored: other panels show them
+    best = pareto_front(
+        [(1.0, x, max(y, 0.0)) for x, y in anchors]
+    )  # times are ignored: other panels show them
     low, high = min(y for _, y in anchors), max(y for _, y in anchors)
     room = 0.12 * (high - low) + 1.0
     panel.set_ylim(low - room, high + room)

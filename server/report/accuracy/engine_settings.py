@@ -19,9 +19,11 @@ from ....schemas.wire.answers import Verdict
 from ...residency.arena import ArenaBuffer
 from ...residency.voxel_store import VoxelStore
 from ...scene import Scene
-from .accuracy_case import AVATAR, REACH, Ground
-from .accuracy_plan import Plan
-from .accuracy_row import (
+from .interleaved_timing import TimedSetting, take_times
+from .measured_scene import AVATAR, REACH, MeasuredScene
+from .measurement_plan import MeasurementPlan
+from .reference_answers import ReferenceAnswers
+from .setting_results import (
     ALONE,
     BUDGET,
     DEGREE,
@@ -31,32 +33,17 @@ from .accuracy_row import (
     STEP,
     TOLERANCE,
     Row,
-    judge_distances,
-    judge_verdicts,
+    compare_distances,
+    compare_verdicts,
 )
-from .accuracy_timing import Timed, take_times
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Tick = Callable[[], None]
 
 DECODE_LOOPS = 3
 # A budget of node visits that is never spent. A tolerance without a budget is answered exactly;
 # with a budget, the engine uses the search that may stop within the tolerance.
 UNSPENT = 1 << 40
-
-
-class Exact(NamedTuple):
-    """Reference answers.
-
-    contact, distance: (k,), verdict and signed distance [m] of the judged poses.
-    tangent: (t,), verdict of the near-tangent poses.  tangent_poses: (t, 4, 4).
-    """
-
-    contact: Bools
-    distance: Floats
-    tangent: Bools
-    tangent_poses: Floats
 
 
 class Setting(NamedTuple):
@@ -70,12 +57,12 @@ class Setting(NamedTuple):
     options: dict[str, Any]
 
 
-def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
+def engine_settings(plan: MeasurementPlan, plain: BuildConfig, radius: float) -> list[Setting]:
     """Return one setting per value of each knob, with defaults for everything else.
 
     The values include each knob's default.
 
-    plain: the ground's configuration, with a lattice step; its values are the defaults.
+    plain: the measured scene's configuration, with a lattice step; its values are the defaults.
     radius: result of the model `mean` for `plain` [m]. Other builds use it as a fixed radius. A
     coarser lattice then changes only the lattice, not the mean distance of the points that are
     left.
@@ -83,7 +70,7 @@ def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setti
     found: list[Setting] = []
     step = plain.resolution or DEFAULT_STEP
 
-    def held(default: bool, **changes: Any) -> BuildConfig:
+    def with_radius(default: bool, **changes: Any) -> BuildConfig:
         """Return a build with the default's radius; the default itself is unchanged."""
         return plain if default else replace(plain, radius=radius, **changes)
 
@@ -93,29 +80,29 @@ def engine_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setti
         found.append(Setting(Row(knob, setting, value, default), config, options))
 
     for tolerance in plan.tolerances:
-        asked = {"tolerance": tolerance, "budget_visits": UNSPENT} if tolerance else {}
+        options = {"tolerance": tolerance, "budget_visits": UNSPENT} if tolerance else {}
         name = f"search within {length_name(tolerance)}" if tolerance else "0"
-        add(TOLERANCE, name, plain, not tolerance, tolerance, **asked)
+        add(TOLERANCE, name, plain, not tolerance, tolerance, **options)
     add(TOLERANCE, f"{length_name(plan.alone)}{ALONE}", plain, False, plan.alone, tolerance=plan.alone)
     for budget in plan.budgets:
         add(BUDGET, f"{budget:,} visits", plain, False, budget, budget_visits=budget)
     add(BUDGET, "none", plain, True, math.inf)
     for value in sorted({*plan.steps, step}):
         default = value == step
-        add(STEP, length_name(value), held(default, resolution=value), default, value)
+        add(STEP, length_name(value), with_radius(default, resolution=value), default, value)
     for degree in sorted({*plan.degrees, plain.degree}):
         default = degree == plain.degree
-        add(DEGREE, str(degree), held(default, degree=degree), default, degree)
+        add(DEGREE, str(degree), with_radius(default, degree=degree), default, degree)
     for leaf in sorted({*plan.leaves, plain.leaf}):
         default = leaf == plain.leaf
-        add(LEAF, str(leaf), held(default, leaf=leaf), default, leaf)
+        add(LEAF, str(leaf), with_radius(default, leaf=leaf), default, leaf)
     for slab, name in ((True, "sphere with slab"), (False, "sphere")):
         default = slab == plain.with_slab
-        add(NODES, name, held(default, with_slab=slab), default, float(slab))
+        add(NODES, name, with_radius(default, with_slab=slab), default, float(slab))
     return found
 
 
-def radius_settings(plan: Plan, plain: BuildConfig, radius: float) -> list[Setting]:
+def radius_settings(plan: MeasurementPlan, plain: BuildConfig, radius: float) -> list[Setting]:
     """Return the settings of the radius models with the plan's factors.
 
     The radii of `fixed` are rounded.
@@ -144,9 +131,9 @@ def length_name(metres: float) -> str:
 class Archives:
     """Archives of the settings, each built once and kept open; a context manager."""
 
-    def __init__(self, ground: Ground, folder: Path) -> None:
-        """Build archives of the ground's scan in `folder` when they are first needed."""
-        self._ground, self._folder = ground, folder
+    def __init__(self, measured: MeasuredScene, folder: Path) -> None:
+        """Build archives of the measured scan in `folder` when they are first needed."""
+        self._measured, self._folder = measured, folder
         self._scenes: dict[tuple[Any, ...], Scene] = {}
         self._figures: dict[tuple[Any, ...], tuple[int, float]] = {}
         self._folders: dict[tuple[Any, ...], Path] = {}
@@ -170,13 +157,13 @@ class Archives:
             target = self._folder / f"archive-{len(self._scenes)}"
             self._folders[key] = target
             # The archive usually has one shard: more processes would only load numba several times.
-            summary = build_archive([self._ground.scan], target, replace(config, jobs=1))
+            summary = build_archive([self._measured.scan], target, replace(config, jobs=1))
             self._figures[key] = (summary.bytes, decode_seconds(target))
             store = VoxelStore(target)
             budget = sum(ArenaBuffer.rounded(int(size)) for size in store.sizes)
             store.close()
             scene = self._open.enter_context(Scene.open(target, budget_bytes=budget))
-            scene.add_avatar(AVATAR, self._ground.avatar)
+            scene.add_avatar(AVATAR, self._measured.avatar)
             self._scenes[key] = scene
         return self._scenes[key]
 
@@ -214,30 +201,34 @@ def decode_seconds(folder: Path) -> float:
     return best
 
 
-def judge_engine(
-    settings: list[Setting], archives: Archives, ground: Ground, exact: Exact, tick: Tick
+def compare_engine(
+    settings: list[Setting],
+    archives: Archives,
+    measured: MeasuredScene,
+    reference: ReferenceAnswers,
+    tick: Tick,
 ) -> None:
     """Fill in the errors, node and pair tests, and archive size of each setting."""
     for setting in settings:
         row, scene = setting.row, archives.scene(setting.config)
-        answers = scene.collide(AVATAR, ground.judged, **setting.options)
+        answers = scene.collide(AVATAR, measured.judged, **setting.options)
         contact, unknown = answers.verdict == Verdict.CONTACT, answers.verdict == Verdict.UNKNOWN
-        judge_verdicts(row, contact, unknown, exact.contact)
+        compare_verdicts(row, contact, unknown, reference.contact)
         row.node_tests, row.pair_tests = float(answers.node_visits.mean()), float(answers.point_tests.mean())
-        tangent = scene.collide(AVATAR, exact.tangent_poses, **setting.options).verdict
-        judge_verdicts(
-            row, tangent == Verdict.CONTACT, tangent == Verdict.UNKNOWN, exact.tangent, tangent=True
+        tangent = scene.collide(AVATAR, reference.tangent_poses, **setting.options).verdict
+        compare_verdicts(
+            row, tangent == Verdict.CONTACT, tangent == Verdict.UNKNOWN, reference.tangent, tangent=True
         )
-        found = scene.distance(AVATAR, ground.judged, REACH, **setting.options)
-        judge_distances(row, found.signed_distance, exact.distance)
+        found = scene.distance(AVATAR, measured.judged, REACH, **setting.options)
+        compare_distances(row, found.signed_distance, reference.distance)
         row.archive_bytes, seconds = archives.figures(setting.config)
         row.decode_ms = seconds * 1e3
-        row.scene = ground.name
-        _must_be_right(setting)
+        row.scene = measured.name
+        _check_answers(setting)
         tick()
 
 
-def _must_be_right(setting: Setting) -> None:
+def _check_answers(setting: Setting) -> None:
     """Raise InternalError if a setting changed an answer that it must not change."""
     row = setting.row
     wrong = row.early + row.late + row.unknown + row.tangent_early + row.tangent_late + row.tangent_unknown
@@ -254,20 +245,22 @@ def _must_be_right(setting: Setting) -> None:
         )
 
 
-def time_engine(settings: list[Setting], archives: Archives, ground: Ground, plan: Plan, tick: Tick) -> None:
+def time_engine(
+    settings: list[Setting], archives: Archives, measured: MeasuredScene, plan: MeasurementPlan, tick: Tick
+) -> None:
     """Fill in the time of each setting, and its ratio to the time of the default.
 
     All settings are timed in turn. Settings with the same archive and options are timed once.
     """
-    timed: dict[tuple[Any, ...], Timed] = {}
-    of: list[Timed] = []
+    timed: dict[tuple[Any, ...], TimedSetting] = {}
+    of: list[TimedSetting] = []
     for setting in settings:
         scene = archives.scene(setting.config)
         key = (_key(setting.config), *sorted(setting.options.items()))
         if key not in timed:
-            timed[key] = Timed(partial(scene.collide, AVATAR, **setting.options))
+            timed[key] = TimedSetting(partial(scene.collide, AVATAR, **setting.options))
         of.append(timed[key])
-    take_times(list(timed.values()), ground.walk, plan.loops, plan.chunk, tick)
+    take_times(list(timed.values()), measured.walk, plan.loops, plan.chunk, tick)
     for setting, subject in zip(settings, of, strict=True):
         fill_times(setting.row, subject)
         default = next(
@@ -281,7 +274,7 @@ def count_timed(settings: list[Setting]) -> int:
     return len({(_key(s.config), *sorted(s.options.items())) for s in settings})
 
 
-def fill_times(row: Row, subject: Timed) -> None:
+def fill_times(row: Row, subject: TimedSetting) -> None:
     """Fill in the times of a subject."""
     row.mean_us, row.noise = subject.mean * 1e6, subject.noise
-    row.p50_us, row.p99_us = subject.percentile(50) * 1e6, subject.percentile(99) * 1e6
+    row.p50_us, row.p99_us = subject.quantile(0.5) * 1e6, subject.quantile(0.99) * 1e6

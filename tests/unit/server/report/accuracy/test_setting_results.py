@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.report.accuracy import accuracy_felt, accuracy_timing
-from solidcloud.server.report.accuracy.accuracy import write_rows
-from solidcloud.server.report.accuracy.accuracy_engine import engine_settings, length_name, radius_settings
-from solidcloud.server.report.accuracy.accuracy_felt import measure_felt, measure_made
-from solidcloud.server.report.accuracy.accuracy_plan import BRIEF, FULL, Plan
-from solidcloud.server.report.accuracy.accuracy_report import Report
-from solidcloud.server.report.accuracy.accuracy_row import (
+from solidcloud.server.report.accuracy import interleaved_timing, user_errors
+from solidcloud.server.report.accuracy.accuracy_report import write_rows
+from solidcloud.server.report.accuracy.engine_settings import engine_settings, length_name, radius_settings
+from solidcloud.server.report.accuracy.interleaved_timing import TimedSetting, take_times
+from solidcloud.server.report.accuracy.measurement_plan import BRIEF, FULL, MeasurementPlan
+from solidcloud.server.report.accuracy.setting_results import (
     BUDGET,
     COLUMNS,
     DEGREE,
@@ -25,13 +24,14 @@ from solidcloud.server.report.accuracy.accuracy_row import (
     RADIUS,
     STEP,
     TOLERANCE,
+    Report,
     Row,
+    compare_distances,
+    compare_verdicts,
     error_of,
-    judge_distances,
-    judge_verdicts,
-    mark_front,
+    mark_pareto_fronts,
 )
-from solidcloud.server.report.accuracy.accuracy_timing import Timed, take_times
+from solidcloud.server.report.accuracy.user_errors import measure_generated_doors, measure_user_errors
 from solidcloud.server.report.common.doorway import Doorway
 from solidcloud.server.report.common.leak import Leak
 
@@ -41,16 +41,16 @@ def test_early_late_and_unknown_are_told_apart() -> None:
     contact = np.array([True, False, False, True, False, False])
     unknown = np.array([False, False, True, False, False, True])
     row = Row(TOLERANCE, "1 mm")
-    judge_verdicts(row, contact, unknown, exact)
+    compare_verdicts(row, contact, unknown, exact)
     assert (row.poses, row.early, row.late, row.unknown) == (6, 1, 1, 2)
     assert row.wrong_share == 4 / 6 and row.tangent == 0
-    judge_verdicts(row, exact, np.zeros(6, bool), exact, tangent=True)
+    compare_verdicts(row, exact, np.zeros(6, bool), exact, tangent=True)
     assert (row.tangent, row.tangent_early, row.tangent_late, row.early) == (6, 0, 0, 1)
 
 
 def test_a_distance_without_a_pair_is_counted_and_not_averaged() -> None:
     row = Row(TOLERANCE, "1 mm")
-    judge_distances(row, np.array([0.010, math.inf, 0.5, math.inf]), np.array([0.012, 0.2, 0.5, math.inf]))
+    compare_distances(row, np.array([0.010, math.inf, 0.5, math.inf]), np.array([0.012, 0.2, 0.5, math.inf]))
     assert row.distance_missing == 1
     assert row.distance_max_mm == pytest.approx(2.0) and row.distance_mean_mm == pytest.approx(1.0)
 
@@ -72,7 +72,7 @@ def test_the_front_holds_what_nothing_beats() -> None:
     rows = [timed("fast", 1, 20), timed("good", 4, 5), timed("between", 2, 10), timed("beaten", 3, 15)]
     rows += [timed("as fast but worse", 1.08, 25), timed("as good but slower", 5, 5)]
     rows += [timed("another knob", 0.1, 0.0, "leaf size"), timed("does not pass", 0.5, math.inf)]
-    mark_front(rows, (TOLERANCE,))
+    mark_pareto_fronts(rows, (TOLERANCE,))
     assert {row.setting for row in rows if "doorway" in row.front} == {
         "fast",
         "good",
@@ -89,7 +89,7 @@ def test_two_errors_at_once_leave_more_unbeaten() -> None:
             ("thick", 4.0, 50.0, 0.0), ("thin", 4.0, 10.0, 40.0), ("local", 4.8, 24.0, -10.0), ("mean", 4.8, 25.0, 20.0)
         )
     ]  # fmt: skip
-    mark_front(rows, (RADIUS,))
+    mark_pareto_fronts(rows, (RADIUS,))
     assert [row.front for row in rows] == [
         ("leak", "doorway and leak"), ("doorway", "doorway and leak"), ("doorway and leak",), (),
     ]  # fmt: skip
@@ -114,20 +114,20 @@ def test_rows_are_written_as_json_and_csv_that_hold_every_field(tmp_path: Path) 
 def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
     """A clock that stands still but for what is added to it."""
     now = [0.0]
-    monkeypatch.setattr(accuracy_timing.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(interleaved_timing.time, "perf_counter", lambda: now[0])
     yield now
 
 
 def test_settings_are_timed_in_turn_and_a_busy_moment_is_left_out(clock: list[float]) -> None:
     asked: list[tuple[str, int]] = []
 
-    def answer(name: str, each: float) -> Timed:
+    def answer(name: str, each: float) -> TimedSetting:
         def ask(poses: np.ndarray) -> None:
             asked.append((name, len(poses)))
             busy = 7.0 if name == "slow" and len(asked) == 5 else 0.0
             clock[0] += each * len(poses) + busy
 
-        return Timed(ask)
+        return TimedSetting(ask)
 
     subjects = [answer("slow", 3.0), answer("fast", 1.0)]
     ticks = []
@@ -136,13 +136,15 @@ def test_settings_are_timed_in_turn_and_a_busy_moment_is_left_out(clock: list[fl
     assert asked == [("slow", 8), ("slow", 4), ("slow", 4), ("fast", 8), ("fast", 4), ("fast", 4)] * 3
     assert len(ticks) == 6
     assert [s.mean for s in subjects] == [3.0, 1.0]
-    assert [s.percentile(99) for s in subjects] == [3.0, 1.0]
+    assert [s.quantile(0.99) for s in subjects] == [3.0, 1.0]
 
 
 def test_noise_is_what_the_middle_repetition_took_longer() -> None:
-    subject = Timed(lambda poses: None, 2, [np.array([2.0, 4.0]), np.array([4.0, 4.0]), np.array([9.0, 9.0])])
+    subject = TimedSetting(
+        lambda poses: None, 2, [np.array([2.0, 4.0]), np.array([4.0, 4.0]), np.array([9.0, 9.0])]
+    )
     assert subject.mean == 1.5 and subject.noise == 8 / 6
-    assert subject.percentile(0) == 1.0 and subject.percentile(100) == 2.0
+    assert subject.quantile(0.0) == 1.0 and subject.quantile(1.0) == 2.0
 
 
 @pytest.mark.parametrize("plan", [BRIEF, FULL])
@@ -172,7 +174,7 @@ def test_the_defaults_are_those_of_the_archive_that_is_given() -> None:
 
 
 @pytest.mark.parametrize("plan", [BRIEF, FULL])
-def test_no_radius_model_is_measured_twice(plan: Plan) -> None:
+def test_no_radius_model_is_measured_twice(plan: MeasurementPlan) -> None:
     for radius in (0.0124, 0.00987, 0.003, 0.25):
         names = [s.row.setting for s in radius_settings(plan, BuildConfig(resolution=1e-4), radius)]
         assert len(set(names)) == len(names) == 5 * len(plan.factors), names
@@ -181,9 +183,9 @@ def test_no_radius_model_is_measured_twice(plan: Plan) -> None:
 def test_with_another_avatar_the_leak_is_measured_and_the_doorway_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(accuracy_felt, "leak_places", lambda truth, places: places)
-    monkeypatch.setattr(accuracy_felt, "leak", lambda scene, places, **_: Leak(1.0, 2.0, 3.0, 0.25))
-    monkeypatch.setattr(accuracy_felt, "doorway_error", lambda *_, **__: Doorway(math.inf, 0.5, math.inf))
+    monkeypatch.setattr(user_errors, "leak_places", lambda truth, places: places)
+    monkeypatch.setattr(user_errors, "leak", lambda scene, places, **_: Leak(1.0, 2.0, 3.0, 0.25))
+    monkeypatch.setattr(user_errors, "doorway_error", lambda *_, **__: Doorway(math.inf, 0.5, math.inf))
     truth = SimpleNamespace(facades=["facade"])
     for own in (False, True):
         settings = [
@@ -193,7 +195,7 @@ def test_with_another_avatar_the_leak_is_measured_and_the_doorway_is_not(
         ]
         ground: Any = SimpleNamespace(truth=truth, own=own)
         archives: Any = SimpleNamespace(scene=lambda config: None)
-        measure_felt(settings, archives, ground, BRIEF, lambda: None)
+        measure_user_errors(settings, archives, ground, BRIEF, lambda: None)
         for row in (s.row for s in settings):
             assert (row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm, row.leak_share) == (1, 2, 3, 0.25)
             assert row.doorway_mm == (math.inf if own else None)
@@ -203,7 +205,7 @@ def test_with_another_avatar_the_leak_is_measured_and_the_doorway_is_not(
 def test_doors_are_made_for_the_models_of_the_plan_and_fill_their_rows_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = Plan(points=9000, made_models=("mean", "local+border"))
+    plan = MeasurementPlan(points=9000, made_models=("mean", "local+border"))
     plain = BuildConfig(resolution=1e-3)
     settings = [*engine_settings(plan, plain, 0.0124), *radius_settings(plan, plain, 0.0124)]
     asked = {}
@@ -213,9 +215,9 @@ def test_doors_are_made_for_the_models_of_the_plan_and_fill_their_rows_alone(
         others["tick"]()
         return {"mean": Doorway(0.58, 0.555, 25.0), "local+border": Doorway(math.inf, 0.555, math.inf)}
 
-    monkeypatch.setattr(accuracy_felt, "made_doorways", made)
+    monkeypatch.setattr(user_errors, "measure_doorways", made)
     ticks: list[None] = []
-    measure_made(settings, tmp_path, plan, lambda: ticks.append(None))
+    measure_generated_doors(settings, tmp_path, plan, lambda: ticks.append(None))
     found = {s.row.setting: s.row.made_doorway_mm for s in settings if s.row.made_doorway_mm is not None}
     assert found == {"mean": 25.0, "local+border": math.inf} and len(ticks) == 1
     assert asked["models"] == ["mean", "local+border"] and asked["points"] == 9000 and asked["seed"] == 2012

@@ -1,4 +1,4 @@
-"""Bar charts of the accuracy report: bounding volumes, each knob, and the sheet with a door."""
+"""Bar charts of the accuracy report: each knob, and the sheet with a door."""
 
 import io
 from collections.abc import Sequence
@@ -8,60 +8,13 @@ from typing import Any
 import numpy as np
 
 from ..common.sphere_pictures import load_pyplot
-from .accuracy_arithmetic import PRIMITIVE, VOLUME
-from .accuracy_row import RADIUS, Row
+from .setting_results import RADIUS, Row
 
 # Colours of the pictures' palette: halves the file size without losing a colour.
 PALETTE = 256
 MODEL_COLOURS = {
     "mean": "#2f2a26", "local": "#1f7a8c", "border": "#c8553d", "local+border": "#7a5195", "fixed": "#b8860b",
 }  # fmt: skip
-
-
-def draw_volumes(rows: Sequence[Row], target: Path) -> Path:
-    """Draw the times of bounding volumes and primitives, with axis-aligned and rotated walls."""
-    pyplot = load_pyplot()
-    groups = [knob for knob in (VOLUME, PRIMITIVE) if any(row.knob == knob for row in rows)]
-    figure, panels = pyplot.subplots(
-        1, len(groups), figsize=(6.6 * len(groups), 3.9), squeeze=False, layout="constrained"
-    )
-    for panel, knob in zip(panels[0], groups, strict=True):
-        draw_bars(panel, rows, knob)
-    panels[0][0].legend(frameon=False, fontsize=9, loc="lower right")
-    save_picture(figure, target)
-    pyplot.close(figure)
-    return target
-
-
-def draw_bars(panel: Any, rows: Sequence[Row], knob: str) -> None:
-    """Draw the times of a knob of the plain descent, with axis-aligned and rotated walls."""
-    names = list(dict.fromkeys(row.setting for row in rows if row.knob == knob))
-    most = 0.0
-    for shift, (suffix, colour, said) in enumerate(
-        (("", "#1f7a8c", "axis-aligned walls"), (", turned", "#e0a100", "the same scene, rotated"))
-    ):
-        own = {row.setting: row for row in rows if row.knob == knob + suffix}
-        for i, name in enumerate(names):
-            if name not in own:
-                continue
-            mean, place = own[name].mean_us or 0.0, i - 0.2 + 0.4 * shift
-            panel.barh(place, mean, height=0.38, color=colour, label=said if i == 0 else None)
-            panel.text(mean * 1.01, place, f" {_bar_text(own[name])}", va="center", fontsize=9)
-            most = max(most, mean)
-    panel.set_yticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
-    panel.invert_yaxis()
-    panel.set_xlim(0, 1.45 * most)
-    panel.set_xlabel("time per pose, plain scalar descent [µs]   ← faster")
-    title = "Bounding volume of a node: no answer changes" if knob == VOLUME else "Primitive of a point"
-    panel.set_title(title, fontsize=10.5, loc="left")
-    for side in ("top", "right"):
-        panel.spines[side].set_visible(False)
-
-
-def _bar_text(row: Row) -> str:
-    """Format the text at a bar's end."""
-    wrong = row.early + row.late
-    return f"{row.mean_us or 0.0:.1f}" + (f", {wrong} of {row.poses:,} wrong" if wrong else "")
 
 
 def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:

@@ -6,7 +6,7 @@ from ..common.paper_case import PAPER_POINTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class MeasurementPlan:
     """Settings to measure, one knob at a time, and the number of measurements of each.
 
     points: of the generated façade.  most_points: maximum number taken from a given archive.
@@ -14,7 +14,6 @@ class Plan:
     these and at as many poses with random offsets from the walk.
     near_tangent: poses within a micrometre of touching.
     brute: poses at which the reference itself is checked, by a test of every pair of points.
-    plain_frames: poses of the walk on which the plain descent is timed.
     loops: timed repetitions of each setting, all settings in turn.
     chunk: consecutive poses timed as one call, for the percentiles: the time of a call with one
     pose would be mostly overhead.
@@ -29,7 +28,6 @@ class Plan:
     points: int = PAPER_POINTS
     most_points: int = 1_000_000
     frames: int = 1200
-    plain_frames: int = 300
     near_tangent: int = 400
     brute: int = 40
     loops: int = 5
@@ -45,10 +43,9 @@ class Plan:
     made_models: tuple[str, ...] = ()
 
 
-BRIEF = Plan()
-FULL = Plan(
+BRIEF = MeasurementPlan()
+FULL = MeasurementPlan(
     frames=2400,
-    plain_frames=1200,
     near_tangent=4000,
     brute=400,
     loops=15,

@@ -8,10 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from .accuracy_report import Report
-from .accuracy_row import PLAIN, Row, knobs
-from .accuracy_timing import NOISY
-from .accuracy_words import CHARTS, KNOBS, TERMS, findings
+from .interleaved_timing import NOISY
+from .page_texts import CHARTS, KNOBS, TERMS, findings
+from .setting_results import Report, Row, knobs
 
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#2f2a26;background:#fbfaf7;max-width:75rem}
@@ -39,7 +38,7 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
     """Write the page. charts: as `draw_charts` returns them."""
     facts = report.facts
     body = [
-        f"<h1>Accuracy and query time</h1><p>{escape(report.ground)}; an avatar of {facts['avatar_points']:,} points. "
+        f"<h1>Accuracy and query time</h1><p>{escape(report.scene)}; an avatar of {facts['avatar_points']:,} points. "
         f"Times are measured on a walk of {facts['walk_poses']:,} poses, verdicts on {facts['judged_poses']:,} poses, "
         f"{facts['judged_contacts']:,} of them in contact, and on {facts['near_tangent_poses']:,} within a micrometre "
         "of touching. The reference is the server's exact answer. At "
@@ -57,7 +56,6 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
     ]
     if "verdicts" in charts:
         body.append(_picture(charts["verdicts"], CHARTS["verdicts"]))
-    body.append(_picture(charts["volumes"], CHARTS["volumes"]))
     body.append(
         "<h2>Pareto front</h2><p>Settings of the server that no other setting beats in time and in at least one "
         "error.</p>"
@@ -104,7 +102,7 @@ def _cells(row: Row) -> list[str]:
     """Return the cells of a row, in the order of HEADS."""
     noisy = " (noisy)" if row.noise is not None and row.noise > NOISY else ""
     return [
-        row.setting + (" (default)" if row.default and row.by != PLAIN else ""),
+        row.setting + (" (default)" if row.default else ""),
         _figure(row.mean_us, 2) + noisy,
         *(_figure(value, 2) for value in (row.p50_us, row.p99_us, row.times)),
         *_counts((row.early, row.late, row.unknown), row.poses),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Ask = Callable[[Floats], Any]
+Query = Callable[[Floats], Any]
 
 # A setting is marked as noisy if its median repetition took this much longer than its best: other
 # work ran on the machine.
@@ -17,7 +17,7 @@ NOISY = 1.3
 
 
 @dataclass
-class Timed:
+class TimedSetting:
     """One setting and its times.
 
     ask: queries poses (k, 4, 4).  chunk: number of consecutive poses in a run, which is timed as
@@ -25,7 +25,7 @@ class Timed:
     loops: for each repetition (runs,), the time of each run [s].
     """
 
-    ask: Ask
+    ask: Query
     chunk: int = 1
     loops: list[Floats] = field(default_factory=list)
 
@@ -47,13 +47,13 @@ class Timed:
         """Return the ratio of the median repetition to the best runs: 1 on a quiet machine."""
         return float(np.median([loop.sum() for loop in self.loops]) / self.best.sum())
 
-    def percentile(self, share: float) -> float:
-        """Return a percentile, over runs, of the time per pose [s]. share: in percent."""
-        return float(np.percentile(self.best, share)) / self.chunk
+    def quantile(self, share: float) -> float:
+        """Return a quantile, over runs, of the time per pose [s]. share: 0 to 1."""
+        return float(np.quantile(self.best, share)) / self.chunk
 
 
 def take_times(
-    subjects: Sequence[Timed], poses: Floats, loops: int, chunk: int, tick: Callable[[], None]
+    subjects: Sequence[TimedSetting], poses: Floats, loops: int, chunk: int, tick: Callable[[], None]
 ) -> None:
     """Time all subjects on the same poses, `loops` times in turn.
 

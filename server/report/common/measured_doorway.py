@@ -25,7 +25,7 @@ from ....builder.synthetic.scenes import make_facade
 from ....builder.synthetic.truth import FacadeTruth, read_truth
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
-from .doorway import LIFTS, Doorway, made_figure, passage
+from .doorway import SOLE_HEIGHTS, Doorway, made_figure, passage
 
 # Widest door tried [m], twice the figure. If the figure does not pass it, the error is infinite.
 WIDEST = 1.06
@@ -34,14 +34,14 @@ FINEST = 0.0005
 AVATAR = "figure"
 
 
-class MadeDoor(NamedTuple):
+class GeneratedDoor(NamedTuple):
     """A generated façade: its scene, with the figure added, and its ground truth."""
 
     scene: Scene
     truth: FacadeTruth
 
 
-def made_doorways(
+def measure_doorways(
     folder: Path,
     config: BuildConfig,
     models: Sequence[str],
@@ -58,11 +58,11 @@ def made_doorways(
     models.
     points, seed: of the façades.  tick: called after each façade.
     """
-    made: dict[float, MadeDoor] = {}
+    made: dict[float, GeneratedDoor] = {}
     figure = made_figure()
     with ExitStack() as scenes:
 
-        def at(width: float) -> MadeDoor:
+        def at(width: float) -> GeneratedDoor:
             """Return the façade with a door of this width, generated at the first call."""
             if width not in made:
                 made[width] = _make(folder / f"door{len(made)}", config, width, points, seed)
@@ -82,15 +82,15 @@ def made_doorways(
     return found
 
 
-def passes(door: MadeDoor, model: str) -> bool:
-    """Return whether the figure passes the main door at half of the heights LIFTS or more."""
+def passes(door: GeneratedDoor, model: str) -> bool:
+    """Return whether the figure passes the main door at half of the heights SOLE_HEIGHTS or more."""
     figure = made_figure()
     clear = 0
-    for lift in LIFTS:
+    for lift in SOLE_HEIGHTS:
         poses = passage(door.truth.door("main"), lift, door.truth.origin, figure)
         verdict = door.scene.collide(AVATAR, poses, radius_model=model).verdict
         clear += bool((verdict == Verdict.CLEAR).all())
-    return 2 * clear >= len(LIFTS)
+    return 2 * clear >= len(SOLE_HEIGHTS)
 
 
 def _narrowest(passing: Callable[[float], bool]) -> float:
@@ -107,11 +107,11 @@ def _narrowest(passing: Callable[[float], bool]) -> float:
     return passed
 
 
-def _make(folder: Path, config: BuildConfig, width: float, points: int, seed: int) -> MadeDoor:
+def _make(folder: Path, config: BuildConfig, width: float, points: int, seed: int) -> GeneratedDoor:
     """Generate, build and open a façade in `folder`."""
     folder.mkdir(parents=True)
     made = make_facade(folder / "facade.laz", points=points, seed=seed, door=width)
     build_archive(list(made.paths), folder / "archive", config)
     scene = Scene.open(folder / "archive")
     scene.add_avatar(AVATAR, made_figure())
-    return MadeDoor(scene, read_truth(made.truth).facades[0])
+    return GeneratedDoor(scene, read_truth(made.truth).facades[0])

@@ -11,8 +11,14 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.truth import DoorTruth, FacadeTruth
-from solidcloud.server.report.common import made_doorway
-from solidcloud.server.report.common.made_doorway import FINEST, WIDEST, MadeDoor, made_doorways, passes
+from solidcloud.server.report.common import measured_doorway
+from solidcloud.server.report.common.measured_doorway import (
+    FINEST,
+    WIDEST,
+    GeneratedDoor,
+    measure_doorways,
+    passes,
+)
 from solidcloud.server.scene import Scene
 
 
@@ -22,8 +28,8 @@ class Facades:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, narrowest: dict[str, float]) -> None:
         self.widths: list[float] = []
         self.closed = 0
-        monkeypatch.setattr(made_doorway, "_make", self.make)
-        monkeypatch.setattr(made_doorway, "passes", lambda door, model: door.truth >= narrowest[model])
+        monkeypatch.setattr(measured_doorway, "_make", self.make)
+        monkeypatch.setattr(measured_doorway, "passes", lambda door, model: door.truth >= narrowest[model])
 
     def make(self, folder: Path, config: BuildConfig, width: float, points: int, seed: int) -> Any:
         """A façade whose truth is its door's width."""
@@ -31,7 +37,7 @@ class Facades:
         scene = SimpleNamespace(
             close=self.close, add_avatar=lambda name, points: SimpleNamespace(radius=0.01)
         )
-        return MadeDoor(scene, width)  # type: ignore[arg-type]
+        return GeneratedDoor(scene, width)  # type: ignore[arg-type]
 
     def close(self) -> None:
         """Count a scene that is closed."""
@@ -44,7 +50,7 @@ def test_narrowest_is_found_to_half_a_millimetre_and_facades_are_made_once(
     narrowest = {"mean": 0.5543, "local": 0.5551, "fixed:1": 2.0}
     facades = Facades(monkeypatch, narrowest)
     ticks: list[None] = []
-    found = made_doorways(tmp_path, BuildConfig(), list(narrowest), tick=lambda: ticks.append(None))
+    found = measure_doorways(tmp_path, BuildConfig(), list(narrowest), tick=lambda: ticks.append(None))
     for model in ("mean", "local"):
         assert narrowest[model] <= found[model].narrowest <= narrowest[model] + FINEST
     assert math.isinf(found["fixed:1"].narrowest) and math.isinf(found["fixed:1"].error)
@@ -70,10 +76,10 @@ def test_figure_passes_what_is_clear_at_half_of_the_heights(tmp_path: Path) -> N
         bolt = [] if height is None else [np.column_stack([along, 0 * along + 0.05, 0 * along + height])]
         archive = archive_cases.build(tmp_path, np.concatenate(jambs + bolt), voxel=8.0).archive
         with Scene.open(archive) as scene:
-            scene.add_avatar(made_doorway.AVATAR, figure_points())
-            return passes(MadeDoor(scene, truth), "mean")
+            scene.add_avatar(measured_doorway.AVATAR, figure_points())
+            return passes(GeneratedDoor(scene, truth), "mean")
 
-    lifts = made_doorway.LIFTS
+    lifts = measured_doorway.SOLE_HEIGHTS
     tall = figure_points()[:, 2].max()
     middle = tall + (lifts[1] + lifts[2]) / 2
     assert bolted(None)

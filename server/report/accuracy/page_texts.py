@@ -4,9 +4,8 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from .accuracy_arithmetic import ALL_PAIRS, ARITHMETIC, PRIMITIVE, VOLUME
-from .accuracy_row import ALONE, BUDGET, DEGREE, LEAF, NODES, RADIUS, SHEET, STEP, TOLERANCE, Row
-from .accuracy_timing import NOISY
+from .interleaved_timing import NOISY
+from .setting_results import ALONE, BUDGET, DEGREE, LEAF, NODES, RADIUS, SHEET, STEP, TOLERANCE, Row
 
 # Times that differ by less than this factor are called the same: times of one archive built twice
 # differed by 6 %.
@@ -41,8 +40,6 @@ CHARTS = {
     "are on the Pareto front.",
     "verdicts": "The same settings against the share of verdicts that differ from the exact ones, and against the "
     "largest distance error.",
-    "volumes": "The same hierarchy, traversed by the same plain program, with nodes bounded by spheres, by spheres cut "
-    "by a slab, and by axis-aligned boxes; and with a cube in place of each point's sphere.",
 }
 
 # Why `local` leaks less than `mean` at the same doorway error, but not less than half; on the
@@ -50,11 +47,6 @@ CHARTS = {
 LEFT = (
     "The effect of density is gone: the median leak no longer grows with the spacing of points. The rest is due to "
     "random gaps between points, and to one jamb of the door that is scanned as sparsely as the sparsest wall."
-)
-
-_PLAIN = (
-    "Measured with a plain scalar descent in which only the test differs. Its times are comparable with one another, "
-    "but not with the server's. "
 )
 
 KNOBS = {
@@ -79,15 +71,6 @@ KNOBS = {
     SHEET: "The purpose of smaller spheres on rims. The scene is a sheet without thickness with a door of 1 m: the "
     "figure can only touch the rim. The façade's jambs are planes 1.2 m deep with hardly a point on a rim, where "
     "`border` changes almost nothing. The ball is pushed at the sheet away from its rims.",
-    ARITHMETIC: _PLAIN + "The test of two points in five kinds of arithmetic. Map coordinates are those of a scene at "
-    "500 km east and 5,600 km north; the other kinds use a place near the avatar or the scan's origin as origin.",
-    VOLUME: _PLAIN + "Two leaves are compared as in the server: the avatar's points are first tested against the "
-    "bounding volume of the scene's leaf. The façade's walls are parallel to the axes, which favours boxes.",
-    VOLUME + ", turned": _PLAIN + "The same scene and poses, rotated so that no wall is parallel to an axis.",
-    ALL_PAIRS: _PLAIN + "Two leaves are compared as in the paper: every point of one with every point of the other.",
-    PRIMITIVE: _PLAIN + "A cube as wide as the sphere in place of each sphere: simpler to test, but a corner reaches "
-    "1.7 times as far as a side. Cubes stay parallel to the world's axes when the avatar rotates.",
-    PRIMITIVE + ", turned": _PLAIN + "The same scene and poses, rotated so that no wall is parallel to an axis.",
 }  # fmt: skip
 
 
@@ -104,9 +87,8 @@ def findings(rows: Sequence[Row], brute: int = 0) -> list[str]:
         _radius(rows),
         _equal_door(rows),
         _made(rows),
+        _sheet(rows),
     ]
-    said += [_sheet(rows), _arithmetic(rows)]
-    said += [_volumes(rows, ""), _volumes(rows, ", turned"), _cubes(rows)]
     return [line for line in said if line]
 
 
@@ -123,17 +105,10 @@ def _exact(rows: Sequence[Row], brute: int) -> str:
     if row is None or row.mean_us is None:
         return ""
     said = f"The exact answer takes {row.mean_us:.1f} µs per pose, p99 of groups {row.p99_us:.1f} µs."
-    plain = _find(rows, ARITHMETIC, "integers")
-    if plain is None or not brute:
+    if not brute:
         return said
-    # The exact answer is the reference, and its own count of wrong verdicts means nothing. The
-    # agreement of other methods does.
-    wrong = plain.early + plain.late + plain.tangent_early + plain.tangent_late
-    agree = "agree" if not wrong else f"disagree {wrong} times"
-    return (
-        f"{said} Check: a test of every pair of points in integers at {brute:,} poses, and the plain integer descent "
-        f"at {plain.poses + plain.tangent:,} poses, {plain.tangent:,} of them near-tangent, {agree} with it."
-    )
+    # The exact answer is the reference: its own count of wrong verdicts means nothing.
+    return f"{said} Check: a test of every pair of points in integers agrees with it at {brute:,} poses."
 
 
 def _tolerance(rows: Sequence[Row]) -> str:
@@ -290,59 +265,3 @@ def _sheet(rows: Sequence[Row]) -> str:
     if wider is not None and (wider.doorway_mm or 0.0) < 0.0:
         said += f" At the mean radius, border makes this door {-(wider.doorway_mm or 0.0):.0f} mm wider than it is."
     return said
-
-
-def _arithmetic(rows: Sequence[Row]) -> str:
-    own = [r for r in rows if r.knob == ARITHMETIC]
-    if not own:
-        return ""
-    parts = [
-        f"{r.setting} {_ratio(r)}, {r.early + r.late} of {r.poses:,} and "
-        f"{r.tangent_early + r.tangent_late} of {r.tangent:,} near-tangent wrong"
-        for r in own
-        if not r.default
-    ]
-    return (
-        "Arithmetic, compared with float32 with a certified bound and integers where it does not decide: "
-        + "; ".join(parts)
-        + "."
-    )
-
-
-def _volumes(rows: Sequence[Row], suffix: str) -> str:
-    own = {r.setting: r for r in rows if r.knob == VOLUME + suffix}
-    if not {"sphere", "sphere with slab", "box"} <= own.keys():
-        return ""
-    sphere, slab, box = (own[name].mean_us or 0.0 for name in ("sphere", "sphere with slab", "box"))
-    where = "with rotated walls" if suffix else "with axis-aligned walls"
-    if _alike(box, sphere):
-        order = "Groups of boxes and groups of spheres take the same time, within noise,"
-    elif box < sphere:
-        order = "Groups of boxes beat groups of spheres"
-    else:
-        order = "Groups of spheres beat groups of boxes"
-    third = (
-        "as long as boxes, within noise"
-        if _alike(box, slab)
-        else f"{'more' if box < slab else 'less'} than boxes"
-    )
-    return (
-        f"{order} as bounds, {where}: {box:.1f} against {sphere:.1f} µs per pose in a plain descent. A sphere cut by a "
-        f"slab takes {slab:.1f} µs: {third}."
-    )
-
-
-def _cubes(rows: Sequence[Row]) -> str:
-    lines = []
-    for suffix, where in (("", "axis-aligned walls"), (", turned", "rotated walls")):
-        own = [r for r in rows if r.knob == PRIMITIVE + suffix]
-        cubes = next((r for r in own if r.setting.startswith("points cubes")), None)
-        boxes = next((r for r in own if r.setting == "points spheres, nodes boxes"), None)
-        if cubes is None or boxes is None or not boxes.mean_us:
-            continue
-        lines.append(
-            f"{where}: {_ratio(cubes, 'spheres under the same boxes', boxes)}, "
-            f"{cubes.early} of {cubes.poses:,} poses early, distance errors up to "
-            f"{cubes.distance_max_mm or 0.0:.0f} mm"
-        )
-    return "Cubes instead of spheres for points, " + "; ".join(lines) + "." if lines else ""

@@ -9,24 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.report.accuracy import accuracy_picture
-from solidcloud.server.report.accuracy.accuracy_arithmetic import PRIMITIVE, VOLUME, plain_settings
-from solidcloud.server.report.accuracy.accuracy_engine import engine_settings, radius_settings
-from solidcloud.server.report.accuracy.accuracy_labels import place_labels
-from solidcloud.server.report.accuracy.accuracy_page import table, write_page
-from solidcloud.server.report.accuracy.accuracy_picture import draw_charts, points_of
-from solidcloud.server.report.accuracy.accuracy_plan import BRIEF
-from solidcloud.server.report.accuracy.accuracy_report import Report
-from solidcloud.server.report.accuracy.accuracy_row import (
-    PLAIN,
+from solidcloud.server.report.accuracy import error_charts
+from solidcloud.server.report.accuracy.chart_labels import place_labels
+from solidcloud.server.report.accuracy.engine_settings import engine_settings, radius_settings
+from solidcloud.server.report.accuracy.error_charts import draw_charts, points_of
+from solidcloud.server.report.accuracy.html_page import table, write_page
+from solidcloud.server.report.accuracy.measurement_plan import BRIEF
+from solidcloud.server.report.accuracy.page_texts import KNOBS, findings, leak_at
+from solidcloud.server.report.accuracy.setting_results import (
     RADIUS,
     SHEET,
     STEP,
     TOLERANCE,
+    Report,
     Row,
-    mark_front,
+    mark_pareto_fronts,
 )
-from solidcloud.server.report.accuracy.accuracy_words import KNOBS, findings, leak_at
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 PLAIN_BUILD = BuildConfig(resolution=1e-4)
@@ -46,10 +44,6 @@ def all_rows() -> list[Row]:
     rng = np.random.default_rng(5)
     settings = [*engine_settings(BRIEF, PLAIN_BUILD, 0.0124), *radius_settings(BRIEF, PLAIN_BUILD, 0.0124)]
     rows = [s.row for s in settings]
-    for knob, kind in plain_settings():
-        rows.append(Row(knob, kind.name, by=PLAIN))
-        if knob in (VOLUME, PRIMITIVE):
-            rows.append(Row(f"{knob}, turned", kind.name, by=PLAIN))
     for name, factor, door, leak in (
         ("mean", 1.0, -2.5, -11.6),
         ("mean:3", 3.0, 33.4, -21.0),
@@ -64,10 +58,9 @@ def all_rows() -> list[Row]:
         row.noise, row.poses, row.tangent = 1.0, 2400, 400
         row.early = 0 if row.default else int(rng.integers(0, 300))
         row.distance_max_mm, row.distance_mean_mm = 0.0, 0.0
-        if row.by != PLAIN:
-            row.doorway_mm, row.leak_p99_mm = 24.0 * scale, 20.0 - scale
-            row.archive_bytes, row.decode_ms = 2_492_304, 20.0
-    mark_front(rows, (TOLERANCE, STEP, RADIUS))
+        row.doorway_mm, row.leak_p99_mm = 24.0 * scale, 20.0 - scale
+        row.archive_bytes, row.decode_ms = 2_492_304, 20.0
+    mark_pareto_fronts(rows, (TOLERANCE, STEP, RADIUS))
     return rows
 
 
@@ -143,13 +136,13 @@ def test_points_that_coincide_share_a_label_and_what_stops_a_ball_early_is_drawn
 ) -> None:
     said: list[list[str]] = []
     monkeypatch.setattr(
-        accuracy_picture, "place_labels", lambda panel, anchors, labels, colours: said.append(list(labels))
+        error_charts, "place_labels", lambda panel, anchors, labels, colours: said.append(list(labels))
     )
     rows = all_rows()
     for row in rows:
         if row.setting in ("search within 1 mm", "search within 2 mm", "search within 5 cm"):
             row.mean_us, row.doorway_mm, row.leak_p99_mm = 20.0, 30.0, -64.0 if "5 cm" in row.setting else 7.0
-    accuracy_picture.draw_scatter(rows, ("doorway", "leak"), "made façade", tmp_path / "chart.png")
+    error_charts.draw_scatter(rows, ("doorway", "leak"), "made façade", tmp_path / "chart.png")
     doors, walls, trade = said
     assert "search within 1 mm to 5 cm" in doors  # three of one place
     assert "search within 1 mm, 2 mm" in walls and "search within 5 cm: -64 mm" in walls
@@ -200,20 +193,9 @@ def test_the_findings_follow_from_the_rows() -> None:
     assert "border makes this door 10 mm wider than it is" in fast
     next(row for row in rows if row.knob == SHEET and row.setting == "border").doorway_mm = 1.0
     assert "wider than it is" not in " ".join(findings(rows))
-    by_name = {row.setting: row for row in rows if row.knob == VOLUME}
-    for sphere, box, said in ((9.0, 2.0, "Groups of boxes beat"), (2.0, 9.0, "Groups of spheres beat")):
-        by_name["sphere"].mean_us, by_name["box"].mean_us = sphere, box
-        assert said in " ".join(findings(rows))
     assert findings([]) == []
     assert "Check: " not in fast
-    integers = next(row for row in rows if row.setting == "integers")
-    integers.early = 0
-    assert (
-        "every pair of points in integers at 40 poses, and the plain integer descent at 2,800 poses, 400 of them "
-        "near-tangent, agree with it." in findings(rows, 40)[0]
-    )
-    integers.tangent_late = 2
-    assert "disagree 2 times" in findings(rows, 40)[0]
+    assert findings(rows, 40)[0].endswith("every pair of points in integers agrees with it at 40 poses.")
 
 
 def test_times_within_noise_are_not_told_apart() -> None:
@@ -232,10 +214,6 @@ def test_times_within_noise_are_not_told_apart() -> None:
         found = findings(rows)[1]
         assert found.count(said) == 2, found
         assert ("it is not measurably faster" in found) != won
-    bounds = [Row(VOLUME, name, mean_us=5.0) for name in ("sphere", "sphere with slab", "box")]
-    assert "take the same time, within noise," in (same := findings(bounds)[0]) and "as long as boxes" in same
-    bounds[2].mean_us = 9.0
-    assert "takes 5.0 µs: less than boxes" in findings(bounds)[0]
 
 
 def felt(setting: str, doorway: float, leak: float) -> Row:

@@ -21,7 +21,7 @@ class Walk(NamedTuple):
     elevation: int
 
 
-class Frames(NamedTuple):
+class WalkAnswers(NamedTuple):
     """Answers of a walk, one element per pose.
 
     verdict: (k,) uint8.  engine: (k,) float64, time in the engine [s].

@@ -12,8 +12,8 @@ from ....builder.synthetic.sheet import make_sheet
 from ...scene import Scene
 from ..common.doorway import doorway_error
 from ..common.leak import leak
-from .accuracy_case import AVATAR
-from .accuracy_row import SHEET, Row
+from .measured_scene import AVATAR
+from .setting_results import SHEET, Row
 
 MODELS = ("mean", "border")
 FACTORS = (1.0, 2.0, 3.0)

@@ -13,23 +13,26 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import InternalError
-from solidcloud.server.report.accuracy.accuracy import judge, warnings_of
-from solidcloud.server.report.accuracy.accuracy_arithmetic import VOLUME, check_judge, measure_plain
-from solidcloud.server.report.accuracy.accuracy_case import (
-    LEAST_OFF,
-    MOST_OFF,
+from solidcloud.server.report.accuracy.accuracy_report import warnings_of
+from solidcloud.server.report.accuracy.engine_settings import UNSPENT, Archives, Setting, compare_engine
+from solidcloud.server.report.accuracy.measured_scene import (
     REACH,
-    Ground,
+    MeasuredScene,
+    archive_scene,
     config_of,
-    given_ground,
-    turned_ground,
     unknown_regions,
 )
-from solidcloud.server.report.accuracy.accuracy_engine import UNSPENT, Archives, Exact, Setting, judge_engine
-from solidcloud.server.report.accuracy.accuracy_plan import Plan
-from solidcloud.server.report.accuracy.accuracy_row import BUDGET, DEGREE, TOLERANCE, Row
+from solidcloud.server.report.accuracy.measurement_plan import MeasurementPlan
+from solidcloud.server.report.accuracy.reference_answers import (
+    MAX_OFFSET,
+    MIN_OFFSET,
+    ReferenceAnswers,
+    check_reference,
+    find_reference,
+)
+from solidcloud.server.report.accuracy.setting_results import BUDGET, DEGREE, TOLERANCE, Row
 
-PLAN = Plan(frames=40, near_tangent=20, plain_frames=10, loops=1)
+PLAN = MeasurementPlan(frames=40, near_tangent=20, loops=1)
 CONFIG = BuildConfig(resolution=1e-3, radius=0.01, jobs=1)
 
 
@@ -49,9 +52,9 @@ class Judged:
         self.folder.mkdir()
         avatar = folder / "figure.ply"
         synthetic_scans.write_ply(avatar, figure_points(200))
-        self.ground: Ground = given_ground(folder / "hall", PLAN, avatar, self.folder)
-        self.archives = Archives(self.ground, self.folder)
-        self.exact: Exact = judge(self.ground, CONFIG, self.archives, PLAN)
+        self.scene: MeasuredScene = archive_scene(folder / "hall", PLAN, avatar, self.folder)
+        self.archives = Archives(self.scene, self.folder)
+        self.exact: ReferenceAnswers = find_reference(self.archives.scene(CONFIG), self.scene, PLAN)
         self.archive = Archive(self.archives.folder(CONFIG))
 
 
@@ -72,8 +75,8 @@ def test_an_archive_is_built_again_as_it_was(judged: Judged, tmp_path: Path) -> 
         voxel=1.5, resolution=2e-3, radius=0.031, degree=5, leaf=9, cells="balanced", cell_points=200,
         with_slab=False, models=frozenset({"mean", "local"}), jobs=1,
     )  # fmt: skip
-    build_archive([judged.ground.scan], tmp_path / "given", given)
-    ground = given_ground(tmp_path / "given", PLAN, None, tmp_path)
+    build_archive([judged.scene.scan], tmp_path / "given", given)
+    ground = archive_scene(tmp_path / "given", PLAN, None, tmp_path)
     with (
         Archives(ground, tmp_path) as archives,
         Archive(archives.folder(ground.config)) as again,
@@ -94,8 +97,8 @@ def test_what_is_not_measured_is_said(judged: Judged) -> None:
         "unknown in 2 regions." in unknown_regions(replace(header, unknown=np.zeros((2, 2, 3), np.int64)))[0]
     )
     assert "unknown everywhere" in unknown_regions(replace(one, unknown_everywhere=True))[0]
-    assert unknown_regions(header) == () and warnings_of(judged.ground, exact) == []
-    ground = judged.ground._replace(warnings=("left out",))
+    assert unknown_regions(header) == () and warnings_of(judged.scene, exact) == []
+    ground = judged.scene._replace(warnings=("left out",))
     for changed, said in (
         ({"contact": np.zeros(80, bool)}, "None of the 80 judged poses touches"),
         ({"contact": np.ones(80, bool)}, "All 80 judged poses touch"),
@@ -108,25 +111,17 @@ def test_what_is_not_measured_is_said(judged: Judged) -> None:
 def test_near_tangent_poses_are_within_a_micrometre_on_either_side(judged: Judged) -> None:
     scene = judged.archives.scene(CONFIG)
     off = scene.distance("avatar", judged.exact.tangent_poses, REACH).signed_distance
-    assert len(off) >= 10 and np.abs(off).max() <= MOST_OFF and np.abs(off).min() >= LEAST_OFF / 4
+    assert len(off) >= 10 and np.abs(off).max() <= MAX_OFFSET and np.abs(off).min() >= MIN_OFFSET / 4
     assert (off > 0).any() and (off < 0).any()
     assert ((off <= 0) == judged.exact.tangent).all()
 
 
 def test_every_pair_of_points_agrees_with_the_judge_and_would_say_if_not(judged: Judged) -> None:
     exact = judged.exact
-    assert check_judge(judged.archive, judged.ground, exact, 20) == 20
+    assert check_reference(judged.archive, judged.scene, exact, 20) == 20
     for wrong in (exact._replace(contact=~exact.contact), exact._replace(tangent=~exact.tangent)):
         with pytest.raises(InternalError, match="every pair of points finds the opposite"):
-            check_judge(judged.archive, judged.ground, wrong, 20)
-
-
-def test_a_volume_that_changed_an_answer_would_be_an_error(judged: Judged) -> None:
-    rows = measure_plain(judged.archive, judged.ground, judged.exact, PLAN, lambda: None, only=(VOLUME,))
-    assert len(rows) == 4 and all(row.times and row.poses == 80 for row in rows)
-    wrong = judged.exact._replace(contact=~judged.exact.contact)
-    with pytest.raises(InternalError, match="verdicts differ from the server's"):
-        measure_plain(judged.archive, judged.ground, wrong, PLAN, lambda: None, only=(VOLUME,))
+            check_reference(judged.archive, judged.scene, wrong, 20)
 
 
 @pytest.mark.parametrize(
@@ -148,27 +143,18 @@ def test_a_knob_that_changed_what_it_must_not_would_be_an_error(
         settings = [Setting(Row(knob, "as it is"), CONFIG, options)]
         if fails:
             with pytest.raises(InternalError, match=said):
-                judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
+                compare_engine(settings, judged.archives, judged.scene, exact, lambda: None)
         else:
-            judge_engine(settings, judged.archives, judged.ground, exact, lambda: None)
+            compare_engine(settings, judged.archives, judged.scene, exact, lambda: None)
             row = settings[0].row
             assert row.late == row.unknown == 0 and row.decode_ms
             assert (row.early > 0) == (options == {"tolerance": 0.01, "budget_visits": UNSPENT})
 
 
-def test_the_turned_scene_is_the_same_scene(judged: Judged, tmp_path: Path) -> None:
-    turned = turned_ground(judged.ground, tmp_path)
-    with Archives(turned, tmp_path) as archives:
-        found = archives.scene(CONFIG).distance("avatar", turned.judged, REACH).signed_distance
-    near = np.isfinite(found) & np.isfinite(judged.exact.distance)
-    # Points are put on the lattice anew: either is moved by sqrt(3) / 2 steps at most.
-    assert near.sum() > 40 and np.abs(found - judged.exact.distance)[near].max() <= 3**0.5 * 1e-3
-    walls = np.abs(turned.walk[0, :3, :3])
-    assert ((walls > 0.05) & (walls < 0.97)).sum() >= 7, "an axis stayed an axis"
-
-
 def test_of_a_large_archive_the_voxels_around_its_middle_are_taken(judged: Judged, tmp_path: Path) -> None:
-    few = given_ground(judged.folder.parent / "hall", Plan(most_points=3000, frames=40), None, tmp_path)
+    few = archive_scene(
+        judged.folder.parent / "hall", MeasurementPlan(most_points=3000, frames=40), None, tmp_path
+    )
     assert "of 5,000 points" in few.name and few.truth is None and len(few.walk) == 40
     taken = int(few.name.split(", ", 1)[1].split(" ")[0].replace(",", ""))
     assert 0 < taken <= 3000

@@ -1,0 +1,144 @@
+"""Reference answers, with which the settings are compared: the server's exact ones, checked by brute force."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....builder.voxel.point_radius import voxel_points
+from ....schemas.archive.archive import Archive
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.errors import BadDataError, InternalError
+from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_model import make_avatar
+from ...scene import Scene
+from .measured_scene import AVATAR, REACH, SEED, MeasuredScene
+from .measurement_plan import MeasurementPlan
+
+Floats = NDArray[np.float64]
+Units = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+# Absolute signed distance of near-tangent poses, from one exact unit to a micrometre [m].
+MIN_OFFSET, MAX_OFFSET = 1.5e-8, 1e-6
+# Maximum number of moves along the nearest pair's normal: after a move another pair may be the
+# nearest.
+TANGENT_STEPS = 12
+
+
+class ReferenceAnswers(NamedTuple):
+    """Reference answers.
+
+    contact, distance: (k,), verdict and signed distance [m] of the judged poses.
+    tangent: (t,), verdict of the near-tangent poses.  tangent_poses: (t, 4, 4).
+    """
+
+    contact: Bools
+    distance: Floats
+    tangent: Bools
+    tangent_poses: Floats
+
+
+def find_reference(scene: Scene, measured: MeasuredScene, plan: MeasurementPlan) -> ReferenceAnswers:
+    """Return the reference answers: the exact ones of a scene of the default configuration."""
+    tangent = tangent_poses(scene, measured.judged, plan.near_tangent)
+    distance = scene.distance(AVATAR, measured.judged, REACH).signed_distance
+    return ReferenceAnswers(
+        exact_contact(scene, measured.judged), distance, exact_contact(scene, tangent), tangent
+    )
+
+
+def tangent_poses(scene: Scene, poses: Floats, count: int) -> Floats:
+    """Return poses (<= count, 4, 4) whose signed distance is within MAX_OFFSET of 0, on either side.
+
+    Each pose is moved along the contact normal of its nearest pair, as `distance` returns it, until
+    its signed distance is as small as drawn at random. Poses that do not converge are left out.
+    scene: with the avatar added.
+    """
+    rng = np.random.default_rng([SEED, 0x7A])
+    moved = poses[rng.choice(len(poses), min(len(poses), 2 * count), replace=False)].copy()
+    off = np.exp(rng.uniform(np.log(MIN_OFFSET), np.log(MAX_OFFSET), len(moved))) * rng.choice(
+        [-1, 1], len(moved)
+    )
+    settled = np.zeros(len(moved), bool)
+    for _ in range(TANGENT_STEPS):
+        open_ = np.flatnonzero(~settled)
+        found = scene.distance(AVATAR, moved[open_], REACH)
+        short = off[open_] - found.signed_distance
+        settled[open_] = np.isfinite(short) & (np.abs(found.signed_distance) <= MAX_OFFSET)
+        go = np.isfinite(short) & ~settled[open_]
+        moved[open_[go], :3, 3] += short[go, None] * found.normal[go]
+    return moved[settled][:count]
+
+
+def exact_contact(scene: Scene, poses: Floats) -> NDArray[np.bool_]:
+    """Return whether poses (k,) are in contact, exactly. Raises BadDataError if one is unknown."""
+    verdict = scene.collide(AVATAR, poses).verdict
+    if (verdict == Verdict.UNKNOWN).any():
+        raise BadDataError(
+            f"{int((verdict == Verdict.UNKNOWN).sum())} poses are unknown, expected none: check the scan"
+        )
+    return verdict == Verdict.CONTACT
+
+
+def check_reference(
+    archive: Archive, measured: MeasuredScene, reference: ReferenceAnswers, poses: int
+) -> int:
+    """Check the reference verdicts against brute force at `poses` poses.
+
+    Brute force tests every pair of points in integers. Half of the poses are near-tangent, if there
+    are enough. Returns the number of poses compared.
+    Raises InternalError if a verdict differs.
+    """
+    scene = _scene_units(archive)
+    scene = scene[np.argsort(scene[:, 0], kind="stable")]
+    origin = np.array(archive.header.lattice.origin)
+    avatar = make_avatar(measured.avatar)
+    reach = round(archive.header.radius * UNITS_PER_METRE) + round(avatar.radius * UNITS_PER_METRE)
+    near = np.linspace(0, max(len(reference.tangent) - 1, 0), min(poses // 2, len(reference.tangent)))
+    far = np.linspace(0, len(reference.contact) - 1, poses - len(near))
+    near, far = near.astype(int), far.astype(int)
+    compared = np.concatenate([reference.tangent_poses[near], measured.judged[far]])
+    expected = np.concatenate([reference.tangent[near], reference.contact[far]])
+    for number, (pose, contact) in enumerate(zip(compared, expected, strict=True)):
+        if _touches(_placed_units(pose, measured.avatar, origin), scene, reach) != contact:
+            raise InternalError(
+                f"pose {number} of those judged: the server answers {'contact' if contact else 'clear'}, a test of "
+                "every pair of points finds the opposite: this is a bug of this software, report it"
+            )
+    return len(compared)
+
+
+def _touches(avatar: Units, scene: Units, reach: int) -> bool:
+    """Return whether a pair of points is within `reach` (NUMERICS.md N5).
+
+    avatar: (n, 3).  scene: (s, 3), sorted by x. All in exact units. Pairs farther apart than
+    `reach` along x are not in reach; nor are their squares computed, which keeps these within 63
+    bits.
+    """
+    first = np.searchsorted(scene[:, 0], avatar[:, 0] - reach)
+    last = np.searchsorted(scene[:, 0], avatar[:, 0] + reach, side="right")
+    for point, begin, end in zip(avatar, first, last, strict=True):
+        apart = np.abs(scene[begin:end] - point)
+        apart = apart[(apart <= reach).all(axis=1)]
+        if ((apart * apart).sum(axis=1) <= reach * reach).any():
+            return True
+    return False
+
+
+def _placed_units(pose: Floats, points: Floats, origin: Floats) -> Units:
+    """Return points (n, 3) [m] under a pose, in exact units from the origin."""
+    shift = pose[:3, 3] - origin
+    x, y, z = points.T
+    placed = [((m[0] * x + m[1] * y) + m[2] * z) + t for m, t in zip(pose[:3, :3], shift, strict=True)]
+    return np.rint(np.stack(placed, axis=1) * UNITS_PER_METRE).astype(np.int64)
+
+
+def _scene_units(archive: Archive) -> Units:
+    """Return all scan points (n, 3) in exact units from the origin (NUMERICS.md N5)."""
+    lattice = archive.header.lattice
+    steps = [
+        voxel_points(*archive.read_voxel(row)) + coordinate * lattice.voxel_steps
+        for row, coordinate in enumerate(archive.coordinates)
+    ]
+    return np.rint(np.concatenate(steps).astype(np.float64) * lattice.units_per_step).astype(np.int64)

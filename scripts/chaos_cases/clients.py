@@ -1,6 +1,6 @@
-"""A client of a chaos run: a process that asks one question after another and judges each answer.
+"""A client of a chaos run: a process that sends one query after another and checks each answer.
 
-It is killed, stopped and started again while it asks. What it finds wrong it writes to a file of its own.
+It may be killed, frozen and restarted meanwhile. It writes the faults that it finds to its own file.
 """
 
 import json
@@ -18,23 +18,23 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server.client import Client
 
-from . import board as b
-from .ground import SCENE, Request, ask, with_avatars
+from . import scoreboard as b
+from .fixtures import SCENE, Request, ask, with_avatars
 from .judge import judge
 
 TIMEOUT = 5.0
-# Between two questions of one id [s]: the machine is shared with the server.
+# Pause between two queries of one id [s]: the machine is shared with the server.
 PACE = 0.01
-# A question to a server that is away is answered at once: no more of these a second than this.
+# Pause after a query without a server, which is answered at once [s].
 PAUSE_AWAY = 0.02
 
 
-class Asker:
-    """One process's questions, under one or more client ids that ask at the same time."""
+class QueryingClient:
+    """Queries of one process, under one or more client ids at the same time."""
 
     def __init__(self, folder: Path, slot: int, endpoint: str, seed: int, requests: list[Request]) -> None:
-        self.board = b.Board(folder / "board")
-        self.row = self.board.client(slot)
+        self.scoreboard = b.Scoreboard(folder / "board")
+        self.row = self.scoreboard.client(slot)
         self.endpoint, self.seed, self.requests = endpoint, seed, requests
         self.said: Counter[str] = Counter()
         self.causes: Counter[str] = Counter()
@@ -44,50 +44,50 @@ class Asker:
         self._lock = threading.Lock()
 
     def ended(self) -> bool:
-        """Return whether the driver wants no more, or is gone."""
-        driver = self.board.driver
+        """Return whether the driver has ended the run, or was killed."""
+        driver = self.scoreboard.driver
         return bool(driver[b.STOP]) or time.monotonic() - driver[b.HEARTBEAT] > b.ORPHANED
 
     def run(self, ids: int) -> None:
-        """Ask under so many ids until told to stop."""
-        still = b.Stillness(self.row, ids)
+        """Send queries under `ids` ids until the run ends."""
+        still = b.IdleFlags(self.row, ids)
         threads = [threading.Thread(target=self._run, args=(number, still)) for number in range(ids)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
 
-    def _run(self, number: int, still: b.Stillness) -> None:
-        """Ask under one id."""
+    def _run(self, number: int, still: b.IdleFlags) -> None:
+        """Send queries under one id."""
         rng = np.random.default_rng([self.seed, number])
         with Client(self.endpoint, scene=SCENE, timeout=TIMEOUT) as client, with_avatars(client):
             while not self.ended():
-                if self.board.driver[b.PAUSE]:
+                if self.scoreboard.driver[b.PAUSE]:
                     still.set(number, True)
                     time.sleep(0.01)
                     continue
                 still.set(number, False)
-                if self.board.driver[b.PAUSE]:
-                    continue  # the driver may have taken it for still
+                if self.scoreboard.driver[b.PAUSE]:
+                    continue  # the driver may already count it as idle
                 try:
                     self._ask(client, self.requests[int(rng.integers(len(self.requests)))])
-                except Exception as error:  # a client that crashes is a fault as well
+                except Exception as error:  # a crash of a client is a fault, too
                     self._count(b.ERRORS, f"{type(error).__name__}: {str(error)[:200]}")
                     time.sleep(PAUSE_AWAY)
                 time.sleep(PACE)
 
     def _ask(self, client: Any, request: Request) -> None:
-        """Ask one question, judge the answer and count it."""
+        """Send one query, check the answer and count it."""
         begin = time.monotonic()
-        before = self.board.now()
+        before = self.scoreboard.now()
         try:
             got = ask(client, request.op, request.arguments, request.parameters)
         except BusyError as error:
             self._count(b.BUSY, f"busy: {_kind(error)}")
             time.sleep(PAUSE_AWAY)
             return
-        after = self.board.now()
-        served = self.board.served_since(begin)
+        after = self.scoreboard.now()
+        served = self.scoreboard.served_since(begin)
         truths = [truth for generation, truth in enumerate(request.truths) if served >> generation & 1]
         found = judge(got, truths)
         away = not (before.up or after.up) and before.epoch == after.epoch
@@ -113,13 +113,13 @@ class Asker:
 
     @staticmethod
     def _silent(got: Any) -> bool:
-        """Return whether an answer was made here, because nobody gave one."""
+        """Return whether the client made the answer itself, because no server gave one."""
         if hasattr(got, "engine_seconds"):
             return len(got) > 0 and got.engine_seconds == 0.0
         return not got.simulated
 
     def _claim(self, avatar: str, got: Moved, served: int) -> None:
-        """Write down a frame that ended clear, but not where it would have if all were known: judged in the end."""
+        """Record a frame that is reported clear with something unknown; it is judged at the end."""
         with self._lock:
             self._claims.write(
                 json.dumps({"avatar": avatar, "pose": got.pose.tolist(), "served": served}) + "\n"
@@ -127,9 +127,15 @@ class Asker:
             self._claims.flush()
 
     def _note(
-        self, request: Request, found: Any, served: int, before: b.Now, after: b.Now, begin: float
+        self,
+        request: Request,
+        found: Any,
+        served: int,
+        before: b.ServerState,
+        after: b.ServerState,
+        begin: float,
     ) -> None:
-        """Write down what was wrong."""
+        """Record the faults of an answer."""
         note = {
             "op": request.op, "served": served, "before": before, "after": after, "asked": begin,
             "answered": time.monotonic(), "faults": found.faults[:5], "clear": found.clear, "right": found.right,
@@ -139,7 +145,7 @@ class Asker:
         self._log.flush()
 
     def _count(self, column: int, cause: str) -> None:
-        """Count a question that was refused, by what was said."""
+        """Count a refused query by its error message."""
         with self._lock:
             self.row[b.ASKED] += 1
             self.row[column] += 1
@@ -153,6 +159,6 @@ def _kind(error: Exception) -> str:
 
 
 def main(folder: Path, slot: int, endpoint: str, seed: int, ids: int) -> None:
-    """Be one client process."""
+    """Run one client process."""
     requests = pickle.loads((folder / "pool.pickle").read_bytes())
-    Asker(folder, slot, endpoint, seed, requests).run(ids)
+    QueryingClient(folder, slot, endpoint, seed, requests).run(ids)

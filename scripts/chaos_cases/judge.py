@@ -1,6 +1,6 @@
-"""Whether an answer is right: it says what the truth says, or that it does not know.
+"""Comparison of answers with the true ones.
 
-A row that is `unknown` is never wrong, whatever its bounds, if these hold. A row that is called exact must have every
+A row that is `unknown` is never wrong if its bounds hold. A row that is `exact` must have every
 figure of the truth, bit for bit.
 """
 
@@ -13,7 +13,7 @@ from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.schemas.wire.questions import CONTACTS
 
-# What is judged by itself, what depends on what was in memory, and what says how sure the rest is.
+# Columns that are judged separately, that depend on the cache, or that state certainty.
 _NOT_COMPARED = {
     "verdict",
     "voxels_missing",
@@ -28,7 +28,7 @@ _VALUES = ("signed_distance", "distance")
 
 
 class Judgement(NamedTuple):
-    """Rows of one answer. faults: what is wrong, in sentences.  false_clear: rows called clear that are in contact."""
+    """Numbers of rows of one answer. faults: sentences.  false_clear: rows called clear that are in contact."""
 
     right: int
     unknown: int
@@ -38,7 +38,7 @@ class Judgement(NamedTuple):
 
 
 def judge(got: Any, truths: Sequence[Any]) -> Judgement:
-    """Judge an answer by the truths that it may be: wrong where it is wrong by each of them."""
+    """Judge an answer by several possible truths: it is wrong if it is wrong by each of them."""
     found = [_judge_one(got, truth) for truth in truths]
     return min(found, key=lambda judgement: (len(judgement.faults), judgement.false_clear))
 
@@ -64,7 +64,7 @@ def _judge_one(got: Any, truth: Any) -> Judgement:
     exact = got.exact.astype(bool) if len(getattr(got, "exact", ())) == len(got) else known
     if isinstance(truth, SweepAnswers) and isinstance(got, SweepAnswers):
         faults += _motions(got, truth, known & exact)
-        # Of several pairs that touch first, any that is in memory may be the witness.
+        # Of several pairs that touch first, any that is resident may be the witness.
         exact = exact & (got.voxels_missing == 0)
     faults += _figures(got, truth, known & exact)
     faults += _bounds(got, truth, ~(known & exact))
@@ -73,7 +73,7 @@ def _judge_one(got: Any, truth: Any) -> Judgement:
 
 
 def _figures(got: Cost, truth: Cost, rows: Any) -> list[str]:
-    """Return what differs in rows that claim to be exact."""
+    """Return differences in exact rows."""
     faults = []
     skip = set(_NOT_COMPARED)
     if isinstance(truth, ContactsAnswers):
@@ -100,13 +100,13 @@ def _figures(got: Cost, truth: Cost, rows: Any) -> list[str]:
 
 
 def _same(one: Any, other: Any) -> Any:
-    """Return which rows are the same bits; NaN is the same as NaN."""
+    """Return which rows have the same bits; NaN equals NaN."""
     equal = (one == other) | ((one != one) & (other != other))
     return equal.all(axis=tuple(range(1, equal.ndim)))
 
 
 def _lists(got: Any, truth: Any, rows: Any, starts: str, names: Sequence[str]) -> list[str]:
-    """Return what differs in lists of pairs or clusters."""
+    """Return differences in lists of pairs or clusters."""
     faults = []
     for row in np.flatnonzero(rows):
         mine, theirs = (slice(*getattr(each, starts)[row : row + 2].tolist()) for each in (got, truth))
@@ -120,7 +120,7 @@ def _lists(got: Any, truth: Any, rows: Any, starts: str, names: Sequence[str]) -
 
 
 def _pairs(got: ObjectsAnswers, truth: ObjectsAnswers) -> list[str]:
-    """Return what differs in the objects that touch one another; a pair that is unknown is no fault."""
+    """Return differences in the pairs of objects in contact; an unknown pair is no fault."""
     said, true = (
         {
             tuple(pair): verdict
@@ -134,7 +134,7 @@ def _pairs(got: ObjectsAnswers, truth: ObjectsAnswers) -> list[str]:
 
 
 def _motions(got: SweepAnswers, truth: SweepAnswers, rows: Any) -> list[str]:
-    """Return where the first contact of a motion is not where it truly is, to the tolerance of the question."""
+    """Return motions whose first contact differs from the true one by more than the query's tolerance."""
     wrong = rows & ~((got.lower <= truth.upper) & (truth.lower <= got.upper))
     return [
         f"row {row}: first contact within {got.lower[row]} .. {got.upper[row]} of the motion, "
@@ -144,12 +144,12 @@ def _motions(got: SweepAnswers, truth: SweepAnswers, rows: Any) -> list[str]:
 
 
 def _bounds(got: Any, truth: Any, rows: Any) -> list[str]:
-    """Return where bounds of what is not exact do not hold the true figure."""
+    """Return rows, not exact, whose bounds do not include the true figure."""
     name = next((name for name in _VALUES if hasattr(truth, name)), None)
     if name is None or not hasattr(got, "lower") or len(got.lower) != len(rows):
         return []
     true = getattr(truth, name)
-    # Bounds are rounded outward; what is compared with them is the truth's own figure, rounded to nearest.
+    # Bounds are rounded outward, and the true figure to nearest.
     low, high = got.lower - 1e-9, got.upper + 1e-9
     wrong = rows & np.isfinite(true) & ((true < low) | (true > high))
     return [
@@ -159,8 +159,7 @@ def _bounds(got: Any, truth: Any, rows: Any) -> list[str]:
 
 
 def _judge_moved(got: Moved, truth: Moved) -> Judgement:
-    """Judge one frame; one that was not simulated whole, or that something unknown may have led elsewhere, says
-    nothing of where the avatar would be."""
+    """Judge one frame. A frame with skipped effects or unknown answers is not judged."""
     if got.unknown or got.skipped or not got.simulated:
         return Judgement(0, 1, 0, [])
     faults = []

@@ -1,4 +1,4 @@
-"""What came of a chaos run: figures, what of them breaks a promise, and a table."""
+"""Report of a chaos run: figures, violations of the guarantees, and a table."""
 
 import json
 import re
@@ -6,59 +6,59 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .ground import judge_claims, whole_lines
-from .lives import Lives
-from .storm import Storm
+from .chaos_run import ChaosRun
+from .fixtures import judge_claims, whole_lines
+from .server_restarts import ServerRuns
 
 STOP_SECONDS = 2.0
 SLOPE = 1.0  # [MB a minute]
-# zenoh's own threads block on behalf of tasks: they come and go with the load. So many more may there be in the end.
+# zenoh's own threads block on behalf of tasks: they come and go with the load. The end may have this many more.
 ZENOH_THREAD, POOL_GROWTH = re.compile(r"(app|acc|net|rx|tx)-\d+"), 2
 # Shards are opened at the first read of one of their records, once.
 SHARD = re.compile(r"\d+-\d{6}\.h5")
 
 
 class Limits(NamedTuple):
-    """What is allowed. recovery: seconds until right answers.  stop: seconds of a SIGTERM."""
+    """Limits. recovery: seconds until right answers.  stop: seconds of a SIGTERM."""
 
     recovery: float = 2.0
     stop: float = STOP_SECONDS
 
 
-def make_report(storm: Storm, folder: Path, seconds: float, limits: Limits) -> dict[str, Any]:
-    """Return the figures of a run; `violations`: sentences, none where all promises held."""
-    lives = storm.lives
-    totals = storm.board.totals()
-    slope = lives.slope()
+def make_report(run: ChaosRun, folder: Path, seconds: float, limits: Limits) -> dict[str, Any]:
+    """Return the figures of a run; `violations`: sentences, none if all guarantees held."""
+    server_runs = run.server_runs
+    totals = run.scoreboard.totals()
+    slope = server_runs.slope()
     claims, false_claims = judge_claims(folder)
     log = (folder / "server.log").read_text(errors="replace")
     report = {
         "seconds": round(seconds, 1),
-        "seed": storm.seed,
+        "seed": run.seed,
         **totals,
         "frames clear though something was unknown": claims,
         "of them in contact": false_claims,
-        "done": dict(sorted(storm.done.items())),
+        "done": dict(sorted(run.done.items())),
         "causes": _causes(folder),
-        "servers": lives.number,
-        "servers that ended by themselves": lives.died,
-        "seconds from serving to right, of each client": _spread(storm.recovery),
-        "seconds of SIGTERM": _spread([stop.seconds for stop in lives.stops]),
-        "exit codes of SIGTERM": sorted({stop.code for stop in lives.stops}),
-        "memory": _memory(lives),
+        "servers": server_runs.number,
+        "servers that ended by themselves": server_runs.died,
+        "seconds from serving to right, of each client": _spread(run.recovery),
+        "seconds of SIGTERM": _spread([stop.seconds for stop in server_runs.stops]),
+        "exit codes of SIGTERM": sorted({stop.code for stop in server_runs.stops}),
+        "memory": _memory(server_runs),
         "MB a minute, last server, after two minutes": None if slope is None else round(slope[0], 3),
         "minutes seen of it": None if slope is None else round(slope[1], 1),
-        "quiet points": [quiet._asdict() for quiet in lives.quiet],
+        "quiet points": [quiet._asdict() for quiet in server_runs.quiet],
         "tracebacks in the server's log": log.count("Traceback (most recent call last)"),
-        "stuck": storm.stuck,
+        "stuck": run.stuck,
         "wrong answers": _notes(folder),
     }
-    report["violations"] = _violations(report, lives, limits)
+    report["violations"] = _violations(report, server_runs, limits)
     return report
 
 
-def _violations(report: dict[str, Any], lives: Lives, limits: Limits) -> list[str]:
-    """Return which promises were broken."""
+def _violations(report: dict[str, Any], server_runs: ServerRuns, limits: Limits) -> list[str]:
+    """Return the violated guarantees."""
     found = [
         f"{report[name]} {words}"
         for name, words in (
@@ -73,12 +73,12 @@ def _violations(report: dict[str, Any], lives: Lives, limits: Limits) -> list[st
     found += report["stuck"]
     if not report["right"]:
         found.append("no answer was right: nothing was tested")
-    if lives.died:
-        found.append(f"{len(lives.died)} servers ended by themselves, with {lives.died}")
+    if server_runs.died:
+        found.append(f"{len(server_runs.died)} servers ended by themselves, with {server_runs.died}")
     worst = report["seconds from serving to right, of each client"]
     if worst and worst["longest"] > limits.recovery:
         found.append(f"right again after {worst['longest']} s, at most {limits.recovery:g} expected")
-    for stop in lives.stops:
+    for stop in server_runs.stops:
         if stop.code or stop.seconds > limits.stop:
             found.append(
                 f"SIGTERM: exit code {stop.code} after {stop.seconds:.2f} s, 0 within {limits.stop:g} expected"
@@ -86,13 +86,13 @@ def _violations(report: dict[str, Any], lives: Lives, limits: Limits) -> list[st
     rate = report["MB a minute, last server, after two minutes"]
     if rate is not None and rate > SLOPE:
         found.append(f"memory grows by {rate} MB a minute, under {SLOPE:g} expected")
-    # The first look of a life may be before something was first used.
-    last = [quiet for quiet in lives.quiet if quiet.life == lives.number][1:]
+    # At the first quiet point of a server, something may not have been used yet.
+    last = [quiet for quiet in server_runs.quiet if quiet.life == server_runs.number][1:]
     return found + _not_held([quiet.threads for quiet in last], [quiet.files for quiet in last])
 
 
 def _not_held(threads: list[dict[str, int]], files: list[dict[str, int]]) -> list[str]:
-    """Return which threads and files, by name at each quiet point, are not held as they must be."""
+    """Return violations of the rules for threads and files, given by name at each quiet point."""
     found = _not_constant("threads", [_without(count, ZENOH_THREAD) for count in threads])
     pool = [sum(count.values()) - sum(_without(count, ZENOH_THREAD).values()) for count in threads]
     half = len(pool) // 2
@@ -110,12 +110,12 @@ def _not_held(threads: list[dict[str, int]], files: list[dict[str, int]]) -> lis
 
 
 def _without(count: dict[str, int], names: re.Pattern[str]) -> dict[str, int]:
-    """Return the counts of all names but those that match a pattern."""
+    """Return the counts of the names that do not match a pattern."""
     return {name: number for name, number in count.items() if not names.fullmatch(name)}
 
 
 def _not_constant(what: str, counts: list[dict[str, int]]) -> list[str]:
-    """Return which names are not as often in each of the counts."""
+    """Return the names whose count changes."""
     found = []
     for name in sorted({name for count in counts for name in count}):
         seen = [count.get(name, 0) for count in counts]
@@ -125,7 +125,7 @@ def _not_constant(what: str, counts: list[dict[str, int]]) -> list[str]:
 
 
 def _spread(values: list[float]) -> dict[str, Any] | None:
-    """Return how many, their median and the longest."""
+    """Return number, median and maximum of values."""
     if not values:
         return None
     ordered = sorted(values)
@@ -136,18 +136,18 @@ def _spread(values: list[float]) -> dict[str, Any] | None:
     }
 
 
-def _memory(lives: Lives) -> list[dict[str, Any]]:
-    """Return each life's memory every ten seconds [MB]."""
+def _memory(server_runs: ServerRuns) -> list[dict[str, Any]]:
+    """Return each server's memory every ten seconds [MB]."""
     found: dict[tuple[int, int], float] = {}
     begins: dict[int, float] = {}
-    for life, at, rss in lives.memory:
+    for life, at, rss in server_runs.memory:
         since = at - begins.setdefault(life, at)
         found[life, int(since // 10) * 10] = round(rss / 1e6, 1)
     return [{"life": life, "seconds": since, "MB": size} for (life, since), size in found.items()]
 
 
 def _causes(folder: Path) -> dict[str, int]:
-    """Return what was said to questions that were refused."""
+    """Return the error messages of refused queries, counted."""
     total: Counter[str] = Counter()
     for path in folder.glob("causes-*.json"):
         try:
@@ -158,13 +158,13 @@ def _causes(folder: Path) -> dict[str, int]:
 
 
 def _notes(folder: Path) -> list[Any]:
-    """Return the first of what clients found wrong."""
+    """Return the first faults that clients found."""
     lines = [line for path in sorted(folder.glob("wrong-*.jsonl")) for line in whole_lines(path)]
     return [json.loads(line) for line in lines[:20]]
 
 
 def table(report: dict[str, Any]) -> str:
-    """Return the figures for a reader."""
+    """Format the figures as a table."""
     away = report["seconds from serving to right, of each client"] or {}
     stops = report["seconds of SIGTERM"] or {}
     rows = [

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import archive_cases
 import numpy as np
 import pytest
-from chaos_cases import board as b
-from chaos_cases.ground import AVATARS, ask, judge_claims, make_pool
+from chaos_cases import scoreboard as b
+from chaos_cases.fixtures import AVATARS, ask, judge_claims, make_pool
 from chaos_cases.judge import judge
-from chaos_cases.lives import Lives, Quiet
 from chaos_cases.report import Limits, _violations
+from chaos_cases.server_restarts import QuietPoint, ServerRuns
 from msgspec.structs import replace
 from rogues.tools import zeros
 from solidcloud.schemas.wire.answers import (
@@ -126,11 +126,11 @@ def test_an_answer_of_another_length_is_wrong() -> None:
     assert judge(collided(Verdict.CLEAR), [collided(Verdict.CLEAR, Verdict.CLEAR)]).faults
 
 
-def test_the_board_is_one_for_all(tmp_path: Path) -> None:
-    driver = b.Board(tmp_path / "board", 3)
-    client = b.Board(tmp_path / "board")
+def test_the_scoreboard_is_one_for_all(tmp_path: Path) -> None:
+    driver = b.Scoreboard(tmp_path / "board", 3)
+    client = b.Scoreboard(tmp_path / "board")
     driver.driver[b.UP] = 1
-    assert client.now() == b.Now(True, 0)
+    assert client.now() == b.ServerState(True, 0)
     client.client(2)[b.WRONG] += 4
     assert driver.totals()["wrong"] == 4
 
@@ -152,10 +152,10 @@ def test_a_lie_is_an_answer_that_a_client_would_take(request_, kind) -> None:
 
 
 def test_a_client_is_still_once_all_its_ids_are(tmp_path: Path) -> None:
-    board = b.Board(tmp_path / "board", 1)
+    board = b.Scoreboard(tmp_path / "board", 1)
     row = board.client(0)
     row[b.IDLE] = 1  # of a process that was killed
-    still = b.Stillness(row, 6)
+    still = b.IdleFlags(row, 6)
     seen = [row[b.IDLE]]
     for number in (*range(5), 0):
         still.set(number, True)
@@ -169,8 +169,8 @@ def test_a_client_is_still_once_all_its_ids_are(tmp_path: Path) -> None:
 
 def violations(threads: list[dict[str, int]], files: list[dict[str, int]]) -> list[str]:
     """What of a run is broken whose last life has held this at quiet points."""
-    quiet = [Quiet(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0, False)]  # of a life before
-    quiet += [Quiet(2, 0.0, *held, 0, 0, False) for held in zip(threads, files, strict=True)]
+    quiet = [QuietPoint(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0, False)]  # of a life before
+    quiet += [QuietPoint(2, 0.0, *held, 0, 0, False) for held in zip(threads, files, strict=True)]
     report = dict.fromkeys(
         ("wrong", "of them in contact", "clear_away", "errors", "tracebacks in the server's log",
          "seconds from serving to right, of each client", "MB a minute, last server, after two minutes")
@@ -210,8 +210,8 @@ def test_shards_may_be_opened_later_once_each_and_other_files_not() -> None:
 
 
 def test_a_generation_that_was_served_while_a_question_was_under_way_is_remembered(tmp_path: Path) -> None:
-    driver = b.Board(tmp_path / "board", 1)
-    client = b.Board(tmp_path / "board")
+    driver = b.Scoreboard(tmp_path / "board", 1)
+    client = b.Scoreboard(tmp_path / "board")
     driver.serve(1)
     asked = time.monotonic()
     for generations in (3, 2, 3, 1):  # to the other and back, while a client is frozen
@@ -221,10 +221,14 @@ def test_a_generation_that_was_served_while_a_question_was_under_way_is_remember
 
 
 def test_memory_is_judged_at_calm_quiet_points_of_the_last_life() -> None:
-    def quiet(life: int, minutes: float, megabytes: float, calm: bool, of_files: float = 0.0) -> Quiet:
-        return Quiet(life, 60 * minutes, {}, {}, int(megabytes * 1e6), int(of_files * 1e6), calm)
+    def quiet(life: int, minutes: float, megabytes: float, calm: bool, of_files: float = 0.0) -> QuietPoint:
+        return QuietPoint(life, 60 * minutes, {}, {}, int(megabytes * 1e6), int(of_files * 1e6), calm)
 
-    lives = SimpleNamespace(number=2, quiet=[quiet(1, 0, 900, True), quiet(2, 1, 300, True)])
-    assert Lives.slope(lives) is None, "one point has no slope"
-    lives.quiet += [quiet(2, 2, 500, False), quiet(2, 3, 340, True, of_files=36), quiet(2, 5, 308, True)]
-    assert Lives.slope(lives) == pytest.approx((2.0, 4.0))
+    server_runs = SimpleNamespace(number=2, quiet=[quiet(1, 0, 900, True), quiet(2, 1, 300, True)])
+    assert ServerRuns.slope(server_runs) is None, "one point has no slope"
+    server_runs.quiet += [
+        quiet(2, 2, 500, False),
+        quiet(2, 3, 340, True, of_files=36),
+        quiet(2, 5, 308, True),
+    ]
+    assert ServerRuns.slope(server_runs) == pytest.approx((2.0, 4.0))

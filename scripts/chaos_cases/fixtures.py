@@ -1,6 +1,7 @@
-"""The scene of a chaos run: two generations of a made façade, and a pool of requests with their true answers.
+"""Test data of a chaos run: two generations of a generated façade, and requests with their true answers.
 
-Truths are answered in this process, of private copies of the archives with room for all of them in memory.
+The true answers come from scenes in this process, of private copies of the archives, with caches
+that hold them whole.
 """
 
 import json
@@ -29,14 +30,14 @@ VOXEL = 0.5  # small, so that a small cache loads all the time [m]
 GENERATIONS = 2
 AVATARS = {"figure": (figure_points(300, 2012, 1.75), 0.05), "ball": (np.zeros((1, 3)), 0.12)}
 ROOM = 1 << 30
-# Of what all voxels take decoded, what the server may hold.
+# The server's cache, as a share of all decoded voxels.
 CACHE_SHARE = 0.25
 
 Arrays = NDArray[np.float64]
 
 
 class Request(NamedTuple):
-    """One question of the pool. truths: the answer of each generation."""
+    """One request of the pool. truths: the true answer of each generation."""
 
     op: str
     arguments: tuple[Any, ...]
@@ -44,8 +45,8 @@ class Request(NamedTuple):
     truths: tuple[Any, ...]
 
 
-class Ground(NamedTuple):
-    """What is served. live: the folder that the server reads.  kept: a copy of it, never touched.  cache: bytes."""
+class Fixture(NamedTuple):
+    """Folders of a run. live: what the server reads.  kept: an intact copy.  cache: of the server [bytes]."""
 
     live: Path
     kept: Path
@@ -53,17 +54,17 @@ class Ground(NamedTuple):
     cache: int
 
     def index(self, generation: int) -> Path:
-        """Return the index of a generation, kept beside."""
+        """Return the intact index of a generation."""
         return self.kept / f"index-{generation}.h5"
 
     def put(self, generation: int) -> None:
-        """Make the live folder hold a generation: its index replaces the one there; the shards of all lie there."""
+        """Replace the live folder's index by that of a generation. The folder has the shards of all."""
         beside = self.live.with_name("index.new")
         shutil.copyfile(self.index(generation), beside)
         os.replace(beside, self.live / INDEX_NAME)
 
     def mend(self) -> None:
-        """Give every shard of the live folder its bytes back, each in a new file."""
+        """Replace every shard of the live folder by an intact copy."""
         for path in sorted((self.kept / "shards").iterdir()):
             beside = self.live.with_name("shard.new")
             shutil.copyfile(path, beside)
@@ -74,8 +75,8 @@ class Ground(NamedTuple):
         return sorted((self.live / "shards").iterdir())
 
 
-def make_ground(folder: Path, points: int, requests: int, seed: int) -> Ground:
-    """Build both generations, and answer the pool of requests of each."""
+def make_fixture(folder: Path, points: int, requests: int, seed: int) -> Fixture:
+    """Build both generations, and compute the true answers of the pool for each."""
     rng = np.random.default_rng(seed)
     made = make_facade(folder / "facade.laz", points=points)
     config = BuildConfig(voxel=VOXEL, keep=frozenset(["scan"]))
@@ -83,31 +84,31 @@ def make_ground(folder: Path, points: int, requests: int, seed: int) -> Ground:
     np.savetxt(folder / "wall.xyz", _wall(), fmt="%.3f")
     shutil.copytree(folder / "first", folder / "second")
     add_scans(folder / "second", [folder / "wall.xyz"])
-    ground = Ground(folder / "live", folder / "kept", folder / "pool.pickle", 0)
-    (ground.kept / "shards").mkdir(parents=True)
+    fixture = Fixture(folder / "live", folder / "kept", folder / "pool.pickle", 0)
+    (fixture.kept / "shards").mkdir(parents=True)
     for generation, name in enumerate(("first", "second")):
-        shutil.copyfile(folder / name / INDEX_NAME, ground.index(generation))
+        shutil.copyfile(folder / name / INDEX_NAME, fixture.index(generation))
         for shard in (folder / name / "shards").iterdir():
-            shutil.copyfile(shard, ground.kept / "shards" / shard.name)
-    (ground.live / "shards").mkdir(parents=True)
-    ground.mend()
-    ground.put(0)
+            shutil.copyfile(shard, fixture.kept / "shards" / shard.name)
+    (fixture.live / "shards").mkdir(parents=True)
+    fixture.mend()
+    fixture.put(0)
     with (
         Scene.open(folder / "first", budget_bytes=ROOM) as one,
         Scene.open(folder / "second", budget_bytes=ROOM) as two,
     ):
         size = one.info().resident_bytes
-        # A third of what is asked is about the wall that generation 1 has alone.
+        # A third of the requests concern the wall that only generation 1 has.
         scan = read_thinned([folder / "facade.laz"], points, 2000)
         places = np.concatenate([scan, rng.choice(_wall(), len(scan) // 2)])
         pool = make_pool((one, two), requests, places, rng)
-    ground.pool.write_bytes(pickle.dumps(pool))
+    fixture.pool.write_bytes(pickle.dumps(pool))
     assert made.points == points
-    return ground._replace(cache=int(size * CACHE_SHARE))
+    return fixture._replace(cache=int(size * CACHE_SHARE))
 
 
 def judge_claims(folder: Path) -> tuple[int, int]:
-    """Return how many frames were said to end clear though something was unknown, and how many of them do not."""
+    """Return the number of frames reported clear with something unknown, and how many of them touch."""
     claims = [json.loads(line) for path in folder.glob("claims-*.jsonl") for line in whole_lines(path)]
     touching = []
     for name in ("first", "second"):
@@ -126,19 +127,19 @@ def judge_claims(folder: Path) -> tuple[int, int]:
 
 
 def whole_lines(path: Path) -> list[str]:
-    """Return the lines of a file of JSON objects; the last one may be cut, by a kill."""
+    """Return the lines of a file of JSON objects, without a last one that a kill cut off."""
     return [line for line in path.read_text().splitlines() if line.endswith("}")]
 
 
 def _wall() -> Arrays:
-    """Points of a wall across the ground before the façade, which generation 1 has and generation 0 has not."""
+    """Return the points of a wall in front of the façade, which only generation 1 has."""
     x, z = np.meshgrid(np.arange(-5.0, 5.0, 0.05), np.arange(0.0, 2.5, 0.05))
     return np.column_stack([x.ravel(), np.full(x.size, -2.0), z.ravel()])
 
 
 @contextmanager
 def with_avatars(scene: Any) -> Iterator[Any]:
-    """A scene that knows the avatars."""
+    """Add the avatars to a scene, and yield it."""
     for name, (points, radius) in AVATARS.items():
         scene.add_avatar(name, points, radius)
     yield scene
@@ -147,7 +148,7 @@ def with_avatars(scene: Any) -> Iterator[Any]:
 def make_pool(
     scenes: tuple[Scene, ...], count: int, places: Arrays, rng: np.random.Generator
 ) -> list[Request]:
-    """Make so many requests about what is near the places (n, 3), and answer them of each scene."""
+    """Return `count` requests near the places (n, 3), with the answer of each scene."""
     for scene in scenes:
         with with_avatars(scene):
             pass
@@ -162,7 +163,7 @@ def make_pool(
 
 
 def ask(scene: Any, op: str, arguments: tuple[Any, ...], parameters: dict[str, Any]) -> Any:
-    """Ask a scene or a client one question; a path is answered by its parts, joined."""
+    """Send one query to a scene or a client; join the parts of a path."""
     if op != "path":
         return getattr(scene, op)(*arguments, **parameters)
     from solidcloud.schemas.wire.path_messages import part_to_answers
@@ -172,7 +173,7 @@ def ask(scene: Any, op: str, arguments: tuple[Any, ...], parameters: dict[str, A
 
 
 def near(rng: np.random.Generator, places: Arrays, count: int) -> Arrays:
-    """Return points (k, 3), most of them some decimetres from one of the places."""
+    """Return points (k, 3), most of them within decimetres of one of the places."""
     found: Arrays = rng.choice(places, count) + rng.normal(0.0, 0.3, (count, 3))
     return found
 
@@ -189,7 +190,7 @@ def poses_near(rng: np.random.Generator, places: Arrays, count: int) -> Arrays:
 
 
 def _moved(rng: np.random.Generator, poses: Arrays, far: float) -> Arrays:
-    """Return the poses, each shifted a little."""
+    """Return the poses, each shifted by at most `far` [m]."""
     there = poses.copy()
     there[:, :3, 3] += rng.uniform(-far, far, (len(poses), 3)) * [1, 1, 0.1]
     return there
@@ -219,7 +220,7 @@ def _raycast(rng: np.random.Generator, places: Arrays) -> Any:
     return (near(rng, places, 12), rng.normal(size=(12, 3)), 12.0), {}
 
 
-# What is asked, and with which arguments and parameters.
+# Query -> function that makes its arguments and parameters.
 _MAKERS: dict[str, Any] = {
     "collide": lambda rng, places: ((_avatar(rng), poses_near(rng, places, 12)), {"margin": 0.02}),
     "distance": lambda rng, places: ((_avatar(rng), poses_near(rng, places, 4), 0.6), {}),

@@ -1,4 +1,4 @@
-"""The server of a chaos run, life after life: started, killed, asked to stop, and watched."""
+"""The servers of a chaos run, one after another: started, killed, terminated and observed."""
 
 import os
 import signal
@@ -13,19 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import board as b
-from .ground import SCENE, Ground
+from . import scoreboard as b
+from .fixtures import SCENE, Fixture
 
 START_SECONDS = 300.0  # the first start on a machine compiles
 STOP_SECONDS = 60.0
 WATCH_PERIOD = 0.5
 
 
-class Quiet(NamedTuple):
-    """What a server holds while nobody asks. life: which.  at: when [s].  threads: by name.  files: by kind or name.
+class QuietPoint(NamedTuple):
+    """Resources of a server while no client sends queries.
 
-    rss: bytes resident.  of_files: those of them that are a file's, so that the system may take them back.
-    calm: whether the server had dropped all avatars that nobody used.
+    life: number of the server.  at: time [s].  threads: by name.  files: by kind or name.
+    rss: resident bytes.  of_files: those that belong to files, which the system may reclaim.
+    calm: whether the server had dropped all unused avatars.
     """
 
     life: int
@@ -37,24 +38,24 @@ class Quiet(NamedTuple):
     calm: bool
 
 
-class Stop(NamedTuple):
-    """One SIGTERM. begin: when [s].  seconds: until it ended.  code: that it ended with."""
+class Shutdown(NamedTuple):
+    """One SIGTERM. begin: time [s].  seconds: until the server ended.  code: its exit code."""
 
     begin: float
     seconds: float
     code: int
 
 
-class Lives:
-    """One server after another at one endpoint."""
+class ServerRuns:
+    """Servers that follow one another at one endpoint."""
 
-    def __init__(self, ground: Ground, endpoint: str, board: b.Board, log: Path) -> None:
-        self.ground, self.endpoint, self.board = ground, endpoint, board
+    def __init__(self, fixture: Fixture, endpoint: str, board: b.Scoreboard, log: Path) -> None:
+        self.fixture, self.endpoint, self.scoreboard = fixture, endpoint, board
         self.log = log.open("ab")
         self.number = 0
         self.serving_at = 0.0
-        self.stops: list[Stop] = []
-        self.quiet: list[Quiet] = []
+        self.stops: list[Shutdown] = []
+        self.quiet: list[QuietPoint] = []
         self.memory: list[tuple[int, float, int]] = []  # life, time, RSS
         self.died: list[int] = []  # exit codes of servers that ended by themselves
         self._process: subprocess.Popen | None = None
@@ -62,16 +63,16 @@ class Lives:
 
     @property
     def pid(self) -> int:
-        """Return the process id of the server that is up."""
+        """Return the process id of the running server."""
         assert self._process is not None
         return self._process.pid
 
     def start(self) -> None:
-        """Start a server, and return when it says that it serves."""
+        """Start a server, and return when it serves."""
         self._tell(up=True)
         self.number += 1
-        command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(self.ground.live)]
-        command += ["--name", SCENE, "--listen", self.endpoint, "--cache", str(self.ground.cache)]
+        command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(self.fixture.live)]
+        command += ["--name", SCENE, "--listen", self.endpoint, "--cache", str(self.fixture.cache)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self.log, text=True)
         timer = threading.Timer(START_SECONDS, process.kill)
         timer.start()
@@ -85,11 +86,11 @@ class Lives:
         self._process = process
 
     def running(self) -> bool:
-        """Return whether the server has not ended by itself; notes the code it ended with."""
+        """Return whether the server runs. Record the exit code of one that ended by itself."""
         if self._process is None or self._process.poll() is None:
             return self._process is not None
         self.died.append(self._process.returncode)
-        self._gone()
+        self._mark_ended()
         return False
 
     def kill(self) -> None:
@@ -97,10 +98,10 @@ class Lives:
         if self._process is not None:
             self._process.kill()
             self._process.wait()
-            self._gone()
+            self._mark_ended()
 
     def terminate(self) -> None:
-        """Ask the server to stop, and note how long it takes."""
+        """Terminate the server, and record how long it takes."""
         if self._process is None:
             return
         begin = time.monotonic()
@@ -110,15 +111,15 @@ class Lives:
         except subprocess.TimeoutExpired:
             self._process.kill()
             code = self._process.wait()
-        self.stops.append(Stop(begin, time.monotonic() - begin, code))
-        self._gone()
+        self.stops.append(Shutdown(begin, time.monotonic() - begin, code))
+        self._mark_ended()
 
     def hang_up(self) -> None:
-        """Ask the server to reload."""
+        """Make the server reload, by SIGHUP."""
         os.kill(self.pid, signal.SIGHUP)
 
-    def look(self, *, calm: bool) -> None:
-        """Note what the server holds; for moments when nobody asks. calm: see `Quiet`."""
+    def record_quiet_point(self, *, calm: bool) -> None:
+        """Record the server's resources while no client sends queries. calm: see `QuietPoint`."""
         folder = Path("/proc") / str(self.pid)
         threads = Counter((task / "comm").read_text().strip() for task in (folder / "task").iterdir())
         files: Counter[str] = Counter()
@@ -126,13 +127,14 @@ class Lives:
             with suppress(OSError):  # closed meanwhile
                 files[entry.readlink().name.partition(":")[0]] += 1
         self.quiet.append(
-            Quiet(self.number, time.monotonic(), dict(threads), dict(files), *_resident(self.pid), calm)
+            QuietPoint(self.number, time.monotonic(), dict(threads), dict(files), *_resident(self.pid), calm)
         )
 
     def slope(self) -> tuple[float, float] | None:
-        """Return the slope of the last life's memory once settled [MB a minute], and the minutes it was seen for.
+        """Return the growth of the last server's memory [MB a minute], and the minutes it was observed.
 
-        Memory is what is no file's, at calm quiet points. None: they are too few, or less than a minute apart.
+        Memory of files is excluded. Only calm quiet points count. None: there are too few of them, or
+        they are less than a minute apart.
         """
         seen = np.array(
             [(q.at, q.rss - q.of_files) for q in self.quiet if q.life == self.number and q.calm], np.float64
@@ -142,8 +144,8 @@ class Lives:
         rate = np.polyfit(seen[:, 0] - seen[0, 0], seen[:, 1], 1)[0]
         return float(rate * 60 / 1e6), float(seen[-1, 0] - seen[0, 0]) / 60
 
-    def _gone(self) -> None:
-        """Tell that no server is up."""
+    def _mark_ended(self) -> None:
+        """Tell the clients that no server is up."""
         assert self._process is not None and self._process.stdout is not None
         self._process.stdout.close()
         self._process = None
@@ -151,11 +153,11 @@ class Lives:
 
     def _tell(self, *, up: bool) -> None:
         """Tell the clients whether a server may be up."""
-        self.board.driver[b.EPOCH] += 1
-        self.board.driver[b.UP] = up
+        self.scoreboard.driver[b.EPOCH] += 1
+        self.scoreboard.driver[b.UP] = up
 
     def _watch(self) -> None:
-        """Note the server's memory, until this process ends."""
+        """Record the server's memory until this process ends."""
         while True:
             process = self._process
             if process is not None:
@@ -166,7 +168,7 @@ class Lives:
 
 
 def _resident(process: int) -> tuple[int, int]:
-    """Return the memory that a process has resident, and that of it that is files' [bytes]."""
+    """Return a process's resident memory, and the part of it that belongs to files [bytes]."""
     _, resident, shared, *_ = Path(f"/proc/{process}/statm").read_text().split()
     page = os.sysconf("SC_PAGE_SIZE")
     return int(resident) * page, int(shared) * page

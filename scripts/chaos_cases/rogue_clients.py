@@ -1,6 +1,6 @@
-"""Processes that do harm for a few seconds each: rogues, floods, heavy requests, invented ids.
+"""Rogue clients, each a process of a few seconds: false answers, floods, heavy requests, invented ids.
 
-They speak zenoh themselves, as a client that is not ours would.
+They use zenoh directly, as a foreign client would.
 """
 
 import itertools
@@ -20,29 +20,29 @@ from solidcloud.schemas.wire.encoding import MSGPACK, encode
 from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, ContactsRequest, make_poses
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
-from .ground import SCENE
+from .fixtures import SCENE
 
 ENCODING = zenoh.Encoding(MSGPACK)
-# Keys that meet the questions of all clients of the scene, or their states.
+# Keys that match the queries of all clients of the scene, or their states.
 WIDE = widths(SCENE, "*")
 
 
 def _open(endpoint: str, mode: str) -> zenoh.Session:
-    """Open a session that is connected to the server and obeys nobody."""
+    """Open a session with the server, without access control."""
     config = session_config(connect=endpoint)
     config.insert_json5("mode", f'"{mode}"')
     return zenoh.open(config)
 
 
 def _lie(query: Any) -> None:
-    """Answer a question with zeros: clear, whatever was asked."""
+    """Answer a query with zeros, which mean clear."""
     with query:
         if query.payload is not None:
             query.reply(query.key_expr, zeros(query), encoding=ENCODING)
 
 
 def rogue(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
-    """Declare queryables under wide keys that answer `clear`, tokens of others, and publish states and wishes."""
+    """Answer `clear` under wide keys, declare tokens of other clients, publish states and motion commands."""
     rng = np.random.default_rng(seed)
     mode = str(rng.choice(["client", "peer"]))
     try:
@@ -70,7 +70,7 @@ def rogue(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
 
 
 def flood(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
-    """Keep 1,000 questions of one client in flight."""
+    """Keep 1,000 queries of one client in flight."""
     client = f"flood{seed}"
     poses = make_poses(np.tile(np.eye(4), (20, 1, 1)))
     with (
@@ -97,7 +97,7 @@ def flood(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
 
 
 def heavy(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
-    """Ask for all contacts of 200,000 points at a margin of 3 m, under two ids, and go before the answer."""
+    """Request all contacts of 200,000 points at a margin of 3 m, under two ids; leave before the answer."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (200_000, 3))
     poses = make_poses(np.tile(np.eye(4), (2000, 1, 1)))
@@ -119,7 +119,7 @@ def heavy(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
 
 
 def invented(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
-    """Add avatars under one invented id after the other, and declare no token."""
+    """Add avatars under one invented id after another, without a token."""
     rng = np.random.default_rng(seed)
     request = encode(AddAvatarRequest("body", rng.uniform(-1, 1, (2000, 3)), 0.01))
     with _open(endpoint, "peer") as session:
@@ -132,16 +132,16 @@ def invented(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
 
 
 def usurper(folder: Path, endpoint: str, seed: int, seconds: float) -> None:
-    """Listen where the server did, while it is away, and answer `clear` to whoever connects."""
+    """Listen at the server's endpoint while it is down, and answer `clear` to all clients."""
     config = session_config(listen=endpoint)
     config.insert_json5("access_control/enabled", "false")
     with zenoh.open(config) as session, session.declare_queryable("solidcloud/**", _lie, complete=True):
         time.sleep(seconds)
 
 
-STRANGERS = {"rogue": rogue, "flood": flood, "heavy": heavy, "invented": invented}
+ROGUE_CLIENTS = {"rogue": rogue, "flood": flood, "heavy": heavy, "invented": invented}
 
 
 def main(kind: str, folder: Path, endpoint: str, seed: int, seconds: float) -> None:
-    """Be one of them, or what takes a dead server's place."""
-    (STRANGERS | {"usurper": usurper})[kind](folder, endpoint, seed, seconds)
+    """Run one kind of rogue client, or the usurper of a dead server's endpoint."""
+    (ROGUE_CLIENTS | {"usurper": usurper})[kind](folder, endpoint, seed, seconds)

@@ -1,6 +1,6 @@
-"""The driver of a chaos run: starts a server and its clients, and does one harm after another to both.
+"""The driver of a chaos run: starts a server and its clients, and injects one fault after another.
 
-All that decides what is done comes from one seed; when it is done, and so what is answered, does not.
+The faults are chosen by one seed. Their timing, and therefore the answers, are not reproducible.
 """
 
 import multiprocessing
@@ -21,38 +21,39 @@ from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.server.client import Client
 
-from . import board as b
-from . import clients, strangers
-from .ground import GENERATIONS, SCENE, Ground
-from .lives import Lives
+from . import clients, rogue_clients
+from . import scoreboard as b
+from .fixtures import GENERATIONS, SCENE, Fixture
+from .server_restarts import ServerRuns
 
 CLIENTS = 16
-# The last of the clients ask under several ids each.
+# The last SEVERAL clients have IDS ids each.
 SEVERAL, IDS = 2, 6
 QUIET_EVERY = 30.0
 READY_SECONDS = 60.0
 RIGHT_SECONDS = 20.0
-# Harm and how often it is done; the first two are of the part of a run in which servers die.
-KILLS = {"kill server": 3, "terminate server": 2}
-HARM = {
+# Faults and their frequencies; SERVER_FAULTS only in the part of a run in which servers are killed.
+SERVER_FAULTS = {"kill server": 3, "terminate server": 2}
+FAULTS = {
     "kill client": 4, "freeze client": 4, "rogue": 4, "flood": 3, "heavy": 2, "invented": 2, "reload": 4, "hang up": 3,
     "flip bytes": 4, "flip index": 2, "truncate": 3, "read errors": 2,
 }  # fmt: skip
 
 
-# Harm that leaves avatars behind, which the server keeps for a minute. At the end of each period of the last life none
-# is done for so long that the server has dropped them all [s]; memory is judged then.
+# Faults that leave avatars behind, which the server keeps for a minute. At the end of each period of
+# the last server, none is injected for so long that the server has dropped them all [s]; its memory
+# is then measured.
 LEAVES_AVATARS = ("invented", "heavy")
 PERIOD, CALM, DROPPED = 120.0, 75.0, 70.0
 
 
 def _forking() -> Any:
-    """Return what forks processes that have imported all they need: 16 that import it anew take a minute."""
+    """Return a context that forks processes with their imports done: 16 separate imports take a minute."""
     from multiprocessing import forkserver
 
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["chaos_cases.clients", "chaos_cases.strangers"])
-    # The process that forks does not take over sys.path, and says nothing of what it cannot import.
+    context.set_forkserver_preload(["chaos_cases.clients", "chaos_cases.rogue_clients"])
+    # The process that forks does not inherit sys.path, and does not report failed imports.
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
     try:
@@ -64,16 +65,16 @@ def _forking() -> Any:
     return context
 
 
-class Storm:
-    """One run. board, lives: what is told and what is served."""
+class ChaosRun:
+    """One chaos run."""
 
     def __init__(
-        self, folder: Path, ground: Ground, endpoint: str, seed: int, without: Sequence[str], say: Any
+        self, folder: Path, fixture: Fixture, endpoint: str, seed: int, without: Sequence[str], say: Any
     ) -> None:
-        self.folder, self.ground, self.endpoint, self.seed, self.say = folder, ground, endpoint, seed, say
+        self.folder, self.fixture, self.endpoint, self.seed, self.say = folder, fixture, endpoint, seed, say
         self.random = random.Random(seed)
-        self.board = b.Board(folder / "board", CLIENTS)
-        self.lives = Lives(ground, endpoint, self.board, folder / "server.log")
+        self.scoreboard = b.Scoreboard(folder / "board", CLIENTS)
+        self.server_runs = ServerRuns(fixture, endpoint, self.scoreboard, folder / "server.log")
         self.done: Counter[str] = Counter()
         self.recovery: list[float] = []
         self.stuck: list[str] = []
@@ -82,18 +83,18 @@ class Storm:
         self._clients: dict[int, Any] = {}
         self._born: dict[int, float] = {}
         self._frozen: dict[int, float] = {}
-        self._strangers: list[tuple[Any, float]] = []
-        self._disturbed = 0.0  # when harm was last done that leaves avatars behind
-        self._harm = dict(HARM)
+        self._rogues: list[tuple[Any, float]] = []
+        self._disturbed = 0.0  # time of the last fault that leaves avatars behind
+        self._faults = dict(FAULTS)
         for kind in [*without, *(() if has_strace() else ("read errors",))]:
-            self._harm.pop(kind, None)
+            self._faults.pop(kind, None)
 
     def run(self, seconds: float) -> None:
-        """Do harm for so long; servers die in the first 0.4 of it."""
-        self.board.driver[b.HEARTBEAT] = time.monotonic()
-        threading.Thread(target=self._live, daemon=True).start()
+        """Inject faults for `seconds`; servers are killed in the first 0.4 of it."""
+        self.scoreboard.driver[b.HEARTBEAT] = time.monotonic()
+        threading.Thread(target=self._send_heartbeats, daemon=True).start()
         self._serve(0)
-        self.lives.start()
+        self.server_runs.start()
         try:
             for slot in range(CLIENTS):
                 self._start_client(slot)
@@ -105,38 +106,38 @@ class Storm:
             periods = 0
             while (now := time.monotonic()) < begin + seconds:
                 deadly = now < begin + 0.4 * seconds
-                lived = now - self.lives.serving_at
+                lived = now - self.server_runs.serving_at
                 calm = not deadly and lived % PERIOD > PERIOD - CALM
-                kinds = self._harm | (KILLS if deadly else {})
+                kinds = self._faults | (SERVER_FAULTS if deadly else {})
                 kinds = {
                     kind: often for kind, often in kinds.items() if not (calm and kind in LEAVES_AVATARS)
                 }
                 if not deadly and int(lived / PERIOD) > periods:
-                    self._quiet(calm=now - self._disturbed > DROPPED)
+                    self._record_quiet_point(calm=now - self._disturbed > DROPPED)
                 periods = int(lived / PERIOD)
                 kind = self.random.choices(list(kinds), list(kinds.values()))[0]
                 self.say(f"{now - begin:6.1f} s  {kind}")
-                self._do(kind)
+                self._inject(kind)
                 self._pause(self.random.uniform(0.2, 1.2))
                 if time.monotonic() > quiet_at or time.monotonic() > begin + seconds:
-                    self._quiet()
+                    self._record_quiet_point()
                     quiet_at = time.monotonic() + QUIET_EVERY
             self._heal()
             self._recover(time.monotonic())
         finally:
             self._end()
 
-    def _do(self, kind: str) -> None:
-        """Do one harm."""
+    def _inject(self, kind: str) -> None:
+        """Inject one fault."""
         self.done[kind] += 1
         if kind in LEAVES_AVATARS:
             self._disturbed = time.monotonic()
-        if kind in strangers.STRANGERS:
-            self._stranger(kind)
+        if kind in rogue_clients.ROGUE_CLIENTS:
+            self._start_rogue(kind)
         elif kind == "kill server":
             self._kill_server()
         elif kind == "terminate server":
-            self.lives.terminate()
+            self.server_runs.terminate()
             self._pause(self.random.uniform(0.0, 1.0))
             self._restart()
         elif kind == "kill client":
@@ -157,16 +158,16 @@ class Storm:
             self._damage(kind)
 
     def _kill_server(self) -> None:
-        """Kill the server, now and then while it reloads; let another take its place, now and then; start one."""
+        """Kill the server, sometimes during a reload, sometimes with a usurper at its endpoint; restart it."""
         if self.random.random() < 0.3:
             self._offer((self.generation + 1) % GENERATIONS)
-            self.lives.hang_up()
+            self.server_runs.hang_up()
             self._pause(self.random.uniform(0.0, 0.3))
-        self.lives.kill()
+        self.server_runs.kill()
         if self.random.random() < 0.5:
             self.done["usurper"] += 1
             args = ("usurper", self.folder, self.endpoint, 0, 60.0)
-            process = self._context.Process(target=strangers.main, args=args, daemon=True)
+            process = self._context.Process(target=rogue_clients.main, args=args, daemon=True)
             process.start()
             self._pause(self.random.uniform(1.0, 3.0))
             process.kill()
@@ -175,17 +176,17 @@ class Storm:
         self._restart()
 
     def _restart(self) -> None:
-        """Start another server, and time how long the clients take to hear right answers again."""
+        """Start another server, and measure when its clients receive right answers again."""
         surviving = [
             slot for slot, row in ((slot, self._client_row(slot)) for slot in self._clients)
             if row[b.RIGHT_AT] > self._born[slot] and slot not in self._frozen
         ]  # fmt: skip
-        self.lives.start()
+        self.server_runs.start()
         self._serve(self.generation)
-        self._recover(self.lives.serving_at, surviving)
+        self._recover(self.server_runs.serving_at, surviving)
 
     def _recover(self, since: float, slots: list[int] | None = None) -> None:
-        """Note how long after `since` each of the clients heard its first right answer."""
+        """Record how long after `since` each client received its first right answer."""
         slots = [slot for slot in self._clients if slot not in self._frozen] if slots is None else slots
         self._until(lambda: all(self._client_row(slot)[b.RIGHT_AT] > since for slot in slots), RIGHT_SECONDS)
         took: list[float] = []
@@ -204,12 +205,12 @@ class Storm:
     def _serve(self, generation: int) -> None:
         """Tell that this generation, and no other, is served."""
         self.generation = generation
-        self.board.serve(1 << generation)
+        self.scoreboard.serve(1 << generation)
 
     def _offer(self, generation: int) -> None:
         """Put a generation into the folder, which may be served from now on."""
-        self.board.serve(1 << generation | 1 << self.generation)
-        self.ground.put(generation)
+        self.scoreboard.serve(1 << generation | 1 << self.generation)
+        self.fixture.put(generation)
         self.generation = generation
 
     def _switch(self, *, hang_up: bool) -> None:
@@ -221,7 +222,7 @@ class Storm:
         """Have the server serve what is in the folder; False where it does not say that it does."""
         deadline = time.monotonic() + READY_SECONDS
         if hang_up:
-            self.lives.hang_up()
+            self.server_runs.hang_up()
         while time.monotonic() < deadline:
             self._beat()
             try:
@@ -241,16 +242,16 @@ class Storm:
     # Files
 
     def _damage(self, kind: str) -> None:
-        """Damage what the server reads, and mend it a moment later."""
+        """Damage the server's files, and restore them soon after."""
         if kind == "read errors":
             self._read_errors()
         elif kind == "flip index":
-            self._flip(self.ground.live / INDEX_NAME, 3)
+            self._flip(self.fixture.live / INDEX_NAME, 3)
             with suppress(SolidcloudError), Client(self.endpoint, scene=SCENE) as client:
                 client.reload()
-            self.ground.put(self.generation)
+            self.fixture.put(self.generation)
         else:
-            for path in self.ground.shards():
+            for path in self.fixture.shards():
                 if kind == "flip bytes":
                     self._flip(path, 40)
                 else:
@@ -259,13 +260,13 @@ class Storm:
         self._heal()
 
     def _heal(self) -> None:
-        """Give all files their bytes back, and have the server open them."""
-        self.ground.mend()
-        self.ground.put(self.generation)
+        """Restore all files, and make the server reload."""
+        self.fixture.mend()
+        self.fixture.put(self.generation)
         self._reload()
 
     def _flip(self, path: Path, count: int) -> None:
-        """Flip so many bits of a file, in place."""
+        """Flip `count` bits of a file, in place."""
         size = path.stat().st_size
         with path.open("r+b") as file:
             for _ in range(count):
@@ -276,8 +277,8 @@ class Storm:
                 file.write(bytes([byte]))
 
     def _read_errors(self) -> None:
-        """Let every read of the server's files fail for a moment, as a disk that is dying does."""
-        command = ["strace", "-f", "-p", str(self.lives.pid), "-o", os.devnull]
+        """Make every read of the server's files fail for a moment, as a failing disk does."""
+        command = ["strace", "-f", "-p", str(self.server_runs.pid), "-o", os.devnull]
         command += ["-e", "trace=pread64", "-e", "inject=pread64:error=EIO"]
         with subprocess.Popen(command, stderr=subprocess.DEVNULL) as tracer:
             self._pause(self.random.uniform(0.5, 1.5))
@@ -296,55 +297,55 @@ class Storm:
         self._clients[slot], self._born[slot] = process, time.monotonic()
 
     def _thaw(self, slot: int) -> None:
-        """Let a frozen client go on."""
+        """Resume a frozen client."""
         if self._frozen.pop(slot, None) is not None:
             os.kill(self._clients[slot].pid, signal.SIGCONT)
 
-    def _stranger(self, kind: str) -> None:
-        """Start one that does harm for a few seconds."""
+    def _start_rogue(self, kind: str) -> None:
+        """Start a rogue client for a few seconds."""
         seconds = self.random.uniform(1.0, 4.0)
         args = (kind, self.folder, self.endpoint, self.random.randrange(1 << 32), seconds)
-        process = self._context.Process(target=strangers.main, args=args, daemon=True)
+        process = self._context.Process(target=rogue_clients.main, args=args, daemon=True)
         process.start()
-        self._strangers.append((process, time.monotonic() + seconds + 5.0))
+        self._rogues.append((process, time.monotonic() + seconds + 5.0))
 
     def _client_row(self, slot: int) -> Any:
-        return self.board.client(slot)
+        return self.scoreboard.client(slot)
 
     # Time
 
-    def _live(self) -> None:
-        """Say that the driver lives, for as long as it does."""
+    def _send_heartbeats(self) -> None:
+        """Send the driver's heartbeat until this process ends."""
         while True:
-            self.board.driver[b.HEARTBEAT] = time.monotonic()
+            self.scoreboard.driver[b.HEARTBEAT] = time.monotonic()
             time.sleep(1.0)
 
     def _beat(self) -> None:
-        """Do what is due."""
+        """Do the periodic work: thaw clients, end rogues, restart clients that ended."""
         now = time.monotonic()
         for slot in [slot for slot, until in self._frozen.items() if now > until]:
             self._thaw(slot)
-        for stranger in list(self._strangers):
-            if now > stranger[1]:
-                stranger[0].kill()
-            if not stranger[0].is_alive():
-                self._strangers.remove(stranger)
+        for rogue in list(self._rogues):
+            if now > rogue[1]:
+                rogue[0].kill()
+            if not rogue[0].is_alive():
+                self._rogues.remove(rogue)
         for slot, process in list(self._clients.items()):
-            if not process.is_alive() and not self.board.driver[b.STOP]:
+            if not process.is_alive() and not self.scoreboard.driver[b.STOP]:
                 self.stuck.append(f"client {slot} ended by itself, with exit code {process.exitcode}")
                 self._start_client(slot)
-        if self.lives.number and not self.lives.running() and self.board.driver[b.UP]:
+        if self.server_runs.number and not self.server_runs.running() and self.scoreboard.driver[b.UP]:
             self.say("the server ended by itself")
 
     def _pause(self, seconds: float) -> None:
-        """Wait."""
+        """Wait for some seconds, with periodic work."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self._beat()
             time.sleep(min(left, 0.05))
 
     def _until(self, met: Any, seconds: float) -> bool:
-        """Wait until a condition is met, for so long at most."""
+        """Wait until a condition is met, for at most `seconds`; return whether it is."""
         deadline = time.monotonic() + seconds
         while not met():
             if time.monotonic() > deadline:
@@ -353,33 +354,33 @@ class Storm:
             time.sleep(0.005)
         return True
 
-    def _quiet(self, *, calm: bool = False) -> None:
-        """Let everybody be still, and record what the server holds.
+    def _record_quiet_point(self, *, calm: bool = False) -> None:
+        """Pause all clients, and record the server's resources.
 
-        calm: the server has dropped all avatars that nobody uses.
+        calm: the server has dropped all unused avatars.
         """
         for slot in list(self._frozen):
             self._thaw(slot)
-        self._until(lambda: not self._strangers, 15.0)
+        self._until(lambda: not self._rogues, 15.0)
         self._until(lambda: all(row[b.RIGHT_AT] > self._born[s] for s, row in self._rows()), READY_SECONDS)
-        self.board.driver[b.PAUSE] = 1
+        self.scoreboard.driver[b.PAUSE] = 1
         if self._until(lambda: all(row[b.IDLE] for _, row in self._rows()), 15.0):
             self._pause(2.0)
-            self.lives.look(calm=calm)
+            self.server_runs.record_quiet_point(calm=calm)
         else:
             self.done["no quiet point"] += 1
-        self.board.driver[b.PAUSE] = 0
+        self.scoreboard.driver[b.PAUSE] = 0
 
     def _rows(self) -> list[tuple[int, Any]]:
         return [(slot, self._client_row(slot)) for slot in self._clients]
 
     def _end(self) -> None:
-        """End everybody, the server by SIGTERM, while the clients ask."""
+        """End all processes, the server first, by SIGTERM, while the clients send queries."""
         for slot in list(self._frozen):
             self._thaw(slot)
-        self.lives.terminate()
-        self.board.driver[b.STOP] = 1
-        for process in [*self._clients.values(), *(stranger for stranger, _ in self._strangers)]:
+        self.server_runs.terminate()
+        self.scoreboard.driver[b.STOP] = 1
+        for process in [*self._clients.values(), *(rogue for rogue, _ in self._rogues)]:
             process.join(10.0)
             process.kill()
             process.join()

@@ -1,7 +1,7 @@
 """A session in this process: an avatar of a client sends motion commands and receives states.
 
-The methods of the session that `Client.session` returns. Here each command is a frame of its own,
-simulated before `wish` returns, so its state is there at once.
+It has the methods of the session that `Client.session` returns. Each command is simulated as a
+separate frame before `wish` returns, so its state is available at once.
 """
 
 import threading
@@ -19,7 +19,7 @@ from ..scene_interface import FrameCommand, LatestState
 from .simulation import Simulation
 
 # Maximum number of states kept for `states`; of more, the oldest are dropped.
-_MOST_STATES = 1024
+_MAX_STATES = 1024
 
 
 class LocalSession:
@@ -30,7 +30,7 @@ class LocalSession:
         self._simulation, self._user = simulation, user
         self._commands = threading.Lock()  # held for a frame, so that states come in the order of commands
         self._changed = threading.Condition()
-        self._states: deque[State | SolidcloudError] = deque(maxlen=_MOST_STATES)
+        self._states: deque[State | SolidcloudError] = deque(maxlen=_MAX_STATES)
         self._latest: State | None = None
         self._error: SolidcloudError | None = None  # newer than `_latest`
         self._when = 0.0
@@ -70,8 +70,8 @@ class LocalSession:
         turn: with a velocity, about the scene's up axis [rad/s].  objects: poses of the scene's
         objects that this user moves.  time: of the command, on a clock that does not go back [s];
         None: of this process.
-        Raises BadRequestError for an invalid command, or if the session is closed. What the frame
-        was refused for, `latest`, `wait` and `states` raise.
+        Raises BadRequestError for an invalid command, or if the session is closed. If the frame is
+        refused, `latest`, `wait` and `states` raise its error.
         """
         array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
         speed = None if velocity is None else tuple(float(part) for part in velocity)
@@ -97,7 +97,7 @@ class LocalSession:
         return wish.seq
 
     def _keep(self, said: State | SolidcloudError) -> None:
-        """Keep what came of a frame for `latest`, `wait` and `states`."""
+        """Store the result of a frame for `latest`, `wait` and `states`."""
         with self._changed:
             if isinstance(said, SolidcloudError):
                 self._error = said
@@ -107,21 +107,22 @@ class LocalSession:
             self._changed.notify_all()
 
     def _raise_error(self) -> None:
-        """Raise, once, what was refused since the last state. To be called with `_changed` held."""
+        """Raise, once, the error of a frame refused since the last state. Call with `_changed` held."""
         error, self._error = self._error, None
         if error is not None:
             raise error
 
     def latest(self) -> LatestState | None:
-        """Return the last state and its age; None: there is none yet. Raise, once, a refusal since."""
+        """Return the last state and its age, or None before the first. Raise, once, a later error."""
         with self._changed:
             self._raise_error()
             return None if self._latest is None else LatestState(self._latest, monotonic() - self._when)
 
     def wait(self, seq: int, timeout: float = 5.0) -> State:
-        """Return the state of a command, or of a newer one. BusyError: none came within `timeout` [s].
+        """Return the state of a command, or of a newer one.
 
-        Raises, once, what was refused since the last state.
+        Raises BusyError if none came within `timeout` [s], and, once, the error of a frame refused
+        since the last state.
         """
 
         def reached() -> bool:
@@ -137,8 +138,8 @@ class LocalSession:
     def states(self, timeout: float = 5.0) -> Iterator[State]:
         """Yield each state in order, until none came for `timeout` [s] or the session is closed.
 
-        Of more than 1,024 that nobody took, the oldest are left out. Raises what was refused, at its
-        place among them.
+        At most 1,024 states are kept; of more, the oldest are dropped. Raises the error of a refused
+        frame at its place among them.
         """
         while True:
             with self._changed:

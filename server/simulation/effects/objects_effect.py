@@ -1,6 +1,6 @@
 """Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
 
-Motion commands place a kinematic object (`Bodies.tell`), whatever is at that pose. A pushed object
+Motion commands place a kinematic object (`Bodies.place_objects`), even into users. A pushed object
 is moved by the user whose motion it ended: by the remaining translation, level, as far as the
 object touches nothing on its way. Then the user follows. The object has no momentum: it never moves
 farther than its user's motion command, and stands when nobody pushes. An object that touches the

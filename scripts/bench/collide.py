@@ -13,7 +13,7 @@ from .sides import BRUTE, CAPT, COLLIDE, SCIPY, TABLE, compare_set, evenly
 CASE = "façade"
 WALK, FAR, NEAR, CONTACT = "walk", "far", "clear, near", "contact"
 FAR_POSES = 600
-TABLE_PART, CAPT_PART, FAR_MOST, CONTACT_MOST = 0.25, 0.15, 2.0, 10.0
+TABLE_PART, CAPT_PART, MAX_FAR_US, MAX_CONTACT_US = 0.25, 0.15, 2.0, 10.0
 
 
 def pose_sets(bench: Bench) -> list[PoseSet]:
@@ -81,10 +81,10 @@ def _goals(part: Part, ours: list[str]) -> None:
             measured = ratio(mean, part.value(walk, peer, COLLIDE))
             part.goal(f"collide {key}", f"collide, walk: mean / {peer} ({name})", measured, share, "x")
         far = [f.value for f in part.figures if f.side == name and f.case.endswith(FAR) and f.what == COLLIDE]
-        part.goal("collide far", f"collide, far poses ({name})", max(far, default=None), FAR_MOST, "µs")
+        part.goal("collide far", f"collide, far poses ({name})", max(far, default=None), MAX_FAR_US, "µs")
         touching = part.value(f"{CASE}, walk, {CONTACT}", name, COLLIDE)
         part.goal(
-            "collide contact", f"collide, colliding poses of the walk ({name})", touching, CONTACT_MOST, "µs"
+            "collide contact", f"collide, colliding poses of the walk ({name})", touching, MAX_CONTACT_US, "µs"
         )
         scipy = ratio(part.value(walk, SCIPY, COLLIDE), mean)
         if scipy is not None:

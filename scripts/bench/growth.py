@@ -28,7 +28,7 @@ from .sides import COLLIDE, OURS, Contender, time_in_turn, timer
 
 FACADES = (2, 17, 170)
 DEFAULT_FACADES = FACADES[:2]
-MOST = 1.3
+MAX_GROWTH = 1.3
 CASE = "growth"
 
 
@@ -90,9 +90,9 @@ def run(bench: Bench, clock: Clock) -> Part:
     first, *others = [float(np.median(spent)) for spent in times.values()]
     whole = len(sizes) == len(FACADES)
     part.remarks.append("each town has the radius of its own mean closest-point distance, as the default is")
-    part.goal("growth", "collide, 10⁸ points / 10⁶ points", others[-1] / first if whole else None, MOST, "x")
+    part.goal("growth", "collide, 10⁸ points / 10⁶ points", others[-1] / first if whole else None, MAX_GROWTH, "x")
     if not whole:
-        part.goal("growth", "collide, 10⁷ points / 10⁶ points", others[-1] / first, MOST, "x")
+        part.goal("growth", "collide, 10⁷ points / 10⁶ points", others[-1] / first, MAX_GROWTH, "x")
         part.missing.append("10⁸ points: give --growth FOLDER, where the archives are, or stay once made")
     return part
 

@@ -12,7 +12,7 @@ from .machine import Clock
 from .results import Part
 
 BYTES_A_POINT, DECODE_MS = 10.0, 5.0
-MOST_LOADS = 40
+MAX_LOADS = 40
 
 
 def run(bench: Bench, clock: Clock) -> Part:
@@ -40,7 +40,7 @@ def _loads(bench: Bench, clock: Clock, part: Part, store: VoxelStore, name: str)
     arena = ArenaBuffer(ArenaBuffer.rounded(int(store.sizes[row]))).arena
     read, decoded, whole = [], [], []
     store.load(row, arena, 0)
-    for _ in clock.loops(max(bench.loops, MOST_LOADS), 0.4):
+    for _ in clock.loops(max(bench.loops, MAX_LOADS), 0.4):
         begin = time.perf_counter()
         store.archive.read_frames(row)
         middle = time.perf_counter()

@@ -15,7 +15,7 @@ from .results import Part, ratio
 from .sides import BRUTE, COLLIDE, SCIPY, Contender, evenly, time_in_turn, timer
 
 REACH = 0.5  # reach of distance [m]
-AT_MOST, AT_LEAST = 2.0, 10_000.0
+MAX_RATIO, MIN_RATE = 2.0, 10_000.0
 DISTANCE = "distance, witness, 0.5 m"
 NEARLY = 1e-6  # tolerance: scipy sums distances in float64 in another order [m]
 SCIPY_POSES = 60
@@ -77,12 +77,12 @@ def _distance(bench: Bench, clock: Clock, part: Part, name: str, scene: Scene) -
         part.add(case, name, what, spent, "µs", len(clear))
     measured = ratio(part.value(case, name, DISTANCE), part.value(case, name, COLLIDE))
     part.goal(
-        "distance collide", f"distance / stateless collide, clear poses ({name})", measured, AT_MOST, "x"
+        "distance collide", f"distance / stateless collide, clear poses ({name})", measured, MAX_RATIO, "x"
     )
     times = time_in_turn([contenders[1]], walk, bench.loops, clock, bench.rng, 0.2)[DISTANCE]
     rate = part.add(f"walk, {name}", name, DISTANCE, [1e6 / t for t in times], "poses/s", len(walk))
     part.goal(
-        "distance rate", f"distance, all poses of the walk ({name})", rate, AT_LEAST, "poses/s", at_least=True
+        "distance rate", f"distance, all poses of the walk ({name})", rate, MIN_RATE, "poses/s", at_least=True
     )
     _judge_distance(bench, part, name, scene, case)
 

@@ -23,7 +23,7 @@ ROW = (1, 1, 2, 4)
 SCRIPTS = Path(__file__).resolve().parent.parent
 
 
-class Ground:
+class ReferenceBuild:
     """Scans, the archive that an undisturbed build makes of them, and the duration of that build."""
 
     def __init__(self, folder: Path) -> None:
@@ -39,7 +39,7 @@ class Ground:
         if code != 0:
             raise RuntimeError(f"a build here exited with {code}: {(folder / 'warm.log').read_text()}")
         begin = time.perf_counter()
-        self.reference = content(self._undisturbed("reference"))
+        self.files = content(self._undisturbed("reference"))
         self.seconds = time.perf_counter() - begin
         log = self._built("counted", CountCalls())
         self.calls = int(log.rpartition("calls ")[2])
@@ -76,7 +76,7 @@ class Ground:
     def case(self, jobs: int = 1, overwrite: bool = False) -> Case:
         """Return a new target."""
         self._cases += 1
-        case = Case(self.folder / f"case-{self._cases}", self.scans, self.reference, jobs)
+        case = Case(self.folder / f"case-{self._cases}", self.scans, self.files, jobs)
         if overwrite:
             case.put_old(self.old)
         return case
@@ -92,7 +92,7 @@ def check_finish(case: Case, tally: Tally, what: str, **how: object) -> None:
     tally.add(what, faults, **how)
 
 
-def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
+def forked_kills(reference: ReferenceBuild, kills: int, seed: int, tally: Tally) -> None:
     """Kill builds of one process in forks.
 
     Half of them are killed at a random moment, half at a random call of CALLS.
@@ -100,18 +100,18 @@ def forked_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
     rng = random.Random(seed)
     done = 0
     while done < kills:
-        case = ground.case(overwrite=rng.random() < 0.2)
+        case = reference.case(overwrite=rng.random() < 0.2)
         hows: list[str] = []
         how = {"seed": seed, "kills": hows, "overwrite": bool(case.old)}
         for turn in range(min(rng.choice(ROW), kills - done)):
             # Finished work is not repeated: each repetition is shorter.
             by_call, span = rng.random() < 0.5, 1 / (turn + 1)
             if by_call:
-                trap = KillAt(rng.randint(1, round(ground.calls * span)), rng.random() < 0.5)
+                trap = KillAt(rng.randint(1, round(reference.calls * span)), rng.random() < 0.5)
                 hows.append(f"call {trap.number}{' after' if trap.after else ''}")
                 child = build(case.arguments(), case.folder.with_suffix(".log"), trap)
             else:
-                delay = rng.uniform(0, ground.seconds * span)
+                delay = rng.uniform(0, reference.seconds * span)
                 hows.append(f"{delay:.3f} s")
                 child = Child(case.arguments(), case.folder.with_suffix(".log"))
                 child.go()
@@ -139,16 +139,16 @@ def _after_kill(case: Case, status: int | None, said: str, tally: Tally, **how: 
     tally.add("killed", faults, **how)
 
 
-def real_kills(ground: Ground, kills: int, seed: int, tally: Tally) -> None:
+def real_kills(reference: ReferenceBuild, kills: int, seed: int, tally: Tally) -> None:
     """Kill real commands, each in a separate process group, with one job and with two."""
     rng = random.Random(seed)
-    spans = {jobs: _span(ground, jobs) for jobs in (1, 2)}
+    spans = {jobs: _span(reference, jobs) for jobs in (1, 2)}
     tally.counts["milliseconds of an undisturbed command, one job"] = round(spans[1] * 1e3)
     tally.counts["milliseconds of an undisturbed command, two jobs"] = round(spans[2] * 1e3)
     done = 0
     while done < kills:
         jobs = rng.choice((1, 2))
-        case = ground.case(jobs, rng.random() < 0.2)
+        case = reference.case(jobs, rng.random() < 0.2)
         hows: list[str] = []
         how = {"seed": seed, "kills": hows, "jobs": jobs, "overwrite": bool(case.old)}
         for turn in range(min(rng.choice(ROW), kills - done)):
@@ -202,9 +202,9 @@ def command(told: int, words: list[str]) -> None:
     sys.exit(run(words))
 
 
-def _span(ground: Ground, jobs: int) -> float:
+def _span(reference: ReferenceBuild, jobs: int) -> float:
     """Return the duration of an undisturbed command from its beginning [s]."""
-    case = ground.case(jobs)
+    case = reference.case(jobs)
     with tempfile.TemporaryFile() as log:
         process = _start(case, log)
         begin = time.perf_counter()

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from .at_random import Ground, check_finish
+from .at_random import ReferenceBuild, check_finish
 from .case import Case, Tally
 from .child import Child
 
@@ -120,7 +120,7 @@ def one_of_each(calls: list[Call]) -> list[Call]:
 
 
 def all_calls(
-    ground: Ground, tally: Tally, every: int | None = 1, say: Callable[[str], None] | None = None
+    reference: ReferenceBuild, tally: Tally, every: int | None = 1, say: Callable[[str], None] | None = None
 ) -> int:
     """Inject each fault at each call of a build, of one that overwrites, and of `add`.
 
@@ -129,9 +129,9 @@ def all_calls(
     """
     points = 0
     commands: dict[str, Callable[[], Case]] = {
-        "build": ground.case,
-        "build --overwrite": lambda: ground.case(overwrite=True),
-        "add": ground.change,
+        "build": reference.case,
+        "build --overwrite": lambda: reference.case(overwrite=True),
+        "add": reference.change,
     }
     if not every:
         del commands["build --overwrite"]

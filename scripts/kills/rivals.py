@@ -3,7 +3,7 @@
 import signal
 import time
 
-from .at_random import Ground, check_finish
+from .at_random import ReferenceBuild, check_finish
 from .case import Tally
 from .child import Child
 
@@ -11,9 +11,9 @@ from .child import Child
 AT_ONCE = 1.0
 
 
-def rival(ground: Ground, tally: Tally) -> float:
+def rival(reference: ReferenceBuild, tally: Tally) -> float:
     """Stop a builder halfway, let another try, resume the first; return the duration of the second [s]."""
-    case = ground.case()
+    case = reference.case()
     work = case.folder / ".hall.building"
     first = Child(case.arguments(), case.folder.with_suffix(".first.log"))
     first.go()
@@ -37,10 +37,10 @@ def rival(ground: Ground, tally: Tally) -> float:
     tally.add("two builders", faults + case.finished())
 
     # A lock ends with its holder: a builder that starts after a kill is not refused.
-    case = ground.case()
+    case = reference.case()
     first = Child(case.arguments(), case.folder.with_suffix(".first.log"))
     first.go()
-    first.wait(ground.seconds / 2)
+    first.wait(reference.seconds / 2)
     first.signal(signal.SIGKILL)
     first.end()
     check_finish(case, tally, "a builder after a killed one")

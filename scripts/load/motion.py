@@ -17,7 +17,7 @@ RATE = 30.0  # poses per second
 SPACING = 0.02  # between the samples of a path [m]
 # A corner is rounded over this time at full speed, limited to a length [m]: before a door the path
 # is straight for 9 m.
-ROUNDING_SECONDS, LEAST_ROUNDING, MOST_ROUNDING = 1.0, 1.2, 5.0
+ROUNDING_SECONDS, MIN_ROUNDING, MAX_ROUNDING = 1.0, 1.2, 5.0
 # Lateral acceleration [m/s²]: at 1.5 m/s a turn of 0.6 m radius is walked at full speed, at 5 m/s
 # one of 6 m.
 SIDEWAYS = 4.0
@@ -49,7 +49,7 @@ def make_way(corners: Floats, speed: float, closed: bool = False) -> Way:
 
     closed: the last corner equals the first, and is rounded too.
     """
-    width = int(np.clip(ROUNDING_SECONDS * speed, LEAST_ROUNDING, MOST_ROUNDING) / 2 / SPACING) | 1
+    width = int(np.clip(ROUNDING_SECONDS * speed, MIN_ROUNDING, MAX_ROUNDING) / 2 / SPACING) | 1
     steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.linspace(0.0, along[-1], max(2, int(along[-1] / SPACING)) + 1)

@@ -13,7 +13,7 @@ from . import server
 from .drive import Setup
 from .users import AVATAR
 
-MOST_SECONDS = 900.0
+MAX_SECONDS = 900.0
 
 
 def first_answer(
@@ -35,7 +35,7 @@ def first_answer(
         client.add_avatar(AVATAR, figure_points(setup.points))
         begin = time.monotonic()
         process = stack.enter_context(server.started(command, setup.work / "server.log"))
-        while time.monotonic() - begin < MOST_SECONDS and process.poll() is None:
+        while time.monotonic() - begin < MAX_SECONDS and process.poll() is None:
             if int(client.collide(AVATAR, pose[None]).verdict[0]) == verdict:
                 return time.monotonic() - begin
             time.sleep(0.005)

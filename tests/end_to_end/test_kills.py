@@ -63,7 +63,7 @@ import os, sys
 from pathlib import Path
 sys.path.append(sys.argv[2])
 import solidcloud.builder.pipeline as pipeline
-from kills.at_random import Ground, _after_kill
+from kills.at_random import ReferenceBuild, _after_kill
 from kills.case import Tally
 from kills.child import build
 
@@ -72,9 +72,9 @@ def bit_by_bit(folder, target, *_):
     os.rename(folder / "shards", target / "shards")
     os.kill(os.getpid(), 9)
 
-ground, tally = Ground(Path(sys.argv[1])), Tally()
+reference, tally = ReferenceBuild(Path(sys.argv[1])), Tally()
 pipeline.publish_folder = bit_by_bit
-case = ground.case()
+case = reference.case()
 child = build(case.arguments(), case.folder.with_suffix(".log"))
 _after_kill(case, child.status, child.said(), tally)
 print(len(tally.bad), tally.bad[0]["faults"][0] if tally.bad else child.said())

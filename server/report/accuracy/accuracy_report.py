@@ -95,7 +95,7 @@ def measure(
         settings += radius_settings(plan, measured.config, header.radius)
         measure_engine(settings, archives, measured, reference, plan, progress)
         rows = [s.row for s in settings]
-        if measured.truth is not None and measured.own:
+        if measured.truth is not None and measured.is_figure:
             rows += measure_generated_scenes(settings, scratch, plan, progress)
     mark_pareto_fronts(rows, SHOWN)
     facts = {

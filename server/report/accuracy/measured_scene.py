@@ -37,7 +37,7 @@ class MeasuredScene(NamedTuple):
     config: default configuration of its build, with a lattice step.
     warnings: sentences about what cannot be measured.
     truth: ground truth of the generated façade; None for other scans.
-    own: the avatar is the generated figure; the doorway error is defined only for it.
+    is_figure: the avatar is the generated figure; the doorway error is defined only for it.
     avatar: (n, 3) [m].  walk: (k, 4, 4), poses on which times are measured.
     around: (k, 4, 4), the walk's poses with random offsets.
     """
@@ -47,7 +47,7 @@ class MeasuredScene(NamedTuple):
     config: BuildConfig
     warnings: tuple[str, ...]
     truth: SceneTruth | None
-    own: bool
+    is_figure: bool
     avatar: Floats
     walk: Floats
     around: Floats
@@ -81,7 +81,7 @@ def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Path | None, fol
     Raises BadDataError if there is no floor to stand on.
     """
     with Archive(archive) as opened:
-        points, total = _middle_points(opened, plan.most_points), opened.header.points
+        points, total = _middle_points(opened, plan.max_points), opened.header.points
         config, warnings = config_of(opened.header), unknown_regions(opened.header)
     scan = folder / "points.ply"
     write_ply(scan, points)

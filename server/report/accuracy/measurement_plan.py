@@ -9,7 +9,7 @@ from ..common.paper_case import PAPER_POINTS
 class MeasurementPlan:
     """Settings to measure, one knob at a time, and the number of measurements of each.
 
-    points: of the generated façade.  most_points: maximum number taken from a given archive.
+    points: of the generated façade.  max_points: maximum number taken from a given archive.
     frames: poses of the walk, on which times are measured. Verdicts and distances are compared at
     these and at as many poses with random offsets from the walk.
     near_tangent: poses within a micrometre of touching.
@@ -26,7 +26,7 @@ class MeasurementPlan:
     """
 
     points: int = PAPER_POINTS
-    most_points: int = 1_000_000
+    max_points: int = 1_000_000
     frames: int = 1200
     near_tangent: int = 400
     brute: int = 40

@@ -41,7 +41,7 @@ def measure_user_errors(
         if setting.row.knob not in USER_ERROR_KNOBS:
             continue
         scene, row = archives.scene(setting.config), setting.row
-        if measured.own:
+        if measured.is_figure:
             row.doorway_mm = doorway_error(scene, AVATAR, facade, door=DOOR, **setting.options).error
             if math.isinf(row.doorway_mm):
                 row.note = "the figure cannot stand in the door"

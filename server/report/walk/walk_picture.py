@@ -16,9 +16,9 @@ from .walk_answers import Walk, WalkAnswers
 COLOURS = {Verdict.CLEAR: "#1f7a8c", Verdict.CONTACT: "#d62839", Verdict.UNKNOWN: "#e0a100"}
 PAPER, INK = "#fbfaf7", "#2f2a26"
 STONE = LinearSegmentedColormap.from_list("stone", [PAPER, "#d9cfc1", "#a08e78", "#5b4d40"])
-# The figure is drawn at most MOST times: in the middle of the CONTACTS longest contacts, and at
+# The figure is drawn at most MAX_FIGURES times: in the middle of the CONTACTS longest contacts, and at
 # regular intervals, at least the share APART of the walk from one another.
-MOST, CONTACTS, APART = 8, 4, 0.07
+MAX_FIGURES, CONTACTS, APART = 8, 4, 0.07
 # Pixels along the longest extent; the plan, where walls are lines, has half as many.
 PIXELS = 700
 # Range of heights above the floor that the plan shows [m]: from shin to above the head.
@@ -66,10 +66,10 @@ def _stops(verdict: NDArray[np.uint8]) -> list[int]:
     count = len(verdict)
     longest = sorted(_runs(verdict == Verdict.CONTACT), key=lambda run: run[0] - run[1])[:CONTACTS]
     wanted = [(first + last) // 2 for first, last in longest]
-    wanted += (np.linspace(0.03, 0.97, 2 * MOST) * count).astype(int).tolist()
+    wanted += (np.linspace(0.03, 0.97, 2 * MAX_FIGURES) * count).astype(int).tolist()
     stops: list[int] = []
     for k in wanted:
-        if len(stops) < MOST and all(abs(k - other) >= APART * count for other in stops):
+        if len(stops) < MAX_FIGURES and all(abs(k - other) >= APART * count for other in stops):
             stops.append(k)
     return sorted(stops)
 

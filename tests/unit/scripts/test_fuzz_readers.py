@@ -57,9 +57,9 @@ first = fuzz.read_mutant(3, "a.las", path, 1 << 40)
 pages = [int(count) * resource.getpagesize() for count in Path("/proc/self/statm").read_text().split()]
 outcome = {outcome!r}
 room = pages[0] + (100 << 20) if outcome == "Unable to allocate" else 1 << 40
-fuzz.MOST_SECONDS = 1 if outcome == "over 1 s" else 7
+fuzz.MAX_SECONDS = 1 if outcome == "over 1 s" else 7
 fuzz.LONGEST_WAIT = 0.5 if outcome == "over 7 s" else 60.0
-fuzz.MOST_BYTES = 20 << 20 if outcome.endswith("MB") else fuzz.MOST_BYTES
+fuzz.MAX_BYTES = 20 << 20 if outcome.endswith("MB") else fuzz.MAX_BYTES
 fuzz.read_all = read_all
 print(json.dumps([first._asdict(), fuzz.read_mutant(3, "a.las", path, room)._asdict()]))
 """

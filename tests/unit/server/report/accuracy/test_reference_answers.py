@@ -153,7 +153,7 @@ def test_a_knob_that_changed_what_it_must_not_would_be_an_error(
 
 def test_of_a_large_archive_the_voxels_around_its_middle_are_taken(judged: Judged, tmp_path: Path) -> None:
     few = archive_scene(
-        judged.folder.parent / "hall", MeasurementPlan(most_points=3000, frames=40), None, tmp_path
+        judged.folder.parent / "hall", MeasurementPlan(max_points=3000, frames=40), None, tmp_path
     )
     assert "of 5,000 points" in few.name and few.truth is None and len(few.walk) == 40
     taken = int(few.name.split(", ", 1)[1].split(" ")[0].replace(",", ""))

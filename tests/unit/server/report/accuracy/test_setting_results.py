@@ -193,7 +193,7 @@ def test_with_another_avatar_the_leak_is_measured_and_the_doorway_is_not(
             for s in engine_settings(BRIEF, BuildConfig(resolution=1e-4), 0.0124)
             if s.row.knob in (TOLERANCE, DEGREE)
         ]
-        ground: Any = SimpleNamespace(truth=truth, own=own)
+        ground: Any = SimpleNamespace(truth=truth, is_figure=own)
         archives: Any = SimpleNamespace(scene=lambda config: None)
         measure_user_errors(settings, archives, ground, BRIEF, lambda: None)
         for row in (s.row for s in settings):

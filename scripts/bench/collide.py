@@ -84,7 +84,11 @@ def _goals(part: Part, ours: list[str]) -> None:
         part.goal("collide far", f"collide, far poses ({name})", max(far, default=None), MAX_FAR_US, "µs")
         touching = part.value(f"{CASE}, walk, {CONTACT}", name, COLLIDE)
         part.goal(
-            "collide contact", f"collide, colliding poses of the walk ({name})", touching, MAX_CONTACT_US, "µs"
+            "collide contact",
+            f"collide, colliding poses of the walk ({name})",
+            touching,
+            MAX_CONTACT_US,
+            "µs",
         )
         scipy = ratio(part.value(walk, SCIPY, COLLIDE), mean)
         if scipy is not None:

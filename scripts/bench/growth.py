@@ -90,7 +90,9 @@ def run(bench: Bench, clock: Clock) -> Part:
     first, *others = [float(np.median(spent)) for spent in times.values()]
     whole = len(sizes) == len(FACADES)
     part.remarks.append("each town has the radius of its own mean closest-point distance, as the default is")
-    part.goal("growth", "collide, 10⁸ points / 10⁶ points", others[-1] / first if whole else None, MAX_GROWTH, "x")
+    part.goal(
+        "growth", "collide, 10⁸ points / 10⁶ points", others[-1] / first if whole else None, MAX_GROWTH, "x"
+    )
     if not whole:
         part.goal("growth", "collide, 10⁷ points / 10⁶ points", others[-1] / first, MAX_GROWTH, "x")
         part.missing.append("10⁸ points: give --growth FOLDER, where the archives are, or stay once made")

@@ -48,7 +48,7 @@ class Hit(NamedTuple):
 
 
 class Obstacle(Protocol):
-    """Bodies that move and block: the other users, the dynamic objects. See bodies.py.
+    """Bodies that move and block: the other users, the dynamic objects. See body_obstacles.py.
 
     One obstacle may represent many bodies: `Hit.what` names the one. A body that was touched when
     the frame began blocks only motions that go deeper into it, so that an avatar can get free. For

@@ -28,7 +28,7 @@ from ..residency.arena import ArenaBuffer
 from ..residency.voxel_store import OpenStore, VoxelStore
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
-# within the reach of a pair (simulation/effects/bodies.py).
+# within the reach of a pair (simulation/world/bodies.py).
 MAX_BODY_RADIUS = MAX_REACH_UNITS / 4 / UNITS_PER_METRE
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]

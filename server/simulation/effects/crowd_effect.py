@@ -3,7 +3,7 @@
 The other users stand where they are now. Those whose turn came earlier in this frame have already
 moved, in the order of the simulation, which its log records. A user that is met blocks, and does
 not move. Users that overlap, for example because they began in one place, may separate but not move
-deeper (blocking.py).
+deeper (body_obstacles.py).
 """
 
 from typing import Any

@@ -2,7 +2,7 @@
 
 Each simulation has one. It updates the bodies like a dict of its users (`bodies[user] = body` after
 each frame, `pop`), and passes on the poses at which motion commands place objects (`place_objects`). Effects
-query it through `BodyObstacle` (blocking.py).
+query it through `BodyObstacle` (body_obstacles.py).
 """
 
 import threading

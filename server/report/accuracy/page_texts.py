@@ -108,7 +108,7 @@ def _exact(rows: Sequence[Row], brute: int) -> str:
     if not brute:
         return said
     # The exact answer is the reference: its own count of wrong verdicts means nothing.
-    return f"{said} Check: a test of every pair of points in integers agrees with it at {brute:,} poses."
+    return f"{said} Check: a test of every pair of points in integers at {brute:,} poses agrees with it."
 
 
 def _tolerance(rows: Sequence[Row]) -> str:

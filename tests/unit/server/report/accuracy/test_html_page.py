@@ -195,7 +195,7 @@ def test_the_findings_follow_from_the_rows() -> None:
     assert "wider than it is" not in " ".join(findings(rows))
     assert findings([]) == []
     assert "Check: " not in fast
-    assert findings(rows, 40)[0].endswith("every pair of points in integers agrees with it at 40 poses.")
+    assert findings(rows, 40)[0].endswith("every pair of points in integers at 40 poses agrees with it.")
 
 
 def test_times_within_noise_are_not_told_apart() -> None:

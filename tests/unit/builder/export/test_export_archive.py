@@ -208,7 +208,7 @@ def test_a_failure_leaves_what_was_there(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export, "_write", full)
+    monkeypatch.setattr(export, "_write_points", full)
     with pytest.raises(OSError, match="No space left"):
         export_archive(georeferenced, path, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == [path.name] and path.read_text() == "before"

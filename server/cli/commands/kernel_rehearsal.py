@@ -5,19 +5,26 @@ for this machine. Therefore a server marks its start (`KernelFiles.starting`). I
 did not complete, a child process first performs everything that a start does. If the child crashes,
 hangs or computes a wrong answer, all compiled kernels are removed and compiled again. A start that
 follows a complete one skips the trial.
+
+A wrong kernel may also make the check of a sound record fail. If the child finds a fault of the
+archive or scene file, a second child therefore looks for it with kernels that it compiles itself.
+If it finds the same fault, the kernels are kept, and the start reports the fault.
 """
 
 import logging
+import os
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.errors import SolidcloudError
+from ....schemas.errors import CorruptError, SolidcloudError
 from ....schemas.kernels.kernel_files import KernelFiles
 from ....schemas.wire.answers import Verdict
 
@@ -28,6 +35,8 @@ log = logging.getLogger(__name__)
 
 # The child may have to compile all kernels, on a slow machine.
 SECONDS = 900.0
+# Exit code of a child that finds a fault of the archive or scene file.
+_DATA_FAULT = 3
 _CLIENT = "rehearsal"
 _RADIUS, _REACH = 0.05, 0.5
 
@@ -35,17 +44,18 @@ _RADIUS, _REACH = 0.05, 0.5
 def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
     """Open and warm `what`, an archive or a scene file, in a child process.
 
-    Removes all compiled kernels if the child fails or takes longer than `seconds`.
+    Removes all compiled kernels if the child fails or takes longer than `seconds`, or if it finds a
+    fault of `what` that a child without these kernels does not find.
     """
-    command = [sys.executable, "-P", "-m", __name__, str(what)]
-    try:
-        code = subprocess.run(command, capture_output=True, timeout=seconds).returncode
-    except subprocess.TimeoutExpired:
-        fault = f"did not finish within {seconds:g} s"
-    else:
-        if code == 0:
+    fault, data_fault = _run_trial(what, seconds, os.environ)
+    if data_fault:
+        with tempfile.TemporaryDirectory() as folder:
+            again = _run_trial(what, seconds, {**os.environ, "NUMBA_CACHE_DIR": folder})
+        if again == ("", data_fault):
             return
-        fault = f"ended with {signal.Signals(-code).name if code < 0 else f'exit code {code}'}"
+        fault = f"found a fault that newly compiled ones do not find ({data_fault})"
+    if not fault:
+        return
     files.remove_all()
     log.warning(
         "compiled kernels in %s: the last server start did not complete, and a trial of the kernels %s: "
@@ -55,8 +65,28 @@ def rehearse(what: Path, files: KernelFiles, seconds: float = SECONDS) -> None:
     )
 
 
+def _run_trial(what: Path, seconds: float, environment: Mapping[str, str]) -> tuple[str, str]:
+    """Run `main` in a child process.
+
+    Returns how the child failed, and the fault of `what` that it found; "" for neither.
+    """
+    command = [sys.executable, "-P", "-m", __name__, str(what)]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, env=environment)
+    except subprocess.TimeoutExpired:
+        return f"did not finish within {seconds:g} s", ""
+    code = done.returncode
+    if code == _DATA_FAULT:
+        return "", done.stdout.decode(errors="replace").strip()
+    if code < 0:
+        return f"ended with {signal.Signals(-code).name}", ""
+    return (f"ended with exit code {code}", "") if code else ("", "")
+
+
 def check_answers(scene: "Scene") -> None:
-    """Make queries whose answers are known. Raises AssertionError if a kernel computes a wrong one.
+    """Make queries whose answers are known.
+
+    Raises AssertionError if a kernel computes a wrong one, CorruptError if a record cannot be read.
 
     Checks that `collide` and `distance`, which use different kernels, agree at the corners and the
     centre of the scene's bounds; that a sphere around a scan point is in contact; and that there is
@@ -67,7 +97,10 @@ def check_answers(scene: "Scene") -> None:
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
     places = np.vstack([corners, (low + high) / 2, high + 2 * _REACH])
     found = scene.distance(_CLIENT, _poses(places), _REACH, client=_CLIENT)
-    touches = scene.collide(_CLIENT, _poses(places), 0.0, client=_CLIENT).verdict == Verdict.CONTACT
+    collided = scene.collide(_CLIENT, _poses(places), 0.0, client=_CLIENT)
+    if faults := found.faults or collided.faults:
+        raise CorruptError("; ".join(faults))
+    touches = collided.verdict == Verdict.CONTACT
     _require(np.array_equal(touches, found.signed_distance <= 0), "collide and distance disagree")
     _require(not touches[-1] and found.signed_distance[-1] == np.inf, "a point is found where there is none")
     points = found.witness_cloud[~np.isnan(found.witness_cloud[:, 0])]
@@ -90,7 +123,10 @@ def _require(holds: bool, fault: str) -> None:
 
 
 def main(path: str) -> int:
-    """Open, warm and check the scene as a server start does. Return 0 unless the kernels fail."""
+    """Open, warm and check the scene as a server start does.
+
+    Returns 0, or _DATA_FAULT with the fault of the archive or scene file on the standard output.
+    """
     from ...scene import Scene
 
     try:
@@ -98,8 +134,9 @@ def main(path: str) -> int:
             scene.warm()
             scene.simulation.warm()
             check_answers(scene)
-    except SolidcloudError:
-        return 0  # a fault of the archive or scene file, which the server start itself reports
+    except SolidcloudError as error:
+        sys.stdout.buffer.write(str(error).encode(errors="backslashreplace"))
+        return _DATA_FAULT
     return 0
 
 

@@ -4,11 +4,19 @@ import os
 import pickle
 import shutil
 import signal
+import tempfile
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
+from numba.core.serialize import dumps
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.kernels import record_rows
 from solidcloud.schemas.kernels.compiling import kernel_files
 from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.schemas.kernels.morton import morton_decode
@@ -68,6 +76,69 @@ def test_kernels_that_are_right_are_kept(
     rehearse(ARCHIVE, files)
     assert caplog.records == []
     assert before <= set(os.listdir(files.folder))  # a rehearsal simulates frames too
+
+
+@compiled
+@pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
+def test_a_fault_of_a_record_that_a_wrong_kernel_finds_is_the_kernels_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Archive(ARCHIVE) as archive:
+        archive.open_tree(0)  # compiled, or loaded: it is kept now
+    stored = kernel_files()
+    shutil.copytree(stored.folder, tmp_path / "solidcloud-kernels")
+    files = KernelFiles(tmp_path / "solidcloud-kernels")
+    for path in stored.folder.glob("*.link_rows-*"):
+        files.write(path.name, no_tree(stored.read(path.name) or b""))
+    # The kernels that a child compiles anew are those of this process, to save the time.
+    monkeypatch.setattr(
+        tempfile, "TemporaryDirectory", partial(nullcontext, str(stored.folder.resolve().parent))
+    )
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    rehearse(ARCHIVE, files)
+    assert list(files.folder.iterdir()) == []
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert "found a fault that newly compiled ones do not find" in said and "do not form a tree" in said
+
+
+def no_tree(payload: bytes) -> bytes:
+    """Return the kernel `link_rows`, compiled for the same signature, with a wrong result."""
+    signature, _ = pickle.loads(payload)
+
+    def link_rows(
+        count: Any, cell_nodes: Any, cell_points: Any, first: Any, is_leaf: Any, cell_of: Any
+    ) -> Any:
+        return -1
+
+    # A child finds the module of compiled code by its name.
+    wrong = FunctionType(link_rows.__code__, vars(record_rows), "link_rows")
+    wrong.__module__ = record_rows.__name__
+    kernel = numba.njit(nogil=True)(wrong)
+    kernel.compile(signature)
+    (result,) = kernel.overloads.values()
+    return bytes(dumps((signature, result._reduce())))
+
+
+@compiled
+@pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
+def test_a_record_that_is_damaged_is_not_the_kernels_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(ARCHIVE, tmp_path / "archive")
+    with Archive(tmp_path / "archive") as archive:
+        for entry in archive.voxels:
+            with open(archive.shard_path(int(entry["shard"])), "r+b") as file:
+                file.seek(int(entry["frame_offset"][1]) + int(entry["frame_bytes"][1]) // 2)
+                (byte,) = file.read(1)
+                file.seek(-1, os.SEEK_CUR)
+                file.write(bytes([byte ^ 255]))
+    files = kernel_files()
+    monkeypatch.setattr(
+        tempfile, "TemporaryDirectory", partial(nullcontext, str(files.folder.resolve().parent))
+    )
+    rehearse(tmp_path / "archive", files)
+    assert caplog.records == []
+    assert list(files.folder.glob("*.kernel"))
 
 
 @compiled

@@ -26,7 +26,10 @@ _HEAD = len(_MAGIC) + hashlib.sha256().digest_size
 _SUFFIX = ".kernel"
 _TEMPORARY = ".tmp"
 _STARTING = ".starting"
+_COMPILING = ".compiling"
 _DAY = 86_400.0
+# Longest wait for another process that compiles a kernel; most take less than a second.
+_CLAIM_SECONDS = 60.0
 # Limits of the folder. All kernels of one version of this package take 37 MB.
 MAX_BYTES = 1 << 29
 MAX_DAYS = 60.0
@@ -53,21 +56,27 @@ class KernelFiles:
         self.folder = folder
         self._warned: set[str] = set()
         self._pruned = False
+        self._claims: dict[str, int] = {}
         self._descriptor = self._open()
 
     def __del__(self) -> None:
-        """Close the folder."""
+        """Remove the marks of what was not written, and close the folder."""
         if (descriptor := getattr(self, "_descriptor", None)) is not None:
+            for name in list(self._claims):
+                self._release(name)
             os.close(descriptor)
 
     def read(self, name: str) -> bytes | None:
-        """Return the payload that was written under `name`; None if there is none that may be used."""
+        """Return the payload that was written under `name`; None if there is none that may be used.
+
+        Without a file, wait while another process compiles it; the first process is to write it.
+        """
         if self._descriptor is None:
             return None
         try:
             content = self._content(name)
         except FileNotFoundError:
-            return None
+            return self.read(name) if self._claim(name) else None
         except OSError as error:
             self.discard(name, error.strerror or str(error))
             return None
@@ -95,6 +104,8 @@ class KernelFiles:
                 raise
         except OSError as error:
             self._warn_not_stored(error.strerror or str(error))
+        finally:
+            self._release(name)
 
     def discard(self, name: str, fault: str) -> None:
         """Remove a damaged file, and log that on the first occurrence."""
@@ -114,7 +125,7 @@ class KernelFiles:
     def prune(self, max_bytes: int = MAX_BYTES, max_days: float = MAX_DAYS) -> None:
         """Remove files not used for `max_days`, then the least recently used beyond `max_bytes`."""
         now, kept = time.time(), 0
-        for name, found in self._files(_TEMPORARY):
+        for name, found in (*self._files(_TEMPORARY), *self._files(_COMPILING)):
             if now - found.st_mtime > _DAY:
                 self._remove(name)
         listed = [(found.st_mtime, found.st_size, name) for name, found in self._files(_SUFFIX)]
@@ -153,6 +164,42 @@ class KernelFiles:
         except OSError:
             return False
         finally:
+            os.close(mark)
+
+    def _claim(self, name: str) -> bool:
+        """Return True once another process that compiles `name` has ended that; False if there is none.
+
+        False marks `name` as compiled by this process, until `write`. So processes that start at
+        the same time do not compile everything twice. A mark is a file that its process holds
+        locked. The system unlocks it however the process ends.
+        """
+        if self._descriptor is None or name in self._claims:
+            return False
+        try:
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            mark = os.open(_claim_name(name), flags, 0o600, dir_fd=self._descriptor)
+        except OSError:
+            return False
+        end, waited = time.monotonic() + _CLAIM_SECONDS, False
+        while time.monotonic() < end:
+            try:
+                fcntl.lockf(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)  # of this process, not of its children
+            except OSError:
+                waited = True
+                time.sleep(0.02)
+                continue
+            if not waited:
+                self._claims[name] = mark
+                return False
+            os.close(mark)
+            return True
+        os.close(mark)
+        return False
+
+    def _release(self, name: str) -> None:
+        """Remove the mark of `_claim`."""
+        if (mark := self._claims.pop(name, None)) is not None:
+            self._remove(_claim_name(name))
             os.close(mark)
 
     def _open(self) -> int | None:
@@ -240,6 +287,10 @@ class KernelFiles:
         if kind not in self._warned:
             self._warned.add(kind)
             log.warning(message)
+
+
+def _claim_name(name: str) -> str:
+    return name.removesuffix(_SUFFIX) + _COMPILING
 
 
 def _head(name: str, payload: bytes) -> bytes:

@@ -268,3 +268,53 @@ def test_the_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -> 
 def test_logging_goes_to_the_error_output_unasked() -> None:
     """A verb that sets up no logging says the line too: Python prints warnings that nobody handles."""
     assert logging.lastResort is not None and logging.lastResort.level == logging.WARNING
+
+
+def test_of_two_processes_that_need_a_kernel_one_compiles_it(files: KernelFiles, folder: Path) -> None:
+    assert files.read(NAME) is None  # this process is to compile it
+    program = (
+        "import sys\nfrom pathlib import Path\n"
+        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
+        "files = KernelFiles(Path(sys.argv[1]))\nprint('reads', flush=True)\nprint(len(files.read(sys.argv[2])))\n"
+    )
+    command = [sys.executable, "-P", "-c", program, str(folder), NAME]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "reads\n"
+        time.sleep(0.2)
+        assert other.poll() is None, "it waits"
+        files.write(NAME, PAYLOAD)
+        assert other.stdout.readline() == f"{len(PAYLOAD)}\n"
+    assert [path.name for path in folder.iterdir()] == [NAME]
+
+
+def test_a_process_that_dies_while_it_compiles_holds_up_nobody(files: KernelFiles, folder: Path) -> None:
+    program = (
+        "import os, sys\nfrom pathlib import Path\n"
+        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
+        "files = KernelFiles(Path(sys.argv[1]))\nassert files.read(sys.argv[2]) is None\nos._exit(7)\n"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", program, str(folder), NAME], check=False)
+    assert done.returncode == 7
+    began = time.monotonic()
+    assert files.read(NAME) is None and time.monotonic() - began < 5.0
+    files.write(NAME, PAYLOAD)
+    assert files.read(NAME) == PAYLOAD and [path.name for path in folder.iterdir()] == [NAME]
+
+
+def test_nobody_waits_for_ever(
+    files: KernelFiles, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("solidcloud.schemas.kernels.kernel_files._CLAIM_SECONDS", 0.1)
+    program = (
+        "import sys, time\nfrom pathlib import Path\n"
+        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
+        "files = KernelFiles(Path(sys.argv[1]))\nassert files.read(sys.argv[2]) is None\n"
+        "print('compiles', flush=True)\ntime.sleep(60)\n"
+    )
+    command = [sys.executable, "-P", "-c", program, str(folder), NAME]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "compiles\n"
+        assert files.read(NAME) is None
+        files.write(NAME, PAYLOAD)
+        other.kill()
+    assert files.read(NAME) == PAYLOAD and not caplog.records

@@ -98,7 +98,7 @@ def make_budget(
     budget_ms: time limit including waits for loads; None: no limit.
     budget_visits: limit in node visits a pose, independent of the clock; None: no limit.
     stop: the request's stop flag. A time budget sets it `GRACE` after its end, for kernels that do
-    not check the clock; if it is NEVER, the budget gets a new flag. Raise BadRequestError.
+    not check the clock; if it is NO_STOP, the budget gets a new flag. Raise BadRequestError.
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")

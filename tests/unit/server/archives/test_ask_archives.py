@@ -25,6 +25,7 @@ def flags(monkeypatch):
     monkeypatch.setattr(ask_archives, "path_question", question)
     monkeypatch.setattr(ask_archives, "answers_in_world", lambda found, *_: found)
     monkeypatch.setattr(ask_archives, "merge_answers", lambda answers: answers)
+    monkeypatch.setattr(ask_archives, "join_answers", lambda answers: answers[0])
     return asked
 
 

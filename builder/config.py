@@ -9,30 +9,8 @@ from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError
 
-# Closest-point distances are measured at about this many points; at all points if there are fewer.
-RADIUS_SAMPLE = 1_000_000
-
-# Points in a work unit (one shard), see `shard_points`: large enough that the cost of opening a
-# file is negligible, small enough that a killed worker loses only a few seconds.
-SHARD_POINTS = 1 << 22
-# A server opens all shards of an archive, and most systems limit a process to 1,024 open files.
-MOST_SHARDS = 512
-
 DEFAULT_STEP = 1e-4
 CELL_KINDS = ("octree", "balanced")
-
-
-def shard_points(points: int) -> int:
-    """Return the number of points per shard of a dataset of `points` points.
-
-    It depends on nothing else, or the bytes of the archive would depend on the number of jobs.
-    Small datasets get a quarter of SHARD_POINTS, which gives each of two workers many shards and
-    lets them end at about the same time: with 10^7 points in 3 shards, one of them was idle for a
-    quarter of the time.
-    """
-    # Voxels are not cut, so a shard may stay half empty. Two consecutive shards together hold more
-    # than this.
-    return max(SHARD_POINTS // 4, min(SHARD_POINTS, points // 64), 2 * points // MOST_SHARDS)
 
 
 def parse_radius(text: str) -> tuple[float | None, frozenset[str]]:
@@ -215,6 +193,11 @@ class BuildConfig:
         for good, found, expected in checks:
             if not good:
                 raise BadRequestError(f"{found}: expected {expected}")
+
+    @property
+    def filter_passes(self) -> int:
+        """Return the number of filter passes over all points; 0 if no filter is enabled."""
+        return (self.moving is not None or self.outliers is not None) + (self.thin is not None)
 
     def stored_models(self) -> tuple[str, ...]:
         """Return the stored radius models, in the order of STORED_MODELS."""

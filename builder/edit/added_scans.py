@@ -13,24 +13,23 @@ from numpy.typing import NDArray
 from ...schemas.archive.index import Header, Source
 from ...schemas.archive.voxel_grid import voxel_coordinates
 from ...schemas.errors import BadRequestError, ScanError
+from ..build_limits import ARCHIVE_BYTES_A_POINT, MAX_SCANS
 from ..passes.radius_classes import ALL_CODES
-from ..passes.resumable_passes import MAX_SCANS
-from ..passes.survey import Survey, hash_file, joined, ranges, survey_range, unopened
-from ..pipeline import ARCHIVE_BYTES_A_POINT
+from ..passes.spool_pass import SpoolUnit, run_points, spool_range
+from ..passes.survey import Survey, hash_file, join_ranges, ranges, survey_range, unopened_survey
 from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
 from ..sources.scan_files import InputFile
 from ..spool.spool import Spool
-from ..spool.spool_pass import SpoolUnit, run_points, spool_range
-from .transaction import Change, scan_name
+from .archive_change import Change, scan_name
 
 # Most scans that an error message names.
-MOST_NAMED = 10
+MAX_NAMED = 10
 # Most rows of a voxel in memory at once while its box is computed.
 BOX_POINTS = 1 << 18
 
 
-class Wanted(NamedTuple):
+class AddOptions(NamedTuple):
     """Selection of the scans to add.
 
     again: also add scans that the archive already contains.
@@ -43,13 +42,13 @@ class Wanted(NamedTuple):
     strict: bool = False
 
 
-def survey_added(change: Change, inputs: Sequence[InputFile], wanted: Wanted) -> list[Survey]:
+def survey_added(change: Change, inputs: Sequence[InputFile], wanted: AddOptions) -> list[Survey]:
     """Return the surveys of the scans of `inputs` to add, all of them usable.
 
     Scans that the archive already contains are reported before any points are read.
     Raise ScanError for unusable scans, BadRequestError for scans that cannot be added.
     """
-    if faults := [unopened(item.path, item.fault).fault for item in inputs if not item.scans]:
+    if faults := [unopened_survey(item.path, item.fault).fault for item in inputs if not item.scans]:
         raise ScanError("\n  ".join(faults))
     scans = [scan for item in inputs for scan in item.scans]
     files = list(dict.fromkeys(scan.path for scan in scans))
@@ -71,7 +70,7 @@ def survey_added(change: Change, inputs: Sequence[InputFile], wanted: Wanted) ->
     with change.stage("survey", about, "points"):
         parts = iter(change.run(survey_range, [unit for units in cut for unit in units]))
         surveys = [
-            joined(scan, [next(parts) for _ in units], hashes[scan.path])
+            join_ranges(scan, [next(parts) for _ in units], hashes[scan.path])
             for scan, units in zip(scans, cut, strict=True)
         ]
     if faults := [survey.fault for survey in surveys if survey.fault]:
@@ -98,14 +97,14 @@ def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_o
         known[key] = name
         new.append(scan)
     if there and not (new and new_only):
-        more = [f"and {len(there) - MOST_NAMED} more"] if len(there) > MOST_NAMED else []
+        more = [f"and {len(there) - MAX_NAMED} more"] if len(there) > MAX_NAMED else []
         advice = (
             "nothing is new"
             if new_only
             else "leave out those already in the archive, or give --new, or --again to add them twice"
         )
         raise BadRequestError(
-            "\n  ".join([f"{len(there)} of {len(scans)} scans: {advice}", *there[:MOST_NAMED], *more])
+            "\n  ".join([f"{len(there)} of {len(scans)} scans: {advice}", *there[:MAX_NAMED], *more])
         )
     return new
 
@@ -113,11 +112,11 @@ def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_o
 def spool_added(change: Change, surveys: list[Survey]) -> tuple[float, int]:
     """Spool the new scans.
 
-    Return the largest distance that quantising moved a point [m] and the `places_sum` (spool.py).
+    Return the largest distance that quantising moved a point [m] and the `position_hash` (run_files.py).
     """
     header, dtype, folder = change.archive.header, change.dtype, change.folder / "spool"
     most, first = run_points(change.share, dtype), len(change.archive.header.sources)
-    change.check_room(sum(survey.count for survey in surveys) * (dtype.itemsize + ARCHIVE_BYTES_A_POINT))
+    change.check_space(sum(survey.count for survey in surveys) * (dtype.itemsize + ARCHIVE_BYTES_A_POINT))
     units = [
         SpoolUnit(
             survey.scan, number, part.start, part.stop, part.count, header.lattice, change.config, dtype, folder,

@@ -12,7 +12,7 @@ from ..passes.radius_classes import class_limits
 AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def touched(
+def affected_voxels(
     archive: Archive, boxes: Mapping[int, NDArray[np.int64]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the index rows of voxels to rebuild, and of voxels whose points are needed for that.

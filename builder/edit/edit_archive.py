@@ -1,7 +1,7 @@
 """Adding and removing scans: makes a new generation of an archive.
 
 Only the affected voxels are rebuilt. added_scans.py prepares what is added, removed_scans.py what is removed.
-rebuild_voxels.py builds both, and transaction.py publishes the result.
+rebuild_voxels.py builds both, and archive_change.py publishes the result.
 """
 
 from collections.abc import Sequence
@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from ...schemas.errors import BadRequestError, ScanError
-from ..resume.build_identity import changed_inputs, described
+from ..resume.build_identity import changed_inputs, describe_build
 from ..run.progress import Progress
 from ..sources.scan_files import open_input_files
 from ..spool.spool import Spool
-from .added_scans import Wanted, box_of, no_longer_unknown, source_of, spool_added, survey_added
-from .rebuild_voxels import ChangeSummary, Difference, rebuild
+from .added_scans import AddOptions, box_of, no_longer_unknown, source_of, spool_added, survey_added
+from .archive_change import changing, scan_name
+from .rebuild_voxels import ChangeSpec, ChangeSummary, rebuild
 from .removed_scans import find_removed, rows_of
-from .transaction import changing, scan_name
 
 # Marks a removed scan, which keeps its row, so that the numbers of the others stay the same.
 REMOVED = "removed"
@@ -50,7 +50,7 @@ def add_scans(
         )
     with changing(Path(target), jobs, memory_bytes, progress) as change:
         inputs = open_input_files(paths, change.config.spacing)
-        what = described(inputs, change.config)
+        what = describe_build(inputs, change.config)
 
         def check_unchanged() -> None:
             """Raise ScanError if a file changed: its hash may not match the points read later."""
@@ -61,7 +61,7 @@ def add_scans(
 
         if change.reads_all:
             change.readers(change.points)  # refuses now: voxels that are too large do not get smaller
-        surveys = survey_added(change, inputs, Wanted(again, new_only, strict))
+        surveys = survey_added(change, inputs, AddOptions(again, new_only, strict))
         try:
             moved, places = spool_added(change, surveys)
         except ScanError:
@@ -75,7 +75,7 @@ def add_scans(
         counts = dict(zip(new.keys.tolist(), new.counts.tolist(), strict=True))
         boxes = {key: box_of(key, new) for key in counts}
         names = tuple(scan_name(source) for source in added)
-        return rebuild(change, Difference(header, names, boxes, places=places, added=counts), check_unchanged)
+        return rebuild(change, ChangeSpec(header, names, boxes, places=places, added=counts), check_unchanged)
 
 
 def remove_scans(
@@ -111,4 +111,4 @@ def remove_scans(
             for row, s in enumerate(header.sources)
         )
         names = tuple(scan_name(header.sources[row]) for row in sorted(rows))
-        return rebuild(change, Difference(replace(header, sources=sources), names, boxes, rows))
+        return rebuild(change, ChangeSpec(replace(header, sources=sources), names, boxes, rows))

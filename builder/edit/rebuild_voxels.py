@@ -15,24 +15,27 @@ from ...schemas.archive.archive_writer import write_index
 from ...schemas.archive.index import SHARD_FOLDER, Header, RadiusNow, Source
 from ...schemas.archive.voxel_grid import voxel_coordinates
 from ...schemas.errors import CorruptError
-from ..config import RADIUS_SAMPLE
-from ..passes.build_shards import Shard, ShardUnit, build_shard, plan_shards
+from ..build_limits import (
+    ARCHIVE_BYTES_A_POINT,
+    DENSE_POINTS,
+    RADIUS_SAMPLE,
+    SCRATCH_BYTES_A_POINT,
+    check_normals,
+)
+from ..passes.build_shards import Shard, ShardUnit, build_shard, max_neighbours, plan_shards
 from ..passes.point_spacing import archive_mean
-from ..passes.resumable_passes import VOXEL_BYTES_A_POINT
-from ..pipeline import ARCHIVE_BYTES_A_POINT, SCRATCH_BYTES_A_POINT
+from ..passes.spool_pass import MIN_RUN_POINTS
 from ..sources.coincident_scans import coincident_sources
 from ..spool.spool import Spool
-from ..spool.spool_pass import LEAST_RUN_POINTS
-from ..voxel.dense_voxel import DENSE_POINTS, check_normals
-from .affected_voxels import touched
+from .affected_voxels import affected_voxels
+from .archive_change import Change, link_kept_shards, publish, reading_back, verify_new
 from .stored_points import (
     RUN_BYTES_A_POINT,
-    FewUnit,
+    CappedUnit,
     GatherUnit,
-    count_few,
+    count_capped,
     gather,
 )
-from .transaction import Change, publish, reading_back, show_kept, verify_new
 
 
 class ChangeSummary(NamedTuple):
@@ -66,12 +69,12 @@ class ChangeSummary(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
-class Difference(NamedTuple):
+class ChangeSpec(NamedTuple):
     """Intended change. header: with the new sources.  scans: names of the scans added or removed.
 
     boxes: key -> box (2, 3) of the points that change, lattice.  dropped: scans whose points are
     removed.
-    places: `places_sum` of the points already spooled (spool.py).  added: key -> number of these
+    places: `position_hash` of the points already spooled (run_files.py).  added: key -> number of these
     points.
     """
 
@@ -83,47 +86,45 @@ class Difference(NamedTuple):
     added: Mapping[int, int] = {}
 
 
-def rebuild(
-    change: Change, difference: Difference, check: Callable[[], None] = lambda: None
-) -> ChangeSummary:
-    """Rebuild what a difference affects, and publish it. check: called before publication.
+def rebuild(change: Change, spec: ChangeSpec, check: Callable[[], None] = lambda: None) -> ChangeSummary:
+    """Rebuild what a change affects, and publish it. check: called before publication.
 
     Raise CorruptError if the data read back differ from the data written, and SolidcloudError if
     there is not enough disk space, or not enough memory for a voxel. After an error the archive is
     unchanged.
     """
     before = change.archive.header
-    header = replace(difference.header, generation=before.generation + 1, radius_now=None)
-    rebuilt, read = touched(change.archive, difference.boxes)
-    built, there = _points_after(change, rebuilt, difference.added)
+    header = replace(spec.header, generation=before.generation + 1, radius_now=None)
+    rebuilt, read = affected_voxels(change.archive, spec.boxes)
+    built, there = _points_after(change, rebuilt, spec.added)
     for counts in (change.points[read], there if change.reads_all else built):
         change.readers(counts)
-    change.check_room(_room(change, header, rebuilt, read, built))
-    gathered = _gather(change, rebuilt, read, difference.dropped)
+    change.check_space(_room(change, header, rebuilt, read, built))
+    gathered = _gather(change, rebuilt, read, spec.dropped)
     spool = Spool(change.folder / "spool", change.dtype, header.lattice)
-    wanted = set(difference.boxes) | set(change.archive.voxels["key"][rebuilt].tolist())
+    wanted = set(spec.boxes) | set(change.archive.voxels["key"][rebuilt].tolist())
     shards = _build(change, header, spool, wanted)
     header, table, files = _new_index(change, header, rebuilt, shards)
     header = replace(
         header,
         radius_counts=before.radius_counts - gathered.radius_counts + sum(s.radius_counts for s in shards),
-        radius_capped=before.radius_capped - gathered.few + sum(s.radius_capped for s in shards),
+        radius_capped=before.radius_capped - gathered.capped + sum(s.radius_capped for s in shards),
     )
     _check_counts(change, header)
     new = {s.name for s in shards}
-    show_kept(change, files, new)
+    link_kept_shards(change, files, new)
     write_index(change.folder, header, table, files)
     to_read = table if change.reads_all else np.concatenate([table[:0], *(s.rows for s in shards)])
     with reading_back(change, new), change.reading(to_read["rows"][:, 2].astype(np.int64)):
         header = _measure(change, header)
         write_index(change.folder, header, table, files)
-        verify_new(change, new, difference.places + gathered.places)
+        verify_new(change, new, spec.places + gathered.places)
         check()
         publish(change, sorted(new), {name for name, _ in files})
     return ChangeSummary(
         archive=change.target,
         generation=header.generation,
-        scans=difference.scans,
+        scans=spec.scans,
         points_before=before.points,
         points=header.points,
         voxels=len(table),
@@ -192,12 +193,12 @@ def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[
 class _Before(NamedTuple):
     """Stored state of the voxels to rebuild.
 
-    radius_counts: of each class.  few: their part of `radius_capped`.  places: `places_sum` of
-    their points that stay (spool.py).
+    radius_counts: of each class.  capped: their part of `radius_capped`.  places: `position_hash` of
+    their points that stay (run_files.py).
     """
 
     radius_counts: NDArray[np.int64]
-    few: int
+    capped: int
     places: int
 
 
@@ -212,7 +213,7 @@ def _gather(
     ]
     with change.reading(change.points[read]) as beside:
         # With radius classes, two runs are filled at the same time.
-        most = max(LEAST_RUN_POINTS, beside // (RUN_BYTES_A_POINT * (2 if before else 1)))
+        most = max(MIN_RUN_POINTS, beside // (RUN_BYTES_A_POINT * (2 if before else 1)))
         units = [
             GatherUnit(
                 change.target,
@@ -235,18 +236,16 @@ def _gather(
             ]
     counts = sum((part.radius_counts for part in parts), np.zeros(32, np.int64))
     places = sum(part.places for part in parts)
-    keys = [part.perhaps_few for part in parts if part.perhaps_few]
+    keys = [part.perhaps_capped for part in parts if part.perhaps_capped]
     if not keys or before is None:
         return _Before(counts, 0, places)
     spool = Spool(before, change.dtype, change.archive.header.lattice)
-    few = [FewUnit(held, sum(map(spool.count, held)), spool, config, _most_near(change)) for held in keys]
+    few = [
+        CappedUnit(held, sum(map(spool.count, held)), spool, config, max_neighbours(change.share))
+        for held in keys
+    ]
     with change.stage("neighbours", sum(unit.points for unit in few), "points"):
-        return _Before(counts, sum(change.run(count_few, few)), places)
-
-
-def _most_near(change: Change) -> int:
-    """Return the number of points around a voxel that a job may hold beside it."""
-    return max(1 << 16, change.share // (2 * VOXEL_BYTES_A_POINT))
+        return _Before(counts, sum(change.run(count_capped, few)), places)
 
 
 def _build(change: Change, header: Header, spool: Spool, wanted: set[int]) -> list[Shard]:
@@ -255,7 +254,7 @@ def _build(change: Change, header: Header, spool: Spool, wanted: set[int]) -> li
     check_normals(spool.counts[which], change.config)
     units = [
         ShardUnit(
-            number, header.generation, keys, points, spool, header.lattice, change.config, _most_near(change),
+            number, header.generation, keys, points, spool, header.lattice, change.config, max_neighbours(change.share),
             header.archive_id, change.folder / SHARD_FOLDER,
         )
         for number, (keys, points) in enumerate(plan_shards(spool.keys[which], spool.counts[which]))

@@ -7,8 +7,8 @@ import numpy as np
 
 from ...schemas.archive.index import Source
 from ...schemas.errors import BadRequestError, CorruptError
-from .stored_points import FindUnit, Found, find_scans
-from .transaction import Change, scan_name
+from .archive_change import Change, scan_name
+from .stored_points import FindUnit, VoxelOfScans, find_scans
 
 
 def rows_of(sources: Sequence[Source], scans: Sequence[str], target: Path) -> frozenset[int]:
@@ -34,7 +34,7 @@ def rows_of(sources: Sequence[Source], scans: Sequence[str], target: Path) -> fr
     return frozenset(rows)
 
 
-def find_removed(change: Change, scans: frozenset[int]) -> list[Found]:
+def find_removed(change: Change, scans: frozenset[int]) -> list[VoxelOfScans]:
     """Find the voxels that hold points of these scans.
 
     Raise CorruptError unless all of their points are found.
@@ -43,7 +43,7 @@ def find_removed(change: Change, scans: frozenset[int]) -> list[Found]:
     rows = np.arange(len(archive.voxels))
     units = [FindUnit(change.target, held, points, scans) for held, points in change.units_of(rows)]
     with change.reading(change.points), change.stage("find", archive.header.points, "points"):
-        found: list[Found] = [voxel for part in change.run(find_scans, units) for voxel in part]
+        found: list[VoxelOfScans] = [voxel for part in change.run(find_scans, units) for voxel in part]
     for scan in sorted(scans):
         count, stored = sum(f.counts.get(scan, 0) for f in found), archive.header.sources[scan].count
         if count != stored:

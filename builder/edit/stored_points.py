@@ -16,17 +16,19 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.radius_model import LOCAL_CLASSES, RADIUS_CLASSES, RIM_BIT
 from ...schemas.kernels.morton import morton_decode
+from ...schemas.process.new_file import new_file
+from ..build_limits import is_dense
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.octree_cells import voxel_codes
 from ..kernels.points.spool_rows import fill_local
 from ..kernels.points.voxel_records import position_hash_sum
 from ..passes.radius_classes import voxel_classes
-from ..resume.journal import new_file
-from ..spool.spool import RUN_SUFFIX, Spool, canonical_columns, places_sum, spool_dtype, write_directory
+from ..spool.run_files import RUN_SUFFIX, canonical_columns, position_hash, spool_dtype, write_directory
+from ..spool.spool import Spool
 from ..voxel.coincident_points import heap_place
-from ..voxel.dense_voxel import is_dense, is_heap, plan_parts
-from ..voxel.record_points import leaves_of, taken
+from ..voxel.dense_voxel import is_heap, plan_parts
+from ..voxel.record_points import iter_points, leaves_of
 from ..voxel.voxel_octree import gather_voxel
 
 # Bytes per point held while a run is written: code and columns, and for one voxel order, sorted
@@ -60,12 +62,12 @@ class Gathered(NamedTuple):
     """Result of spooling stored voxels.
 
     radius_counts: (32,) int64, points of each radius class as stored.
-    perhaps_few: keys of the voxels that may have points with too few neighbours for a class.
-    places: `places_sum` of the points that are not left out (spool.py).
+    perhaps_capped: keys of the voxels that may have points with too few neighbours for a class.
+    places: `position_hash` of the points that are not left out (run_files.py).
     """
 
     radius_counts: NDArray[np.int64]
-    perhaps_few: tuple[int, ...]
+    perhaps_capped: tuple[int, ...]
     places: int
 
 
@@ -78,7 +80,7 @@ class FindUnit(NamedTuple):
     scans: frozenset[int]
 
 
-class Found(NamedTuple):
+class VoxelOfScans(NamedTuple):
     """Voxel that holds points of these scans.
 
     row: of the index.  box: (2, 3) lattice, of those points.  counts: points of each scan.
@@ -89,14 +91,14 @@ class Found(NamedTuple):
     counts: dict[int, int]
 
 
-class FewUnit(NamedTuple):
+class CappedUnit(NamedTuple):
     """Voxels whose points with too few neighbours are to be counted."""
 
     keys: tuple[int, ...]
     points: int
     spool: Spool
     config: BuildConfig
-    most_near: int
+    max_neighbours: int
 
 
 def stored_column(record: DecompressedRecord, name: str, rows: NDArray[np.int64]) -> NDArray:
@@ -119,7 +121,7 @@ class _Points(NamedTuple):
 def record_points(record: DecompressedRecord, dtype: np.dtype) -> Iterator[_Points]:
     """Yield the points of a record, with the columns of a spool row, a block at a time."""
     columns = [name for name in dtype.names or () if name != "local"]
-    for block in taken(record, _FROM_CORNER):
+    for block in iter_points(record, _FROM_CORNER):
         yield _Points(
             voxel_codes(block.xyz), {name: stored_column(record, name, block.rows) for name in columns}
         )
@@ -193,7 +195,7 @@ def gather(unit: GatherUnit) -> Gathered:
     runs = _Runs(unit.spool, unit.name, dtype, unit.run_points)
     before = _Runs(unit.before, unit.name, dtype, unit.run_points) if unit.before else None
     dropped = np.array(sorted(unit.dropped), np.int64)
-    counts, perhaps_few, places = np.zeros(RADIUS_CLASSES, np.int64), [], 0
+    counts, perhaps_capped, places = np.zeros(RADIUS_CLASSES, np.int64), [], 0
     wanted = {name for name in dtype.names or () if name != "local"} | {"radius_class"}
     with Archive(unit.archive) as archive:
         for row in unit.rows:
@@ -207,20 +209,20 @@ def gather(unit: GatherUnit) -> Gathered:
                         before.take(key, points)
                     if len(dropped):
                         points, gone = _without(points, dropped)
-                        places -= places_sum(
+                        places -= position_hash(
                             key, morton_decode(gone).astype(np.int32), archive.header.lattice
                         )
                     runs.take(key, points)
             if archive.header.radius_class:
                 each = record.class_counts()
                 counts += each
-                if few_are_possible(each, archive.header.models):
-                    perhaps_few.append(key)
+                if may_be_capped(each, archive.header.models):
+                    perhaps_capped.append(key)
             del record  # free it before the next one is read
     for written in (runs, before):
         if written:
             written.write()
-    return Gathered(counts, tuple(perhaps_few), places)
+    return Gathered(counts, tuple(perhaps_capped), places)
 
 
 def _without(points: _Points, scans: NDArray[np.int64]) -> tuple[_Points, NDArray[np.uint64]]:
@@ -230,7 +232,7 @@ def _without(points: _Points, scans: NDArray[np.int64]) -> tuple[_Points, NDArra
     return _Points(points.codes[kept], columns), points.codes[~kept]
 
 
-def few_are_possible(counts: NDArray[np.int64], models: tuple[str, ...]) -> bool:
+def may_be_capped(counts: NDArray[np.int64], models: tuple[str, ...]) -> bool:
     """Return whether a voxel may hold points with too few neighbours.
 
     counts: points of each class. Such points have the last local class, and no rim.
@@ -240,7 +242,7 @@ def few_are_possible(counts: NDArray[np.int64], models: tuple[str, ...]) -> bool
     return int(counts[last]) > 0
 
 
-def find_scans(unit: FindUnit) -> list[Found]:
+def find_scans(unit: FindUnit) -> list[VoxelOfScans]:
     """Find the voxels that hold points of some scans.
 
     Raise CorruptError if a record cannot be read.
@@ -256,7 +258,7 @@ def find_scans(unit: FindUnit) -> list[Found]:
             low, high = np.full(3, 1 << 31, np.int64), np.full(3, -1, np.int64)
             counts = np.zeros(len(scans), np.int64)
             with archive.locating(row):
-                for block in taken(record, _FROM_CORNER):
+                for block in iter_points(record, _FROM_CORNER):
                     of = stored_column(record, "scan_index", block.rows)
                     if len(xyz := block.xyz[np.isin(of, scans)]):
                         low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
@@ -264,7 +266,9 @@ def find_scans(unit: FindUnit) -> list[Found]:
             del record
             corner = archive.coordinates[row] * archive.header.lattice.voxel_steps
             each = dict(zip(scans.tolist(), counts.tolist(), strict=True))
-            found.append(Found(row, np.stack([low, high]) + corner, {s: n for s, n in each.items() if n}))
+            found.append(
+                VoxelOfScans(row, np.stack([low, high]) + corner, {s: n for s, n in each.items() if n})
+            )
     return found
 
 
@@ -279,12 +283,12 @@ def _holds_scans(record: DecompressedRecord, scans: NDArray[np.int64]) -> bool:
     return False
 
 
-def count_few(unit: FewUnit) -> int:
+def count_capped(unit: CappedUnit) -> int:
     """Count the points of voxels with too few neighbours for a class, as in `radius_capped`."""
-    return sum(_few_of(key, unit) for key in unit.keys)
+    return sum(_capped_of(key, unit) for key in unit.keys)
 
 
-def _few_of(key: int, unit: FewUnit) -> int:
+def _capped_of(key: int, unit: CappedUnit) -> int:
     """Count such points of one voxel.
 
     A dense voxel is processed in the parts that it is built in.
@@ -292,13 +296,13 @@ def _few_of(key: int, unit: FewUnit) -> int:
     spool, models = unit.spool, unit.config.models
     if not is_dense(spool.count(key), unit.config):
         local = gather_voxel(spool.rows(key)).local
-        return voxel_classes(key, local, models, spool, unit.most_near).few
+        return voxel_classes(key, local, models, spool, unit.max_neighbours).capped
     few = 0
     for part in plan_parts(spool, key, unit.config):
-        codes, times = range(part[0].code, part[-1].past), 1
+        codes, times = range(part[0].code, part[-1].code_end), 1
         if is_heap(part):  # all points have the same class
             local, times = heap_place(codes.start), part[0].points
         else:
             local = gather_voxel(spool.block_rows(key, codes.start, codes.stop)).local
-        few += times * voxel_classes(key, local, models, spool, unit.most_near, codes).few
+        few += times * voxel_classes(key, local, models, spool, unit.max_neighbours, codes).capped
     return few

@@ -24,7 +24,7 @@ from ...schemas.archive.vtkhdf import vtk_file
 from ...schemas.errors import BadRequestError
 from ...schemas.process.new_file import sync_folder
 from ..run.progress import Progress, Silent
-from ..voxel.record_points import Taken, read_columns, record_columns, stored_columns, taken
+from ..voxel.record_points import PointBlock, iter_points, read_columns, record_columns, stored_columns
 from .export_contents import Contents
 
 FORMATS = ("laz", "las", "ply", "vtkhdf")
@@ -150,11 +150,11 @@ def _format_of(output: Path, form: str | None) -> str:
 
 def _blocks(
     archive: Archive, row: int, base: NDArray[np.int64], box: NDArray[np.int64], columns: dict[str, np.dtype]
-) -> Iterator[tuple[Taken, dict[str, NDArray]]]:
+) -> Iterator[tuple[PointBlock, dict[str, NDArray]]]:
     """Yield the points of one voxel in a box, with columns, a block at a time."""
     record = archive.open_voxel(row, columns=record_columns(columns))
     with archive.locating(row):
-        for block in taken(record, base[row], box=box):
+        for block in iter_points(record, base[row], box=box):
             yield block, read_columns(record, columns, block.rows)
 
 

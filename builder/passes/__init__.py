@@ -1,6 +1,7 @@
-"""Passes of a build: survey, filter, radius classes, shards, preview, verification.
+"""Passes of a build, one file a pass: survey, spool, filter, shards, radius, preview, verification.
 
-May import builder/config.py, builder.kernels, builder.resume, builder.run, builder.sources,
-builder.sources.common, builder.spool, builder.voxel, schemas.
-Read in the order in which pipeline.py calls them: survey.py, filter.py, build_shards.py, verify.py.
+May import builder/build_limits.py, builder/config.py, builder.kernels, builder.resume, builder.run,
+builder.sources, builder.sources.common, builder.spool, builder.voxel, schemas.
+Read in the order in which pipeline.py calls them: survey.py, spool_pass.py, filter.py,
+build_shards.py, point_spacing.py, preview.py, verify.py.
 """

@@ -3,25 +3,29 @@
 They are pure and idempotent, and run in any process.
 """
 
+import base64
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive_writer import write_shard
 from ...schemas.archive.codec import encode_voxel
-from ...schemas.archive.index import shard_name
+from ...schemas.archive.index import SHARD_FOLDER, VOXEL_DTYPE, shard_name
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.process.interrupts import check_interrupt
-from ..config import BuildConfig, shard_points
+from ..build_limits import VOXEL_BYTES_A_POINT, check_normals, is_dense, shard_points
+from ..config import BuildConfig
+from ..resume.kept_work import BuildDirectory, ShardIntact, Work, run_unfinished
+from ..resume.transaction import Transaction
 from ..spool.spool import Spool
-from ..voxel.dense_voxel import BuiltVoxel, build_dense, is_dense
-from ..voxel.voxel_octree import build_voxel, gather_voxel
+from ..voxel.dense_voxel import build_dense
+from ..voxel.voxel_octree import BuiltVoxel, build_voxel, gather_voxel
 from .radius_classes import ALL_CODES, voxel_classes
 
 
@@ -29,7 +33,7 @@ class ShardUnit(NamedTuple):
     """Shard to write. number, generation: of its name.  keys: of its voxels, ascending.
 
     points: total number in its voxels.  spool: source of the points.
-    most_near: points around a voxel that may be held beside it, see radius_classes.py.  folder:
+    max_neighbours: points around a voxel that may be held beside it, see radius_classes.py.  folder:
     destination of the shard.
     """
 
@@ -40,7 +44,7 @@ class ShardUnit(NamedTuple):
     spool: Spool
     lattice: Lattice
     config: BuildConfig
-    most_near: int
+    max_neighbours: int
     archive_id: bytes
     folder: Path
 
@@ -101,9 +105,9 @@ class _ClassCounts:
         times: number of times that each point occurs and is counted.
         """
         unit = self.unit
-        found = voxel_classes(key, local, unit.config.models, unit.spool, unit.most_near, codes)
+        found = voxel_classes(key, local, unit.config.models, unit.spool, unit.max_neighbours, codes)
         self.of += times * np.bincount(found.of_point, minlength=RADIUS_CLASSES)
-        self.capped += times * found.few
+        self.capped += times * found.capped
         return found.of_point
 
 
@@ -141,3 +145,54 @@ def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxe
         voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
         del points
         yield BuiltVoxel(voxel, encode_voxel(voxel, unit.archive_id), low, high)
+
+
+def max_neighbours(memory_bytes: int) -> int:
+    """Return the number of points around a voxel that a job may hold beside it, or a part of it."""
+    return max(1 << 16, memory_bytes // (2 * VOXEL_BYTES_A_POINT))
+
+
+def build_shards(
+    spool: Spool,
+    identity: bytes,
+    build_dir: BuildDirectory,
+    build: Transaction,
+) -> list[Shard]:
+    """Run the third pass: build every voxel and write the shards. The largest are built first."""
+    check_normals(spool.counts, build.config)
+    folder = build_dir.archive / SHARD_FOLDER
+    most = max_neighbours(build.share)
+    plans = plan_shards(spool.keys, spool.counts)
+    units = [
+        (
+            f"done/{number:06d}",
+            ShardUnit(number, 0, keys, points, spool, spool.lattice, build.config, most, identity, folder),
+        )
+        for number, (keys, points) in enumerate(plans)
+    ]
+    units.sort(key=lambda named: -named[1].points)
+    work = Work(build_shard, dump_shard, load_shard, ShardIntact(folder))
+    with build.stage("build", sum(points for _, points in plans), "points"):
+        shards = run_unfinished(
+            build_dir.journal, build.executor, work, units, build.progress, lambda unit: unit.points
+        )
+    named = {shard.name for shard in shards}
+    for path in folder.iterdir():
+        if path.name not in named:
+            path.unlink(missing_ok=True)
+    return [shard for _, shard in sorted(zip((unit.number for _, unit in units), shards, strict=True))]
+
+
+def dump_shard(shard: Shard) -> dict[str, Any]:
+    """Convert a shard to its journal entry."""
+    return {
+        **shard._asdict(),
+        "rows": base64.b85encode(shard.rows.tobytes()).decode(),
+        "radius_counts": shard.radius_counts.tolist(),
+    }
+
+
+def load_shard(noted: dict[str, Any]) -> Shard:
+    """Convert a journal entry to a shard."""
+    rows = np.frombuffer(base64.b85decode(noted["rows"]), VOXEL_DTYPE)
+    return Shard(**{**noted, "rows": rows, "radius_counts": np.array(noted["radius_counts"], np.int64)})

@@ -14,8 +14,8 @@ from ...schemas.archive.voxel_grid import Lattice, voxel_coordinates
 from ..config import BuildConfig
 from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
-from ..spool.spool_pass import Spooled
 from .build_shards import Shard
+from .spool_pass import Spooled
 from .survey import Survey
 
 

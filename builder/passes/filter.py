@@ -14,23 +14,21 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, CorruptError
 from ..config import BuildConfig
-from ..resume.build_directory import RUN_FOLDERS
-from ..resume.journal import Journal, Work, resumed
+from ..resume.kept_work import RUN_FOLDERS, Journal, RunsIntact, Work, run_unfinished
 from ..run.executor import Executor
 from ..run.progress import Progress
-from ..spool.spool import (
+from ..spool.run_files import (
     RUN_SUFFIX,
     RunSums,
-    Spool,
     canonical_columns,
     new_run,
-    places_sum,
+    position_hash,
     row_codes,
     spool_dtype,
     write_directory,
 )
+from ..spool.spool import Spool
 from ..spool.spool_blocks import BlockReader
-from ..spool.spool_pass import RunsHold
 from .filter_rules import Rules, make_rules
 from .filter_verdicts import KEPT, REASONS, near_verdicts, thin_verdicts
 
@@ -55,7 +53,7 @@ class FilterUnit(NamedTuple):
 class Filtered(NamedTuple):
     """Result of one unit. runs: name of its run -> sums of the run; empty if no point remains.
 
-    places_before, places: the `places_sum` of the points read and of the points kept.
+    places_before, places: the `position_hash` of the points read and of the points kept.
     """
 
     runs: dict[str, RunSums]
@@ -86,9 +84,9 @@ def filtered_spool(
         target.mkdir(parents=True, exist_ok=True)
         dtype = spool_dtype(config) if i == len(passes) - 1 else spool.dtype
         units = _units(spool, rule, dtype, target)
-        work = Work(filter_voxels, _dump, _load, RunsHold(target))
+        work = Work(filter_voxels, _dump, _load, RunsIntact(target))
         named = [(f"{name}/{unit.path.stem}", unit) for unit in units]
-        results = resumed(journal, executor, work, named, progress, lambda unit: unit.points)
+        results = run_unfinished(journal, executor, work, named, progress, lambda unit: unit.points)
         for result in results:
             _add(left_out, result.left_out)
         if spool.places not in (None, sum(r.places_before for r in results) % (1 << 64)):
@@ -156,8 +154,8 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
                 )
                 _add(left_out, _counted(block.rows, verdict))
                 rows = _narrowed(block.rows[verdict == KEPT], unit.dtype)
-                before += places_sum(key, block.rows["local"], unit.spool.lattice)
-                after += places_sum(key, rows["local"], unit.spool.lattice)
+                before += position_hash(key, block.rows["local"], unit.spool.lattice)
+                after += position_hash(key, rows["local"], unit.spool.lattice)
                 file.write(rows[np.lexsort((*canonical_columns(rows), row_codes(rows)))].tobytes())
                 kept += len(rows)
             if kept:

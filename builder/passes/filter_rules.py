@@ -25,14 +25,11 @@ name.
 
 from fractions import Fraction
 from math import isqrt
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.errors import BadRequestError
 from ..config import BuildConfig
-from ..spool.spool import spool_dtype
 
 # Reasons why a point was left out, as `info` shows them.
 MOVING, OUTLIER, THINNED = "moving", "outliers", "thinned"
@@ -66,31 +63,6 @@ class Rules(NamedTuple):
     seen: Reach | None
     outliers: Reach | None
     thin: int | None
-
-
-def is_filtered(config: BuildConfig) -> bool:
-    """Return whether any rule is enabled."""
-    return not (config.thin is None and config.outliers is None and config.moving is None)
-
-
-def filter_dtype(config: BuildConfig) -> np.dtype:
-    """Return the dtype of spool rows that the filters read.
-
-    It always has the scan number, which the filters need and count by, whatever columns are kept.
-    """
-    names = spool_dtype(config).names or ()
-    fields: list[tuple[Any, ...]] = [("local", "<i4", (3,)), ("scan_index", "<u2")]
-    if "intensity" in names:
-        fields.append(("intensity", "<f4"))
-    return np.dtype(fields)
-
-
-def filter_passes(config: BuildConfig) -> int:
-    """Return the number of passes over all points.
-
-    Progress counts up to this multiple of their number.
-    """
-    return (config.moving is not None or config.outliers is not None) + (config.thin is not None)
 
 
 def _reach(option: str, metres: float, number: int, lattice: Lattice, wider: int = 1) -> Reach:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.neighbours.filter_counts import best_of_cells, count_others, other_scans
-from ..spool.spool import row_codes
+from ..spool.run_files import row_codes
 from ..spool.spool_blocks import Block, BlockReader, Box, Grid, NearPoints
 from .filter_rules import MOVING, OUTLIER, THINNED, Reach, Rules
 

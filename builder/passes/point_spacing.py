@@ -1,5 +1,8 @@
 """Mean closest-point distance of an archive, over a sample of its distinct points.
 
+Half of it is the radius of the model `mean`, as in the paper ([Fig12] section 7). It is computed
+over distinct points, across voxel borders; duplicates would make it zero (NUMERICS.md case 28).
+
 Closest points are found across voxel borders. A voxel is opened once for its own points. Points
 that may have a closer point in another voxel are queried there in rounds, with all queries to one
 voxel together. Each voxel is therefore opened twice in total, and one voxel at a time is in memory,
@@ -7,6 +10,7 @@ however many points they have: 12 bytes per point, 16 with intensities, for its 
 its nodes.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,19 +21,31 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ..kernels.neighbours.nearest_points import FAR, BoxTree, closest_in_record, make_box_tree, near_boxes
 from ..kernels.points.voxel_records import first_of_each
-from ..run.executor import Executor
+from ..run.executor import Executor, jobs_of, run_units, voxel_ranges
 from ..run.progress import Progress, Silent
-from ..run.work_units import jobs_of, portions, run_units
-from ..voxel.point_radius import SUM_UNITS, MeanDistance, mean_of_squares
-from ..voxel.record_points import hash_limit, leaves_of, spheres_of, taken
+from ..voxel.record_points import hash_limit, iter_points, leaves_of, spheres_of
 
 # Voxels in which a point is queried at a time. A corner has 7 other voxels around it.
 _NEAR_VOXELS = 8
 # Number of points queried together that may have a closer point in other voxels; it bounds the
 # lists of voxels.
 _BATCH = 1 << 17
+# Distances are added as integers of 2^-32 m: every order gives the same sum (NUMERICS.md N8), and
+# 10^6 distances of 2 km fit 63 bits.
+SUM_UNITS = 2.0**32
 # Squares of distances below this [SUM_UNITS] can be summed in three parts of 64 bits: 2 km.
 _SHORT = 1 << 43
+
+
+class MeanDistance(NamedTuple):
+    """Mean closest-point distance [m].
+
+    error: its standard error [m], 0 if all points were used.  sample: number of points used.
+    """
+
+    mean: float
+    error: float
+    sample: int
 
 
 class Sums(NamedTuple):
@@ -44,7 +60,7 @@ class Sums(NamedTuple):
         return Sums(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class Open(NamedTuple):
+class PendingPoints(NamedTuple):
     """Points that may have a closer point in another voxel.
 
     lattice: (q, 3) int64.  own: (q,) int64, row of their voxel.
@@ -95,7 +111,7 @@ def archive_mean(
     share = min(1.0, sample / header.points)
     units = [
         _OwnUnit(folder, rows, share, int(points[rows.start : rows.stop].sum()))
-        for rows in portions(points, jobs_of(executor))
+        for rows in voxel_ranges(points, jobs_of(executor))
     ]
     results = run_units(executor, _own_sums, units, progress, lambda unit: unit.points)
     found = [(unit.rows.start, *result) for unit, result in zip(units, results, strict=True)]
@@ -103,7 +119,9 @@ def archive_mean(
     sums = Sums()
     for _, part, _ in found:
         sums = sums.plus(part)
-    left = Open(*(np.concatenate(column) for column in zip(*(part[2] for part in found), strict=True)))
+    left = PendingPoints(
+        *(np.concatenate(column) for column in zip(*(part[2] for part in found), strict=True))
+    )
 
     def ask(
         rows: NDArray[np.int64],
@@ -111,15 +129,25 @@ def archive_mean(
         lattice: NDArray[np.int64],
         best: NDArray[np.int64],
     ) -> NDArray[np.int64]:
-        runs = sorted(portions(points[rows], jobs_of(executor)), key=lambda run: run.start)
+        runs = sorted(voxel_ranges(points[rows], jobs_of(executor)), key=lambda run: run.start)
         others = [_other_unit(folder, rows, starts, lattice, best, run) for run in runs]
         return np.concatenate(list(run_units(executor, _other_best, others, Silent(), len)))
 
     for begin in range(0, len(left.best), _BATCH):
-        batch = Open(*(column[begin : begin + _BATCH] for column in left))
-        settle(batch, boxes, ask)
+        batch = PendingPoints(*(column[begin : begin + _BATCH] for column in left))
+        refine_closest(batch, boxes, ask)
     sums = sums.plus(sums_of(left.best, header.lattice.step))
     return mean_of_squares(*sums, share >= 1.0)
+
+
+def mean_of_squares(total: int, squares: int, sample: int, everything: bool) -> MeanDistance:
+    """Return the mean from integer sums: distances in SUM_UNITS, and their squares."""
+    if sample == 0:
+        return MeanDistance(0.0, 0.0, 0)
+    mean = total / sample
+    variance = max(squares / sample - mean * mean, 0.0) * sample / max(sample - 1, 1)
+    error = 0.0 if everything else math.sqrt(variance / sample) / SUM_UNITS
+    return MeanDistance(mean / SUM_UNITS, error, sample)
 
 
 def sums_of(best: NDArray[np.int64], step: float) -> Sums:
@@ -137,8 +165,8 @@ def sums_of(best: NDArray[np.int64], step: float) -> Sums:
     return Sums(total, squares, len(distances))
 
 
-def settle(
-    left: Open,
+def refine_closest(
+    left: PendingPoints,
     boxes: BoxTree,
     ask: Callable[
         [NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]
@@ -171,7 +199,7 @@ def settle(
         pending = pending[again]
 
 
-def own_best(archive: Archive, row: int, share: float) -> tuple[Open, NDArray[np.int64]]:
+def closest_in_own_voxel(archive: Archive, row: int, share: float) -> tuple[PendingPoints, NDArray[np.int64]]:
     """Find the closest other point, within one voxel, of its sampled distinct points.
 
     Return the points that may have a closer point elsewhere, and the squared distances [steps^2] of
@@ -179,10 +207,10 @@ def own_best(archive: Archive, row: int, share: float) -> tuple[Open, NDArray[np
     """
     base, steps = _corners(archive)[row], archive.header.lattice.voxel_steps
     record = archive.open_voxel(row, columns=())
-    parts = list(taken(record, base, limit=hash_limit(share)))
+    parts = list(iter_points(record, base, limit=hash_limit(share)))
     nothing = np.empty(0, np.int64)
     if not parts:
-        return Open(np.empty((0, 3), np.int64), nothing, nothing), nothing
+        return PendingPoints(np.empty((0, 3), np.int64), nothing, nothing), nothing
     xyz, nodes = np.concatenate([p.xyz for p in parts]), np.concatenate([p.nodes for p in parts])
     first = first_of_each(xyz)
     queries, nodes = xyz[first].astype(np.int64), nodes[first]
@@ -193,10 +221,10 @@ def own_best(archive: Archive, row: int, share: float) -> tuple[Open, NDArray[np
     gap = np.minimum(queries + 1, steps - queries).min(axis=1)
     left = best > gap * gap
     own = np.full(int(left.sum()), row, np.int64)
-    return Open(queries[left] + base, own, best[left]), best[~left]
+    return PendingPoints(queries[left] + base, own, best[left]), best[~left]
 
 
-def other_best(
+def closest_in_other_voxel(
     archive: Archive, row: int, lattice: NDArray[np.int64], best: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return the new best (q,) [steps^2] of points (q, 3) queried in another voxel."""
@@ -219,7 +247,7 @@ def _points(archive: Archive) -> NDArray[np.int64]:
     return archive.voxels["rows"][:, 2].astype(np.int64)
 
 
-def _own_sums(unit: _OwnUnit) -> tuple[Sums, Open]:
+def _own_sums(unit: _OwnUnit) -> tuple[Sums, PendingPoints]:
     """Return the sums of the points settled in a range of voxels, and the others.
 
     Runs in any process.
@@ -227,10 +255,10 @@ def _own_sums(unit: _OwnUnit) -> tuple[Sums, Open]:
     with Archive(unit.folder) as archive:
         sums, left = Sums(), []
         for row in unit.rows:
-            still, done = own_best(archive, row, unit.share)
+            still, done = closest_in_own_voxel(archive, row, unit.share)
             sums = sums.plus(sums_of(done, archive.header.lattice.step))
             left.append(still)
-    return sums, Open(*(np.concatenate(column) for column in zip(*left, strict=True)))
+    return sums, PendingPoints(*(np.concatenate(column) for column in zip(*left, strict=True)))
 
 
 def _other_unit(
@@ -248,11 +276,11 @@ def _other_unit(
 
 
 def _other_best(unit: _OtherUnit) -> NDArray[np.int64]:
-    """Return `other_best` of each voxel of a unit, concatenated; runs in any process."""
+    """Return `closest_in_other_voxel` of each voxel of a unit, concatenated; runs in any process."""
     with Archive(unit.folder) as archive:
         return np.concatenate(
             [
-                other_best(archive, int(row), unit.lattice[a:b], unit.best[a:b])
+                closest_in_other_voxel(archive, int(row), unit.lattice[a:b], unit.best[a:b])
                 for row, a, b in _runs(unit.rows, unit.starts)
             ]
         )

@@ -12,18 +12,14 @@ from ...schemas.archive.index import Header
 from ...schemas.archive.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
 from ...schemas.errors import CorruptError
 from ...schemas.process.interrupts import check_interrupt
-from ...schemas.process.new_file import new_file, publish
+from ...schemas.process.new_file import publish
+from ...schemas.process.new_hdf5_file import new_hdf5_file
+from ..build_limits import MAX_PREVIEW_POINTS, PREVIEW_PART, WHOLE_PREVIEW_POINTS
 from ..kernels.points.voxel_records import first_of_each, point_hashes
-from ..run.executor import Executor
+from ..run.executor import Executor, jobs_of, run_units, voxel_ranges
 from ..run.progress import Progress, Silent
-from ..run.work_units import jobs_of, portions, run_units
-from ..voxel.record_points import hash_limit, read_columns, record_columns, stored_columns, taken
+from ..voxel.record_points import hash_limit, iter_points, read_columns, record_columns, stored_columns
 
-# Most points of a preview: a viewer rotates them smoothly, and they take 1.2 MB.
-MOST_POINTS = 200_000
-# The preview has at most this fraction (1 / _PART) of an archive's points, or it would outweigh the
-# records of a small archive. Archives of up to _FEW points are previewed whole.
-_PART, _FEW = 8, 20_000
 # Coordinates are rounded to this [m]: they then compress to 6 bytes a point instead of 19.
 _ROUNDED = 2.0**-13
 
@@ -54,13 +50,13 @@ def write_preview(folder: Path, executor: Executor | None = None, progress: Prog
     """
     with Archive(folder) as archive:
         header, points = archive.header, archive.voxels["rows"][:, 2].astype(np.int64)
-    most = min(MOST_POINTS, max(_FEW, header.points // _PART))
+    most = min(MAX_PREVIEW_POINTS, max(WHOLE_PREVIEW_POINTS, header.points // PREVIEW_PART))
     # Five standard deviations below the limit: the random number of selected points hardly ever
     # exceeds it.
     share = 1.0 if header.points <= most else (most - 5 * math.sqrt(most)) / header.points
     units = [
         _Unit(folder, rows, share, int(points[rows.start : rows.stop].sum()))
-        for rows in portions(points, jobs_of(executor))
+        for rows in voxel_ranges(points, jobs_of(executor))
     ]
     results = run_units(executor, _choose, units, progress or Silent(), lambda unit: unit.points)
     found = sorted(zip(units, results, strict=True), key=lambda pair: pair[0].rows.start)
@@ -69,7 +65,7 @@ def write_preview(folder: Path, executor: Executor | None = None, progress: Prog
         chosen = _choose(_Unit(folder, range(1), 1.0, 1))
         chosen = _Chosen(chosen.lattice[:1], {name: column[:1] for name, column in chosen.columns.items()})
     path = folder / PREVIEW_NAME
-    with new_file(path) as file:
+    with new_hdf5_file(path) as file:
         file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
         file.attrs["generation"] = np.uint32(header.generation)
         with VtkPoints(file, stored_columns(header), compressed=True) as out:
@@ -99,7 +95,7 @@ def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
         return [], [f"{path}: of another archive or generation"]
     low, high = header.lattice.to_world(np.stack([header.low, header.high]))
     outside = (found.points < low - _ROUNDED) | (found.points > high + _ROUNDED)
-    if not 0 < len(found.points) <= MOST_POINTS or outside.any():
+    if not 0 < len(found.points) <= MAX_PREVIEW_POINTS or outside.any():
         return [f"{path}: points that are not the archive's: delete it"], []
     return [], []
 
@@ -112,7 +108,7 @@ def _choose(unit: _Unit) -> _Chosen:
         base, limit = archive.coordinates * archive.header.lattice.voxel_steps, hash_limit(unit.share)
         for row in unit.rows:
             record = archive.open_voxel(row, columns=record_columns(columns))
-            some = list(taken(record, base[row], limit=limit))
+            some = list(iter_points(record, base[row], limit=limit))
             if some:
                 xyz, rows = np.concatenate([t.xyz for t in some]), np.concatenate([t.rows for t in some])
                 first = first_of_each(xyz)

@@ -35,20 +35,20 @@ ALL_CODES = range(1 << 63)
 READ_POINTS = 1 << 18
 # Sets of at most this many points are not split to save memory: halving them hardly reduces their
 # neighbourhood.
-LEAST_TOGETHER = 64
+MIN_TOGETHER = 64
 
 
 class Classes(NamedTuple):
     """Radius classes.
 
-    of_point: (n,) uint8.  few: number of points with too few neighbours for a local class.
+    of_point: (n,) uint8.  capped: number of points with too few neighbours for a local class.
     """
 
     of_point: NDArray[np.uint8]
-    few: int
+    capped: int
 
 
-class Limits(NamedTuple):
+class ClassLimits(NamedTuple):
     """Squared distance limits [steps^2].
 
     reach2: limit up to which a point is a neighbour.
@@ -60,7 +60,7 @@ class Limits(NamedTuple):
     local2: NDArray[np.int64]
 
 
-def class_limits(step: float) -> Limits:
+def class_limits(step: float) -> ClassLimits:
     """Return the limits on a lattice of step `step` [m].
 
     The step is taken as its decimal text: 10 steps of 0.1 mm are exactly 1 mm.
@@ -68,7 +68,7 @@ def class_limits(step: float) -> Limits:
     steps_a_metre = 1 / Fraction(repr(step))
     radii = [Fraction(radius, 1_000_000) for radius in LOCAL_RADII[:-1]]
     local2 = [int((LOCAL_SHARE * radius * steps_a_metre) ** 2) for radius in radii]
-    return Limits(int((Fraction(repr(REACH)) * steps_a_metre) ** 2), np.array(local2, np.int64))
+    return ClassLimits(int((Fraction(repr(REACH)) * steps_a_metre) ** 2), np.array(local2, np.int64))
 
 
 def voxel_classes(
@@ -76,13 +76,13 @@ def voxel_classes(
     local: NDArray[np.int32],
     models: Collection[str],
     spool: Spool,
-    most_near: int,
+    max_neighbours: int,
     codes: range = ALL_CODES,
 ) -> Classes:
     """Compute the class of each point of a voxel; equal points have the same class.
 
     local: (n, 3) [voxel steps], n >= 1.
-    most_near: most points around the queried points that may be in memory, as long as a smaller
+    max_neighbours: most points around the queried points that may be in memory, as long as a smaller
     query helps.
     codes: for a voxel that is built in parts, the Morton codes of the queried part; `local` holds
     all points with these codes.
@@ -97,7 +97,7 @@ def voxel_classes(
         begin, end = parts.pop()
         asked = own[begin:end]
         box = np.stack([asked.min(axis=0) - reach, asked.max(axis=0) + reach]).astype(np.int64)
-        most = most_near if end - begin > LEAST_TOGETHER else None
+        most = max_neighbours if end - begin > MIN_TOGETHER else None
         near = _points_near(chain([own[:begin], own[end:]], _around(key, box, spool, codes)), box, most)
         if near is None:
             middle = (begin + end) // 2
@@ -196,7 +196,7 @@ def _points_in(key: int, box: NDArray[np.int64], spool: Spool, without: range) -
             yield np.concatenate([_inside(rows["local"], box) for rows in parts])
 
 
-def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: Limits) -> NDArray[np.uint8]:
+def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: ClassLimits) -> NDArray[np.uint8]:
     """Compute the classes (q,) of points, with the TOO_FEW_NEIGHBOURS bit, from each other and from points nearby.
 
     asked: (q, 3).  near: (m, 3).  All points are distinct.

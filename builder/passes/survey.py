@@ -14,20 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, Lattice, make_lattice
-from ...schemas.errors import ScanError
+from ...schemas.errors import BadRequestError, ScanError
+from ..build_limits import MAX_SCANS, RANGE_POINTS, RANGES
 from ..config import DEFAULT_STEP, BuildConfig
 from ..kernels.points.spool_rows import usable_bounds
+from ..resume.kept_work import BuildDirectory, Work, run_unfinished
+from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
 from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
+from ..sources.scan_files import InputFile
 
 # A header's bounds are trusted if no point lies farther outside than this [m]: they are rounded,
 # but not by more.
 BOUNDS_WITHIN = 0.01
-
-# Least and most points of a range. A worker takes 2 s for 2^24 points. A small scan is also cut,
-# which gives two workers something to do. A file is cut into about RANGES ranges, on every machine.
-RANGE_POINTS = (1 << 20, 1 << 24)
-RANGES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +151,7 @@ def hash_file(path: Path) -> tuple[str, str]:
         return "", str(error)
 
 
-def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:
+def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey:
     """Combine the results of a scan's ranges and of `hash_file` to its survey."""
     low = np.min([part.low for part in parts], axis=0)
     high = np.max([part.high for part in parts], axis=0)
@@ -188,10 +187,10 @@ def joined(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> Survey
 def survey_scan(scan: Scan) -> Survey:
     """Survey one scan in this process: bounds, counts, and whether it can be read to its end."""
     parts = [survey_range(unit) for unit in ranges(scan, scan.declared_count or 0)]
-    return joined(scan, parts, hash_file(scan.path))
+    return join_ranges(scan, parts, hash_file(scan.path))
 
 
-def unopened(path: Path, fault: str, region: NDArray[np.float64] | None = None) -> Survey:
+def unopened_survey(path: Path, fault: str, region: NDArray[np.float64] | None = None) -> Survey:
     """Return the survey of a file that cannot be opened, or that holds no scan if `fault` is empty.
 
     region: (2, 3) world [m], where its points may have been; None: not known.
@@ -265,3 +264,85 @@ def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:
         ):
             return None
     return float(step)
+
+
+def survey_scans(
+    inputs: Sequence[InputFile],
+    about: int,
+    build_dir: BuildDirectory,
+    build: Transaction,
+) -> tuple[list[Survey], list[Survey]]:
+    """Read every scan once; return the usable scans, ordered by content, and the faulty ones."""
+    inputs = sorted(inputs, key=lambda item: str(item.path))  # this order numbers the journal entries
+    scans = [scan for item in inputs for scan in item.scans]
+    files = [item.path for item in inputs if item.scans]
+    units = [
+        (f"survey/{number:06d}-{unit.start:012d}", unit)
+        for number, scan in enumerate(scans)
+        for unit in ranges(scan, about)
+    ]
+    hashing = [(f"survey/sha256-{number:06d}", path) for number, path in enumerate(files)]
+    with build.stage("survey", sum(unit.points for _, unit in units), "points"):
+        both: list[tuple[str, Path | RangeUnit]] = [*hashing, *units]
+        work: Work[Path | RangeUnit, Any] = Work(_hash_or_survey, _dump_either, _load_either)
+        found = run_unfinished(build_dir.journal, build.executor, work, both, build.progress, _points_of)
+    sha256 = dict(zip(files, found, strict=False))
+    surveys, at = [], len(hashing)
+    for scan in scans:
+        count = len(ranges(scan, about))
+        surveys.append(join_ranges(scan, found[at : at + count], sha256[scan.path]))
+        at += count
+    surveys += [unopened_survey(item.path, item.fault, item.region) for item in inputs if not item.scans]
+    good = sorted((s for s in surveys if not s.fault), key=_content_order)
+    faulty = sorted((s for s in surveys if s.fault), key=_content_order)
+    _check_surveys(good, faulty, inputs, build.config)
+    return good, faulty
+
+
+def _hash_or_survey(unit: Path | RangeUnit) -> Any:
+    """Run a unit of the survey: hash a file, or read a range."""
+    return survey_range(unit) if isinstance(unit, RangeUnit) else hash_file(unit)
+
+
+def _dump_either(result: Any) -> Any:
+    """Convert a result of the survey to its journal entry."""
+    return list(result) if isinstance(result, tuple) else dump_part(result)
+
+
+def _load_either(noted: Any) -> Any:
+    """Convert a journal entry to a result of the survey."""
+    return tuple(noted) if isinstance(noted, list) else load_part(noted)
+
+
+def _points_of(unit: Path | RangeUnit) -> int:
+    """Return the number of points that a unit of the survey reads."""
+    return unit.points if isinstance(unit, RangeUnit) else 0
+
+
+def _check_surveys(
+    good: list[Survey], faulty: list[Survey], inputs: Sequence[InputFile], config: BuildConfig
+) -> None:
+    """Refuse scans that cannot be built with these options."""
+    if faulty and not config.skip_bad:
+        more = "" if len(faulty) == 1 else "".join(f"\n  {s.fault}" for s in faulty[1:])
+        raise ScanError(
+            f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)"
+        )
+    if not good:
+        first = inputs[0].path if inputs else "nothing"
+        raise ScanError(f"{first}: no usable scan, expected at least one: check the files")
+    if ("scan" in config.keep or config.filter_passes) and len(good) > MAX_SCANS:
+        raise BadRequestError(
+            f"--keep scan, or a filter, with {len(good)} scans: expected at most {MAX_SCANS}: build in parts"
+        )
+    unclean = [s for s in good if s.unclean]
+    if unclean and config.strict:
+        wrong = sum(s.unclean for s in unclean)
+        raise ScanError(
+            f"{unclean[0].path}: {wrong} points that are not finite, expected none with --strict: clean the scan"
+        )
+
+
+def _content_order(survey: Survey) -> tuple[str, int, str]:
+    """Return the sort key of a scan. It depends on content, so the order of paths has no effect."""
+    return survey.sha256, survey.scan.index if survey.scan else -1, str(survey.path)

@@ -1,5 +1,7 @@
 """Verification of an archive: reopens it and checks every invariant that FORMAT.md states."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,21 +10,18 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import DecompressedRecord
-from ...schemas.archive.index import SHARD_FOLDER
+from ...schemas.archive.index import SHARD_FOLDER, Header
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
-from ...schemas.errors import BadRequestError, CorruptError
+from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ...schemas.process.interrupts import check_interrupt
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import last_unenclosing_node, measure_points, position_hash_sum
-from ..run.executor import Executor, worker_count
+from ..run.executor import Executor, jobs_of, run_units, voxel_ranges, worker_count
 from ..run.progress import Progress, Silent
-from ..run.work_units import jobs_of, portions, run_units
 from ..voxel.exact_enclosure import loose_nodes, sample_nodes
-from ..voxel.point_radius import voxel_points
-from ..voxel.record_points import leaves_of, spheres_of
+from ..voxel.record_points import leaves_of, spheres_of, voxel_points
 from .preview import preview_faults
-from .unchanged_archive import unchanged
 
 
 class VerifyReport(NamedTuple):
@@ -67,7 +66,7 @@ class _Found(NamedTuple):
     """Result of a unit.
 
     points: in voxels that could be read.  classes: (RADIUS_CLASSES,), of those points.
-    places: sum of their positions, see `places_sum`; 0 if not requested.  damaged: shards with
+    places: sum of their positions, see `position_hash`; 0 if not requested.  damaged: shards with
     faults.
     """
 
@@ -96,7 +95,7 @@ def verify_archive(
     exact: verify the bounds once more in Python integers, without compiled code.
     sample: verify only this many of them, spread over the archive; None: all.
     executor: runs the work; None: this process.
-    places: the `places_sum` that all points must have (spool.py); None: not known.
+    places: the `position_hash` that all points must have (run_files.py); None: not known.
 
     A job holds one voxel: 12 bytes per point of it, 16 with intensities, and 40 if bounds are
     verified. Raise FormatError or CorruptError only if the index itself cannot be used,
@@ -121,7 +120,7 @@ def verify_archive(
             places is not None,
             int(counts[rows.start : rows.stop, 2].sum()),
         )
-        for rows in portions(counts[:, 2], jobs_of(executor))
+        for rows in voxel_ranges(counts[:, 2], jobs_of(executor))
     ]
     progress.start("verify", header.points, "points")
     with unchanged(folder, header):  # because each unit opens the archive again
@@ -154,6 +153,34 @@ def verify_archive(
         damaged,
         others,
     )
+
+
+@contextmanager
+def unchanged(folder: Path, header: Header) -> Iterator[None]:
+    """Raise SolidcloudError if the archive in `folder` no longer is that of `header` after reading.
+
+    What was read is then a mix of two archives, and any error on the way is a consequence.
+    Otherwise errors pass unchanged.
+    """
+    try:
+        yield
+    except Exception:
+        _check_unchanged(folder, header)
+        raise
+    _check_unchanged(folder, header)
+
+
+def _check_unchanged(folder: Path, header: Header) -> None:
+    try:
+        with Archive(folder) as archive:
+            now = archive.header
+    except (FormatError, OSError):
+        return  # the reader has reported it, or will
+    if (now.archive_id, now.generation) != (header.archive_id, header.generation):
+        raise SolidcloudError(
+            f"{folder}: changed while it was read, generation {header.generation} and then {now.generation}"
+            f"{' of another build' if now.archive_id != header.archive_id else ''}: give the command again"
+        )
 
 
 def verify_jobs(folder: Path, jobs: int, *, deep: bool, exact: bool) -> int:

@@ -1,37 +1,40 @@
 """Estimate of a build before it begins: bytes, memory, time by stage, voxels, and limits.
 
-The estimate follows from a few properties of the scene (`Scene`: of existing scans, found by
-`scan_sample.py`, or of a hypothetical number of points) and from measured rates (`Rates`: rates.json,
-which `scripts/bench_build --write-rates` writes, or measured here). A stage takes a constant time
-plus a time per point. The part shared among workers was determined by measuring with one worker and
-with two.
+The estimate follows from a few properties of the scene (`SceneStats`: of existing scans, found by
+`scan_sample.py`, or of a hypothetical number of points) and from measured rates (rates.py). A stage
+takes a constant time plus a time per point. The part shared among workers was determined by
+measuring with one worker and with two.
 
 Bytes per point are those of a packed sample (`packed_sample.py`) and hold within 15 %. Without a
 sample they are guessed from the density of points on surfaces. Times hold within a factor of 1.5 if
 the scene resembles a scanned building. An estimate lists its assumptions.
 """
 
-import json
 import math
 import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from importlib import resources
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...schemas.archive.voxel_grid import KEY_BIAS, MAX_VOXEL_STEPS
-from ...schemas.errors import CorruptError
-from ..config import DEFAULT_STEP, RADIUS_SAMPLE, BuildConfig, shard_points
+from ..build_limits import (
+    DENSE_POINTS,
+    MAX_PREVIEW_POINTS,
+    MAX_SCANS,
+    PREVIEW_PART,
+    RANGE_POINTS,
+    RANGES,
+    WHOLE_PREVIEW_POINTS,
+    shard_points,
+)
+from ..config import DEFAULT_STEP, BuildConfig
+from ..passes.spool_pass import run_points
 from ..run.executor import worker_count
 from ..run.memory_shares import jobs_that_fit, memory_share
-from ..spool.spool import spool_dtype
-from ..spool.spool_pass import run_points
-
-RATES_NAME = "rates.json"
-VERSION = 1
+from ..spool.run_files import spool_dtype
+from .rates import Rates
 
 # Bytes of the index apart from its voxels, and per voxel (schemas/FORMAT.md); of a shard's file
 # apart from the records, for HDF5 itself, per voxel (measured: 1,020 to 1,050); and per voxel in a
@@ -43,17 +46,10 @@ DIRECTORY_BYTES = 40
 # Approximate number of runs over which a voxel is spread: overlapping scans, and adjacent ranges of
 # a scan.
 RUNS_A_VOXEL = 8
-# A scan is spooled in ranges: approximate number per file, and least and most points of each
-# (survey.py).
-RANGES, RANGE_POINTS = 32, (1 << 20, 1 << 24)
-# Preview beside the shards: least points, most points, one point in this many, and bytes per point
-# (preview.py).
-PREVIEW, PREVIEW_BYTES = (20_000, 200_000, 8), 6
-# The length of a frame is uint32 in the index; the column of scans is uint16 (schemas/FORMAT.md).
+# Bytes per point of the preview (preview.py).
+PREVIEW_BYTES = 6
+# The length of a frame is uint32 in the index (schemas/FORMAT.md).
 MAX_FRAME = 1 << 32
-MAX_SCANS = 1 << 16
-# A voxel with more points is built in parts, and has no normals (dense_voxel.py).
-DENSE_POINTS = 1 << 20
 # A folder with more files than this is slow to list on most file systems.
 MANY_FILES = 1_000_000
 # The densest voxel holds about this multiple of the mean (measured: 7 on a generated façade in
@@ -63,99 +59,8 @@ DENSEST = 8
 MEASURED_WITHIN, GUESSED_WITHIN = 1.15, 2.5
 
 
-class Stage(NamedTuple):
-    """Cost of a stage.
-
-    start: constant [s].  serial: per point, not shared [s].  parallel: per point, of one core [s].
-    first: additional cost of each of the first RADIUS_SAMPLE points, of one core [s]. At most that
-    many points have their closest points searched, and part of other stages behaves the same way.
-    """
-
-    start: float
-    first: float
-    serial: float
-    parallel: float
-
-    def seconds(self, points: float, jobs: int) -> float:
-        """Return the time [s] for `points` points with `jobs` workers."""
-        first = min(points, RADIUS_SAMPLE) * self.first
-        return self.start + points * self.serial + (first + points * self.parallel) / jobs
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rates:
-    """Measured rates of builds.
-
-    machine: its class.  cores: their number.  rests_on: what was measured.
-    stages: name -> Stage, in the order of a build.  workers: starting the processes of more than
-    one job [s].
-    read: format -> seconds per point, reading alone, on one core.  passes: number of times a build
-    reads its scans.
-    archive: (pitch, bytes per point), ascending. The pitch is the square root of the surface area
-    per point, divided by the lattice step.
-    process, worker, point: memory [bytes] of the first process, of each other process, and of each
-    point until --memory is reached.
-    disk: write rate of the disk [bytes/s].  density: points/m^2 of the generated façade of 587,923
-    points.
-    crossed: number of voxels divided by area / voxel^2.
-    """
-
-    machine: str
-    cores: int
-    rests_on: str
-    stages: dict[str, Stage]
-    workers: float
-    read: dict[str, float]
-    passes: int
-    archive: list[tuple[float, float]]
-    process: float
-    worker: float
-    point: float
-    disk: float
-    density: float
-    crossed: float
-
-    def bytes_a_point(self, ratio: float) -> float:
-        """Return the archive's bytes per point for a pitch of `ratio` lattice steps.
-
-        They are linear in the logarithm of the pitch, as the number of bits is.
-        """
-        known = [(math.log2(at), size) for at, size in self.archive]
-        at = math.log2(max(ratio, 1e-3))
-        pairs = list(pairwise(known))
-        (x0, y0), (x1, y1) = next((p for p in pairs if at <= p[1][0]), pairs[-1])
-        # At least one byte: nodes and cells alone take that.
-        return max(1.0, y0 + (y1 - y0) * (at - x0) / (x1 - x0))
-
-
-def load_rates(text: str | None = None) -> Rates:
-    """Return the packaged rates, or those of a text. Raise CorruptError if they cannot be read."""
-    if text is None:
-        text = (resources.files(__package__) / RATES_NAME).read_text(encoding="utf-8")
-    try:
-        found = json.loads(text)
-        if found.pop("version") != VERSION:
-            raise ValueError("unsupported version")
-        found["stages"] = {name: Stage(**stage) for name, stage in found["stages"].items()}
-        found["archive"] = [(float(at), float(size)) for at, size in found["archive"]]
-        rates = Rates(**found)
-        if len(rates.archive) < 2 or "las" not in rates.read:
-            raise ValueError("too few figures")
-        return rates
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise CorruptError(
-            f"{RATES_NAME}: {error}, expected what scripts/bench_build --write-rates writes: measure again"
-        ) from None
-
-
-def dump_rates(rates: Rates) -> str:
-    """Return rates as the text of rates.json."""
-    stages = {name: stage._asdict() for name, stage in rates.stages.items()}
-    return json.dumps({"version": VERSION, **asdict(rates), "stages": stages}, indent=1) + "\n"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class SceneStats:
     """Known properties of the points to build.
 
     points, scans: their numbers.  largest: points of the largest scan.  input_bytes: of the files;
@@ -182,7 +87,9 @@ class Scene:
     packed: float | None = None
 
 
-def imagined(points: int, rates: Rates, density: float | None = None, scans: int | None = None) -> Scene:
+def hypothetical_scene(
+    points: int, rates: Rates, density: float | None = None, scans: int | None = None
+) -> SceneStats:
     """Return a hypothetical scene. density: points/m^2 of surface; None: that of the façade.
 
     scans: their number; None: scans of 1.4 million points each, as in [Fig12] section 3: 700 scans,
@@ -191,7 +98,7 @@ def imagined(points: int, rates: Rates, density: float | None = None, scans: int
     dense = density or rates.density
     number = scans or max(1, round(points / 1.4e6))
     like = "given" if density else "as in a façade of 587,923 points"
-    return Scene(
+    return SceneStats(
         points=points,
         scans=number,
         largest=math.ceil(points / number),
@@ -225,7 +132,7 @@ class Limit(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class BuildPlan:
     """Estimate of a build; see `estimate`. disk_bytes: most at one time, apart from the scans.
 
     archive_within: factor; the archive takes at least archive_bytes divided by it and at most
@@ -261,7 +168,7 @@ class Plan:
         return {**asdict(self), "limits": limits}
 
 
-def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | None = None) -> Plan:
+def estimate(scene: SceneStats, config: BuildConfig, rates: Rates, target: Path | None = None) -> BuildPlan:
     """Estimate the build of a scene.
 
     target: location of the archive, to check free space; None: no check.
@@ -279,7 +186,7 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
     runs = _runs(scene, config, jobs)
     directories = min(runs * voxels, scene.points, RUNS_A_VOXEL * voxels + runs) * DIRECTORY_BYTES
     stages = _seconds(scene, config, rates, jobs, size + spool)
-    plan = Plan(
+    plan = BuildPlan(
         points=scene.points,
         scans=scene.scans,
         lattice_step=step,
@@ -293,7 +200,8 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
         index_bytes=voxels * INDEX_BYTES,
         spool_bytes=spool,
         preview_bytes=round(
-            PREVIEW_BYTES * min(PREVIEW[1], max(PREVIEW[0], scene.points / PREVIEW[2]), scene.points)
+            PREVIEW_BYTES
+            * min(MAX_PREVIEW_POINTS, max(WHOLE_PREVIEW_POINTS, scene.points / PREVIEW_PART), scene.points)
         ),
         disk_bytes=size + spool,
         shards=max(1, math.ceil(scene.points / shard_points(scene.points))),
@@ -307,25 +215,32 @@ def estimate(scene: Scene, config: BuildConfig, rates: Rates, target: Path | Non
     return replace(plan, limits=_limits(plan, scene, config, directories, target))
 
 
-def _voxels(scene: Scene, edge: float, rates: Rates) -> int:
+def _voxels(scene: SceneStats, edge: float, rates: Rates) -> int:
     """Return the number of voxels with points, from a sample of this edge or from the area."""
     if scene.voxels is not None and scene.voxels[0] == edge:
         return max(1, round(scene.voxels[1]))
     return max(1, min(scene.points, round(rates.crossed * scene.area / edge**2)))
 
 
-def _runs(scene: Scene, config: BuildConfig, jobs: int) -> int:
+def _runs(scene: SceneStats, config: BuildConfig, jobs: int) -> int:
     """Return the number of runs.
 
     survey.py cuts scans into ranges, spool_pass.py ranges into runs.
     """
     mean = scene.points / scene.scans
-    a_range = min(max(mean / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], mean)
+    a_range = _range_points(mean)
     a_run = min(a_range, run_points(memory_share(jobs, config), spool_dtype(config)))
     return max(scene.scans, math.ceil(scene.scans * math.ceil(mean / a_range) * math.ceil(a_range / a_run)))
 
 
-def _seconds(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, written: int) -> dict[str, float]:
+def _range_points(points: float) -> float:
+    """Return the number of points of a range of a scan with `points` points, as survey.py cuts it."""
+    return min(max(points / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], points)
+
+
+def _seconds(
+    scene: SceneStats, config: BuildConfig, rates: Rates, jobs: int, written: int
+) -> dict[str, float]:
     """Return the seconds of each stage.
 
     The passes that read are slower for formats other than LAS.
@@ -335,8 +250,10 @@ def _seconds(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, written
         points * max(0.0, rates.read.get(name, rates.read["las"]) - rates.read["las"])
         for name, points in scene.formats.items()
     )
-    # A single scan that cannot seek is read by one worker.
-    reading /= min(working, scene.scans) if scene.scans > 1 or set(scene.formats) <= {"las", "laz"} else 1
+    # A scan that can seek is read in ranges, by several workers; any other by one worker.
+    mean = scene.points / scene.scans
+    ranges = math.ceil(mean / _range_points(mean)) if set(scene.formats) <= {"las", "laz"} else 1
+    reading /= min(working, scene.scans * ranges)
     found = {name: stage.seconds(scene.points, working) for name, stage in rates.stages.items()}
     if jobs > 1:
         found["workers"] = rates.workers
@@ -351,7 +268,7 @@ def _seconds(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, written
     return found
 
 
-def _memory(scene: Scene, config: BuildConfig, rates: Rates, jobs: int, tables: float) -> int:
+def _memory(scene: SceneStats, config: BuildConfig, rates: Rates, jobs: int, tables: float) -> int:
     """Return the memory of all processes. Tables that grow with voxels are added to --memory."""
     base = rates.process + (jobs * rates.worker if jobs > 1 else 0)
     return round(min(base + rates.point * scene.points, max(base, config.memory_bytes)) + tables)
@@ -379,7 +296,7 @@ def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
 
 
 def _limits(
-    plan: Plan, scene: Scene, config: BuildConfig, directories: float, target: Path | None
+    plan: BuildPlan, scene: SceneStats, config: BuildConfig, directories: float, target: Path | None
 ) -> tuple[Limit, ...]:
     """Return what could stop the build. Some limits grow with it although --memory is kept."""
     dense = plan.points_a_voxel * DENSEST * plan.bytes_a_point

@@ -19,10 +19,10 @@ from ...schemas.errors import ScanError
 from ...schemas.process.interrupts import check_interrupt
 from ..config import BuildConfig
 from ..kernels.points.occupied_cubes import FREE, find_cube_points, insert_all
+from ..passes.spool_pass import usable
 from ..sources.common.scan import Scan, ScanBlock
-from ..spool.spool_pass import usable
 from ..voxel.voxel_octree import VoxelPoints, build_voxel
-from .build_plan import Rates
+from .rates import Rates
 
 # Number of blocks to pack, and points per block: packing takes about 1 us per point.
 BLOCKS, BLOCK_POINTS = 48, 12_000
@@ -36,11 +36,11 @@ READ_SECONDS, READ_SECONDS_A_POINT, FIND_SECONDS = 2.0, 2e-8, 1e-8
 # Points read to find the centre of a block; some of them may be invalid returns.
 PROBE_POINTS = 256
 # Scans are read whole if there is time for this share of them.
-MOST_SHARE = 0.8
+MAX_SHARE = 0.8
 # Key and archive id of the sample's records; as hard to compress as any other.
 _KEY, _ID = 0x1B3A75C2D49E6F08, bytes.fromhex("8f1e6a03b7c95d2470eb42d81fa6395c")
 # Most points held before cubes with too many points are halved.
-MOST_HELD = 6_000_000
+MAX_HELD = 6_000_000
 
 
 class Packed(NamedTuple):
@@ -149,7 +149,7 @@ class _Reader:
             for block in _usable_blocks(self.scans[number], start, stop):
                 parts.append(self.taken(number, block, chosen))
                 held += len(parts[-1].slot)
-                if cubes is not None and held > MOST_HELD:
+                if cubes is not None and held > MAX_HELD:
                     parts = [cubes.cropped(_joined(parts), ROOM * BLOCK_POINTS)]
                     held = len(parts[0].slot)
         return _joined(parts)
@@ -250,7 +250,7 @@ def _share(scans: Sequence[Scan], counts: Sequence[int], rates: Rates) -> float:
         for scan, count in zip(scans, counts, strict=True)
     )
     share = max(READ_SECONDS, READ_SECONDS_A_POINT * sum(counts)) / reading
-    return share if share < MOST_SHARE else 1.0
+    return share if share < MAX_SHARE else 1.0
 
 
 def _bytes_a_point(

@@ -20,8 +20,9 @@ from ..config import DEFAULT_STEP, BuildConfig
 from ..passes.survey import shared_step
 from ..sources.common.scan import Scan
 from ..sources.scan_files import InputFile, open_input_files
-from .build_plan import Plan, Rates, Scene, estimate, load_rates
+from .build_plan import BuildPlan, SceneStats, estimate
 from .packed_sample import BrokenScanError, Packed, packed_sample
+from .rates import Rates, load_rates
 
 # Edges [m] of the cubes that measure surface area. The first edge is used that is far more than the
 # distance between points, which gives a cube at least POINTS_A_CUBE points; it should be far less
@@ -41,10 +42,10 @@ SECONDS = 10.0
 # or more if its beginning has.
 TEXT_BYTES = 30
 # Most scans left out that are named.
-MOST_NAMED = 5
+MAX_NAMED = 5
 
 
-class _Look(NamedTuple):
+class _Sample(NamedTuple):
     """Sample at one place.
 
     points: their number.  held: edge [m] -> (k,) int64 keys of non-empty cubes.
@@ -73,14 +74,14 @@ class _Grid(NamedTuple):
     edge: float
     origin: NDArray[np.float64]
 
-    def look(self, xyz: NDArray[np.float64]) -> _Look:
+    def look(self, xyz: NDArray[np.float64]) -> _Sample:
         """Sample points (n, 3) [m]: find the cubes that hold them."""
         xyz = xyz[(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)] - self.origin
         held = {edge: _keys(xyz, edge) for edge in {*CUBES, self.edge}}
-        return _Look(len(xyz), held, xyz[::SOME] + self.origin)
+        return _Sample(len(xyz), held, xyz[::SOME] + self.origin)
 
 
-def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
+def estimate_distinct(looks: Sequence[NDArray[np.int64]]) -> float:
     """Estimate a lower bound on the number of distinct keys from samples (Chao 1987, incidence).
 
     The numbers of keys seen in one sample only, and in two, indicate how many were seen in none.
@@ -92,35 +93,35 @@ def unseen(looks: Sequence[NDArray[np.int64]]) -> float:
     return len(seen) + share * once * (once - 1) / (2 * (twice + 1))
 
 
-class _Seen(NamedTuple):
+class _ScanSample(NamedTuple):
     """Samples of one scan. points: number in the scan.
 
     all_over: samples lie everywhere in the scan.
     """
 
     points: int
-    looks: list[_Look]
+    looks: list[_Sample]
     all_over: bool
 
 
 # Represents a scan that cannot be read and is left out.
-_LOST = _Seen(0, [], True)
+_UNREADABLE = _ScanSample(0, [], True)
 
 
-def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
+def _sample_scan(scan: Scan, looks: int, grid: _Grid) -> _ScanSample:
     """Sample a scan: read some of its points, and their number from its header."""
     count = scan.declared_count
     if scan.seekable and count:
         if count <= looks * LOOK_POINTS:
             found = [grid.look(block.xyz) for block in scan.blocks(LOOK_POINTS)]
-            return _Seen(count, found, True)
+            return _ScanSample(count, found, True)
         starts = np.linspace(0, count - LOOK_POINTS, looks).astype(np.int64).tolist()
         found = [
             grid.look(block.xyz)
             for start in starts
             for block in scan.blocks(LOOK_POINTS, start, start + LOOK_POINTS)
         ]
-        return _Seen(count, found, True)
+        return _ScanSample(count, found, True)
     found, read, whole = [], 0, True
     for block in scan.blocks(1 << 14):
         found.append(grid.look(block.xyz))
@@ -131,12 +132,12 @@ def _see(scan: Scan, looks: int, grid: _Grid) -> _Seen:
     if count is None:
         # Only the length of the file is known.
         count = read if whole else max(read, scan.path.stat().st_size // TEXT_BYTES)
-    return _Seen(count, found, whole)
+    return _ScanSample(count, found, whole)
 
 
-def seen_scene(
+def sample_scene(
     inputs: Sequence[InputFile], config: BuildConfig, rates: Rates | None = None, *, quick: bool = False
-) -> Scene:
+) -> SceneStats:
     """Sample opened scans to describe a build of them; pack some blocks of points.
 
     quick: read only a few points, and pack none.  rates: None: the packaged rates.
@@ -151,19 +152,19 @@ def seen_scene(
     # differ from those of the build.
     grid = _Grid(config.voxel, np.zeros(3) if bounds is None else bounds[0])
     begin, blind = time.perf_counter(), 0
-    seen: list[_Seen] = []
+    seen: list[_ScanSample] = []
     for scan in scans:
         if time.perf_counter() - begin > SECONDS and seen:
             blind += 1
-            seen.append(_Seen(scan.declared_count or 0, [], False))
+            seen.append(_ScanSample(scan.declared_count or 0, [], False))
             continue
         try:
-            seen.append(_see(scan, max(4, LOOKS // len(scans)), grid))
+            seen.append(_sample_scan(scan, max(4, LOOKS // len(scans)), grid))
         except ScanError as error:
             if not config.skip_bad:
                 raise
             lost.append(str(error))
-            seen.append(_LOST)
+            seen.append(_UNREADABLE)
     packed = None
     while True:
         points, area = _points_and_area(seen)
@@ -176,7 +177,7 @@ def seen_scene(
             if not config.skip_bad:
                 raise
             lost.append(str(error))
-            seen[[scan is error.scan for scan in scans].index(True)] = _LOST
+            seen[[scan is error.scan for scan in scans].index(True)] = _UNREADABLE
     voxels = _total(seen, config.voxel)
     looked = sum(look.points for each in seen for look in each.looks)
     formats: Counter[str] = Counter()
@@ -187,16 +188,16 @@ def seen_scene(
         assumed.append(f"{blind:,} scans not sampled are like the others")
     if unsaid := sum(scan.declared_count is None for scan in scans):
         assumed.append(f"{unsaid:,} files do not declare their number of points: one per {TEXT_BYTES} bytes")
-    assumed += [f"without a scan that cannot be read: {fault}" for fault in lost[:MOST_NAMED]]
-    if len(lost) > MOST_NAMED:
-        assumed.append(f"without {len(lost) - MOST_NAMED:,} more scans that cannot be read")
+    assumed += [f"without a scan that cannot be read: {fault}" for fault in lost[:MAX_NAMED]]
+    if len(lost) > MAX_NAMED:
+        assumed.append(f"without {len(lost) - MAX_NAMED:,} more scans that cannot be read")
     if packed is not None:
         assumed.append(
             f"bytes per point as in {packed.points:,} points packed as in a build; {packed.share:.0%} of all were read"
         )
         if packed.voxels is not None:
             voxels = float(packed.voxels)
-    return Scene(
+    return SceneStats(
         points=points,
         scans=len(scans),
         largest=max(each.points for each in seen),
@@ -211,7 +212,7 @@ def seen_scene(
     )
 
 
-def _points_and_area(seen: Sequence[_Seen]) -> tuple[int, float]:
+def _points_and_area(seen: Sequence[_ScanSample]) -> tuple[int, float]:
     """Return the number of points and their surface area [m^2].
 
     Raise ScanError if there are none.
@@ -228,7 +229,7 @@ def _points_and_area(seen: Sequence[_Seen]) -> tuple[int, float]:
 
 def _packed(
     scans: Sequence[Scan],
-    seen: Sequence[_Seen],
+    seen: Sequence[_ScanSample],
     bounds: NDArray[np.float64] | None,
     density: float,
     config: BuildConfig,
@@ -256,13 +257,13 @@ def _packed(
     )
 
 
-def _total(seen: Sequence[_Seen], edge: float) -> float:
+def _total(seen: Sequence[_ScanSample], edge: float) -> float:
     """Estimate the number of cubes of an edge that hold points, including unsampled cubes."""
     through = [look for each in seen if each.all_over for look in each.looks]
     if through and sum(look.points for look in through) >= sum(each.points for each in seen if each.all_over):
         found = float(len(np.unique(np.concatenate([look.held[edge] for look in through]))))
     else:
-        found = unseen([look.held[edge] for look in through])
+        found = estimate_distinct([look.held[edge] for look in through])
     for each in seen:
         if each.looks and not each.all_over:
             # Only its beginning was sampled; the rest is assumed to extend as far in proportion.
@@ -289,18 +290,18 @@ def _bounds(scans: Sequence[Scan]) -> NDArray[np.float64] | None:
     return np.stack([np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)])
 
 
-def planned(
+def plan_build(
     paths: Sequence[Path],
     config: BuildConfig,
     target: Path,
     rates: Rates | None = None,
     *,
     quick: bool = False,
-) -> Plan:
-    """Return the estimate of building scans, folders of them or a list. quick: see `seen_scene`.
+) -> BuildPlan:
+    """Return the estimate of building scans, folders of them or a list. quick: see `sample_scene`.
 
     Raise ScanError and BadRequestError as a build would, as far as a sample can detect the error.
     """
     rates = rates or load_rates()
-    scene = seen_scene(open_input_files(paths, config.spacing), config, rates, quick=quick)
+    scene = sample_scene(open_input_files(paths, config.spacing), config, rates, quick=quick)
     return estimate(scene, config, rates, target)

@@ -25,7 +25,7 @@ _PLACED = {"pose": "pose", "crs": "coordinate system", "units": "unit", "up": "d
 _OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
 
 
-def described(inputs: Sequence[InputFile], config: BuildConfig) -> dict[str, Any]:
+def describe_build(inputs: Sequence[InputFile], config: BuildConfig) -> dict[str, Any]:
     """Return the software, options and inputs of a build, as a JSON value.
 
     Memory and jobs are not included.
@@ -82,7 +82,7 @@ def check_same(folder: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> 
 
 def changed_inputs(inputs: Sequence[InputFile], config: BuildConfig, what: Mapping[str, Any]) -> str:
     """Return a text listing the inputs that changed since `what` was described, or ""."""
-    return _listed(_input_differences(what["inputs"], described(inputs, config)["inputs"]))
+    return _listed(_input_differences(what["inputs"], describe_build(inputs, config)["inputs"]))
 
 
 def _option_differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[list[str], list[str]]:
@@ -131,7 +131,7 @@ def _listed(items: list[str]) -> str:
     return "; ".join(items[:NAMED]) + (f"; and {more} more" if more > 0 else "")
 
 
-def is_whole(
+def is_up_to_date(
     target: Path,
     inputs: Sequence[InputFile],
     config: BuildConfig,

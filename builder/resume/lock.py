@@ -3,6 +3,7 @@
 This module imports nothing slow, so that a second builder is refused at once.
 """
 
+import errno
 import fcntl
 import os
 from collections.abc import Iterator
@@ -10,6 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ...schemas.errors import BadRequestError
+
+# Errors of flock that mean another process holds the lock; any other is a fault of the file system.
+_HELD = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 def lock_path(target: Path) -> Path:
@@ -43,9 +47,11 @@ def locked(target: Path) -> Iterator[None]:
         file = open(path, "w")  # noqa: SIM115  stays open as long as the lock
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except OSError as error:
             file.close()
-            raise _taken(target) from None
+            if error.errno in _HELD:
+                raise _taken(target) from None
+            raise OSError(error.errno, error.strerror, str(path)) from None
         # The previous holder may have removed the file we just locked. Then lock the one that
         # exists now.
         if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:

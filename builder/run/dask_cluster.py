@@ -239,8 +239,8 @@ class ClusterExecutor:
         finally:
             self._take_back()
 
-    def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
-        """Submit a unit, as `Hands` describes.
+    def submit(self, function: Callable[[Unit], Result], unit: Unit) -> Future:
+        """Submit a unit, as `RemoteBackend` describes.
 
         The unit is not `pure` in dask's sense: an equal unit must run again.
         """
@@ -252,24 +252,24 @@ class ClusterExecutor:
         self._given.add(future)
         return future
 
-    def done(self, tickets: Sequence[Future]) -> Iterable[Future]:
-        """Wait until units are done, as `Hands` describes."""
+    def done(self, handles: Sequence[Future]) -> Iterable[Future]:
+        """Wait until units are done, as `RemoteBackend` describes."""
         with self._client.as_current():
             return self._patiently(
-                lambda: wait(list(tickets), timeout=ASK_SECONDS, return_when="FIRST_COMPLETED").done
+                lambda: wait(list(handles), timeout=ASK_SECONDS, return_when="FIRST_COMPLETED").done
             )
 
-    def result(self, ticket: Future) -> Any:
-        """Return the result of a unit, as `Hands` describes."""
+    def result(self, handle: Future) -> Any:
+        """Return the result of a unit, as `RemoteBackend` describes."""
         try:
             # If a worker dies before its result is fetched, dask runs the unit again.
-            result = self._patiently(lambda: ticket.result(timeout=ASK_SECONDS), ticket)
+            result = self._patiently(lambda: handle.result(timeout=ASK_SECONDS), handle)
         except KilledWorker as error:
             raise SolidcloudError(
                 f"a unit's worker died {error.allowed_failures + 1} times, last {error.last_worker.address}: "
                 "out of memory? give a larger --memory or fewer workers, or look at its log"
             ) from None
-        self._given.discard(ticket)  # the worker forgets the result with the last reference
+        self._given.discard(handle)  # the worker forgets the result with the last reference
         return result
 
     def _patiently(self, ask: Callable[[], Answer], future: Future | None = None) -> Answer:

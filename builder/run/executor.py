@@ -11,8 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import pairwise
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
 from ...schemas.process.interrupts import blocking_sigint, check_interrupt
@@ -20,13 +24,17 @@ from .progress import Progress
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
-Ticket = TypeVar("Ticket")
+Handle = TypeVar("Handle")
 
 # With fewer points, a second process costs more (1 to 2 s to start and to load the kernels) than it
 # saves.
 POINTS_WORTH_A_PROCESS = 4_000_000
 # Per process: most units handed out and not done, and most results that wait for earlier ones.
 WAITING, AHEAD = 4, 64
+# Ranges of voxels per job: the last ones to finish are small compared with the whole.
+_RANGES_A_JOB = 8
+# Least points of a range: fewer are not worth opening the archive again.
+_MIN_POINTS = 1 << 20
 # How often a wait for a unit checks for an interrupt.
 ASK_SECONDS = 0.1
 
@@ -67,8 +75,8 @@ class Executor(Protocol):
         ...
 
 
-class Hands(Protocol[Ticket]):
-    """Remote execution of units. A ticket represents a unit that was handed out.
+class RemoteBackend(Protocol[Handle]):
+    """Remote execution of units. A handle represents a unit that was handed out.
 
     jobs, at_once: as for `Executor`.
     """
@@ -76,45 +84,45 @@ class Hands(Protocol[Ticket]):
     jobs: int
     at_once: int
 
-    def hand_out(self, function: Callable[[Any], Any], unit: Any) -> Ticket:
-        """Start function(unit) and return its ticket."""
+    def submit(self, function: Callable[[Any], Any], unit: Any) -> Handle:
+        """Start function(unit) and return its handle."""
         ...
 
-    def done(self, tickets: Sequence[Ticket]) -> Iterable[Ticket]:
-        """Wait until at least one unit is done; return the tickets of those that are."""
+    def done(self, handles: Sequence[Handle]) -> Iterable[Handle]:
+        """Wait until at least one unit is done; return the handles of those that are."""
         ...
 
-    def result(self, ticket: Ticket) -> Any:
+    def result(self, handle: Handle) -> Any:
         """Return the result of a unit that is done; raise the exception that it raised."""
         ...
 
 
 def results_in_order(
-    hands: Hands[Ticket],
+    backend: RemoteBackend[Handle],
     function: Callable[[Unit], Result],
     units: Sequence[Unit],
     progress: Progress,
     size: Callable[[Unit], int],
 ) -> Iterator[Result]:
-    """Yield function(unit) for each unit, in order, executed by `hands`.
+    """Yield function(unit) for each unit, in order, executed by `backend`.
 
     Progress advances by size(unit) as units finish. Some units are handed out ahead, which keeps
     processes from waiting for a long unit of another. The number of results that wait for their
     turn is bounded by AHEAD per process. A unit that fails ends the iteration at once. If `at_once`
     is less than `jobs`, only that many units are handed out at a time.
     """
-    most = WAITING * hands.jobs if hands.at_once >= hands.jobs else hands.at_once
-    running: dict[Ticket, int] = {}
+    most = WAITING * backend.jobs if backend.at_once >= backend.jobs else backend.at_once
+    running: dict[Handle, int] = {}
     results: dict[int, Result] = {}
     given = 0
     for taken in range(len(units)):
         while taken not in results:
-            while given < len(units) and len(running) < most and given - taken < AHEAD * hands.jobs:
-                running[hands.hand_out(function, units[given])] = given
+            while given < len(units) and len(running) < most and given - taken < AHEAD * backend.jobs:
+                running[backend.submit(function, units[given])] = given
                 given += 1
-            for ticket in hands.done(list(running)):
-                number = running.pop(ticket)
-                results[number] = hands.result(ticket)
+            for handle in backend.done(list(running)):
+                number = running.pop(handle)
+                results[number] = backend.result(handle)
                 progress.advance(size(units[number]))
         yield results.pop(taken)
 
@@ -200,23 +208,23 @@ class ProcessExecutor:
             return
         yield from results_in_order(self, function, units, progress, size)
 
-    def hand_out(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
-        """Submit a unit, as `Hands` describes."""
+    def submit(self, function: Callable[[Unit], Result], unit: Unit) -> Future[Result]:
+        """Submit a unit, as `RemoteBackend` describes."""
         assert self._pool is not None
         with _worker_deaths(), blocking_sigint():
             return self._pool.submit(function, unit)
 
-    def done(self, tickets: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
-        """Wait until units are done, as `Hands` describes."""
+    def done(self, handles: Sequence[Future[Any]]) -> Iterable[Future[Any]]:
+        """Wait until units are done, as `RemoteBackend` describes."""
         while True:
             check_interrupt()
-            if done := wait(tickets, ASK_SECONDS, FIRST_COMPLETED).done:
+            if done := wait(handles, ASK_SECONDS, FIRST_COMPLETED).done:
                 return done
 
-    def result(self, ticket: Future[Any]) -> Any:
-        """Return the result of a unit, as `Hands` describes."""
+    def result(self, handle: Future[Any]) -> Any:
+        """Return the result of a unit, as `RemoteBackend` describes."""
         with _worker_deaths():
-            return ticket.result()
+            return handle.result()
 
 
 @contextmanager
@@ -230,3 +238,40 @@ def _worker_deaths() -> Iterator[None]:
             "a worker process ended abruptly: out of memory, or an error that cannot be sent here? give fewer "
             "--jobs or a smaller --memory; the same command resumes the build"
         ) from None
+
+
+def voxel_ranges(points: NDArray[np.int64], jobs: int) -> list[range]:
+    """Cut rows, of `points` points each, into ranges of similar numbers of points, largest first.
+
+    A range exceeds the planned size by at most one row. Which rows are in which range depends on
+    `jobs`; results must not.
+    """
+    if not len(points):
+        return []
+    ends = np.cumsum(points)
+    planned = max(_MIN_POINTS, int(ends[-1]) // (_RANGES_A_JOB * jobs))
+    starts = np.flatnonzero(np.diff((ends - points) // planned, prepend=-1))
+    cuts = [*starts.tolist(), len(points)]
+    runs = [range(a, b) for a, b in pairwise(cuts)]
+    return sorted(runs, key=lambda run: -int(points[run.start : run.stop].sum()))
+
+
+def jobs_of(executor: Executor | None) -> int:
+    """Return the number of units that run at a time."""
+    return executor.jobs if executor else 1
+
+
+def run_units(
+    executor: Executor | None,
+    function: Callable[[Unit], Result],
+    units: Sequence[Unit],
+    progress: Progress,
+    size: Callable[[Unit], int],
+) -> Iterator[Result]:
+    """Yield the results of `Executor.map`; without an executor run the units in this process."""
+    if executor:
+        yield from executor.map(function, units, progress, size)
+        return
+    for unit in units:
+        yield function(unit)
+        progress.advance(size(unit))

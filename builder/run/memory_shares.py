@@ -18,7 +18,7 @@ WORKER_BYTES = 110 << 20
 # Baseline of a build with one job, which is a single process.
 ALONE_BYTES = 150 << 20
 # Minimum that a worker needs: a part of a dense voxel (dense_voxel.py) and its surroundings.
-LEAST_SHARE = 96 << 20
+MIN_SHARE = 96 << 20
 # A build may exceed `--memory` by this much rather than be refused: 64 MB is less than Python with
 # numba.
 OVER_BYTES = 200 << 20
@@ -47,13 +47,12 @@ OTHERWISE = " to resume, or a smaller --voxel and --fresh"
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
     """Return how many of the wanted processes the memory bound allows, at least one."""
     room = config.memory_bytes + OVER_BYTES - BUILDER_BYTES
-    return max(1, min(jobs, room // (WORKER_BYTES + LEAST_SHARE)))
+    return max(1, min(jobs, room // (WORKER_BYTES + MIN_SHARE)))
 
 
 def memory_share(jobs: int, config: BuildConfig) -> int:
     """Return the bytes of data that each of `jobs` processes may hold."""
-    base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
-    return max(LEAST_SHARE, (config.memory_bytes - base) // jobs)
+    return max(MIN_SHARE, (config.memory_bytes - _base(jobs, config)) // jobs)
 
 
 def cluster_worker_limit(jobs: int, memory_bytes: int) -> int:
@@ -113,13 +112,14 @@ def bytes_beside_records(counts: NDArray[np.int64], readers: int, jobs: int, con
 
 
 def _base(jobs: int, config: BuildConfig) -> int:
-    """Return the baseline memory [bytes] of `jobs` processes."""
-    return ALONE_BYTES if jobs == 1 and not config.cluster else BUILDER_BYTES + jobs * WORKER_BYTES
+    """Return the baseline memory [bytes] of the builder and `jobs` workers; of one process for a single job."""
+    alone = jobs == 1 and not (config.cluster or config.scheduler)
+    return ALONE_BYTES if alone else BUILDER_BYTES + jobs * WORKER_BYTES
 
 
 def _room(jobs: int, config: BuildConfig) -> int:
     """Return the bytes that `jobs` processes together may hold of records being read back."""
-    return max(config.memory_bytes + OVER_BYTES - _base(jobs, config), LEAST_SHARE)
+    return max(config.memory_bytes + OVER_BYTES - _base(jobs, config), MIN_SHARE)
 
 
 def _room_of_one(jobs: int, config: BuildConfig) -> int:

@@ -18,7 +18,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import sync_folder
+from ...schemas.process.new_file import new_file
 from .placed_scan import METRES, TURNS
 
 LIST_SUFFIX = ".toml"
@@ -88,16 +88,8 @@ def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
             )
     # Other broken text is informational only: replace what is not UTF-8.
     data = _BROKEN_NAME.sub("\ufffd", text).encode()
-    temporary = Path(path).with_name(f".{Path(path).name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync_folder(Path(path).parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with new_file(Path(path)) as file:
+        file.write(data)
 
 
 def _table(entry: ScanEntry, folder: Path) -> dict[str, Any]:

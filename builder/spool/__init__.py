@@ -1,5 +1,5 @@
-"""Spool of all points of a build: sorted runs on disk, and the pass that writes them.
+"""Spool of all points of a build: sorted runs on disk.
 
-May import builder/config.py, builder.kernels, builder.resume, builder.sources.common, schemas.
+May import builder/config.py, builder.kernels, schemas.
 Begin with spool.py.
 """

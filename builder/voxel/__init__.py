@@ -1,5 +1,5 @@
 """Points of one voxel to its record: octree, sphere hierarchies, radii, normals, dense voxels.
 
-May import builder/config.py, builder.kernels, builder.spool, schemas.
+May import builder/build_limits.py, builder/config.py, builder.kernels, builder.spool, schemas.
 Begin with voxel_octree.py.
 """

@@ -42,7 +42,8 @@ def balance_cells(
     permitted cube has fewer, or if fewest > most / 2 (degree 2) permits no other cut.
     """
     balance = _Balance(codes, largest_log2, fewest, most)
-    balance.settle(balance.rest_of(0, len(codes), root_log2), 0, root_log2)  # empty above the largest cube
+    rest = balance.build_cells(0, len(codes), root_log2)  # empty if the root is above the largest cube
+    balance.absorb_remainder(rest, 0, root_log2)
     order = np.concatenate([points for points, _ in balance.cells])
     sizes = [len(points) for points, _ in balance.cells]
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
@@ -60,7 +61,7 @@ class _Balance:
         self.codes, self.largest, self.fewest, self.most = codes, largest, fewest, most
         self.cells: list[tuple[NDArray[np.int64], int]] = []
 
-    def rest_of(self, begin: int, end: int, log2: int) -> NDArray[np.int64]:
+    def build_cells(self, begin: int, end: int, log2: int) -> NDArray[np.int64]:
         """Make cells of the cube that holds the points [begin, end).
 
         Return the ranks of the remaining points, too few for a cell.
@@ -76,9 +77,9 @@ class _Balance:
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if a < b:
                 made = len(self.cells)
-                rest = self.rest_of(a, b, log2 - 1)
+                rest = self.build_cells(a, b, log2 - 1)
                 if log2 - 1 == self.largest:
-                    self.settle(rest, made, log2 - 1)
+                    self.absorb_remainder(rest, made, log2 - 1)
                 else:
                     rests.append(rest)
         return self._merge(rests, log2)
@@ -99,7 +100,7 @@ class _Balance:
             held = []
         return np.concatenate([np.arange(0), *held])
 
-    def settle(self, rest: NDArray[np.int64], first: int, log2: int) -> None:
+    def absorb_remainder(self, rest: NDArray[np.int64], first: int, log2: int) -> None:
         """Merge the remainder of a largest cube into the smallest of its cells, `first` onwards."""
         if len(rest) == 0:
             return

@@ -14,8 +14,8 @@ from ...schemas.archive.voxel import Nodes
 from ...schemas.kernels.morton import morton_decode
 from ..config import BuildConfig
 from ..kernels.trees.pack_tree import max_nodes, node_counts
-from ..spool.spool_pass import ranks
-from .cell_trees import CellTrees, build_trees
+from ..spool.run_files import ranks
+from .voxel_octree import CellTrees, build_trees
 
 # Greater than every key; keys have 48 bits.
 _END = np.uint64(0xFFFFFFFFFFFFFFFF)

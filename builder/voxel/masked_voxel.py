@@ -14,11 +14,10 @@ from ...schemas.archive.codec import OPTIONAL_COLUMNS, encode_voxel
 from ...schemas.archive.index import Header
 from ...schemas.archive.normal_reach import squared_reach
 from ..config import BuildConfig
-from .dense_voxel import BuiltVoxel
-from .point_radius import voxel_points
-from .voxel_octree import VoxelPoints, build_voxel
+from .record_points import voxel_points
+from .voxel_octree import BuiltVoxel, VoxelPoints, build_voxel
 
-__all__ = ["BuiltVoxel", "build_rest", "read_points"]
+__all__ = ["BuiltVoxel", "build_masked_voxel", "read_points"]
 
 
 def read_points(archive: Archive, row: int) -> VoxelPoints:
@@ -31,7 +30,7 @@ def read_points(archive: Archive, row: int) -> VoxelPoints:
     return VoxelPoints(local, **{name: getattr(voxel, name) for name in OPTIONAL_COLUMNS})
 
 
-def build_rest(header: Header, key: int, points: VoxelPoints, stays: NDArray[np.bool_]) -> BuiltVoxel:
+def build_masked_voxel(header: Header, key: int, points: VoxelPoints, stays: NDArray[np.bool_]) -> BuiltVoxel:
     """Build the voxel of the points that stay, with the options of the archive's build.
 
     stays: (n,) mask, at least one set. The voxel is built as a whole. If a build would make it part

@@ -1,4 +1,4 @@
-"""Access to the points of an opened record, block by block: all, those in a box, or a sample."""
+"""Points of a voxel: of an opened record block by block (all, those in a box, a sample), or all at once."""
 
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.index import Header
-from ...schemas.archive.voxel import top_shift
+from ...schemas.archive.voxel import Links, VoxelData, top_shift
 from ..kernels.neighbours.nearest_points import NodeSpheres
 from ..kernels.points.voxel_records import Leaves, copy_points
 
@@ -22,7 +22,7 @@ _COLUMNS: dict[str, tuple[str, np.dtype]] = {
 _EVERYWHERE = np.array([[-(1 << 62)] * 3, [1 << 62] * 3], np.int64)
 
 
-class Taken(NamedTuple):
+class PointBlock(NamedTuple):
     """Points of a record.
 
     xyz: (m, 3) int32 [voxel steps].  rows: (m,) int64, index of each point in the record.  nodes:
@@ -70,7 +70,7 @@ def record_columns(columns: Iterable[str]) -> list[str]:
 def read_columns(
     record: DecompressedRecord, columns: Iterable[str], rows: NDArray[np.int64]
 ) -> dict[str, NDArray]:
-    """Return columns of some points of a record, by name. rows: (m,), see `Taken`.
+    """Return columns of some points of a record, by name. rows: (m,), see `PointBlock`.
 
     The record must have these columns.
     """
@@ -93,14 +93,14 @@ def hash_limit(share: float) -> np.uint64:
     return np.uint64(0 if share >= 1.0 else max(1, int(share * 2.0**64)))
 
 
-def taken(
+def iter_points(
     record: DecompressedRecord,
     base: NDArray[np.int64],
     *,
     box: NDArray[np.int64] | None = None,
     limit: np.uint64 = np.uint64(0),  # noqa: B008  a number
     block: int = BLOCK_POINTS,
-) -> Iterator[Taken]:
+) -> Iterator[PointBlock]:
     """Yield blocks of at most `block` points of a record, in the order of the leaf nodes' rows.
 
     No block is empty. base: (3,) lattice coordinates of the voxel's corner.
@@ -114,4 +114,14 @@ def taken(
     while at < nodes:
         at, held = copy_points(leaves, at, base, low, high, limit, xyz, rows, node)
         if held:
-            yield Taken(xyz[:held].copy(), rows[:held].copy(), node[:held].copy())
+            yield PointBlock(xyz[:held].copy(), rows[:held].copy(), node[:held].copy())
+
+
+def voxel_points(voxel: VoxelData, links: Links) -> NDArray[np.int64]:
+    """Return the points of a voxel (p, 3) int64 [voxel steps], in stored order."""
+    leaf = np.flatnonzero(links.is_leaf)
+    # Sort by first point: a cell that is a single leaf node stands among the roots, before the leaf
+    # nodes of other cells.
+    leaf = leaf[np.argsort(links.first[leaf], kind="stable")]
+    low = voxel.cells.low[links.cell[leaf]].astype(np.int64) + voxel.nodes.block_low[leaf]
+    return np.repeat(low, voxel.nodes.count[leaf].astype(np.int64), axis=0) + voxel.points.astype(np.int64)

@@ -6,12 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.voxel import Nodes, top_shift
+from ...schemas.archive.voxel import CELL_BITS, Nodes, top_shift
 from ..config import BuildConfig
 from ..kernels.trees.bounding_sphere import ceil_sqrt
 from ..kernels.trees.build_tree import enlarge_bounds, initial_bounds
 from ..kernels.trees.pack_tree import pack_tree
-from .cell_trees import HIGHEST
+
+# Greatest coordinate of a centre in a cell.
+HIGHEST = (1 << CELL_BITS) - 1
 
 
 class Top(NamedTuple):

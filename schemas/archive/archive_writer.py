@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ..errors import CorruptError
 from ..process.interrupts import check_interrupt
-from ..process.new_file import new_file, publish, temporary_path
+from ..process.new_file import publish, temporary_path
+from ..process.new_hdf5_file import new_hdf5_file
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .index import DATASETS, INDEX_NAME, VOXEL_DTYPE, Header, index_columns, index_digest
 from .voxel import VoxelData
@@ -74,7 +75,7 @@ def write_shard(
     The file is verified by offsets before it is given its name.
     """
     rows = []
-    with new_file(path) as file:
+    with new_hdf5_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud shard")
         file.attrs["format_version"] = np.uint32(version)
         file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
@@ -148,7 +149,7 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
     """
     path = folder / INDEX_NAME
     columns = index_columns(header, voxels, shards)
-    with new_file(path) as file:
+    with new_hdf5_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud")
         file.attrs["format_version"] = np.uint32(header.format_version)
         file.attrs["units"] = np.bytes_("m")

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError
-from ..process.new_file import NewFile, new_file, publish
+from ..process.new_file import publish
+from ..process.new_hdf5_file import NewHdf5File, new_hdf5_file
 
 PREVIEW_NAME = "preview.vtkhdf"
 
@@ -76,7 +77,7 @@ class VtkPoints:
             begin = len(dataset)
             dataset.resize(begin + len(rows), axis=0)
             dataset[begin:] = rows
-        if isinstance(self._file, NewFile):
+        if isinstance(self._file, NewHdf5File):
             self._file.check()  # HDF5 does not see write errors and would continue
 
     def _finish(self) -> None:
@@ -107,7 +108,7 @@ def vtk_file(path: Path, columns: Mapping[str, np.dtype]) -> Iterator[VtkPoints]
 
     Raises OSError, for example if the disk is full.
     """
-    with new_file(path) as file, VtkPoints(file, columns, compressed=False) as points:
+    with new_hdf5_file(path) as file, VtkPoints(file, columns, compressed=False) as points:
         yield points
     publish(path)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from solidcloud.builder.plan.build_plan import Rates, Stage
-from solidcloud.builder.plan.build_rates import read_rates
+from solidcloud.builder.plan.measure_rates import read_rates
+from solidcloud.builder.plan.rates import Rates, StageRate
 from solidcloud.builder.plan.scan_sample import CUBES
 
 from .build_limits import write_seconds
@@ -30,7 +30,7 @@ WRITTEN = 256 << 20
 PASSES = 2
 
 
-def fit_stage(times: Mapping[tuple[int, int], float]) -> Stage:
+def fit_stage(times: Mapping[tuple[int, int], float]) -> StageRate:
     """Fit a stage to its seconds at SIZES, (points, jobs).
 
     No parameter is below 0, and two jobs are at most twice as fast as one.
@@ -39,7 +39,7 @@ def fit_stage(times: Mapping[tuple[int, int], float]) -> Stage:
     parallel = min(max(0.0, 2 * (one - two)), one)
     start = max(0.0, times[TINY, 1] - TINY * one)
     first = max(0.0, (times[SMALL, 1] - start) / SMALL - one)
-    return Stage(start, first, one - parallel, parallel)
+    return StageRate(start, first, one - parallel, parallel)
 
 
 def calm_times(name: str, builds: Builds) -> dict[tuple[int, int], float]:
@@ -64,7 +64,7 @@ def is_busy(builds: Builds) -> bool:
     return max(run.watched.others or 0.0 for runs in builds.values() for run in runs) > BUSY
 
 
-def fit_stages(builds: Builds) -> dict[str, Stage]:
+def fit_stages(builds: Builds) -> dict[str, StageRate]:
     """Fit all stages to builds at SIZES."""
     names = list(dict.fromkeys(name for runs in builds.values() for run in runs for name in run.stages))
     found = {name: fit_stage(calm_times(name, builds)) for name in names}
@@ -72,7 +72,7 @@ def fit_stages(builds: Builds) -> dict[str, Stage]:
     return found
 
 
-def fit_workers(builds: Builds, stages: Mapping[str, Stage]) -> float:
+def fit_workers(builds: Builds, stages: Mapping[str, StageRate]) -> float:
     """Return the seconds of starting processes.
 
     This is the time of builds by two jobs beyond that of the stages.

@@ -19,7 +19,7 @@ from solidcloud.schemas.errors import SolidcloudError
 
 # Limits that divide a build into units, reduced: about 10 units of a few hundred points, a shard of
 # a quarter of SHARD_POINTS.
-SMALL: dict[str, Any] = {"SHARD_POINTS": 3200, "RANGE_POINTS": (1500, 1500), "LEAST_RUN_POINTS": 700}
+SMALL: dict[str, Any] = {"SHARD_POINTS": 3200, "RANGE_POINTS": (1500, 1500), "MIN_RUN_POINTS": 700}
 POINTS = 4000
 VOXEL = 1.0
 NAME = "hall"

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...builder.voxel.masked_voxel import BuiltVoxel, build_rest, read_points
+from ...builder.voxel.masked_voxel import BuiltVoxel, build_masked_voxel, read_points
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.zstd_frame import pwrite_all
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
@@ -94,7 +94,7 @@ class MaskedArchive(Archive):
             if not stays.any():
                 gone[row] = True
                 continue
-            built = build_rest(self.header, int(self.voxels["key"][row]), points, stays)
+            built = build_masked_voxel(self.header, int(self.voxels["key"][row]), points, stays)
             rebuilt[row] = self._store(built)
             _update_row(voxels, row, built)
         kept = np.flatnonzero(~gone)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...builder.voxel.point_radius import build_local, mean_closest_distance
+from ...builder.voxel.point_hierarchy import build_local, mean_closest_distance
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_positions

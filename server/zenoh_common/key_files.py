@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...schemas.errors import BadRequestError
+from ...schemas.process.new_file import publish, temporary_path
 from .endpoints import canonical
 
 log = logging.getLogger(__name__)
@@ -154,8 +155,6 @@ def _read(path: Path, *, private: bool) -> KeyFile:
 
 def _write(path: Path, key: bytes) -> None:
     """Write a key file atomically, in a folder that only this user can enter."""
-    from ...schemas.process.new_file import publish, temporary_path  # imports h5py, which no client needs
-
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     folder = os.stat(path.parent, follow_symlinks=False)
     if not stat.S_ISDIR(folder.st_mode) or folder.st_uid != os.getuid():

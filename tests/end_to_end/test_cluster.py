@@ -14,11 +14,10 @@ import pytest
 
 pytest.importorskip("distributed")
 
-import solidcloud.builder.config as config_module
-import solidcloud.builder.passes.build_shards as shards_module
+import solidcloud.builder.build_limits as build_limits
 import solidcloud.builder.pipeline as pipeline_module
 import solidcloud.builder.run.dask_cluster as cluster_module
-import solidcloud.builder.run.work_units as portions_module
+import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
@@ -42,18 +41,14 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small_units(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some 40 shards of a few voxels, so that there is a middle of the build."""
-    for module in (config_module, shards_module):
-        if hasattr(module, "SHARD_POINTS"):
-            monkeypatch.setattr(module, "SHARD_POINTS", 2000)
+    monkeypatch.setattr(build_limits, "SHARD_POINTS", 2000)
 
 
 @pytest.fixture(scope="module")
 def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, bytes]]:
     """What a single process makes of the scans."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (config_module, shards_module):
-            if hasattr(module, "SHARD_POINTS"):
-                patch.setattr(module, "SHARD_POINTS", 2000)
+        patch.setattr(build_limits, "SHARD_POINTS", 2000)
         target = tmp_path_factory.mktemp("alone") / "hall"
         build_archive([scans], target, BuildConfig(voxel=VOXEL, jobs=1))
         yield content(target)
@@ -117,20 +112,20 @@ def test_no_more_workers_read_records_back_than_may_hold_them(
     scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handed_out: list[int] = []
-    hand_out, radius = cluster_module.ClusterExecutor.hand_out, pipeline_module._measure_radius
+    submit, radius = cluster_module.ClusterExecutor.submit, pipeline_module._measure_radius
 
     def watched(executor: cluster_module.ClusterExecutor, function: object, unit: object) -> object:
-        ticket = hand_out(executor, function, unit)
+        handle = submit(executor, function, unit)
         handed_out.append(len(executor._given))
-        return ticket
+        return handle
 
     def from_here_on(*arguments: object) -> object:
-        monkeypatch.setattr(cluster_module.ClusterExecutor, "hand_out", watched)
+        monkeypatch.setattr(cluster_module.ClusterExecutor, "submit", watched)
         return radius(*arguments)
 
     monkeypatch.setattr(pipeline_module, "_measure_radius", from_here_on)
     monkeypatch.setattr(pipeline_module, "readers_that_fit", lambda *_: 1)
-    monkeypatch.setattr(portions_module, "_LEAST_POINTS", 1)
+    monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
     build_archive([scans], tmp_path / "hall", BuildConfig(voxel=VOXEL, cluster="local:2"))
     assert len(handed_out) > 20 and set(handed_out) == {1}
     assert content(tmp_path / "hall") == alone

@@ -13,7 +13,7 @@ import pytest
 import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.builder.passes.verify import verify_archive
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.voxel import Links, VoxelData
 from solidcloud.server.avatars.avatar_model import make_avatar

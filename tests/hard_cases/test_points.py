@@ -9,7 +9,7 @@ import pytest
 import synthetic_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.scene import Scene

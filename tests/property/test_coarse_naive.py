@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from point_clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, cloud
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.radius_model import class_radii
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 

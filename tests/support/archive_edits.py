@@ -13,7 +13,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit.rebuild_voxels import ChangeSummary
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 
 OPTIONS: dict[str, Any] = {"voxel": 0.5, "resolution": 1e-3, "jobs": 1}

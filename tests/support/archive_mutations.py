@@ -16,7 +16,7 @@ from naive import placed_units, reach_units, scan_units, touches
 from numpy.typing import NDArray
 from small_builds import build
 from solidcloud.builder.passes.verify import verify_archive
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.codec import decode_voxel
 from solidcloud.schemas.archive.voxel_grid import voxel_coordinates

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.config as config
+import solidcloud.builder.build_limits as build_limits
 import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import BuildSummary, build_archive
-from solidcloud.builder.resume.build_directory import building_folder
+from solidcloud.builder.resume.kept_work import building_folder
 from synthetic_scans import make_scan, write_las, write_xyz
 
 
@@ -34,7 +34,7 @@ def done_folder(target: Path) -> Path:
 def two_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Two scans, one of which is read in three ranges; two shards are made of them."""
     monkeypatch.setattr(survey, "RANGE_POINTS", (100, 100))
-    monkeypatch.setattr(config, "SHARD_POINTS", 1000)
+    monkeypatch.setattr(build_limits, "SHARD_POINTS", 1000)
     raw = np.random.default_rng(2).integers(-1500, 1500, (250, 3))
     write_las(folder / "a.las", raw)
     write_xyz(folder / "b.xyz", make_scan("plane", 3, 150))

@@ -35,7 +35,7 @@ class Judged(NamedTuple):
 
     local: int
     rim: bool
-    few: bool
+    capped: bool
 
 
 def closest_of(distinct: NDArray[np.int64], i: int, step: Fraction) -> list[tuple[int, ...]]:

@@ -170,7 +170,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
 
 def _kept(output: Path) -> str:
     """Return a sentence about the files that an interrupted build leaves."""
-    from ....builder.resume.build_directory import building_folder
+    from ....builder.resume.kept_work import building_folder
 
     folder = building_folder(output)
     if folder.exists():
@@ -180,15 +180,16 @@ def _kept(output: Path) -> str:
 
 def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_json: bool) -> None:
     """Print the estimated cost of a build."""
-    from ....builder.plan.build_plan import estimate, load_rates
-    from ....builder.plan.scan_sample import seen_scene
+    from ....builder.plan.build_plan import estimate
+    from ....builder.plan.rates import load_rates
+    from ....builder.plan.scan_sample import sample_scene
     from ....builder.sources.scan_files import open_input_files
     from ..output.console import print_facts
     from .plan_command import plan_facts
 
     with interruptible():
         found = estimate(
-            seen_scene(open_input_files(scans, config.spacing), config), config, load_rates(), output
+            sample_scene(open_input_files(scans, config.spacing), config), config, load_rates(), output
         )
     if as_json:
         print_json(found.as_json())

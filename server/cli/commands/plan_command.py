@@ -10,7 +10,7 @@ import typer
 from .command_options import AsJson, interruptible, parse_bytes, print_json
 
 if TYPE_CHECKING:
-    from ....builder.plan.build_plan import Limit, Plan
+    from ....builder.plan.build_plan import BuildPlan, Limit
 
 
 def plan(
@@ -62,7 +62,8 @@ def plan(
     Prints bytes, memory, time by stage, and the limits that would stop the build.
     """
     from ....builder.config import BuildConfig
-    from ....builder.plan.build_plan import estimate, imagined, load_rates
+    from ....builder.plan.build_plan import estimate, hypothetical_scene
+    from ....builder.plan.rates import load_rates
     from ....schemas.errors import BadRequestError
     from ..output.console import print_facts
     from ..output.progress_display import progress_listener
@@ -83,16 +84,18 @@ def plan(
     )
     rates = load_rates()
     if measure:
-        from ....builder.plan.build_rates import measured
+        from ....builder.plan.measure_rates import measure_rates
 
         with interruptible(), progress_listener() as bars:
-            rates = measured(rates, bars)
+            rates = measure_rates(rates, bars)
     if points is not None:
-        found = estimate(imagined(_number(points), rates, density, number_of_scans), config, rates, output)
+        found = estimate(
+            hypothetical_scene(_number(points), rates, density, number_of_scans), config, rates, output
+        )
     else:
-        from ....builder.plan.scan_sample import planned
+        from ....builder.plan.scan_sample import plan_build
 
-        found = planned(scans or [], config, output, rates, quick=quick)
+        found = plan_build(scans or [], config, output, rates, quick=quick)
     if as_json:
         print_json(found.as_json())
     else:
@@ -112,7 +115,7 @@ def _number(text: str) -> int:
     return value
 
 
-def plan_facts(plan: "Plan") -> Iterator[tuple[str, str]]:
+def plan_facts(plan: "BuildPlan") -> Iterator[tuple[str, str]]:
     """Yield the names and values that describe a plan."""
     from ..output.console import bytes_text
 

@@ -12,7 +12,7 @@ from ....builder.synthetic.figure import figure_points
 from ....builder.synthetic.scenes import make_facade
 from ....builder.synthetic.truth import SceneTruth, read_truth
 from ....builder.synthetic.walk import walk_poses
-from ....builder.voxel.point_radius import voxel_points
+from ....builder.voxel.record_points import voxel_points
 from ....schemas.archive.archive import Archive
 from ....schemas.archive.index import Header
 from ...avatars.avatar_file import read_avatar

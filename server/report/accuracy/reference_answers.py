@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.voxel.point_radius import voxel_points
+from ....builder.voxel.record_points import voxel_points
 from ....schemas.archive.archive import Archive
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadDataError, InternalError

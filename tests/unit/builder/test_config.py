@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.config import MOST_SHARDS, SHARD_POINTS, BuildConfig, parse_rule, shard_points
+from solidcloud.builder.build_limits import MAX_SHARDS, SHARD_POINTS, shard_points
+from solidcloud.builder.config import BuildConfig, parse_rule
 from solidcloud.builder.passes.build_shards import plan_shards
 from solidcloud.schemas.errors import BadRequestError
 
@@ -48,8 +49,8 @@ def test_an_archive_depends_on_filters_and_not_on_who_does_the_work() -> None:
 def test_shards_are_many_enough_for_workers_and_few_enough_to_open(points: int) -> None:
     each = shard_points(points)
     assert each >= SHARD_POINTS // 4
-    assert 2 * points / each <= MOST_SHARDS + 1
-    assert each <= max(SHARD_POINTS, 2 * points // MOST_SHARDS)
+    assert 2 * points / each <= MAX_SHARDS + 1
+    assert each <= max(SHARD_POINTS, 2 * points // MAX_SHARDS)
     assert points < 10**7 or points / each >= 9
 
 
@@ -57,5 +58,5 @@ def test_shards_are_many_enough_for_workers_and_few_enough_to_open(points: int) 
 def test_no_more_shards_than_may_be_open_whatever_the_voxels_hold(voxel: int) -> None:
     counts = np.full(3000, voxel, np.int64)
     plans = plan_shards(np.arange(3000, dtype=np.uint64), counts)
-    assert len(plans) <= MOST_SHARDS + 1
+    assert len(plans) <= MAX_SHARDS + 1
     assert sum(points for _, points in plans) == counts.sum()

@@ -7,10 +7,10 @@ import h5py
 import hdf5plugin  # noqa: F401  see test_two_jobs_write_the_bytes_of_one
 import numpy as np
 import pytest
-import solidcloud.builder.config as config
+import solidcloud.builder.build_limits as build_limits
+import solidcloud.builder.passes.spool_pass as partition
 import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.spool.spool_pass as partition
 from small_builds import build, content, six_files
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -57,7 +57,7 @@ def test_the_bytes_do_not_depend_on_order_jobs_or_memory(
 ) -> None:
     # Several shards and several runs, though the dataset is small.
     keep = frozenset({"scan", "intensity"})
-    monkeypatch.setattr(config, "SHARD_POINTS", 1200)
+    monkeypatch.setattr(build_limits, "SHARD_POINTS", 1200)
     first = build(scans, out / "a", keep=keep)
     assert first.shards > 1
     assert first.voxels > 8
@@ -100,7 +100,7 @@ def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
     build([tmp_path / "a.las"], out / "a", **options)
     # 64 MB, and 100,000 bytes a point claimed by the spool: runs of 2^18 points.
     monkeypatch.setattr(partition, "SPOOL_BYTES_A_POINT", 100_000)
-    monkeypatch.setattr(partition, "LEAST_RUN_POINTS", 1 << 18)
+    monkeypatch.setattr(partition, "MIN_RUN_POINTS", 1 << 18)
     build([tmp_path / "a.las"], out / "b", memory_bytes=64 << 20, **options)
     monkeypatch.setattr(survey, "RANGE_POINTS", (1 << 17, 1 << 17))
     build([tmp_path / "a.las"], out / "c", **options)

@@ -10,12 +10,14 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
-import solidcloud.builder.config as config
-import solidcloud.builder.passes.resumable_passes as passes
+import solidcloud.builder.build_limits as build_limits
+import solidcloud.builder.passes.build_shards as build_shards
+import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.pipeline as pipeline
 from small_builds import build, content, six_files
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.builder.resume.transaction import Transaction
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from solidcloud.server.scene import Scene
@@ -220,7 +222,7 @@ def test_a_full_disk_is_named_and_the_same_command_goes_on(
 def test_a_record_that_does_not_read_back_fails_the_build_and_is_made_again(
     scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(config, "SHARD_POINTS", 1000)
+    monkeypatch.setattr(build_limits, "SHARD_POINTS", 1000)
     measure = pipeline._measure_radius
 
     def damage(header: object, built: object, folder: Path, *rest: object) -> object:
@@ -242,9 +244,9 @@ def test_a_record_that_does_not_read_back_fails_the_build_and_is_made_again(
     assert not (out / "a").exists()
     # Of several shards only the one that is damaged is made again.
     made: list[object] = []
-    build_shard = passes.build_shard
-    monkeypatch.setattr(passes, "build_shard", lambda unit: made.append(unit) or build_shard(unit))
-    monkeypatch.setattr(passes, "spool_range", lambda _: pytest.fail("spooled again"))
+    build_shard = build_shards.build_shard
+    monkeypatch.setattr(build_shards, "build_shard", lambda unit: made.append(unit) or build_shard(unit))
+    monkeypatch.setattr(spool_pass, "spool_range", lambda _: pytest.fail("spooled again"))
     build(scans, out / "a")
     assert len(made) == 1
     assert len(list((out / "a" / "shards").iterdir())) > 1
@@ -255,7 +257,7 @@ def test_a_build_that_cannot_fit_the_disk_is_refused(
     scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage(out)._replace(free=1000)
-    monkeypatch.setattr(pipeline.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     with pytest.raises(SolidcloudError, match="1000 bytes free, the build needs about"):
         build(scans, out / "a")
     assert not list(out.rglob("*.run"))
@@ -276,11 +278,11 @@ def test_the_runs_of_the_filters_take_room_too(
 ) -> None:
     asked, runs = [], []
 
-    def noted(disk: Path, folder: Path, needed: int) -> None:
+    def noted(_: Transaction, needed: int, folder: Path) -> None:
         asked.append(needed)
         runs.append(sum(path.stat().st_size for path in folder.rglob("*.run")))
 
-    monkeypatch.setattr(pipeline, "_check_space", noted)
+    monkeypatch.setattr(Transaction, "check_space", noted)
     left = build(scans, out / "a", **options).points
     with_all = build(scans, out / "b").points
     assert asked[0] == with_all * (bytes_a_point + 6)
@@ -294,7 +296,7 @@ def test_the_runs_of_the_filters_take_room_too(
 def test_a_voxel_of_more_points_than_a_record_holds_is_refused_before_it_is_built(
     scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "MOST_POINTS", 9)
+    monkeypatch.setattr(pipeline, "MAX_RECORD_POINTS", 9)
     monkeypatch.setattr(pipeline, "build_shards", lambda *_: pytest.fail("built"))
     with pytest.raises(
         SolidcloudError, match=r"holds \d+ points, expected at most 9: give a smaller --voxel"

@@ -12,7 +12,7 @@ from bench.build_watch import Sample, Watched
 from bench.results import Part
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.plan.build_plan import Stage
+from solidcloud.builder.plan.rates import StageRate
 
 ROLLUP = """55b859773000-7ffce90ef000 ---p 00000000 00:00 0                          [rollup]
 Rss:                1672 kB
@@ -101,7 +101,7 @@ def test_a_failed_build_says_why(tmp_path: Path) -> None:
 
 
 def test_a_stage_is_found_again_in_the_times_it_would_take() -> None:
-    stage = Stage(0.3, 5e-7, 1e-8, 2e-7)
+    stage = StageRate(0.3, 5e-7, 1e-8, 2e-7)
     found = build_rates.fit_stage({(n, jobs): stage.seconds(n, jobs) for n, jobs in build_rates.SIZES})
     assert found == pytest.approx(stage, rel=0.05)
 
@@ -122,7 +122,7 @@ def test_other_work_does_not_make_rates_slow(others: float, slower: float) -> No
     builds = rate_builds(others, slower)
     assert build_rates.is_busy(builds) is (others > 1)
     stages = build_rates.fit_stages(builds)
-    assert stages["build"] == pytest.approx(Stage(1.0, 0.0, 0.0, 1e-6), abs=1e-9)
+    assert stages["build"] == pytest.approx(StageRate(1.0, 0.0, 0.0, 1e-6), abs=1e-9)
     assert set(stages) == {"build", "start, end"}
     assert build_rates.fit_memory(builds) == pytest.approx((120 << 20, 10 << 20, 0.0))
     assert build_rates.fit_workers(builds, stages) == (0.0 if others < 1 else build_rates.USUAL_WORKERS)

@@ -22,8 +22,8 @@ from archive_edits import (
 )
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
+from solidcloud.builder.edit import archive_change as change_module
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
-from solidcloud.builder.edit import transaction as change_module
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive

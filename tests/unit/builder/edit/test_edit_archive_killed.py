@@ -19,9 +19,9 @@ from archive_edits import (
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit.archive_change import delete_orphans
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.edit.rebuild_voxels import ChangeSummary
-from solidcloud.builder.edit.transaction import delete_orphans
 from solidcloud.builder.passes.preview import write_preview
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -135,7 +135,7 @@ def test_a_failure_leaves_the_old_archive_and_nothing_else(
             refused(
                 target,
                 SolidcloudError,
-                "No space.*: the archive is what it was",
+                "no space left.*: make room; the archive is what it was",
                 lambda: add_scans(target, [files.b], jobs=1),
             )
     rename = os.replace
@@ -150,7 +150,7 @@ def test_a_failure_leaves_the_old_archive_and_nothing_else(
         refused(
             target,
             SolidcloudError,
-            "No space.*: the archive is what it was",
+            "no space left.*: make room; the archive is what it was",
             lambda: add_scans(target, [files.b], jobs=1),
         )
     assert add_scans(target, [files.b], jobs=1).generation == 1
@@ -169,7 +169,7 @@ def test_an_error_told_once_the_index_is_renamed_leaves_the_new_archive(
         if Path(to) == target / INDEX_NAME:
             raise error
 
-    told = "Input/output.*: the archive is changed nevertheless" if isinstance(error, OSError) else None
+    told = "input/output.*; the archive is changed nevertheless" if isinstance(error, OSError) else None
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", renamed_and_broken)
         expected = SolidcloudError if told else KeyboardInterrupt

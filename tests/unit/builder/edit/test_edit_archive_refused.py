@@ -25,11 +25,11 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit import added_scans as added_module
 from solidcloud.builder.edit import edit_archive as generation_module
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit.archive_change import config_of
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
-from solidcloud.builder.edit.transaction import config_of
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.resume.build_directory import locked
+from solidcloud.builder.resume.lock import locked
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import SHARD_FOLDER
 from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError

@@ -13,14 +13,15 @@ from archive_edits import EVERYTHING, OPTIONS, A, Build, Files, refused
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from dense_voxels import KEY, rows_of, spooled
+from solidcloud.builder.build_limits import SCRATCH_BYTES_A_POINT
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit import added_scans as added_module
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
 from solidcloud.builder.edit import removed_scans as removed_module
-from solidcloud.builder.edit import transaction as change_module
+from solidcloud.builder.edit.archive_change import Change
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
-from solidcloud.builder.edit.transaction import Change
-from solidcloud.builder.pipeline import SCRATCH_BYTES_A_POINT, build_archive
+from solidcloud.builder.pipeline import build_archive
+from solidcloud.builder.resume import transaction
 from solidcloud.builder.run import memory_shares as memory
 from solidcloud.builder.run.executor import ProcessExecutor
 from solidcloud.schemas.archive.archive import Archive
@@ -134,7 +135,7 @@ def test_no_more_jobs_read_than_hold_the_largest_voxels(
             at_once[function.__name__].add(self.at_once)
             return super().map(function, *given)
 
-    monkeypatch.setattr(change_module, "make_executor", lambda *_: Noted())
+    monkeypatch.setattr(transaction, "make_executor", lambda *_: Noted())
     target = built(tmp_path / "x", "ab", keep=EVERYTHING)
     given = 512 << 20
     most_points(monkeypatch, largest(target) + 1, 2, given)
@@ -158,8 +159,8 @@ def test_out_of_memory_says_what_the_archive_is_and_what_to_do(
     refused(
         target,
         SolidcloudError,
-        rf"^{target}: out of memory \(Unable to allocate 3 GiB\): the archive is what it was: give fewer --jobs or a "
-        "smaller --memory, or stop other programs$",
+        rf"^{target}: out of memory \(Unable to allocate 3 GiB\): give fewer --jobs or a smaller --memory, or stop "
+        "other programs; the archive is what it was$",
         lambda: add_scans(target, [files.b], jobs=1),
     )
 
@@ -168,7 +169,7 @@ def test_room_is_asked_for_what_dense_voxels_take_meanwhile(
     built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(Change, "check_room", lambda change, needed: asked.append(needed))
+    monkeypatch.setattr(Change, "check_space", lambda change, needed: asked.append(needed))
     for dense, name in ((1 << 20, "x"), (10, "y")):
         target = built(tmp_path / name, "ab", keep=EVERYTHING)
         monkeypatch.setattr(rebuild_module, "DENSE_POINTS", dense)

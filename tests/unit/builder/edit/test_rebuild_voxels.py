@@ -10,8 +10,8 @@ from archive_edits import EVERYTHING, A, B, Build, Files, refused
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
+from solidcloud.builder.edit.archive_change import Change
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
-from solidcloud.builder.edit.transaction import Change
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import SHARD_FOLDER
 from solidcloud.schemas.errors import CorruptError

@@ -8,19 +8,13 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.passes import filter as filters
 from solidcloud.builder.passes.filter import filtered_spool
-from solidcloud.builder.passes.filter_rules import (
-    MOVING,
-    OUTLIER,
-    THINNED,
-    filter_dtype,
-    filter_passes,
-    is_filtered,
-)
-from solidcloud.builder.resume.journal import Journal
-from solidcloud.builder.run.make_executor import make_executor
+from solidcloud.builder.passes.filter_rules import MOVING, OUTLIER, THINNED
+from solidcloud.builder.resume.kept_work import Journal
+from solidcloud.builder.resume.transaction import make_executor
 from solidcloud.builder.run.progress import Silent
 from solidcloud.builder.spool import spool_blocks as blocks
-from solidcloud.builder.spool.spool import Spool, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool.run_files import filter_dtype, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool.spool import Spool
 from solidcloud.schemas.archive.voxel_grid import Lattice, voxel_coordinates, voxel_keys
 from solidcloud.schemas.errors import BadRequestError
 
@@ -329,5 +323,4 @@ def test_the_filters_need_the_scan_and_nothing_else() -> None:
         {"outliers": (0.1, 2)},
         {"outliers": (0.1, 2), "moving": (0.1, 2), "thin": 0.1},
     ]
-    assert [filter_passes(BuildConfig(**options)) for options in passes] == [0, 1, 1, 2]
-    assert [is_filtered(BuildConfig(**options)) for options in passes] == [False, True, True, True]
+    assert [BuildConfig(**options).filter_passes for options in passes] == [0, 1, 1, 2]

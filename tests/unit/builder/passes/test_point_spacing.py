@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 import solidcloud.builder.passes.point_spacing as spacing
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.run.work_units as portions
+import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.neighbours.nearest_points import FAR, make_box_tree
 from solidcloud.builder.kernels.points.voxel_records import point_hash
-from solidcloud.builder.passes.point_spacing import Open, Sums, archive_mean, settle, sums_of
+from solidcloud.builder.passes.point_spacing import (
+    SUM_UNITS,
+    PendingPoints,
+    Sums,
+    archive_mean,
+    refine_closest,
+    sums_of,
+)
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.run.progress import Progress, Silent
-from solidcloud.builder.voxel.point_radius import SUM_UNITS
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import Header
 from synthetic_scans import make_steps, write_xyz
@@ -134,7 +140,7 @@ def test_units_of_any_size_in_any_order_give_the_same_bits(
     expected = archive_mean(folder, sample)
     if sample > 401:
         assert expected.mean / 2 == header.radius and expected.sample == header.radius_sample
-    monkeypatch.setattr(portions, "_LEAST_POINTS", 1)
+    monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
     advanced: list[int] = []
 
     class Counting(Silent):
@@ -194,8 +200,8 @@ def test_points_are_settled_nearest_boxes_first_until_none_can_be_nearer() -> No
         for row in set(range(60)) - {int(own[i])}:
             d2 = sum((a - b) ** 2 for a, b in zip(point, low[row].tolist(), strict=True))
             expected[i] = min(expected[i], d2 if d2 < FAR else int(FAR))
-    left = Open(queries, own, best)
-    settle(left, make_box_tree(low, high), ask)
+    left = PendingPoints(queries, own, best)
+    refine_closest(left, make_box_tree(low, high), ask)
     assert left.best.tolist() == expected
     assert expected[7] == FAR and len(asked) < 60 * 30
 

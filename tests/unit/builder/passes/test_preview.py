@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import solidcloud.builder.passes.preview as preview
-import solidcloud.builder.run.work_units as portions
+import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.voxel_records import point_hashes
 from solidcloud.builder.passes.preview import write_preview
@@ -51,7 +51,7 @@ def stored(folder: Path) -> dict[tuple[int, ...], set[tuple[int, float]]]:
 def test_points_are_chosen_by_hash_and_have_their_columns(
     most: int, built: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preview, "MOST_POINTS", most)
+    monkeypatch.setattr(preview, "MAX_PREVIEW_POINTS", most)
     count = write_preview(built)
     found, places = read_points(built / PREVIEW_NAME), stored(built)
     with Archive(built) as archive:
@@ -70,8 +70,8 @@ def test_points_are_chosen_by_hash_and_have_their_columns(
 
 
 def test_no_more_than_most_even_by_chance(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preview, "_FEW", 40)
-    monkeypatch.setattr(preview, "MOST_POINTS", 40)
+    monkeypatch.setattr(preview, "WHOLE_PREVIEW_POINTS", 40)
+    monkeypatch.setattr(preview, "MAX_PREVIEW_POINTS", 40)
     monkeypatch.setattr(preview.math, "sqrt", lambda _: -20.0)  # a share that is too large by far
     assert write_preview(built) == 40
     by_hash = sorted(stored(built), key=lambda place: int(point_hashes(np.array([place]))[0]))
@@ -84,7 +84,7 @@ def test_one_archive_has_one_preview_to_the_byte(built: Path, monkeypatch: pytes
     write_preview(built)
     expected = (built / PREVIEW_NAME).read_bytes()
     (built / PREVIEW_NAME).unlink()
-    monkeypatch.setattr(portions, "_LEAST_POINTS", 1)
+    monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
     write_preview(built)
     assert (built / PREVIEW_NAME).read_bytes() == expected
     assert not list(built.glob("*.tmp"))

@@ -7,6 +7,7 @@ from pathlib import Path
 import naive_classes
 import numpy as np
 import pytest
+import solidcloud.builder.build_limits as build_limits
 from dense_voxels import KEY, rows_of, spooled
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig, parse_radius
@@ -18,9 +19,11 @@ from solidcloud.builder.passes import radius_classes as classes
 from solidcloud.builder.passes.radius_classes import class_limits, voxel_classes
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.spool.spool import Spool, write_run
+from solidcloud.builder.spool.run_files import write_run
+from solidcloud.builder.spool.spool import Spool
+from solidcloud.builder.voxel import dense_record
 from solidcloud.builder.voxel import dense_voxel as dense
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import Header
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii, radius_distribution
@@ -71,7 +74,7 @@ def judge(lattice: NDArray[np.int64], step: str = "0.001") -> tuple[NDArray[np.u
     of_place = naive_classes.judge(lattice, step)
     judged = [of_place[tuple(point)] for point in lattice.tolist()]
     classes = np.array([found.local + RIM_BIT * found.rim for found in judged], np.uint8)
-    return classes, sum(found.few for found in judged)
+    return classes, sum(found.capped for found in judged)
 
 
 @pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates"])
@@ -161,7 +164,7 @@ def test_a_part_is_asked_with_what_is_around_it_alone(tmp_path: Path) -> None:
         found = voxel_classes(key, local, ALL, spool, most)
         expected, few = judge(local.astype(np.int64))
         assert np.array_equal(found.of_point, expected)
-        assert found.few == few
+        assert found.capped == few
 
 
 @pytest.mark.parametrize("models", [{"local"}, {"border"}, {"local", "border"}])
@@ -223,7 +226,7 @@ def test_the_kernel_and_the_judge_agree_at_the_edge_of_each_rule(held: int) -> N
             for side in (0, 1, 2):
                 points = _ring(held, math.isqrt(limit) + beyond, side)
                 at = naive_classes.judge(points.astype(np.int64), "0.001")[0, 0, 0]
-                assert class_of_origin(points) == at.local + RIM_BIT * at.rim + TOO_FEW_NEIGHBOURS * at.few
+                assert class_of_origin(points) == at.local + RIM_BIT * at.rim + TOO_FEW_NEIGHBOURS * at.capped
 
 
 def class_of_origin(points: NDArray[np.integer]) -> int:
@@ -327,7 +330,7 @@ def test_a_dense_voxel_has_the_same_classes(
     for voxel in (8.0, 0.7):
         expected = stored(build(tmp_path, lattice, voxel=voxel))
         with monkeypatch.context() as patch:
-            patch.setattr(dense, "DENSE_POINTS", 60)
+            patch.setattr(build_limits, "DENSE_POINTS", 60)
             patch.setattr(classes, "READ_POINTS", 25)
             folder = build(tmp_path, lattice, voxel=voxel)
         points, found, header = stored(folder)
@@ -351,8 +354,8 @@ def test_heaps_have_the_classes_that_they_have_when_all_is_read(
 ) -> None:
     lattice = heaps(4)
     expected, few = judge(np.array(sorted(lattice.tolist())))
-    monkeypatch.setattr(dense, "DENSE_POINTS", 60)
-    monkeypatch.setattr(dense, "WINDOW_POINTS", 50)
+    monkeypatch.setattr(build_limits, "DENSE_POINTS", 60)
+    monkeypatch.setattr(dense_record, "WINDOW_POINTS", 50)
     monkeypatch.setattr(classes, "READ_POINTS", 25)
     points, found, header = stored(build(tmp_path, lattice, voxel=voxel))
     assert points.tolist() == sorted(lattice.tolist())
@@ -364,7 +367,7 @@ def test_heaps_have_the_classes_that_they_have_when_all_is_read(
 def test_of_a_heap_and_of_the_part_that_is_asked_nothing_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dense, "DENSE_POINTS", 60)
+    monkeypatch.setattr(build_limits, "DENSE_POINTS", 60)
     monkeypatch.setattr(classes, "READ_POINTS", 25)
     local = heaps(5).astype(np.int32)
     spool = spooled(tmp_path / "spool", rows_of(local), 4000, [500, 900])
@@ -379,7 +382,7 @@ def test_of_a_heap_and_of_the_part_that_is_asked_nothing_is_read(
     monkeypatch.setattr(Spool, "rows", lambda *asked: noted(rows(*asked)))
     config = BuildConfig(cell_points=40)
     for part in dense.plan_parts(spool, KEY, config):
-        codes = range(part[0].code, part[-1].past)
+        codes = range(part[0].code, part[-1].code_end)
         of_part = voxel_codes(local)
         asked = local[(of_part >= codes.start) & (of_part < codes.stop)]
         read.clear()

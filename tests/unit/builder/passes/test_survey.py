@@ -12,7 +12,7 @@ from solidcloud.builder.passes.survey import (
     choose_lattice,
     dump_part,
     hash_file,
-    joined,
+    join_ranges,
     load_part,
     ranges,
     survey_range,
@@ -102,7 +102,7 @@ def test_a_scan_that_seeks_is_surveyed_in_ranges(tmp_path: Path, monkeypatch: py
     assert [unit.start for unit in ranges(scan, 10**12)] == [0, 30]
     parts = [load_part(dump_part(survey_range(unit))) for unit in ranges(scan, 0)]
     assert [part.count for part in parts] == [20, 20, 10]
-    survey = joined(scan, parts, hash_file(scan.path))
+    survey = join_ranges(scan, parts, hash_file(scan.path))
     assert (survey.count, survey.fault, survey.parts) == (50, "", tuple(parts))
     assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
 
@@ -151,7 +151,7 @@ def test_a_file_that_cannot_be_hashed_is_at_fault(tmp_path: Path) -> None:
     scan.path.unlink()
     digest, fault = hash_file(scan.path)
     assert digest == ""
-    survey = joined(scan, parts, (digest, fault))
+    survey = join_ranges(scan, parts, (digest, fault))
     assert (survey.count, survey.fault) == (0, fault)
     assert "listed.xyz" in fault
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.run.work_units as portions
+import solidcloud.builder.run.executor as executor_module
 from opened_records import points_of
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.passes.point_spacing import archive_mean
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.spool.spool import places_sum
+from solidcloud.builder.spool.run_files import position_hash
 from solidcloud.builder.voxel.exact_enclosure import loose_nodes, sample_nodes
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.archive_writer import write_index, write_shard
@@ -205,7 +205,7 @@ def test_points_that_are_not_those_expected_are_a_fault(copy: Path) -> None:
     with Archive(copy) as archive:
         lattice = archive.header.lattice
         places = sum(
-            places_sum(int(archive.voxels["key"][row]), points_of(archive.open_voxel(row))[0], lattice)
+            position_hash(int(archive.voxels["key"][row]), points_of(archive.open_voxel(row))[0], lattice)
             for row in range(len(archive.voxels))
         ) % (1 << 64)
     assert verify_archive(copy, places=places).faults == ()
@@ -290,7 +290,7 @@ def test_units_give_the_same_report(
     path.write_bytes(data)
     expected = verify_archive(copy, **options)
     assert len(expected.faults) >= (2 if options else 1)
-    monkeypatch.setattr(portions, "_LEAST_POINTS", 1)
+    monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
     executor = Backwards()
     assert verify_archive(copy, executor=executor, **options) == expected  # type: ignore[arg-type]
     assert executor.given > 4

@@ -13,19 +13,19 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.plan import build_plan as plans
 from solidcloud.builder.plan import scan_sample as sample
-from solidcloud.builder.plan.build_plan import Rates, Stage, dump_rates, estimate, imagined, load_rates
-from solidcloud.builder.plan.build_rates import POINTS, measured, room
-from solidcloud.builder.plan.scan_sample import planned, seen_scene, unseen
+from solidcloud.builder.plan.build_plan import estimate, hypothetical_scene
+from solidcloud.builder.plan.measure_rates import POINTS, measure_rates, room
+from solidcloud.builder.plan.rates import Rates, StageRate, dump_rates, load_rates
+from solidcloud.builder.plan.scan_sample import estimate_distinct, plan_build, sample_scene
 from solidcloud.builder.sources.scan_files import InputFile, open_input_files
-from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError
 from synthetic_scans import write_xyz
 
 RATES = Rates(
     machine="m", cores=2, rests_on="r", workers=1.0, passes=2, process=1e8, worker=5e7, point=10.0, disk=1e8,
     density=400.0, crossed=0.5,
-    stages={"survey": Stage(0.5, 0.0, 1e-8, 2e-8), "spool": Stage(0.0, 0.0, 0.0, 1e-7),
-            "radius": Stage(0.2, 8e-7, 0.0, 0.0)},
+    stages={"survey": StageRate(0.5, 0.0, 1e-8, 2e-8), "spool": StageRate(0.0, 0.0, 0.0, 1e-7),
+            "radius": StageRate(0.2, 8e-7, 0.0, 0.0)},
     read={"las": 1e-8, "laz": 3e-7, "text": 1e-6},
     archive=[(10.0, 2.0), (1000.0, 4.0)],
 )  # fmt: skip
@@ -38,10 +38,10 @@ def write_las(path: Path, xyz: np.ndarray) -> None:
 
 
 def test_a_stage_is_its_start_and_so_much_a_point_shared_among_jobs() -> None:
-    assert Stage(1.0, 0.0, 0.25, 0.5).seconds(4, 1) == 4.0
-    assert Stage(1.0, 0.0, 0.25, 0.5).seconds(4, 2) == 3.0
-    assert Stage(1.0, 2e-6, 0.0, 0.0).seconds(5e5, 1) == 2.0
-    assert Stage(1.0, 2e-6, 0.0, 0.0).seconds(1e9, 2) == 2.0
+    assert StageRate(1.0, 0.0, 0.25, 0.5).seconds(4, 1) == 4.0
+    assert StageRate(1.0, 0.0, 0.25, 0.5).seconds(4, 2) == 3.0
+    assert StageRate(1.0, 2e-6, 0.0, 0.0).seconds(5e5, 1) == 2.0
+    assert StageRate(1.0, 2e-6, 0.0, 0.0).seconds(1e9, 2) == 2.0
 
 
 def test_bytes_a_point_are_linear_in_bits_of_the_pitch() -> None:
@@ -79,14 +79,17 @@ def test_rates_that_are_none_are_refused(text: str) -> None:
 
 
 def test_an_imagined_scene_is_as_dense_as_asked() -> None:
-    usual, dense = imagined(10**9, RATES), imagined(10**9, RATES, density=4000.0, scans=10)
+    usual, dense = (
+        hypothetical_scene(10**9, RATES),
+        hypothetical_scene(10**9, RATES, density=4000.0, scans=10),
+    )
     assert (usual.area, usual.scans) == (10**9 / 400, 714)
     assert (dense.area, dense.scans, dense.largest) == (10**9 / 4000, 10, 10**8)
     assert "as in a façade" in usual.assumed[0] and "given" in dense.assumed[0]
 
 
 def test_an_estimate_adds_up() -> None:
-    scene = imagined(10**6, RATES, scans=4)
+    scene = hypothetical_scene(10**6, RATES, scans=4)
     found = estimate(scene, ONE, RATES)
     pitch = math.sqrt(1 / 400) / 1e-4
     voxels = round(0.5 * scene.area / 64)
@@ -104,7 +107,7 @@ def test_an_estimate_adds_up() -> None:
 
 def test_more_jobs_take_less_time_and_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plans.os, "cpu_count", lambda: 4)
-    scene = imagined(10**8, RATES)
+    scene = hypothetical_scene(10**8, RATES)
     one, four, eight = (estimate(scene, BuildConfig(jobs=jobs), RATES) for jobs in (1, 4, 8))
     assert four.stages["survey"] == pytest.approx(0.5 + 1.0 + 0.5) and one.stages["survey"] == pytest.approx(
         3.5
@@ -116,13 +119,13 @@ def test_more_jobs_take_less_time_and_more_memory(monkeypatch: pytest.MonkeyPatc
 
 
 def test_memory_is_bounded_but_for_what_grows_with_voxels() -> None:
-    scene = imagined(10**9, RATES)
+    scene = hypothetical_scene(10**9, RATES)
     found = estimate(scene, replace(ONE, memory_bytes=1 << 30), RATES)
     assert (1 << 30) + found.index_bytes < found.memory_bytes < 1.1 * (1 << 30)
 
 
 def test_formats_that_are_slow_to_read_add_to_both_passes() -> None:
-    scene = imagined(10**6, RATES, scans=1)
+    scene = hypothetical_scene(10**6, RATES, scans=1)
     las, laz, text, other = (
         estimate(replace(scene, formats={name: 10**6}), ONE, RATES).stages
         for name in ("las", "laz", "text", "new")
@@ -132,20 +135,31 @@ def test_formats_that_are_slow_to_read_add_to_both_passes() -> None:
     assert other == las
 
 
+def test_one_large_scan_that_can_seek_is_read_by_all_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plans.os, "cpu_count", lambda: 4)
+    scene = hypothetical_scene(10**8, RATES, scans=1)
+    las, laz, text = (
+        estimate(replace(scene, formats={name: 10**8}), replace(ONE, jobs=4), RATES).stages
+        for name in ("las", "laz", "text")
+    )
+    assert laz["survey"] - las["survey"] == pytest.approx(29.0 / 4)
+    assert text["survey"] - las["survey"] == pytest.approx(99.0)
+
+
 def test_a_slow_disk_is_waited_for() -> None:
-    scene = imagined(10**6, RATES)
+    scene = hypothetical_scene(10**6, RATES)
     slow = estimate(scene, ONE, replace(RATES, disk=1e6))
     assert slow.seconds == pytest.approx((slow.archive_bytes + slow.spool_bytes) / 1e6)
 
 
 def test_a_radius_that_is_given_is_not_measured() -> None:
-    assert "radius" not in estimate(imagined(10**6, RATES), replace(ONE, radius=0.01), RATES).stages
+    assert "radius" not in estimate(hypothetical_scene(10**6, RATES), replace(ONE, radius=0.01), RATES).stages
 
 
 def test_limits_that_bind_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def binding(points: float, density: float | None = None, **options: object) -> set[str]:
         found = estimate(
-            imagined(int(points), RATES, density),
+            hypothetical_scene(int(points), RATES, density),
             BuildConfig(jobs=1, **options),
             RATES,
             tmp_path / "no" / "archive",
@@ -163,7 +177,6 @@ def test_limits_that_bind_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     normals = {"points of the densest voxel"}
     assert not binding(1e8, voxel=2.0, keep=frozenset({"normal"})) & normals
     assert binding(1e8, voxel=64.0, keep=frozenset({"normal"})) >= normals
-    assert plans.DENSE_POINTS == dense.DENSE_POINTS
     assert binding(1e12, 1e5, voxel=200.0) >= {"the densest voxel"}
 
 
@@ -171,15 +184,15 @@ def test_limits_that_bind_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 
 def test_keys_not_seen_are_guessed_from_those_seen_once_and_twice(rng: np.random.Generator) -> None:
-    assert unseen([]) == 0
-    assert unseen([np.array([1, 2]), np.array([1, 2])]) == 2
+    assert estimate_distinct([]) == 0
+    assert estimate_distinct([np.array([1, 2]), np.array([1, 2])]) == 2
     looks = [np.unique(rng.integers(0, 1000, 60)) for _ in range(12)]
     seen = len(np.unique(np.concatenate(looks)))
-    assert seen < 600 and 800 < unseen(looks) < 1250
+    assert seen < 600 and 800 < estimate_distinct(looks) < 1250
 
 
-def looked(path: Path, config: BuildConfig = ONE) -> sample.Scene:
-    return seen_scene(open_input_files([path]), config)
+def looked(path: Path, config: BuildConfig = ONE) -> sample.SceneStats:
+    return sample_scene(open_input_files([path]), config)
 
 
 def test_a_small_scan_is_seen_as_it_is(tmp_path: Path) -> None:
@@ -236,7 +249,7 @@ def test_a_broken_scan_stops_a_plan_as_it_stops_a_build(tmp_path: Path) -> None:
         looked(tmp_path)
     assert looked(tmp_path, replace(ONE, skip_bad=True)).points == 1000
     with pytest.raises(ScanError, match="no scan holds a point"):
-        seen_scene([InputFile(tmp_path / "x", [])], ONE)
+        sample_scene([InputFile(tmp_path / "x", [])], ONE)
 
 
 @pytest.mark.parametrize("name", ["b.xyz", "b.laz"])
@@ -266,7 +279,7 @@ def test_a_scan_that_breaks_where_no_look_fell_is_left_out_as_a_build_does(tmp_p
 def test_bytes_and_voxels_are_those_of_a_build_within_a_half(tmp_path: Path, voxel: float) -> None:
     write_las(tmp_path / "a.las", room(60_000))
     config = replace(ONE, voxel=voxel)
-    plan = planned([tmp_path / "a.las"], config, tmp_path / "archive")
+    plan = plan_build([tmp_path / "a.las"], config, tmp_path / "archive")
     built = build_archive([tmp_path / "a.las"], tmp_path / "archive", config)
     assert plan.points == built.points
     stored = sum(path.stat().st_size for path in (tmp_path / "archive").rglob("*.h5"))
@@ -275,10 +288,10 @@ def test_bytes_and_voxels_are_those_of_a_build_within_a_half(tmp_path: Path, vox
 
 
 def test_measuring_here_changes_times_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("solidcloud.builder.plan.build_rates.POINTS", 20_000)
-    monkeypatch.setattr("solidcloud.builder.plan.build_rates.READ_POINTS", 2_000)
+    monkeypatch.setattr("solidcloud.builder.plan.measure_rates.POINTS", 20_000)
+    monkeypatch.setattr("solidcloud.builder.plan.measure_rates.READ_POINTS", 2_000)
     rates = load_rates()
-    found = measured(rates)
+    found = measure_rates(rates)
     assert POINTS == 1_000_000
     assert found.archive == rates.archive and found.density == rates.density
     assert found.stages.keys() == rates.stages.keys() and found.stages != rates.stages
@@ -289,4 +302,4 @@ def test_measuring_here_changes_times_and_nothing_else(monkeypatch: pytest.Monke
 def test_a_config_that_cannot_be_is_refused(tmp_path: Path) -> None:
     write_las(tmp_path / "a.las", room(1000))
     with pytest.raises(BadRequestError, match="--voxel"):
-        planned([tmp_path / "a.las"], BuildConfig(voxel=-1.0), tmp_path)
+        plan_build([tmp_path / "a.las"], BuildConfig(voxel=-1.0), tmp_path)

@@ -1,4 +1,4 @@
-"""Units that a cluster does long after they were handed out: a build anew has no place for them, the same no change."""
+"""Units that a cluster runs late find no folder in a build that started over, and change nothing in a resumed one."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.passes.resumable_passes as passes
+import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, two_scans
-from solidcloud.builder.resume.build_directory import building_folder
-from solidcloud.builder.resume.journal import _Noting
+from solidcloud.builder.passes.spool_pass import SpoolUnit
+from solidcloud.builder.resume.kept_work import _Journalled, building_folder
 from solidcloud.builder.run.executor import ProcessExecutor
-from solidcloud.builder.spool.spool_pass import SpoolUnit
 
 
 @pytest.fixture
@@ -26,8 +25,8 @@ def test_a_unit_of_an_earlier_session_that_ends_late_changes_nothing(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     units: list[SpoolUnit] = []
-    spool, after = passes.spool_range, pipeline.filter_points
-    monkeypatch.setattr(passes, "spool_range", lambda unit: units.append(unit) or spool(unit))
+    spool, after = spool_pass.spool_range, pipeline.filter_points
+    monkeypatch.setattr(spool_pass, "spool_range", lambda unit: units.append(unit) or spool(unit))
 
     def late(*arguments: Any) -> Any:
         # It was cut otherwise, as the session had more memory, or less.
@@ -50,7 +49,7 @@ class HandedOut:
         run = ProcessExecutor.map
 
         def recorded(executor: ProcessExecutor, function: Any, units: Any, *more: Any) -> Any:
-            if isinstance(function, _Noting):
+            if isinstance(function, _Journalled):
                 self.work += [partial(function, unit) for unit in units]
             return run(executor, function, units, *more)
 

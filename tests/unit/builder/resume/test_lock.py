@@ -1,5 +1,6 @@
-"""One builder at a time, and the second is told before anything that takes time is loaded."""
+"""One builder at a time writes an archive; the second is refused before anything slow is loaded."""
 
+import errno
 import fcntl
 import subprocess
 import sys
@@ -32,6 +33,25 @@ def test_asking_whether_it_is_free_keeps_nobody_off(tmp_path: Path) -> None:
     assert lock_path(target).exists()
     with locked(target):
         pass
+
+
+@pytest.mark.parametrize("number", [errno.EWOULDBLOCK, errno.EACCES])
+def test_a_lock_that_is_held_is_another_build(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fcntl, "flock", lambda *_: (_ for _ in ()).throw(OSError(number, "held")))
+    with pytest.raises(BadRequestError, match="another build is writing it"), locked(tmp_path / "hall"):
+        pytest.fail("locked")
+
+
+def test_a_file_system_without_locks_is_not_another_build(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault = OSError(errno.ENOLCK, "No locks available")
+    monkeypatch.setattr(fcntl, "flock", lambda *_: (_ for _ in ()).throw(fault))
+    with pytest.raises(OSError, match="No locks available") as caught, locked(tmp_path / "hall"):
+        pytest.fail("locked")
+    assert caught.value.filename == str(lock_path(tmp_path / "hall"))
 
 
 def test_a_second_builder_loads_no_numpy(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a build does not go on from: other options, scans, software; and what an error must then say to give."""
+"""A build does not resume with other options, scans or software; the error says what to give."""
 
 import json
 import os
@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.passes.resumable_passes as passes
+import solidcloud.builder.passes.spool_pass as spool_pass
+import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.run.memory_shares as memory
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.resume.build_directory import building_folder
-from solidcloud.builder.resume.build_identity import check_same, described
+from solidcloud.builder.resume.build_identity import check_same, describe_build
+from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.builder.sources.scan_files import InputFile, inspect_scans, open_input_files
 from solidcloud.builder.sources.scan_list import write_scan_list
@@ -111,15 +112,15 @@ def test_many_differences_are_counted() -> None:
 
 def test_a_pose_and_a_file_that_cannot_be_opened_are_part_of_what_is_built(scans: list[Path]) -> None:
     opened = open_input_files(scans)
-    what = described(opened, BuildConfig())
+    what = describe_build(opened, BuildConfig())
     opened[0].scans[0].pose = np.diag([-1.0, -1, 1, 1])
     with pytest.raises(BadRequestError, match=r"a\.las has another pose"):
-        check_same(Path("hall"), what, described(opened, BuildConfig()))
+        check_same(Path("hall"), what, describe_build(opened, BuildConfig()))
     opened[0].scans[0].pose, opened[0].scans[0].crs, opened[0].scans[0].up = np.eye(4), "EPSG:25832", "y"
     with pytest.raises(BadRequestError, match=r"a\.las has another coordinate system and direction up"):
-        check_same(Path("hall"), what, described(opened, BuildConfig()))
+        check_same(Path("hall"), what, describe_build(opened, BuildConfig()))
     gone = [InputFile(scans[0].with_name("gone.las"), [], "no such file"), opened[1]]
-    (entry, _) = described(gone, BuildConfig())["inputs"][::-1]
+    (entry, _) = describe_build(gone, BuildConfig())["inputs"][::-1]
     assert (Path(entry["path"]).name, entry["bytes"], entry["pose"]) == ("gone.las", -1, "")
 
 
@@ -185,12 +186,12 @@ def test_a_bad_scan_found_in_the_survey_leaves_nothing_and_later_ones_do(
 
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(passes, "_check_surveys", lambda *_: fails(None))
+        patch.setattr(survey, "_check_surveys", lambda *_: fails(None))
         with pytest.raises(ScanError):
             build(out / "hall", scans)
     assert not out.exists()
     with monkeypatch.context() as patch:
-        patch.setattr(passes, "spool_range", fails)
+        patch.setattr(spool_pass, "spool_range", fails)
         with pytest.raises(ScanError):
             build(out / "hall", scans)
     assert sorted(p.name for p in (done_folder(out / "hall") / "survey").iterdir())
@@ -243,7 +244,7 @@ def test_a_bad_scan_found_by_a_later_command_says_what_will_be_done(
     write_xyz(folder / "a.xyz", make_scan("plane", 3, 100))
     (folder / "b.xyz").write_text("1 2 3\nbroken\n")
     with monkeypatch.context() as patch:
-        patch.setattr(passes, "_check_surveys", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(survey, "_check_surveys", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert command(capsys, folder, tmp_path / "hall")[0] == 130
     code, said = command(capsys, folder, tmp_path / "hall")
     assert code == 3
@@ -259,5 +260,5 @@ def test_a_voxel_that_does_not_fit_is_built_as_the_error_says(
     said = command(capsys, folder, tmp_path / "hall", "--memory", "1GB")[1]
     assert "to read its record back takes" in said and "a smaller --voxel and --fresh" in said
     named = said.partition("--memory ")[2].partition(" ")[0]
-    monkeypatch.setattr(passes, "spool_range", lambda _: pytest.fail("spooled again"))
+    monkeypatch.setattr(spool_pass, "spool_range", lambda _: pytest.fail("spooled again"))
     assert command(capsys, folder, tmp_path / "hall", "--memory", named) == (0, "")

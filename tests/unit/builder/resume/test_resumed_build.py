@@ -1,4 +1,4 @@
-"""A build that was interrupted goes on: killed anywhere, it ends in the same bytes, and only as what it was."""
+"""A build that is killed anywhere and resumed ends in the same bytes."""
 
 import gc
 import os
@@ -10,14 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.passes.resumable_passes as passes
+import solidcloud.builder.passes.build_shards as build_shards
+import solidcloud.builder.passes.spool_pass as spool_pass
+import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
+import solidcloud.builder.resume.transaction as transaction
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
-from solidcloud.builder.resume.build_directory import building_folder
+from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.sources.common.scan import Scan, library_errors
 from solidcloud.builder.sources.scan_files import open_input_files
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from synthetic_scans import write_las
+
+# The pass that each work unit belongs to.
+PASS_OF = {
+    "survey_range": survey,
+    "hash_file": survey,
+    "spool_range": spool_pass,
+    "build_shard": build_shards,
+}
 
 
 class Killed(BaseException):
@@ -106,13 +117,13 @@ def test_what_was_done_is_not_done_again(
     calls: list[str] = []
 
     def counted(name: str) -> None:
-        function = getattr(passes, name)
+        function = getattr(PASS_OF[name], name)
 
         def instead(unit: Any) -> Any:
             calls.append(name)
             return function(unit)
 
-        monkeypatch.setattr(passes, name, instead)
+        monkeypatch.setattr(PASS_OF[name], name, instead)
 
     for name in ("survey_range", "hash_file", "spool_range", "build_shard"):
         counted(name)
@@ -142,7 +153,7 @@ def test_a_range_spooled_again_leaves_no_run_of_before(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(passes, "run_points", lambda *_: 30)
+        patch.setattr(spool_pass, "run_points", lambda *_: 30)
         interrupted(tmp_path / "hall", scans, monkeypatch)
     folder = done_folder(tmp_path / "hall") / "spool"
     runs = sorted(folder.glob("*.run"))
@@ -172,7 +183,7 @@ def test_a_run_that_changed_while_it_was_in_use_is_found(
             build(tmp_path / "hall", scans, **options)
     assert not (tmp_path / "hall").exists()
     # Nobody knows which it was; the survey is believed, and all else made again.
-    monkeypatch.setattr(passes, "survey_range", lambda _: pytest.fail("surveyed again"))
+    monkeypatch.setattr(survey, "survey_range", lambda _: pytest.fail("surveyed again"))
     build(tmp_path / "hall", scans, **options)
     assert not building_folder(tmp_path / "hall").exists()
 
@@ -191,8 +202,8 @@ def test_a_run_that_ends_too_soon_is_made_again(
         with pytest.raises(CorruptError, match="give the same command again"):
             build(tmp_path / "hall", scans)
     calls: list[Any] = []
-    spool = passes.spool_range
-    monkeypatch.setattr(passes, "spool_range", lambda unit: calls.append(unit) or spool(unit))
+    spool = spool_pass.spool_range
+    monkeypatch.setattr(spool_pass, "spool_range", lambda unit: calls.append(unit) or spool(unit))
     build(tmp_path / "hall", scans)
     assert len(calls) == 1
 
@@ -206,7 +217,7 @@ def test_a_cluster_that_cannot_be_reached_costs_no_work(
     interrupted(tmp_path / "hall", scans, monkeypatch)
     before = content(building_folder(tmp_path / "hall"))
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "make_executor", unreachable)
+        patch.setattr(transaction, "make_executor", unreachable)
         with pytest.raises(BadRequestError, match="answers"):
             build(tmp_path / "hall", scans, scheduler="tcp://127.0.0.1:1")
     assert content(building_folder(tmp_path / "hall")) == before
@@ -216,7 +227,7 @@ def test_a_cluster_that_cannot_be_reached_costs_no_work(
 def test_a_scan_that_changes_while_it_is_read_is_no_archive(
     stage: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    where = passes if stage == "spool_range" else pipeline
+    where = spool_pass if stage == "spool_range" else pipeline
     function, raw = getattr(where, stage), np.random.default_rng(3).integers(-1500, 1500, (250, 3))
 
     def changed_first(*arguments: Any) -> Any:

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.resume.transaction import make_executor
 from solidcloud.builder.run.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, worker_count
-from solidcloud.builder.run.make_executor import make_executor
 from solidcloud.schemas.errors import SolidcloudError
 
 

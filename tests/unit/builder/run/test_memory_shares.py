@@ -10,7 +10,7 @@ from solidcloud.builder.run.memory_shares import (
     BUILDER_BYTES,
     CLUSTER_WORKER_BYTES,
     CLUSTER_WORKER_KILLED,
-    LEAST_SHARE,
+    MIN_SHARE,
     OVER_BYTES,
     RECORD_BYTES,
     WORKER_BYTES,
@@ -24,6 +24,14 @@ from solidcloud.builder.run.memory_shares import (
 from solidcloud.schemas.errors import SolidcloudError
 
 
+def test_a_single_worker_of_a_cluster_is_a_process_beside_the_builder() -> None:
+    memory = 1 << 30
+    assert memory_share(1, BuildConfig(memory_bytes=memory)) == memory - ALONE_BYTES
+    for options in ({"cluster": "local:1"}, {"scheduler": "tcp://here:8786"}):
+        config = BuildConfig(memory_bytes=memory, **options)
+        assert memory_share(1, config) == memory - BUILDER_BYTES - WORKER_BYTES
+
+
 @pytest.mark.parametrize("memory", [64 << 20, 256 << 20, 1 << 30, 4 << 30, 100 << 30])
 @pytest.mark.parametrize("wanted", [1, 2, 7, 64])
 def test_all_processes_fit(memory: int, wanted: int) -> None:
@@ -32,15 +40,15 @@ def test_all_processes_fit(memory: int, wanted: int) -> None:
     assert 1 <= jobs <= wanted
     share = memory_share(jobs, config)
     base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
-    assert base + jobs * share <= max(memory + OVER_BYTES, ALONE_BYTES + LEAST_SHARE)
+    assert base + jobs * share <= max(memory + OVER_BYTES, ALONE_BYTES + MIN_SHARE)
     if jobs < wanted:  # one more would not have had what it cannot do without
-        assert BUILDER_BYTES + (jobs + 1) * (WORKER_BYTES + LEAST_SHARE) > memory + OVER_BYTES
+        assert BUILDER_BYTES + (jobs + 1) * (WORKER_BYTES + MIN_SHARE) > memory + OVER_BYTES
 
 
 def test_a_gigabyte_is_enough_for_two_and_some() -> None:
     config = BuildConfig(memory_bytes=1 << 30)
     assert jobs_that_fit(2, config) == 2
-    assert memory_share(2, config) > 3 * LEAST_SHARE
+    assert memory_share(2, config) > 3 * MIN_SHARE
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 5])
@@ -48,7 +56,7 @@ def test_a_gigabyte_is_enough_for_two_and_some() -> None:
 def test_no_more_processes_read_than_hold_the_largest_voxels(jobs: int, memory: int) -> None:
     config = BuildConfig(memory_bytes=memory)
     base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
-    room = max(memory + OVER_BYTES - base, LEAST_SHARE)
+    room = max(memory + OVER_BYTES - base, MIN_SHARE)
     for points in (1, 10**6, 5 * 10**6, 4 * 10**7, 10**9):
         counts = np.array([7, points, points // 2, points, 3])
         each = sorted(
@@ -123,7 +131,7 @@ def test_no_more_jobs_would_be_enough_than_are_named(cluster: bool) -> None:
 def test_what_is_held_beside_records_fits_beside_them(jobs: int, memory: int) -> None:
     config = BuildConfig(memory_bytes=memory)
     base = ALONE_BYTES if jobs == 1 else BUILDER_BYTES + jobs * WORKER_BYTES
-    room = max(memory + OVER_BYTES - base, LEAST_SHARE)
+    room = max(memory + OVER_BYTES - base, MIN_SHARE)
     for points in (1, 10**6, 3 * 10**6, 5 * 10**6):
         counts = np.array([7, points, points // 2, points, 3])
         readers = readers_that_fit(counts, jobs, config)

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import solidcloud.builder.spool.spool as spool_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.spool.spool import (
+from solidcloud.builder.spool.run_files import (
     KEYS_SUFFIX,
-    Spool,
-    is_other_run,
+    is_run_damaged,
     new_run,
     read_directory,
     spool_dtype,
     write_directory,
     write_run,
 )
+from solidcloud.builder.spool.spool import Spool
 from solidcloud.schemas.archive.archive_writer import file_checksum
 from solidcloud.schemas.archive.voxel_grid import make_lattice
 from solidcloud.schemas.errors import CorruptError
@@ -107,7 +107,7 @@ def test_a_worker_holds_the_directories_of_what_it_asks_for(
     keys = np.arange(voxels, dtype=np.uint64)
     dtype = spool_dtype(BuildConfig())
     for number in range(runs):
-        spool_module.write_directory(tmp_path / f"{number}.run", keys, np.arange(voxels + 1))
+        write_directory(tmp_path / f"{number}.run", keys, np.arange(voxels + 1))
         (tmp_path / f"{number}.run").touch()
         os.truncate(tmp_path / f"{number}.run", voxels * dtype.itemsize)
     tracemalloc.start()
@@ -215,16 +215,16 @@ def test_what_was_written_of_a_run_is_told_from_all_else(tmp_path: Path) -> None
     sums = [*file.sums, *write_directory(run, found, np.append(starts, 20).astype(np.int64))]
     files = (run, run.with_suffix(KEYS_SUFFIX))
     assert sums == [of(path) for path in files for of in (lambda p: p.stat().st_size, file_checksum)]
-    assert not is_other_run(run, sums)
+    assert not is_run_damaged(run, sums)
     for path in files:
         data = path.read_bytes()
         for at in range(0, 8 * len(data), 7):  # each bit of a byte is among them
             path.write_bytes(flipped(data, at))
-            assert is_other_run(run, sums)
+            assert is_run_damaged(run, sums)
         path.write_bytes(data + b"more")
-        assert is_other_run(run, sums)
+        assert is_run_damaged(run, sums)
         path.unlink()
-        assert not is_other_run(run, sums)  # nobody makes anything of it
+        assert not is_run_damaged(run, sums)  # nobody makes anything of it
         path.write_bytes(data)
 
 

@@ -6,15 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import solidcloud.builder.build_limits as build_limits
 from dense_voxels import KEY, assert_same, decoded, hashed, spooled
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.spool.spool import Spool, canonical_columns
-from solidcloud.builder.voxel import dense_voxel as dense
-from solidcloud.builder.voxel.cell_trees import build_trees
+from solidcloud.builder.spool.run_files import canonical_columns
+from solidcloud.builder.spool.spool import Spool
+from solidcloud.builder.voxel import dense_record
 from solidcloud.builder.voxel.coincident_points import heap_place, heap_trees, merge_runs
 from solidcloud.builder.voxel.dense_voxel import build_dense
-from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
+from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_trees, build_voxel
 from solidcloud.schemas.kernels.morton import morton_code
 
 PLACE = (77, 5, 901)
@@ -96,8 +97,8 @@ def test_the_cell_is_that_of_its_points(count: int, config: BuildConfig) -> None
 def test_a_heap_of_many_pairs_is_the_voxel_built_at_once(
     names: tuple[str, ...], classified: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dense, "DENSE_POINTS", 500)
-    monkeypatch.setattr(dense, "WINDOW_POINTS", 70)
+    monkeypatch.setattr(build_limits, "DENSE_POINTS", 500)
+    monkeypatch.setattr(dense_record, "WINDOW_POINTS", 70)
     heap = heap_of(5000, names=names)
     around = heap_of(300, names=names)
     around["local"] += np.random.default_rng(2).integers(-20, 20, (300, 3)).astype(np.int32) * [0, 0, 1]
@@ -132,8 +133,8 @@ def test_a_heap_of_many_pairs_is_the_voxel_built_at_once(
 
 def test_what_is_held_of_a_heap_is_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """400,000 points in parts of 2,000: rows and all that sorts them would be 30 MB; the nodes take most of 2.7."""
-    monkeypatch.setattr(dense, "DENSE_POINTS", 2000)
-    monkeypatch.setattr(dense, "WINDOW_POINTS", 1000)
+    monkeypatch.setattr(build_limits, "DENSE_POINTS", 2000)
+    monkeypatch.setattr(dense_record, "WINDOW_POINTS", 1000)
     config = BuildConfig()
     spool = spooled(tmp_path / "spool", heap_of(400_000), 1000, list(range(0, 400_000, 30_000)))
     small = spooled(tmp_path / "small", heap_of(3000), 1000, [])

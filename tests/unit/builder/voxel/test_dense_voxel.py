@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import solidcloud.builder.build_limits as build_limits
 from dense_voxels import COLUMNS, KEY, assert_same, decoded, hashed, rows_of, spooled
 from numpy.typing import NDArray
+from solidcloud.builder.build_limits import is_dense
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import voxel_codes
-from solidcloud.builder.voxel import dense_voxel as dense
-from solidcloud.builder.voxel.dense_voxel import build_dense, is_dense, plan_parts
+from solidcloud.builder.voxel import dense_record
+from solidcloud.builder.voxel.dense_voxel import build_dense, plan_parts
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 from synthetic_scans import make_steps
@@ -22,8 +24,8 @@ PART = 200
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parts of a few hundred points, passed on in windows of a few cells."""
-    monkeypatch.setattr(dense, "DENSE_POINTS", PART)
-    monkeypatch.setattr(dense, "WINDOW_POINTS", 70)
+    monkeypatch.setattr(build_limits, "DENSE_POINTS", PART)
+    monkeypatch.setattr(dense_record, "WINDOW_POINTS", 70)
 
 
 @pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates"])
@@ -111,8 +113,8 @@ def test_parts_are_few_and_hold_all_points_in_order(tmp_path: Path) -> None:
         assert sum(cube.points for cube in part) <= PART
         for cube in part:
             assert cube.code >= past and cube.code % (1 << 3 * cube.log2) == 0
-            past = cube.past
-            assert cube.points == np.count_nonzero((codes >= cube.code) & (codes < cube.past))
+            past = cube.code_end
+            assert cube.points == np.count_nonzero((codes >= cube.code) & (codes < cube.code_end))
     assert sum(cube.points for part in parts for cube in part) == len(points)
     # Two neighbours hold more than a part together, or they would be one.
     sizes = [sum(cube.points for cube in part) for part in parts]
@@ -133,7 +135,7 @@ def test_a_frame_too_long_for_the_index_is_refused(tmp_path: Path, monkeypatch: 
 
 def test_a_spill_cut_short_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spooled(tmp_path / "spool", rows_of(make_steps("noise", 3, 600, 1000)), 1000, [])
-    monkeypatch.setattr(dense, "by_cell", lambda xyz, starts: xyz.reshape(-1)[:-900])
+    monkeypatch.setattr(dense_record, "by_cell", lambda xyz, starts: xyz.reshape(-1)[:-900])
     with pytest.raises(CorruptError, match="spill file"):
         build_dense(KEY, spool, BuildConfig(cell_points=40), bytes(16), tmp_path)
 
@@ -142,6 +144,7 @@ MEMORY = """
 import sys
 from pathlib import Path
 import numpy as np
+from solidcloud.builder import build_limits
 from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.spool.spool import Spool
@@ -150,7 +153,7 @@ from solidcloud.schemas.archive.voxel_grid import Lattice
 def peak():
     return int(next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]) << 10
 
-dense.DENSE_POINTS = 1 << 15
+build_limits.DENSE_POINTS = 1 << 15
 folder, count = Path(sys.argv[1]), int(sys.argv[2])
 spool = Spool(folder, np.dtype([("local", "<i4", (3,))]), Lattice((0.0, 0.0, 0.0), 0.001, 4000))
 small = Spool(folder.parent / "small", spool.dtype, spool.lattice)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.edit.archive_change import _read_back, _ReadUnit
 from solidcloud.builder.edit.stored_points import FindUnit, GatherUnit, find_scans, gather
-from solidcloud.builder.edit.transaction import _read_back, _ReadUnit
 from solidcloud.builder.passes.point_spacing import _own_sums, _OwnUnit
 from solidcloud.builder.passes.preview import _choose
 from solidcloud.builder.passes.preview import _Unit as PreviewUnit

@@ -6,6 +6,7 @@ import naive_normals
 import numpy as np
 import pytest
 import small_builds
+import solidcloud.builder.build_limits as build_limits
 import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
@@ -14,10 +15,9 @@ from solidcloud.builder.kernels.neighbours.estimate_normals import box_sums
 from solidcloud.builder.kernels.neighbours.nearest_neighbours import BLOCK, FAN, bound_boxes, box_starts
 from solidcloud.builder.kernels.points.octree_cells import voxel_codes
 from solidcloud.builder.passes.verify import verify_archive
-from solidcloud.builder.voxel import dense_voxel as dense
 from solidcloud.builder.voxel import point_normals as normals_module
 from solidcloud.builder.voxel.point_normals import voxel_normals
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError, CorruptError
@@ -216,7 +216,7 @@ def test_a_normal_that_is_another_is_found(tmp_path: Path) -> None:
 
 def test_voxels_built_in_parts_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = build(tmp_path)
-    monkeypatch.setattr(dense, "DENSE_POINTS", 20)
+    monkeypatch.setattr(build_limits, "DENSE_POINTS", 20)
     with pytest.raises(BadRequestError, match="--keep normal: a voxel of"):
         build(tmp_path, name="dense")
     assert not (tmp_path / "dense.scd").exists()

@@ -5,14 +5,10 @@ import math
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.voxel import point_radius as radius
-from solidcloud.builder.voxel.point_radius import (
-    SUM_UNITS,
-    build_local,
-    mean_closest_distance,
-    mean_of_squares,
-    voxel_points,
-)
+from solidcloud.builder.passes.point_spacing import SUM_UNITS, mean_of_squares
+from solidcloud.builder.voxel import point_hierarchy as radius
+from solidcloud.builder.voxel.point_hierarchy import build_local, mean_closest_distance
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
 from solidcloud.schemas.archive.voxel import check_voxel
 from synthetic_scans import make_scan, make_steps

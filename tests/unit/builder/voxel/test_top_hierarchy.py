@@ -8,9 +8,8 @@ import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import split_octree
 from solidcloud.builder.kernels.trees.build_tree import initial_bounds
-from solidcloud.builder.voxel.cell_trees import CellTrees, build_trees, take_cells
 from solidcloud.builder.voxel.top_hierarchy import Top, pack_top
-from solidcloud.builder.voxel.voxel_octree import VoxelPoints, canonical
+from solidcloud.builder.voxel.voxel_octree import CellTrees, VoxelPoints, build_trees, canonical, take_cells
 from synthetic_scans import make_steps
 
 pytestmark = pytest.mark.interpreted

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from six_scans import LATER, dataset, rewrite_index, rows_of
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.archive_writer import write_index
 from solidcloud.schemas.archive.index import RadiusNow

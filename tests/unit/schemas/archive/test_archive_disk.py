@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.process.new_file import new_file, publish
+from solidcloud.schemas.process.new_file import publish
+from solidcloud.schemas.process.new_hdf5_file import new_hdf5_file
 
 
 def write(path: Path, datasets: int = 40) -> None:
     """A file of many small datasets in groups, as shards are."""
-    with new_file(path) as file:
+    with new_hdf5_file(path) as file:
         file.attrs["format"] = np.bytes_("solidcloud shard")
         for i in range(datasets):
             group = file.create_group(f"{i:016x}", track_times=False)
@@ -55,10 +56,10 @@ def test_a_write_that_fails_is_the_systems_error_and_leaves_nothing(
 
 
 def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
-    with pytest.raises(KeyError, match="nothing"), new_file(tmp_path / "a.h5"):
+    with pytest.raises(KeyError, match="nothing"), new_hdf5_file(tmp_path / "a.h5"):
         raise KeyError("nothing of HDF5's")
-    with pytest.raises(FileNotFoundError), new_file(tmp_path / "missing" / "a.h5"):
+    with pytest.raises(FileNotFoundError), new_hdf5_file(tmp_path / "missing" / "a.h5"):
         pass
-    with pytest.raises(KeyboardInterrupt), new_file(tmp_path / "a.h5"):
+    with pytest.raises(KeyboardInterrupt), new_hdf5_file(tmp_path / "a.h5"):
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ import numpy as np
 from six_scans import LATER, dataset, rows_of
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive import index as index_module
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import VOXEL_DTYPE, shard_name

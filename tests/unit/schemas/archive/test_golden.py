@@ -13,7 +13,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, RIM_BIT
 from solidcloud.schemas.kernels.normal_codes import LINE, THICK, decode_normal

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import solidcloud.schemas.process.new_file as new_file_module
+import solidcloud.schemas.process.new_hdf5_file as new_hdf5_file_module
 from solidcloud.schemas.archive.vtkhdf import VtkPoints, read_points, vtk_file
 from solidcloud.schemas.errors import CorruptError
 
@@ -102,7 +102,7 @@ def test_a_full_disk_is_an_error_that_names_the_file(
             raise OSError(errno.ENOSPC, "No space left on device")
         return real(descriptor, data, offset)
 
-    monkeypatch.setattr(new_file_module.os, "pwrite", pwrite)
+    monkeypatch.setattr(new_hdf5_file_module.os, "pwrite", pwrite)
     points, appended = np.random.default_rng(1).random((40_000, 3)), 0
     path = tmp_path / "a.vtkhdf"
     with pytest.raises(OSError, match=r"No space left on device: .*a\.vtkhdf"), vtk_file(path, {}) as out:

@@ -21,7 +21,7 @@ from solidcloud.schemas.process.interrupts import (
     deferring_interrupts,
     interrupt_pending,
 )
-from solidcloud.schemas.process.new_file import new_file
+from solidcloud.schemas.process.new_hdf5_file import new_hdf5_file
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ def test_an_interrupt_while_hdf5_writes_is_one(tmp_path: Path, monkeypatch: pyte
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(os, "ftruncate", interrupted)
-    with pytest.raises(KeyboardInterrupt), new_file(tmp_path / "a.h5") as file:
+    with pytest.raises(KeyboardInterrupt), new_hdf5_file(tmp_path / "a.h5") as file:
         file.create_dataset("x", data=np.arange(10))
     assert list(tmp_path.iterdir()) == []
 

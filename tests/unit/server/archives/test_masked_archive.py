@@ -12,7 +12,7 @@ import pytest
 from masked_scans import BODY, DOOR, ROOM, STEP, build, in_boxes, open_without, two_scans
 from msgspec.structs import asdict
 from numpy.typing import NDArray
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.schemas.wire.arrays import array_fields

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from masked_scans import BODY, DOOR, build, in_boxes, open_without, two_scans
 from numpy.typing import NDArray
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
 from solidcloud.schemas.scene.effect_table import ThroughBox

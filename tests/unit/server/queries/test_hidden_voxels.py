@@ -41,7 +41,7 @@ class Hidden(NamedTuple):
 
 def points_of(archive: Archive, row: int) -> np.ndarray:
     """The points of a voxel (n, 3) [voxel steps]."""
-    from solidcloud.builder.voxel.point_radius import voxel_points
+    from solidcloud.builder.voxel.record_points import voxel_points
 
     return voxel_points(*archive.read_voxel(row)).astype(np.int64)
 

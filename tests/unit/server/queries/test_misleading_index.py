@@ -47,7 +47,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, 
 
 def points_of(archive: Archive, row: int) -> np.ndarray:
     """The points of a voxel (n, 3) [voxel steps]."""
-    from solidcloud.builder.voxel.point_radius import voxel_points
+    from solidcloud.builder.voxel.record_points import voxel_points
 
     return voxel_points(*archive.read_voxel(row)).astype(np.int64)
 

@@ -13,7 +13,7 @@ import radius_class_archives
 import synthetic_scans
 from coarse_tops import ROOM, Made, open_made, scattered
 from numpy.typing import NDArray
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, class_radii
 from solidcloud.schemas.errors import CorruptError
 from solidcloud.server.avatars.avatar_model import make_avatar

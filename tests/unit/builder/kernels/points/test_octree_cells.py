@@ -9,7 +9,7 @@ from solidcloud.builder.kernels.points.octree_cells import (
     split_octree,
     voxel_codes,
 )
-from solidcloud.builder.spool.spool import canonical_columns, row_codes
+from solidcloud.builder.spool.run_files import canonical_columns, row_codes
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel, gather_voxel
 from solidcloud.schemas.archive.codec import encode_voxel
 from solidcloud.schemas.archive.voxel import CELL_BITS, VoxelData, check_voxel

@@ -12,7 +12,7 @@ from solidcloud.builder.kernels.points.voxel_records import (
     point_hashes,
     position_hash_sum,
 )
-from solidcloud.builder.voxel.record_points import Taken, hash_limit, leaves_of, taken
+from solidcloud.builder.voxel.record_points import PointBlock, hash_limit, iter_points, leaves_of
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints
 from solidcloud.schemas.archive.codec import DecompressedRecord
 
@@ -21,9 +21,9 @@ pytestmark = pytest.mark.interpreted
 BASE = np.array([-(1 << 40) + 3, 7, (1 << 35) + 5])
 
 
-def joined(parts: list[Taken]) -> Taken:
+def joined(parts: list[PointBlock]) -> PointBlock:
     """Blocks as one."""
-    return Taken(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return PointBlock(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def hash_by_hand(point: list[int]) -> int:
@@ -44,7 +44,7 @@ def hash_by_hand(point: list[int]) -> int:
 def test_all_points_come_in_blocks_leaf_node_by_leaf_node(kind: str, steps: int, block: int) -> None:
     record = open_scan(kind, 3, 150, steps)
     points, nodes = points_of(record)
-    parts = list(taken(record, BASE, block=block))
+    parts = list(iter_points(record, BASE, block=block))
     assert max(len(p.rows) for p in parts) <= block and min(len(p.rows) for p in parts) > 0
     found, order = joined(parts), np.argsort(nodes, kind="stable")
     assert found.rows.tolist() == order.tolist()
@@ -60,9 +60,9 @@ def test_a_box_has_its_corners(cells: str) -> None:
     inside = ((points >= box[0]) & (points <= box[1])).all(axis=1)
     assert 20 < inside.sum() < 150
     box = np.stack([points[inside].min(axis=0), points[inside].max(axis=0)])  # with points on every face
-    found = joined(list(taken(record, BASE, box=box + BASE)))
+    found = joined(list(iter_points(record, BASE, box=box + BASE)))
     assert sorted(found.rows.tolist()) == np.flatnonzero(inside).tolist()
-    assert list(taken(record, BASE, box=box + BASE + 1000)) == []
+    assert list(iter_points(record, BASE, box=box + BASE + 1000)) == []
 
 
 @pytest.mark.parametrize("share", [0.03, 0.4, 0.97])
@@ -74,7 +74,7 @@ def test_a_share_is_chosen_by_the_hash_of_lattice_coordinates(share: float) -> N
     assert [int(point_hash(*map(np.int64, p))) for p in lattice[:20]] == hashes[:20]
     chosen = [h < int(share * 2.0**64) for h in hashes]
     assert abs(sum(chosen) / 300 - share) < 0.1
-    found = joined(list(taken(record, BASE, limit=hash_limit(share), block=40)))
+    found = joined(list(iter_points(record, BASE, limit=hash_limit(share), block=40)))
     assert sorted(found.rows.tolist()) == np.flatnonzero(chosen).tolist()
     assert point_hashes(points + BASE).tolist() == hashes
     assert hash_limit(1.0) == hash_limit(7.0) == 0 < hash_limit(1e-30)
@@ -83,7 +83,7 @@ def test_a_share_is_chosen_by_the_hash_of_lattice_coordinates(share: float) -> N
 def test_of_equal_points_in_a_leaf_node_a_share_has_the_first() -> None:
     points = np.repeat(np.array([[5, 6, 7], [900, 6, 7], [5, 6, 900]], np.int32), [40, 1, 3], axis=0)
     record = open_points(VoxelPoints(points), 1000)
-    parts = joined(list(taken(record, BASE, limit=np.uint64((1 << 64) - 1))))
+    parts = joined(list(iter_points(record, BASE, limit=np.uint64((1 << 64) - 1))))
     stored, nodes = points_of(record)
     expected = sorted({(int(node), *point) for node, point in zip(nodes, stored.tolist(), strict=True)})
     assert sorted((int(n), *p) for n, p in zip(parts.nodes, parts.xyz.tolist(), strict=True)) == expected
@@ -100,7 +100,7 @@ def test_equal_points_are_told_from_those_beside_them(width: int) -> None:
     )
     record = open_points(VoxelPoints(points), 1000)
     stored, nodes = points_of(record)
-    found = joined(list(taken(record, BASE, limit=np.uint64((1 << 64) - 1))))
+    found = joined(list(iter_points(record, BASE, limit=np.uint64((1 << 64) - 1))))
     rows = [
         min(np.flatnonzero((nodes == node) & (stored == point).all(axis=1)).tolist())
         for node, point in {(int(n), tuple(p)) for n, p in zip(nodes, stored.tolist(), strict=True)}

@@ -14,7 +14,7 @@ from solidcloud.builder.kernels.trees.bounding_sphere import (
     least_variance,
 )
 from solidcloud.builder.kernels.trees.build_tree import build_tree, tree_rows, tree_workspace
-from solidcloud.builder.voxel.hierarchy import Bounds, build_hierarchy
+from solidcloud.builder.voxel.point_hierarchy import Bounds, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
 

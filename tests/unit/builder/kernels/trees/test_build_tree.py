@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.trees.build_tree import DIRECTIONS, EXTREMES
-from solidcloud.builder.voxel.cell_trees import CellTrees, block_points, build_trees, leaf_runs, take_cells
-from solidcloud.builder.voxel.hierarchy import build_hierarchy
+from solidcloud.builder.voxel.point_hierarchy import build_hierarchy
+from solidcloud.builder.voxel.voxel_octree import CellTrees, block_points, build_trees, leaf_runs, take_cells
 from synthetic_scans import make_steps
 
 pytestmark = pytest.mark.interpreted

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree, sort_run
-from solidcloud.builder.voxel.hierarchy import Tree, build_hierarchy
+from solidcloud.builder.voxel.point_hierarchy import Tree, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
 pytestmark = pytest.mark.interpreted

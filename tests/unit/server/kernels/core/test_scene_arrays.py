@@ -6,7 +6,7 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from solidcloud.builder.voxel.point_radius import voxel_points
+from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
 from solidcloud.server.kernels.core.scene_arrays import (

@@ -1,4 +1,4 @@
-"""Transaction that changes an archive: lock it, build the change in a hidden folder, publish it.
+"""Change of an archive, in a transaction: lock it, build the change in a hidden folder, publish it.
 
 New shards stand beside the old ones under new names, and a new index replaces the old one in one
 rename. At every moment there is therefore either the old archive or the new one. Shards that no
@@ -9,10 +9,10 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +20,18 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
-from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
+from ...schemas.errors import BadRequestError, CorruptError, FormatError
 from ...schemas.process.new_file import sync_folder
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import position_hash_sum
 from ..passes.preview import write_preview
 from ..passes.verify import voxel_faults
-from ..resume.build_directory import locked
-from ..run.executor import Executor, worker_count
-from ..run.make_executor import make_executor
-from ..run.memory_shares import bytes_beside_records, jobs_that_fit, memory_share, readers_that_fit
-from ..run.progress import Progress, Silent
-from ..spool.spool import spool_dtype
+from ..resume.lock import locked
+from ..resume.transaction import Transaction
+from ..run.memory_shares import bytes_beside_records, readers_that_fit
+from ..run.progress import Progress
+from ..spool.run_files import spool_dtype
 from ..voxel.record_points import leaves_of
 
 # Points of a unit that reads stored voxels: a few records at a time, on every machine.
@@ -43,32 +42,22 @@ OTHERWISE = ", or build again with a smaller --voxel; the archive is what it was
 _OURS = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5(\..*\.?tmp|\.tmp)?")
 
 
-class Change:
-    """Change in progress.
-
-    archive: its old state.  target: its folder.  folder: the hidden folder.
-    """
+class Change(Transaction):
+    """Change in progress. archive: its old state."""
 
     def __init__(
-        self,
-        target: Path,
-        folder: Path,
-        archive: Archive,
-        config: BuildConfig,
-        executor: Executor,
-        progress: Progress,
+        self, target: Path, archive: Archive, config: BuildConfig, progress: Progress | None
     ) -> None:
-        self.target, self.folder, self.archive, self.config = target, folder, archive, config
-        self.executor, self.progress = executor, progress
+        super().__init__("change", target, target.parent / f".{target.name}.changing", config, progress)
+        self.archive = archive
         self.dtype = spool_dtype(config)
         self.begin = time.perf_counter()
-        self.seconds: dict[str, float] = {}
         self.published = False  # the new index has replaced the old one
 
     @property
-    def share(self) -> int:
-        """Return the bytes of data that each job may hold."""
-        return memory_share(self.executor.jobs, self.config)
+    def outcome(self) -> str:
+        """Return the end of an error message, which says what a failure leaves."""
+        return f"; the archive is {'changed nevertheless' if self.published else 'what it was'}"
 
     @property
     def with_classes(self) -> bool:
@@ -106,30 +95,6 @@ class Change:
         finally:
             self.executor.at_once = self.executor.jobs
 
-    @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
-        """Time a stage and report it to the progress display."""
-        begin = time.perf_counter()
-        self.progress.start(name, total, unit)
-        try:
-            yield
-        finally:
-            self.progress.finish()
-            self.seconds[name] = time.perf_counter() - begin
-
-    def run(self, function: Callable[[Any], Any], units: Sequence[Any]) -> list[Any]:
-        """Return function(unit) of each unit, in order; progress advances by `unit.points`."""
-        return list(self.executor.map(function, units, self.progress, lambda unit: unit.points))
-
-    def check_room(self, needed: int) -> None:
-        """Refuse a change that needs more bytes than are free, before anything is written."""
-        free = shutil.disk_usage(self.target.parent).free
-        if needed > free:
-            raise SolidcloudError(
-                f"{self.target.parent}: {free} bytes free, the change needs about {needed}: make room; the archive is "
-                "what it was"
-            )
-
     def units_of(self, rows: NDArray[np.int64]) -> list[tuple[tuple[int, ...], int]]:
         """Group rows of the index into units of about UNIT_POINTS points.
 
@@ -158,34 +123,16 @@ def changing(target: Path, jobs: int, memory_bytes: int, progress: Progress | No
             f"{target}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
         )
     with locked(target), Archive(target) as archive:
-        config = config_of(archive.header, target, jobs, memory_bytes)
-        folder = target.parent / f".{target.name}.changing"
-        shutil.rmtree(folder, ignore_errors=True)
+        change = Change(target, archive, config_of(archive.header, target, jobs, memory_bytes), progress)
+        shutil.rmtree(change.folder, ignore_errors=True)
         delete_orphans(target, {name for name, _ in archive.shards()})
         try:
             for name in ("spool", "before", SHARD_FOLDER):
-                (folder / name).mkdir(parents=True)
-            jobs = jobs_that_fit(worker_count(jobs, archive.header.points), config)
-            with make_executor(config, jobs) as executor:
-                change = Change(target, folder, archive, config, executor, progress or Silent())
-                with _machine_errors(change):
-                    yield change
+                (change.folder / name).mkdir(parents=True)
+            with change.workers(archive.header.points), change.machine_errors():
+                yield change
         finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _machine_errors(change: Change) -> Iterator[None]:
-    """Turn a disk or memory failure into an error that tells the state of the archive."""
-    try:
-        yield
-    except (MemoryError, OSError) as error:
-        state = "changed nevertheless" if change.published else "what it was"
-        found, advice = str(error), "make room, or check the disk"
-        if isinstance(error, MemoryError):
-            found = f"out of memory ({error or 'no details'})"
-            advice = "give fewer --jobs or a smaller --memory, or stop other programs"
-        raise SolidcloudError(f"{change.target}: {found}: the archive is {state}: {advice}") from error
+            shutil.rmtree(change.folder, ignore_errors=True)
 
 
 def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> BuildConfig:
@@ -217,7 +164,7 @@ def scan_name(source: Source) -> str:
     return f"{source.path}[{source.index}]"
 
 
-def show_kept(change: Change, files: list[tuple[str, int]], new: set[str]) -> None:
+def link_kept_shards(change: Change, files: list[tuple[str, int]], new: set[str]) -> None:
     """Link the shards that stay into the hidden folder, which makes it readable as an archive."""
     for name, _ in files:
         if name not in new:
@@ -254,7 +201,7 @@ class _ReadUnit(NamedTuple):
 def _read_back(unit: _ReadUnit) -> int:
     """Check voxels as verify.py does, reading all their columns.
 
-    Return the `places_sum` (spool.py).
+    Return the `position_hash` (run_files.py).
 
     Raise CorruptError if a voxel has a fault.
     """
@@ -276,7 +223,7 @@ def _read_back(unit: _ReadUnit) -> int:
 def verify_new(change: Change, new: set[str], places: int) -> None:
     """Read back every voxel that was built. The files of all other voxels are unchanged.
 
-    places: the `places_sum` that their points must have (spool.py). The sum detects damage to
+    places: the `position_hash` that their points must have (run_files.py). The sum detects damage to
     runs, which have no checksums. Raise CorruptError if a record is broken, or if the
     records are valid but hold other points.
     """

@@ -1,32 +1,32 @@
-"""The hidden folder of a build: what stays in it after which failure, and what it becomes."""
+"""The hidden folder of a build: what each failure leaves in it, and its publication."""
 
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from solidcloud.builder.resume.build_directory import (
-    Workplace,
+from solidcloud.builder.resume.kept_work import (
+    BuildDirectory,
+    Journal,
+    build_directory,
     building_folder,
-    check_target,
-    forget_finished,
-    publish_folder,
     remove_building,
-    workplace,
+    remove_finished_work,
 )
-from solidcloud.builder.resume.journal import Journal, new_file
+from solidcloud.builder.resume.transaction import check_target, publish_folder
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from solidcloud.schemas.process.new_file import new_file
 
 WHAT: dict[str, Any] = {"software": {"resume": 1}, "options": {"voxel": 8.0}, "inputs": []}
 
 
 def failed(target: Path, error: BaseException, *, surveyed: bool, fresh: bool = False) -> bool:
     """Whether something was there already in a build that fails so; what it wrote stays if its folder does."""
-    with pytest.raises(type(error)), workplace(target, WHAT, fresh=fresh) as place:
-        found = (place.folder / "survey").exists()
-        place.journal.note("survey/1", {})
-        (place.archive / "half.tmp").write_bytes(b"half")
-        place.surveyed = surveyed
+    with pytest.raises(type(error)), build_directory(target, WHAT, fresh=fresh) as build_dir:
+        found = (build_dir.folder / "survey").exists()
+        build_dir.journal.write_entry("survey/1", {})
+        (build_dir.archive / "half.tmp").write_bytes(b"half")
+        build_dir.surveyed = surveyed
         raise error
     assert not list(target.parent.rglob("*.tmp"))
     return found
@@ -65,7 +65,7 @@ def test_a_build_of_something_else_is_left_as_it_is(tmp_path: Path) -> None:
     other = {**WHAT, "options": {"voxel": 4.0}}
     with (
         pytest.raises(BadRequestError, match=r"--voxel was 8\.0, is 4\.0"),
-        workplace(tmp_path / "hall", other, fresh=False),
+        build_directory(tmp_path / "hall", other, fresh=False),
     ):
         pytest.fail("went on")
     assert failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
@@ -78,21 +78,21 @@ def test_a_folder_that_does_not_say_what_it_is_is_not_believed(tmp_path: Path) -
 
 
 def test_the_folder_goes_when_all_is_done(tmp_path: Path) -> None:
-    with workplace(tmp_path / "hall", WHAT, fresh=False) as place:
-        assert place.hidden == building_folder(tmp_path / "hall")
-        assert {p.name for p in place.hidden.iterdir()} == {"build.json", place.folder.name}
-        assert {p.name for p in place.folder.iterdir()} == {"spool", "archive"}
+    with build_directory(tmp_path / "hall", WHAT, fresh=False) as build_dir:
+        assert build_dir.hidden == building_folder(tmp_path / "hall")
+        assert {p.name for p in build_dir.hidden.iterdir()} == {"build.json", build_dir.folder.name}
+        assert {p.name for p in build_dir.folder.iterdir()} == {"spool", "archive"}
     assert not list(tmp_path.iterdir())
 
 
 def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tmp_path: Path) -> None:
     failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    forget_finished(tmp_path / "hall", {**WHAT, "options": {}})
+    remove_finished_work(tmp_path / "hall", {**WHAT, "options": {}})
     assert building_folder(tmp_path / "hall").exists()
-    forget_finished(tmp_path / "hall", WHAT)
+    remove_finished_work(tmp_path / "hall", WHAT)
     assert not list(tmp_path.iterdir())
     building_folder(tmp_path / "hall").mkdir()  # killed between its last two deeds
-    forget_finished(tmp_path / "hall", WHAT)
+    remove_finished_work(tmp_path / "hall", WHAT)
     assert not list(tmp_path.iterdir())
 
 
@@ -101,12 +101,12 @@ def test_a_build_that_cannot_be_forgotten_is_not_gone_on_with(
 ) -> None:
     failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
     with monkeypatch.context() as patch:
-        patch.setattr("solidcloud.builder.resume.build_directory.shutil.rmtree", lambda *_, **__: None)
+        patch.setattr("solidcloud.builder.resume.kept_work.shutil.rmtree", lambda *_, **__: None)
         with (
             pytest.raises(
                 SolidcloudError, match=r"build\.json: cannot be removed, as --fresh requires.* by hand"
             ),
-            workplace(tmp_path / "hall", WHAT, fresh=True),
+            build_directory(tmp_path / "hall", WHAT, fresh=True),
         ):
             pytest.fail("went on")
     assert not failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True, fresh=True)
@@ -122,10 +122,10 @@ def test_what_was_written_late_into_a_published_archive_is_removed(tmp_path: Pat
     shards.mkdir(parents=True)
     for name in (*LATE, "own.tmp", "0-000000.h5"):
         (shards / name).write_bytes(b"")
-    forget_finished(tmp_path / "hall", WHAT)
+    remove_finished_work(tmp_path / "hall", WHAT)
     assert sorted(path.name for path in shards.iterdir()) == ["0-000000.h5", "own.tmp"]
     (shards / LATE[0]).write_bytes(b"")
-    forget_finished(tmp_path / "hall", WHAT)  # no build was killed
+    remove_finished_work(tmp_path / "hall", WHAT)  # no build was killed
     assert (shards / LATE[0]).exists()
 
 
@@ -142,17 +142,17 @@ def test_what_was_written_late_is_part_of_an_archive_to_overwrite(name: str, tmp
 
 
 def test_what_was_made_of_a_run_is_forgotten_with_it(tmp_path: Path) -> None:
-    place = began(tmp_path / "hall")
-    late = place.journal
+    build_dir = began(tmp_path / "hall")
+    late = build_dir.journal
     for name in ("survey/1", "spool/1", "filter-near/1", "filter-thin/1", "done/1"):
-        late.note(name, {"runs": {f"{name[-6:-2]}.run": []}})
-    place.distrust(place.folder / "filter-near" / "near.run")
+        late.write_entry(name, {"runs": {f"{name[-6:-2]}.run": []}})
+    build_dir.discard(build_dir.folder / "filter-near" / "near.run")
     noted = ("survey/1", "spool/1", "filter-near/1", "filter-thin/1", "done/1")
-    assert [name for name in noted if place.journal.recall(name)] == ["survey/1", "spool/1"]
+    assert [name for name in noted if build_dir.journal.read_entry(name)] == ["survey/1", "spool/1"]
     with pytest.raises(FileNotFoundError):  # a shard of what was not believed
-        late.note("done/2", {})
+        late.write_entry("done/2", {})
     again = began(tmp_path / "hall")
-    assert again.folder == place.folder != late.folder
+    assert again.folder == build_dir.folder != late.folder
     assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
 
 
@@ -164,19 +164,19 @@ def test_the_note_of_what_it_is_is_removed_last(tmp_path: Path, monkeypatch: pyt
 
     def watched(path: Path, **_: Any) -> None:
         with pytest.raises(FileNotFoundError):  # where it was, nobody can write any more
-            late.note("survey/2", {})
+            late.write_entry("survey/2", {})
         seen.append((folder / "build.json").exists() and path != folder)
 
-    monkeypatch.setattr("solidcloud.builder.resume.build_directory.shutil.rmtree", watched)
+    monkeypatch.setattr("solidcloud.builder.resume.kept_work.shutil.rmtree", watched)
     remove_building(folder)
     assert seen == [True, False]
 
 
-def began(target: Path, *, fresh: bool = False) -> Workplace:
+def began(target: Path, *, fresh: bool = False) -> BuildDirectory:
     """What a build begins with that is interrupted at once."""
-    with suppress(KeyboardInterrupt), workplace(target, WHAT, fresh=fresh) as place:
+    with suppress(KeyboardInterrupt), build_directory(target, WHAT, fresh=fresh) as build_dir:
         raise KeyboardInterrupt
-    return place
+    return build_dir
 
 
 def test_only_the_same_build_has_the_folder_of_before(tmp_path: Path) -> None:
@@ -186,45 +186,45 @@ def test_only_the_same_build_has_the_folder_of_before(tmp_path: Path) -> None:
     assert third.folder.name != first.folder.name
     assert [p for p in third.hidden.iterdir() if p.is_dir()] == [third.folder]
     with pytest.raises(FileNotFoundError):
-        first.journal.note("survey/1", {})
+        first.journal.write_entry("survey/1", {})
 
 
 @pytest.mark.parametrize("parted", [False, True])
 def test_what_comes_of_points_that_are_not_believed_finds_no_folder(parted: bool, tmp_path: Path) -> None:
-    place = began(tmp_path / "hall")
-    late = place.journal
-    late.note("survey/1", {"count": 7})
-    late.note("spool/1", {"runs": {}})
-    late.note("done/1", {"name": "0-1.h5"})
-    place.distrust(place.folder / "spool")
+    build_dir = began(tmp_path / "hall")
+    late = build_dir.journal
+    late.write_entry("survey/1", {"count": 7})
+    late.write_entry("spool/1", {"runs": {}})
+    late.write_entry("done/1", {"name": "0-1.h5"})
+    build_dir.discard(build_dir.folder / "spool")
     for name in ("survey/2", "spool/2", "done/2"):
         with pytest.raises(FileNotFoundError):
-            late.note(name, {})
+            late.write_entry(name, {})
     if parted:  # killed before it could remove what was there
         late.folder.mkdir()
     again = began(tmp_path / "hall")
-    assert again.folder == place.folder != late.folder
+    assert again.folder == build_dir.folder != late.folder
     assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
-    assert again.journal.recall("survey/1") == {"count": 7}
-    assert again.journal.recall("spool/1") is again.journal.recall("done/1") is None
+    assert again.journal.read_entry("survey/1") == {"count": 7}
+    assert again.journal.read_entry("spool/1") is again.journal.read_entry("done/1") is None
 
 
 def test_nobody_writes_to_what_is_started_over(tmp_path: Path) -> None:
-    with suppress(KeyboardInterrupt), workplace(tmp_path / "hall", WHAT, fresh=False) as place:
-        late = place.journal
-        place.start_over()
+    with suppress(KeyboardInterrupt), build_directory(tmp_path / "hall", WHAT, fresh=False) as build_dir:
+        late = build_dir.journal
+        build_dir.start_over()
         with pytest.raises(FileNotFoundError):
-            late.note("survey/1", {})
+            late.write_entry("survey/1", {})
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
     assert began(tmp_path / "hall").folder != late.folder
 
 
 def test_a_file_that_is_still_written_is_not_published(tmp_path: Path) -> None:
-    with workplace(tmp_path / "hall", WHAT, fresh=False) as place:
-        (place.archive / "index.h5").write_bytes(b"whole")
-        with pytest.raises(FileNotFoundError), new_file(place.archive / "shards" / "0-000000.h5") as file:
-            publish_folder(place.archive, tmp_path / "hall", overwrite=False)
+    with build_directory(tmp_path / "hall", WHAT, fresh=False) as build_dir:
+        (build_dir.archive / "index.h5").write_bytes(b"whole")
+        with pytest.raises(FileNotFoundError), new_file(build_dir.archive / "shards" / "0-000000.h5") as file:
+            publish_folder(build_dir.archive, tmp_path / "hall", overwrite=False)
             file.write(b"late")
     assert sorted(p.name for p in (tmp_path / "hall").rglob("*")) == ["index.h5", "shards"]
     assert [p.name for p in tmp_path.iterdir()] == ["hall"]

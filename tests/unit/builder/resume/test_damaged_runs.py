@@ -1,4 +1,4 @@
-"""Runs that are no more what was written when a build goes on: it ends in the bytes of one that was never disturbed."""
+"""A resumed build discards runs that differ from what was written, and ends in the bytes of an undisturbed build."""
 
 import os
 import shutil
@@ -7,17 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.passes.resumable_passes as passes
+import solidcloud.builder.passes.build_shards as build_shards
+import solidcloud.builder.passes.spool_pass as spool_pass
+import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.passes.filter_rules import filter_dtype
-from solidcloud.builder.resume.build_directory import RUN_FOLDERS, building_folder
-from solidcloud.builder.spool.spool import KEYS_SUFFIX, spool_dtype
+from solidcloud.builder.resume.kept_work import RUN_FOLDERS, building_folder
+from solidcloud.builder.spool.run_files import KEYS_SUFFIX, filter_dtype, spool_dtype
 from solidcloud.schemas.errors import CorruptError
 
 COLUMNS: dict[str, Any] = {"keep": frozenset({"scan", "intensity"})}
 FILTERS: dict[str, Any] = {"thin": 0.01, "outliers": (0.3, 1), **COLUMNS}
+
+# The pass that each work unit belongs to.
+PASS_OF = {
+    "survey_range": survey,
+    "hash_file": survey,
+    "spool_range": spool_pass,
+    "build_shard": build_shards,
+}
 
 
 @pytest.fixture
@@ -49,8 +58,8 @@ def as_it_was(kept: Path, target: Path) -> None:
 def counted(monkeypatch: pytest.MonkeyPatch, name: str) -> list[Any]:
     """The units that a function of the passes is given from now on."""
     units: list[Any] = []
-    function = getattr(passes, name)
-    monkeypatch.setattr(passes, name, lambda unit: units.append(unit) or function(unit))
+    function = getattr(PASS_OF[name], name)
+    monkeypatch.setattr(PASS_OF[name], name, lambda unit: units.append(unit) or function(unit))
     return units
 
 
@@ -128,7 +137,7 @@ def test_what_was_made_of_a_run_that_changed_is_made_anew(
     interrupted(tmp_path / "hall", scans, monkeypatch, **FILTERS)
     with monkeypatch.context() as patch:
         # Built of the changed run by somebody who did not look.
-        patch.setattr(passes, "check_runs", lambda *_: None)
+        patch.setattr(spool_pass, "discard_damaged_runs", lambda *_: None)
         if suffix == ".run":
             run = runs(tmp_path / "hall", folder)[0]
             flip(run, 8 * (run.stat().st_size - 1) + 3)  # of an intensity
@@ -196,10 +205,10 @@ def test_runs_are_read_once_by_a_build_that_goes_on_and_not_by_another(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[str] = []
-    compare = passes.check_runs.__globals__["is_other_run"]
+    compare = spool_pass.discard_damaged_runs.__globals__["is_run_damaged"]
     monkeypatch.setitem(
-        passes.check_runs.__globals__,
-        "is_other_run",
+        spool_pass.discard_damaged_runs.__globals__,
+        "is_run_damaged",
         lambda path, sums: read.append(path.name) or compare(path, sums),
     )
     interrupted(tmp_path / "hall", scans, monkeypatch)
@@ -225,7 +234,7 @@ def test_a_build_stopped_while_it_forgets_comes_to_the_same_bytes(
             done: list[str] = []
             for name in ("rename", "replace", "unlink", "mkdir", "rmdir"):
                 patch.setattr(os, name, counting(getattr(os, name), done, most))
-            patch.setattr(passes, "_sweep_spool", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+            patch.setattr(spool_pass, "_sweep_spool", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):
                 build(target, scans)
         build(target, scans)

@@ -6,23 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solidcloud.builder.spool.spool_pass as partition
+import solidcloud.builder.passes.spool_pass as partition
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.content_hash import SEEDS, content_sum
-from solidcloud.builder.sources.common.scan import Scan, ScanBlock
-from solidcloud.builder.spool.spool import Spool, places_sum, row_codes, spool_dtype, write_run
-from solidcloud.builder.spool.spool_pass import (
-    RunsHold,
+from solidcloud.builder.passes.spool_pass import (
     Spooled,
     SpoolUnit,
     dump_spooled,
     load_spooled,
-    ranks,
     run_points,
     sort_voxel,
     spool_range,
     usable,
 )
+from solidcloud.builder.resume.kept_work import RunsIntact
+from solidcloud.builder.sources.common.scan import Scan, ScanBlock
+from solidcloud.builder.spool.run_files import position_hash, ranks, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool.spool import Spool
 from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from synthetic_scans import make_scan
@@ -199,7 +199,7 @@ def test_the_places_of_what_is_spooled_are_summed_whatever_is_kept(
     lattice = make_lattice((-0.3, 0.1, 0), 0.001, 0.5)
     result, spool = spooled(tmp_path / "s", Listed(xyz), 300, lattice, 70, keep)
     expected = int(content_sum(np.ascontiguousarray(lattice.to_lattice(xyz).T).view(np.uint64), SEEDS[0]))
-    rows = [places_sum(k, part["local"], lattice) for k in spool.keys.tolist() for part in spool.rows(k)]
+    rows = [position_hash(k, part["local"], lattice) for k in spool.keys.tolist() for part in spool.rows(k)]
     assert result.places == sum(rows) % (1 << 64) == expected
 
 
@@ -215,7 +215,7 @@ def test_a_note_of_runs_holds_while_they_are_as_long_as_they_were(tmp_path: Path
     result, _ = spooled(tmp_path / "s", Listed(make_scan("noise", 2, 300)), 300, lattice, 200)
     noted = load_spooled(dump_spooled(result))
     assert noted == result
-    holds = RunsHold(tmp_path / "s")
+    holds = RunsIntact(tmp_path / "s")
     assert holds(noted)
     path = tmp_path / "s" / list(result.runs)[1]
     path.write_bytes(path.read_bytes()[:-1])
@@ -226,7 +226,7 @@ def test_a_note_of_runs_holds_while_they_are_as_long_as_they_were(tmp_path: Path
 
 def test_memory_bounds_a_run() -> None:
     plain, full = (spool_dtype(BuildConfig(keep=keep)) for keep in (frozenset(), frozenset({"intensity"})))
-    assert run_points(0, plain) == partition.LEAST_RUN_POINTS
+    assert run_points(0, plain) == partition.MIN_RUN_POINTS
     most = run_points(1 << 30, plain)
     assert most * partition.SPOOL_BYTES_A_POINT + partition.SPOOL_BYTES <= 1 << 30
     assert run_points(1 << 30, full) < most

@@ -18,7 +18,7 @@ from ..config import BuildConfig
 from ..pipeline import build_archive
 from ..run.progress import Progress, Silent
 from ..sources.scan_files import open_scans
-from .build_plan import Rates, Stage
+from .rates import Rates, StageRate
 
 POINTS = 1_000_000
 READ_POINTS = 300_000
@@ -111,7 +111,7 @@ def _read_seconds(path: Path) -> float:
     return time.process_time() - begin
 
 
-def measured(rates: Rates, progress: Progress | None = None) -> Rates:
+def measure_rates(rates: Rates, progress: Progress | None = None) -> Rates:
     """Return the rates of this machine: those given, scaled by a small build, stage by stage."""
     progress = progress or Silent()
     config = BuildConfig(jobs=1)
@@ -135,7 +135,8 @@ def measured(rates: Rates, progress: Progress | None = None) -> Rates:
         known[name].seconds(POINTS, 1) for name in shared
     )
     stages = {
-        name: Stage(*(value * factors.get(name, whole) for value in stage)) for name, stage in known.items()
+        name: StageRate(*(value * factors.get(name, whole) for value in stage))
+        for name, stage in known.items()
     }
     said = f"a synthetic cloud of {POINTS:,} points built here; the rest as in: {rates.rests_on}"
     return replace(rates, stages=stages, read=read, rests_on=said)

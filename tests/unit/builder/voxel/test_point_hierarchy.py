@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.voxel.hierarchy import Hierarchy, build_hierarchy
+from solidcloud.builder.voxel.point_hierarchy import Hierarchy, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
 pytestmark = pytest.mark.interpreted

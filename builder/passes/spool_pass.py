@@ -8,7 +8,7 @@ the coordinates, and writes them as one run (builder/spool/spool.py).
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,11 @@ from ..kernels.points.spool_rows import (
     scatter,
     usable_bounds,
 )
+from ..resume.kept_work import BuildDirectory, RunsIntact, Work, discard_damaged_runs, run_unfinished
+from ..resume.transaction import Transaction
 from ..sources.common.scan import Scan, ScanBlock
-from .spool import RUN_SUFFIX, RunSums, new_run, run_sizes, write_directory
+from ..spool.run_files import KEYS_SUFFIX, RUN_SUFFIX, RunSums, new_run, ranks, write_directory
+from .survey import Survey
 
 # Bytes per point in a spooling worker: voxel number, code, and a copy of the code in sorted order.
 # With intensity also its bits, a copy of them, and, for a run in one voxel, order, sorted codes and
@@ -38,7 +41,7 @@ SPOOL_BYTES_A_POINT_WITH_INTENSITY = 52
 # In addition: one block being read and one being written.
 SPOOL_BYTES = 48 << 20
 # Least points of a run, whatever the memory: gathering a voxel from many small runs is slow.
-LEAST_RUN_POINTS = 1 << 16
+MIN_RUN_POINTS = 1 << 16
 # Rows generated at a time when a run is written.
 WRITTEN_ROWS = 1 << 18
 
@@ -71,7 +74,7 @@ class Spooled:
 
     runs: name of each run -> sums of what was written.
     content: sums that identify the points, see `content_sum`.
-    places: the same for their lattice coordinates alone, see `places_sum`.
+    places: the same for their lattice coordinates alone, see `position_hash`.
     moved_max: largest distance along an axis that quantising moved a point [m].
     """
 
@@ -92,32 +95,11 @@ def load_spooled(noted: dict[str, Any]) -> Spooled:
     return Spooled(**noted)
 
 
-class HasRuns(Protocol):
-    """Object that names runs. runs: name of each run -> sums of what was written."""
-
-    @property
-    def runs(self) -> dict[str, RunSums]:
-        """Return the runs."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunsHold:
-    """Check that the runs of a journal entry are in `folder` with the right sizes.
-
-    verify_runs.py checks their bytes.
-    """
-
-    folder: Path
-
-    def __call__(self, noted: HasRuns) -> bool:
-        return all(run_sizes(self.folder / name) == tuple(sums[::2]) for name, sums in noted.runs.items())
-
-
 def run_points(memory_bytes: int, dtype: np.dtype) -> int:
     """Return the points that a run may have if a worker may hold `memory_bytes`."""
     with_intensity = "intensity" in (dtype.names or ())
     each = SPOOL_BYTES_A_POINT_WITH_INTENSITY if with_intensity else SPOOL_BYTES_A_POINT
-    return max(LEAST_RUN_POINTS, (memory_bytes - SPOOL_BYTES) // each)
+    return max(MIN_RUN_POINTS, (memory_bytes - SPOOL_BYTES) // each)
 
 
 def spool_range(unit: SpoolUnit) -> Spooled:
@@ -126,7 +108,7 @@ def spool_range(unit: SpoolUnit) -> Spooled:
     The runs are durable on disk when this returns. Pure and idempotent. Raise ScanError if the scan
     changed since the survey.
     """
-    held = _Held(unit, min(unit.count, unit.run_points))
+    held = _RunBuffer(unit, min(unit.count, unit.run_points))
     kept = 0
     runs: dict[str, RunSums] = {}
 
@@ -164,7 +146,7 @@ def usable(block: ScanBlock) -> ScanBlock:
     return ScanBlock(block.xyz[good], None if block.intensity is None else block.intensity[good])
 
 
-class _Held:
+class _RunBuffer:
     """Points that wait to be written as a run: voxel numbers and codes, and the voxels' keys."""
 
     def __init__(self, unit: SpoolUnit, capacity: int) -> None:
@@ -298,10 +280,52 @@ def sort_voxel(codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> No
     bits[:] = bits[order]
 
 
-def ranks(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Return integers ordered like the float32 values of these bits.
+def spool_scans(
+    surveys: list[Survey],
+    lattice: Lattice,
+    dtype: np.dtype,
+    build_dir: BuildDirectory,
+    build: Transaction,
+) -> list[Spooled]:
+    """Run the second pass: write quantised points to disk, sorted by voxel."""
+    discard_damaged_runs(build_dir, build)
+    folder = build_dir.folder / "spool"
+    most = run_points(build.share, dtype)
+    units = []
+    for number, survey in enumerate(surveys):
+        for part in survey.parts:
+            assert survey.scan is not None
+            name = f"{number:06d}-{part.start:012d}"
+            unit = SpoolUnit(
+                survey.scan,
+                number,
+                part.start,
+                part.stop,
+                part.count,
+                lattice,
+                build.config,
+                dtype,
+                folder,
+                name,
+                most,
+            )
+            units.append((f"spool/{name}", unit))
+    notes = [build_dir.journal.read_entry(f"spool/{note.stem}") for note in folder.glob("*.json")]
+    _sweep_spool(folder, {name for noted in notes if noted for name in noted["runs"]})
+    work = Work(spool_range, dump_spooled, load_spooled, RunsIntact(folder))
+    with build.stage("spool", sum(s.count for s in surveys), "points"):
+        spooled = run_unfinished(
+            build_dir.journal, build.executor, work, units, build.progress, lambda unit: unit.count
+        )
+    # A range that had lost a run was spooled again, possibly into fewer runs than before.
+    _sweep_spool(folder, {name for found in spooled for name in found.runs})
+    return spooled
 
-    NaN is last, as in np.lexsort.
-    """
-    negative = (bits >> np.uint32(31)).astype(bool)
-    return np.where(negative, ~bits, bits | np.uint32(1 << 31)).astype(np.uint32)
+
+def _sweep_spool(folder: Path, vouched: set[str]) -> None:
+    """Delete uncertified runs, because a spool consists of all runs in its folder."""
+    stems = {Path(name).stem for name in vouched}
+    for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
+        for path in folder.glob(f"*{suffix}"):
+            if path.stem not in stems:
+                path.unlink(missing_ok=True)  # a worker that was given up may have removed it already

@@ -1,9 +1,9 @@
-"""Work units hold every row once, about as many points each, the largest first."""
+"""Ranges of voxels hold every row once, with about as many points each, the largest first."""
 
 import numpy as np
 import pytest
+from solidcloud.builder.run.executor import jobs_of, run_units, voxel_ranges
 from solidcloud.builder.run.progress import Silent
-from solidcloud.builder.run.work_units import jobs_of, portions, run_units
 
 M = 1 << 20
 
@@ -12,7 +12,7 @@ M = 1 << 20
 @pytest.mark.parametrize("counts", [[5], [M] * 100, [1, 40 * M, 2, 3], [0, 0, 9 * M, 0], list(range(1000))])
 def test_every_row_is_in_one_portion_and_the_largest_come_first(counts: list[int], jobs: int) -> None:
     points = np.array(counts)
-    runs = portions(points, jobs)
+    runs = voxel_ranges(points, jobs)
     assert sorted(row for run in runs for row in run) == list(range(len(points)))
     held = [int(points[list(run)].sum()) for run in runs]
     assert held == sorted(held, reverse=True)
@@ -22,7 +22,7 @@ def test_every_row_is_in_one_portion_and_the_largest_come_first(counts: list[int
 
 
 def test_no_rows_are_no_portions() -> None:
-    assert portions(np.empty(0, np.int64), 2) == []
+    assert voxel_ranges(np.empty(0, np.int64), 2) == []
 
 
 def test_without_an_executor_units_run_here_in_order() -> None:

@@ -1,4 +1,4 @@
-"""An archive that is changed while it is checked or exported: what is told is of one generation, or an error."""
+"""An archive that is replaced while it is verified or exported: the result is of one generation, or an error."""
 
 import shutil
 from collections.abc import Callable
@@ -13,8 +13,7 @@ from solidcloud.builder.edit.edit_archive import add_scans
 from solidcloud.builder.export import export_archive as export_module
 from solidcloud.builder.export.export_archive import export_archive
 from solidcloud.builder.passes import verify as verify_module
-from solidcloud.builder.passes.unchanged_archive import unchanged
-from solidcloud.builder.passes.verify import verify_archive
+from solidcloud.builder.passes.verify import unchanged, verify_archive
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, CorruptError, SolidcloudError
@@ -59,7 +58,7 @@ def test_what_is_checked_of_two_generations_is_an_error(
     assert not report.faults and report.points == 600
 
 
-@pytest.mark.parametrize("name", ["_look", "_write"])
+@pytest.mark.parametrize("name", ["_survey_points", "_write_points"])
 def test_an_export_is_of_the_generation_it_began_with(
     archive: Path, add: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

@@ -1,0 +1,166 @@
+"""Transaction in which build, add and remove write an archive.
+
+Each holds the lock of the archive (lock.py) and works in a hidden folder beside it. The target name
+refers to a complete archive at every moment, because the renames that publish come last.
+"""
+
+import errno
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER
+from ...schemas.archive.vtkhdf import PREVIEW_NAME
+from ...schemas.errors import BadRequestError, SolidcloudError
+from ...schemas.process.new_file import is_temporary, remove_temporaries, sync_folder
+from ...schemas.process.os_errors import os_error_words
+from ..config import BuildConfig
+from ..run.executor import Executor, ProcessExecutor, worker_count
+from ..run.memory_shares import jobs_that_fit, memory_share
+from ..run.progress import Progress, Silent, Stages
+
+
+class Transaction(Stages):
+    """Archive that is being written: where, with which options and workers.
+
+    target: its folder.  folder: the hidden folder.  what: "build" or "change".
+    executor: runs the work units, inside `workers`.
+    """
+
+    executor: Executor
+
+    def __init__(
+        self, what: str, target: Path, folder: Path, config: BuildConfig, progress: Progress | None
+    ) -> None:
+        super().__init__(progress or Silent())
+        self.what, self.target, self.folder, self.config = what, target, folder, config
+
+    @property
+    def outcome(self) -> str:
+        """Return the end of an error message, which says what a failure leaves."""
+        return f", then give the same command again: it resumes from the finished work in {self.folder}"
+
+    @property
+    def share(self) -> int:
+        """Return the bytes of data that each job may hold."""
+        return memory_share(self.executor.jobs, self.config)
+
+    @contextmanager
+    def workers(self, points: int) -> Iterator[None]:
+        """Provide the executor, with as many processes as the points are worth and the memory allows."""
+        jobs = jobs_that_fit(worker_count(self.config.jobs, points), self.config)
+        with make_executor(self.config, jobs) as self.executor:
+            yield
+
+    def run(self, function: Callable[[Any], Any], units: Sequence[Any]) -> list[Any]:
+        """Return function(unit) of each unit, in order; progress advances by `unit.points`."""
+        return list(self.executor.map(function, units, self.progress, lambda unit: unit.points))
+
+    def check_space(self, needed: int, folder: Path | None = None) -> None:
+        """Raise SolidcloudError if files of `needed` bytes do not fit on the disk, before they are written.
+
+        folder: existing files in it are part of the need; None: nothing is there yet.
+        """
+        if folder is not None:
+            needed -= sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        disk = self.target.parent
+        free = shutil.disk_usage(disk).free
+        if needed > free:
+            raise SolidcloudError(
+                f"{disk}: {free} bytes free, the {self.what} needs about {needed}: make room{self.outcome}"
+            )
+
+    @contextmanager
+    def machine_errors(self) -> Iterator[None]:
+        """Turn a failure of the disk or the memory into an error that says what to do and what is kept."""
+        try:
+            yield
+        except MemoryError as error:
+            raise SolidcloudError(
+                f"{self.target}: out of memory ({error or 'no details'}): give fewer --jobs or a smaller --memory, or "
+                f"stop other programs{self.outcome}"
+            ) from error
+        except OSError as error:
+            # HDF5 puts the errno into its message only.
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT) or f"errno = {errno.ENOSPC}" in str(error)
+            found = os_error_words(OSError(errno.ENOSPC, "") if full else error)
+            where = f" ({error.filename})" if error.filename else ""
+            raise SolidcloudError(f"{self.target.parent}{where}: {found}{self.outcome}") from error
+
+
+def make_executor(config: BuildConfig, jobs: int) -> Executor:
+    """Make the executor: a cluster if the options name one, otherwise `jobs` processes.
+
+    One job runs in this process.
+    """
+    address = config.scheduler or config.cluster
+    if address is None:
+        return ProcessExecutor(jobs)
+    # This import loads dask, which nothing else needs.
+    from ..run.dask_cluster import ClusterExecutor
+
+    return ClusterExecutor(address, config.memory_bytes)
+
+
+def check_target(target: Path, overwrite: bool) -> None:
+    """Refuse to write to a target that holds anything else."""
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if not (target / INDEX_NAME).is_file():
+        raise BadRequestError(f"{target}: exists and is no archive, expected a new folder: give another -o")
+    if not overwrite:
+        raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
+    shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
+    strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER, PREVIEW_NAME)]
+    # A unit that was given up may have left a temporary file of a build that was killed before it
+    # could remove it.
+    strangers += [p for p in shards if not p.is_file() or (p.suffix != ".h5" and not is_temporary(p))]
+    if strangers:
+        raise BadRequestError(
+            f"{strangers[0]}: not part of an archive, and --overwrite would delete it: move it, or give another -o"
+        )
+
+
+@contextmanager
+def made_parents(target: Path) -> Iterator[None]:
+    """Create the folders above the target; after a failure, remove those created here."""
+    made = [folder for folder in target.parents if not folder.exists()]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # another process uses it by now
+                folder.rmdir()
+        raise
+
+
+def recover(target: Path) -> None:
+    """Finish an earlier build with `overwrite` that was killed between its two renames."""
+    old = target.parent / f".{target.name}.old"
+    if old.exists() and not target.exists():
+        os.rename(old, target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def publish_folder(folder: Path, target: Path, overwrite: bool) -> None:
+    """Rename the finished folder to its target."""
+    sync_folder(folder)
+    if target.exists() and overwrite and (target / INDEX_NAME).is_file():
+        old = target.parent / f".{target.name}.old"
+        os.rename(target, old)
+        try:
+            os.rename(folder, target)
+        except OSError:
+            os.rename(old, target)
+            raise
+        shutil.rmtree(old)
+    else:
+        os.rename(folder, target)  # replaces an empty folder
+    # Remove files of a unit that was given up and is still running: from now on it cannot create
+    # others.
+    remove_temporaries(target)
+    sync_folder(target.parent)

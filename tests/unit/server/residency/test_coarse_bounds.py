@@ -309,7 +309,7 @@ def test_readers_see_whole_slots_or_none(made: Made, rng: np.random.Generator) -
                 if number % 2:
                     coarse.coarse.store_from_archive(coarse.store, row)
                 else:
-                    coarse.store_from_arena(row)
+                    coarse.remember(row)
 
     with running([threading.Thread(target=read) for _ in range(2)]):
         try:

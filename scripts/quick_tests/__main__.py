@@ -19,7 +19,7 @@ from mutation_cases.plan import TESTS
 from .selection import EVERYTHING, PRODUCT, Selected, select
 
 ROOT = Path(__file__).resolve().parents[2]
-GRACE = 5.0  # seconds beyond the limit for the test that is running
+GRACE = 5.0  # seconds beyond the limit for the test that is running, and then for the report
 # Environment and marker expression of the two processes. What is marked as interpreted is not run compiled too.
 MODES = {
     "interpreted": ({"NUMBA_DISABLE_JIT": "1"}, "interpreted and not slow"),
@@ -33,7 +33,7 @@ def main() -> int:
     parser.add_argument("paths", nargs="*", help="files or folders to take for the change")
     parser.add_argument("--since", metavar="REVISION", help="take what differs from this commit")
     parser.add_argument(
-        "--limit", type=float, default=75.0, help="seconds for the tests (default %(default)s)"
+        "--limit", type=float, default=70.0, help="seconds for the tests (default %(default)s)"
     )
     options = parser.parse_args()
     began = time.time()
@@ -62,7 +62,8 @@ def run_all(selected: list[Selected], began: float, limit: float) -> bool:
             run.finish()
             print(f"\n== {run.mode}\n{run.output.read_text()}", end="")
     done, failed = sum(run.ended.total() for run in runs), any(run.failed() for run in runs)
-    print(f"\nran {done} tests in {time.time() - began:.0f} s: {'FAILED' if failed else 'passed'}")
+    outcome = "FAILED" if failed else "passed" if done else "none ended in time"
+    print(f"\nran {done} tests in {time.time() - began:.0f} s: {outcome}")
     left = Counter(test.partition("::")[0] for run in runs for test in run.left())
     if left:
         each = ", ".join(f"{file} ({count})" for file, count in left.items())
@@ -102,11 +103,16 @@ class Run:
 
     def finish(self) -> None:
         """Wait until the process ends, or end it."""
-        try:
-            self.process.wait(max(0.0, self.end + GRACE - time.time()))
-        except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait()
+        end, self.stopped = self.end + GRACE, False
+        for number in (signal.SIGINT, signal.SIGKILL):  # interrupted, pytest prints what failed
+            try:
+                self.process.wait(max(0.0, end - time.time()))
+                break
+            except subprocess.TimeoutExpired:
+                os.killpg(self.process.pid, number)
+                self.stopped = True
+                end = time.time() + GRACE
+        self.process.wait()
         lines = self.record.read_text().splitlines() if self.record.is_file() else []
         outcomes = [line.partition(" ")[::2] for line in lines]
         self.collected = [test for outcome, test in outcomes if outcome == "collected"]
@@ -115,7 +121,7 @@ class Run:
 
     def failed(self) -> bool:
         """Return whether a test failed, or pytest itself. Code 5: no test was collected."""
-        return "failed" in self.outcomes or self.process.returncode not in (0, 2, 5, -signal.SIGKILL)
+        return "failed" in self.outcomes or not (self.stopped or self.process.returncode in (0, 2, 5))
 
     def left(self) -> list[str]:
         """Return the tests that were not run to their end."""

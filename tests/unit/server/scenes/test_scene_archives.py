@@ -315,7 +315,7 @@ def test_too_small_a_cache_is_told(write: Write) -> None:
 
 
 @pytest.mark.parametrize(
-    "fails", ["store_opener", "simulate", "share_budget", "PlacedArchive.__init__", "Scene.__init__"]
+    "fails", ["store_opener", "make_simulation", "share_budget", "PlacedArchive.__init__", "Scene.__init__"]
 )
 def test_what_fails_half_way_leaves_no_file_open(
     write: Write, monkeypatch: pytest.MonkeyPatch, fails: str
@@ -326,7 +326,7 @@ def test_what_fails_half_way_leaves_no_file_open(
         pass
     calls: list[int] = []
     place, _, method = fails.partition(".")
-    places = {"Scene": Scene, "PlacedArchive": PlacedArchive, "simulate": scene_module}
+    places = {"Scene": Scene, "PlacedArchive": PlacedArchive, "make_simulation": scene_module}
     at_fault: Any = places.get(place, scene_archives)
     name = method or place
     right = getattr(at_fault, name)

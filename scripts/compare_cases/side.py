@@ -1,46 +1,33 @@
 """Process of one version for scripts/compare: runs the cases it is told to and prints their durations.
 
-    python -P side.py ARCHIVE CASE,CASE,...
+    python side.py ARCHIVE CASE,CASE,...
 
 The interpreter determines the version. Names are looked up where either version defines them.
 """
 
-import importlib
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
-DEFAULT_CASES = (
-    "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
-)  # fmt: skip
-CASES = (*DEFAULT_CASES, "build")
+from versions import find, scene_file
+
 # Repetitions in one turn, which then takes about 0.1 to 0.3 s.
 PASSES, SINGLES, MOTIONS, FRAMES, TRIPS, WISHES = 20, 4000, 1200, 600, 300, 150
 BUILD_POINTS = 10_000_000
-EFFECTS = ("stop", "sweep", "slide", "step", "ground")
 
 Case = Callable[[], None]
-
-
-def scene_file(archive: Path) -> Path:
-    """Write the scene file of a walk beside the archive; return its path."""
-    path = archive.parent / f"walk-{sys.prefix.replace('/', '-')}.toml"
-    effects = "".join(f'\n[[effects]]\neffect = "{effect}"\n' for effect in EFFECTS)
-    path.write_text(f'format = 1\n\n[[archives]]\npath = "{archive}"\n{effects}')
-    return path
 
 
 def scene_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     """Return the cases of a scene in this process."""
     import numpy as np
-    from solidcloud.builder.synthetic.facade import build_facade
-    from solidcloud.builder.synthetic.figure import figure_points
-    from solidcloud.builder.synthetic.walk import walk_poses
     from solidcloud.server.scene import Scene
 
+    build_facade = find("build_facade", "builder.synthetic.facade", "builder.made.facade")
+    figure_points = find("figure_points", "builder.synthetic.figure", "builder.made.figure")
+    walk_poses = find("walk_poses", "builder.synthetic.walk", "builder.made.walk")
     scene = stack.enter_context(Scene.open(archive, budget_bytes=1 << 30))
     figure = figure_points(3617)
     scene.add_avatar("al", figure)
@@ -91,16 +78,6 @@ def scene_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     }  # fmt: skip
 
 
-def find(name: str, *modules: str) -> Any:
-    """Return a name from the first of these modules that exists; versions differ in where it is defined."""
-    for module in modules:
-        try:
-            return getattr(importlib.import_module(f"solidcloud.{module}"), name)
-        except ModuleNotFoundError:
-            continue
-    raise ImportError(f"{name} is in none of {', '.join(modules)}")
-
-
 def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
     """Open a scene with the effects of a walk."""
     path = scene_file(archive)
@@ -116,8 +93,8 @@ def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
 def wire_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
     """Return the cases of a client with a separate server."""
     import numpy as np
-    from solidcloud.builder.synthetic.figure import figure_points
 
+    figure_points = find("figure_points", "builder.synthetic.figure", "builder.made.figure")
     client_of = find("Client", "server.client")
     served = find("served", "server.report.walk.server_process", "server.report.serving")
     endpoint = stack.enter_context(served(scene_file(archive), "walk"))

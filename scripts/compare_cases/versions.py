@@ -1,0 +1,47 @@
+"""What a comparison of two versions shares: cases, names in either version, a checkout of a commit."""
+
+import importlib
+import subprocess
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+# Cases whose speed is compared; a build takes much longer than the others.
+DEFAULT_CASES = (
+    "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
+)  # fmt: skip
+CASES = (*DEFAULT_CASES, "build")
+# Fields of answers that are not compared: durations, and how much memory the cache holds.
+VOLATILE = frozenset({"engine_seconds", "wait_seconds", "resident", "resident_bytes"})
+EFFECTS = ("stop", "sweep", "slide", "step", "ground")
+
+
+def find(name: str, *modules: str) -> Any:
+    """Return a name from the first of these modules that exists; versions differ in where it is defined."""
+    for module in modules:
+        try:
+            return getattr(importlib.import_module(f"solidcloud.{module}"), name)
+        except ModuleNotFoundError:
+            continue
+    raise ImportError(f"{name} is in none of {', '.join(modules)}")
+
+
+def base_checkout(root: Path, commit: str, stack: ExitStack) -> Path:
+    """Check out a commit into a temporary folder, install it there, and return the folder."""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="solidcloud-base-")), "base")
+    subprocess.run(["git", "-C", str(root), "worktree", "add", "--detach", str(folder), commit], check=True)
+    stack.callback(
+        subprocess.run, ["git", "-C", str(root), "worktree", "remove", "--force", str(folder)], check=False
+    )
+    subprocess.run([str(folder / "scripts" / "setup")], check=True)
+    return folder
+
+
+def scene_file(archive: Path) -> Path:
+    """Write the scene file of a walk beside the archive; return its path."""
+    path = archive.parent / f"walk-{sys.prefix.replace('/', '-')}.toml"
+    effects = "".join(f'\n[[effects]]\neffect = "{effect}"\n' for effect in EFFECTS)
+    path.write_text(f'format = 1\n\n[[archives]]\npath = "{archive}"\n{effects}')
+    return path

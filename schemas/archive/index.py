@@ -261,17 +261,19 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
     voxels: VOXEL_DTYPE rows sorted by key.
     shards: name and bytes of each, in the order of their numbers.
     """
-    columns = {
+    tables = {
         "shards": np.array([(name.encode(), size) for name, size in shards], SHARD_DTYPE),
         "voxels": voxels,
     }
-    return {
-        name: columns[name]
-        if column.values is None
-        else np.asarray(column.values(header), column.dtype).reshape(column.shape)
-        for name, column in INDEX_COLUMNS.items()
-        if not column.requires or getattr(header, column.requires)
-    }
+    columns = {}
+    for name, column in INDEX_COLUMNS.items():
+        if column.values is None:
+            columns[name] = tables[name]
+        elif not column.requires or getattr(header, column.requires):
+            value = np.asarray(column.values(header), column.dtype)
+            # Any other array keeps its shape, for a reader to refuse if it is wrong.
+            columns[name] = value if value.ndim and value.size else value.reshape(column.shape)
+    return columns
 
 
 def index_digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:

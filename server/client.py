@@ -21,7 +21,7 @@ from ..schemas.wire.encoding import decode_answer, encode
 from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest
 from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_path_parameters
 from ..schemas.wire.question_rules import Question, request_fields
-from ..schemas.wire.questions import QUESTIONS
+from ..schemas.wire.question_table import QUESTIONS
 from ..schemas.wire.request_limits import MAX_POSES
 from ..schemas.wire.requests import has_tolerance_or_budget, make_poses, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo

@@ -25,7 +25,7 @@ from ..schemas.wire.answers import (
 from ..schemas.wire.key_expressions import User
 from ..schemas.wire.motion_messages import Moved, State, Wish
 from ..schemas.wire.question_rules import Question
-from ..schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
+from ..schemas.wire.question_table import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
 from ..schemas.wire.requests import QuestionOptions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer

@@ -9,7 +9,7 @@ import numpy as np
 from .arrays import ArrayType, array_fields
 from .motion_messages import Moved, MoveRequest, State, Wish
 from .path_messages import PathRequest
-from .questions import QUESTIONS, path_questions
+from .question_table import QUESTIONS, path_questions
 from .requests import AddAvatarRequest, Request
 from .scene_messages import AvatarInfo, ErrorReply, ReloadAnswer, SceneInfo, ScenesAnswer
 from .stats import StatsAnswer, StatsRequest

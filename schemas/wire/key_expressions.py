@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from ..errors import BadRequestError
-from .questions import QUESTIONS
+from .question_table import QUESTIONS
 from .request_limits import MAX_NAME_LENGTH
 
 # The 1 is WIRE.md's version: servers of two versions can run side by side, and neither receives the

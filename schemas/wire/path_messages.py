@@ -11,7 +11,7 @@ from ..errors import BadRequestError
 from .answers import Cost
 from .arrays import Poses, array_fields
 from .question_rules import Rows
-from .questions import path_questions, question_of
+from .question_table import path_questions, question_of
 from .request_limits import MAX_CONTACTS
 from .requests import Count, Duration, Length, ModelName, Name, QuestionRequest, Request
 

@@ -1,6 +1,6 @@
 """What a question is: its request, the rules of its answers' columns, and what is generic over questions.
 
-questions.py declares the questions. Everything generic reads the declarations: checks, unknown
+question_table.py declares the questions. Everything generic reads the declarations: checks, unknown
 answers, joining, merging over archives, requests in batches, dispatch, the command line and the
 tests of WIRE.md. No numba here. The functions that answer are in server/queries.
 """

@@ -167,7 +167,7 @@ def ask(scene: Any, op: str, arguments: tuple[Any, ...], parameters: dict[str, A
     if op != "path":
         return getattr(scene, op)(*arguments, **parameters)
     from solidcloud.schemas.wire.path_messages import part_to_answers
-    from solidcloud.schemas.wire.questions import join_answers
+    from solidcloud.schemas.wire.question_table import join_answers
 
     return join_answers([part_to_answers(part) for part in scene.path(*arguments, **parameters)])
 

@@ -11,7 +11,7 @@ import numpy as np
 from solidcloud.schemas.wire.answers import ContactsAnswers, Cost, ObjectsAnswers, SweepAnswers, Verdict
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.schemas.wire.motion_messages import Moved
-from solidcloud.schemas.wire.questions import CONTACTS
+from solidcloud.schemas.wire.question_table import CONTACTS
 
 # Columns that are judged separately, that depend on the cache, or that state certainty.
 _NOT_COMPARED = {

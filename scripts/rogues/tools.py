@@ -25,7 +25,7 @@ from solidcloud.schemas.wire.answers import (
 )
 from solidcloud.schemas.wire.encoding import decode_request, encode
 from solidcloud.schemas.wire.motion_messages import State, Wish
-from solidcloud.schemas.wire.questions import make_unknown
+from solidcloud.schemas.wire.question_table import make_unknown
 from solidcloud.schemas.wire.requests import CollideRequest
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply, ScenesAnswer
 from solidcloud.server.client import Client

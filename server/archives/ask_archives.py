@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas.wire.answers import ContactsAnswers, Cost, Part
 from ...schemas.wire.question_rules import Question
-from ...schemas.wire.questions import QUESTIONS, join_answers
+from ...schemas.wire.question_table import QUESTIONS, join_answers
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stopped, make_budget
 from ..queries.context.query_context import SceneData, with_stop

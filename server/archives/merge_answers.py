@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...schemas.wire.answers import ContactsAnswers, Cost, Verdict
 from ...schemas.wire.arrays import array_fields
 from ...schemas.wire.question_rules import ColumnFrame, Merge, Question, Rows
-from ...schemas.wire.questions import CONTACTS, question_of
+from ...schemas.wire.question_table import CONTACTS, question_of
 from .rigid_transform import Pose, rotate_vectors, transform_boxes, transform_points
 
 _A = TypeVar("_A", bound=Cost)

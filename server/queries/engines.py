@@ -1,4 +1,4 @@
-"""The function that answers each question of schemas/wire/questions.py.
+"""The function that answers each question of schemas/wire/question_table.py.
 
 Each takes the data of one archive, the avatar if the question is about one, the arguments of the
 request in their order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...schemas.wire.answers import SweepAnswers
-from ...schemas.wire.questions import COLLIDE, CONTACTS, DISTANCE, OBJECTS, QUESTIONS, RAYCAST, SWEEP, WITHIN
+from ...schemas.wire.question_table import (
+    COLLIDE,
+    CONTACTS,
+    DISTANCE,
+    OBJECTS,
+    QUESTIONS,
+    RAYCAST,
+    SWEEP,
+    WITHIN,
+)
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..residency.coarse_bounds import drop_clear_pairs
 from .collide import collide

@@ -18,7 +18,7 @@ from ...schemas.errors import SolidcloudError
 from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.arrays import Poses
 from ...schemas.wire.path_messages import answers_to_part, check_path_parameters, split_answers
-from ...schemas.wire.questions import QUESTIONS
+from ...schemas.wire.question_table import QUESTIONS
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.voxels_in_reach import check_poses
 from ..runtime.stop_flag import NO_STOP, StopFlag, stop_at

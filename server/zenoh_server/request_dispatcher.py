@@ -19,7 +19,7 @@ from ...schemas.wire.encoding import MSGPACK, decode_request, encode, wire_encod
 from ...schemas.wire.motion_messages import MoveRequest
 from ...schemas.wire.path_messages import PathRequest
 from ...schemas.wire.question_rules import Question
-from ...schemas.wire.questions import QUESTIONS
+from ...schemas.wire.question_table import QUESTIONS
 from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from ...schemas.wire.requests import AddAvatarRequest, QuestionRequest
 from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ReloadAnswer, ScenesAnswer

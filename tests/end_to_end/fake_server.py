@@ -24,7 +24,7 @@ from solidcloud.schemas.wire.encoding import avatar_digest
 from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.motion_messages import Moved, Touched
 from solidcloud.schemas.wire.path_messages import answers_to_part
-from solidcloud.schemas.wire.questions import make_unknown
+from solidcloud.schemas.wire.question_table import make_unknown
 from solidcloud.schemas.wire.scene_messages import (
     WIRE_VERSION,
     AvatarInfo,

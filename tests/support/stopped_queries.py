@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.wire import questions
+from solidcloud.schemas.wire import question_table as questions
 from solidcloud.schemas.wire.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.contacts import contacts

@@ -1,6 +1,6 @@
 """`solidcloud query`: send collision queries to a server.
 
-The options of questions are written out here and not read from schemas/wire/questions.py: typer
+The options of questions are written out here and not read from schemas/wire/question_table.py: typer
 builds the options of all commands at each start, which importing the declarations would double.
 """
 

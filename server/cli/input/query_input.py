@@ -13,7 +13,7 @@ from ....schemas.wire.answers import Cost
 from ....schemas.wire.motion_messages import Moved
 from ....schemas.wire.path_messages import part_to_answers
 from ....schemas.wire.question_rules import Question
-from ....schemas.wire.questions import OBJECTS, QUESTIONS, join_answers, path_questions
+from ....schemas.wire.question_table import OBJECTS, QUESTIONS, join_answers, path_questions
 from ....schemas.wire.request_limits import MAX_FRAME_SECONDS
 from ....schemas.wire.requests import QuestionRequest
 from .pose_file import read_objects, read_poses, read_rays

@@ -22,7 +22,7 @@ from ....schemas.wire.answers import (
 from ....schemas.wire.arrays import array_fields
 from ....schemas.wire.motion_messages import Moved
 from ....schemas.wire.question_rules import COMMON, Question, Rows
-from ....schemas.wire.questions import CONTACTS, question_of
+from ....schemas.wire.question_table import CONTACTS, question_of
 
 _NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
 _COST = Cost.__struct_fields__

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.questions import QUESTIONS
+from solidcloud.schemas.wire.question_table import QUESTIONS
 from solidcloud.server import client as client_module
 from solidcloud.server.cli.main import run
 from solidcloud.server.queries.engines import ENGINES

@@ -9,7 +9,7 @@ from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.path_messages import PathRequest, part_to_answers
-from solidcloud.schemas.wire.questions import QUESTIONS, join_answers
+from solidcloud.schemas.wire.question_table import QUESTIONS, join_answers
 from solidcloud.server.queries import path as path_module
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 

@@ -24,7 +24,7 @@ from solidcloud.schemas.errors import TooLargeError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.path_messages import part_to_answers
-from solidcloud.schemas.wire.questions import check_answers, join_answers
+from solidcloud.schemas.wire.question_table import check_answers, join_answers
 from solidcloud.server import kernels
 from solidcloud.server.client import Client
 from solidcloud.server.queries import path as path_module

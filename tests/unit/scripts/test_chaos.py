@@ -24,7 +24,7 @@ from solidcloud.schemas.wire.answers import (
 )
 from solidcloud.schemas.wire.encoding import decode_answer, encode
 from solidcloud.schemas.wire.motion_messages import Moved
-from solidcloud.schemas.wire.questions import check_answers, make_unknown
+from solidcloud.schemas.wire.question_table import check_answers, make_unknown
 from solidcloud.schemas.wire.requests import CollideRequest, WithinRequest
 
 

@@ -20,7 +20,7 @@ from solidcloud.schemas.wire.encoding import (
     encode,
     wire_encoding,
 )
-from solidcloud.schemas.wire.questions import check_answers, make_unknown
+from solidcloud.schemas.wire.question_table import check_answers, make_unknown
 from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
     CollideRequest,

@@ -16,7 +16,7 @@ from solidcloud.schemas.wire.answers import (
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.path_messages import answers_to_part, part_to_answers, split_answers
-from solidcloud.schemas.wire.questions import (
+from solidcloud.schemas.wire.question_table import (
     QUESTIONS,
     check_answers,
     join_answers,

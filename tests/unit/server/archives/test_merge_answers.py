@@ -13,7 +13,7 @@ from solidcloud.schemas.wire.answers import (
     Verdict,
 )
 from solidcloud.schemas.wire.arrays import array_fields
-from solidcloud.schemas.wire.questions import make_unknown
+from solidcloud.schemas.wire.question_table import make_unknown
 from solidcloud.server.archives.merge_answers import answers_in_world, limit_pairs, merge_answers
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in Verdict)

@@ -21,7 +21,7 @@ from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encod
 from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.motion_messages import Moved, MoveRequest, Wish
 from solidcloud.schemas.wire.path_messages import PathRequest
-from solidcloud.schemas.wire.questions import check_answers
+from solidcloud.schemas.wire.question_table import check_answers
 from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
     CollideRequest,

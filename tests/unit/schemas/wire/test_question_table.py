@@ -11,7 +11,7 @@ import wire_sections
 from solidcloud.schemas.wire.answers import Part, WithinAnswers
 from solidcloud.schemas.wire.path_messages import PathOperation, PathRequest
 from solidcloud.schemas.wire.question_rules import ColumnRules, Merge, Question
-from solidcloud.schemas.wire.questions import QUESTIONS, path_questions, question_of
+from solidcloud.schemas.wire.question_table import QUESTIONS, path_questions, question_of
 from solidcloud.schemas.wire.requests import QuestionRequest, WithinRequest
 from solidcloud.server.cli.commands.query_command import query
 from solidcloud.server.queries.engines import ENGINES

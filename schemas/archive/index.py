@@ -228,7 +228,8 @@ class IndexColumn(NamedTuple):
 _F8, _I8, _U8, _U4, _U1 = (np.dtype(name) for name in ("<f8", "<i8", "<u8", "<u4", "|u1"))
 
 # Every dataset that an index may have, in the order in which they are written. To add one, add a
-# row, a field of `Header`, a line in `read_header` and a check in index_limits.py.
+# row, a field of `Header` (which builder/passes/dataset_header.py fills in), a line in `read_header`,
+# a check in index_limits.py and a row in FORMAT.md.
 INDEX_COLUMNS = {
     "origin": IndexColumn(_F8, (3,), lambda header: header.lattice.origin),
     "step": IndexColumn(_F8, (1,), lambda header: header.lattice.step),

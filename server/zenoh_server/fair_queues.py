@@ -218,6 +218,35 @@ class FairQueues:
                 self._forget(ticket)
             return dropped, self._start_waiting()
 
+    def give_own_turn(self, client: str) -> list[Ticket]:
+        """Move the waiting requests of a client from a shared turn to its own; return those to start.
+
+        Nothing moves while another of its requests has begun: its requests stay in order.
+        """
+        with self._lock:
+            name, count = self._clients.get(client, (client, 0))
+            if name == client:
+                return []
+            shared = self._turns[name]
+            own = _Turn()
+            own.waiting.extend(ticket for ticket in shared.waiting if ticket.client == client)
+            if len(own.waiting) < count:
+                return []
+            if not shared.busy:
+                self._ready[shared.waiting[0].slow].remove(name)
+            shared.waiting = deque(ticket for ticket in shared.waiting if ticket.client != client)
+            shared.count -= count
+            if not shared.busy and shared.waiting:
+                self._ready[shared.waiting[0].slow].append(name)
+            if not shared.count:
+                del self._turns[name]
+            own.count = count
+            for ticket in own.waiting:
+                ticket.turn = client
+            self._turns[client], self._clients[client] = own, (client, count)
+            self._ready[own.waiting[0].slow].append(client)
+            return self._start_waiting()
+
     def __len__(self) -> int:
         """Return the number of requests accepted and not yet answered."""
         with self._lock:

@@ -160,6 +160,11 @@ class Lane:
         for job in [*self._supervisor.jobs, *self._streaming.values()]:
             job.end("the server stops")
 
+    def client_here(self, client: str) -> None:
+        """Give a client with a token its own turn, also for requests that came before the token."""
+        if self._tokens.turn(client) == client:
+            self._start(self._queues.give_own_turn(client))
+
     def client_gone(self, client: str) -> None:
         """Stop and drop all requests of a disconnected client, then have the dispatcher forget it."""
         dropped, started = self._queues.drop(client)

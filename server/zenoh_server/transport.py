@@ -194,5 +194,6 @@ def _watch(samples: Any, tokens: LivelinessTokens, lane: Lane, sessions: SceneSe
                 lane.client_gone(client)
             else:
                 tokens.here(client)
+                lane.client_here(client)
         except Exception:  # affects this client only
             log.exception("client %s", client)

@@ -174,6 +174,21 @@ def test_clients_without_a_token_share_a_turn(scene, endpoint):
         assert all(next(iter(handler)).ok for handler in asked)
 
 
+def test_a_request_that_comes_before_its_clients_token_gets_its_own_turn(scene, endpoint):
+    config = ServerConfig(listen=endpoint, max_request_seconds=2 * DEADLINE)
+    scene.avatars["b", "al"] = (POINTS, 0.125)
+    with stoppable(scene, config) as service, zenoh.open(session_config(connect=endpoint)) as session:
+        session.get("solidcloud/1/scene/floor/a/info", timeout=DEADLINE)
+        eventually(lambda: service.began == 1)
+        payload = encode(CollideRequest("al", heights([-1.0])))
+        asked = session.get("solidcloud/1/scene/floor/b/collide", payload=payload, timeout=DEADLINE)
+        eventually(lambda: service.in_flight() == 2)
+        with session.liveliness().declare_token("solidcloud/1/client/floor/b"):
+            assert next(iter(asked)).ok, "it waited behind a request of another client"
+            eventually(lambda: service.in_flight() == 1)
+        service.gate.set()
+
+
 def test_a_request_over_its_time_is_stopped(scene, endpoint):
     config = ServerConfig(listen=endpoint, max_request_seconds=0.2)
     with stoppable(scene, config) as service, Client(endpoint, scene="floor", timeout=DEADLINE) as client:

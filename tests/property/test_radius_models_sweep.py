@@ -201,7 +201,7 @@ def test_classes_of_one_radius_cost_and_answer_as_one_radius_does(
         case = archive_cases.build(tmp_path, points, models=radius_class_archives.STORED)
     first, last = judged_sweeps.motions(rng, points, avatar, 100, 0.4, 0.5, turn)
     with judged_sweeps.opened(case) as data:
-        alike = data._replace(arrays=data.arrays._replace(drop=np.zeros(RADIUS_CLASSES, np.int64)))
+        alike = data._replace(arrays=data.arrays._replace(radius_deficit=np.zeros(RADIUS_CLASSES, np.int64)))
         one, many = (judged_sweeps.ask(which, avatar, 0.01, first, last) for which in (data, alike))
     assert columns(one, FOUND + COUNTED) == columns(many, FOUND + COUNTED)
     assert {int(Verdict.CLEAR), int(Verdict.CONTACT)} <= set(one.verdict.tolist())

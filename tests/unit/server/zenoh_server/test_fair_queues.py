@@ -47,6 +47,30 @@ def test_requests_of_one_client_run_one_at_a_time_and_in_order():
     assert len(queues) == 0
 
 
+def test_a_client_whose_token_comes_late_leaves_the_shared_turn():
+    queues = make(workers=2)
+    running, _ = offered(queues, "a", "a0", turn=ANONYMOUS)
+    waiting, _ = offered(queues, "b", "b0", turn=ANONYMOUS)
+    late = [offered(queues, "c", f"c{number}", turn=ANONYMOUS)[0] for number in range(2)]
+    assert queues.give_own_turn("c") == late[:1]
+    assert [ticket.turn for ticket in late] == ["c", "c"]
+    assert queues.finished(late[0]) == late[1:]
+    assert queues.finished(running) == [waiting]
+    assert queues.finished(late[1]) == queues.finished(waiting) == []
+    assert len(queues) == 0
+
+
+def test_a_client_that_has_begun_stays_in_the_shared_turn():
+    queues = make(workers=2)
+    running, _ = offered(queues, "a", "a0", turn=ANONYMOUS)
+    other, _ = offered(queues, "b", "b0", turn=ANONYMOUS)
+    waiting, _ = offered(queues, "a", "a1", turn=ANONYMOUS)
+    assert queues.give_own_turn("a") == queues.give_own_turn("nobody") == []
+    assert queues.finished(running) == [other]
+    assert queues.finished(other) == [waiting]
+    assert queues.give_own_turn("a") == queues.finished(waiting) == []
+
+
 def test_clients_take_turns():
     queues = make(workers=1)
     ticket, _ = offered(queues, "a", "a0")
@@ -324,6 +348,14 @@ class AnyOrder(RuleBasedStateMachine):
         dropped, started = self.queues.drop(client)
         expected = [ticket.request for ticket in self.waiting.pop(client, [])]
         assert [ticket.request for ticket in dropped] == expected
+        self.started(started)
+
+    @rule(client=st.sampled_from("abcdef"))
+    def token(self, client):
+        began = any(ticket.client == client for ticket in [*self.at_work, *self.detached])
+        started = self.queues.give_own_turn(client)
+        for ticket in self.waiting.get(client, []):
+            ticket.turn = ticket.turn if began else client
         self.started(started)
 
     @invariant()

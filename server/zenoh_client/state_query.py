@@ -45,7 +45,8 @@ class StateQuery:
 
     def move(self, key: str) -> None:
         """Query for the states of another user from now on. key: of these states."""
-        self.close()
+        # The old querier is dropped and not undeclared: while another thread uses it, that raises
+        # "Already borrowed". zenoh undeclares it with its last reference.
         self._key, self._pause = key, _PAUSE
         self._declare()
         self._send()

@@ -34,10 +34,10 @@ from .zenoh_common.endpoints import DEFAULT_ENDPOINT
 
 log = logging.getLogger(__name__)
 
-# Poses in one request: 512 KiB, so that one client's long list does not keep others waiting for
-# seconds, and an answer arrives well within the timeout.
+# Poses in one request (512 KiB). A longer one would keep other clients waiting for seconds, and its
+# answer might miss the timeout.
 BATCH_POSES = 4096
-# The same for questions that take up to milliseconds a pose.
+# The same for queries that take up to milliseconds a pose.
 SLOW_BATCH = 256
 # Size of the answer to a batch, far below the largest message [bytes].
 _BATCH_BYTES = 8 << 20
@@ -48,19 +48,20 @@ _A = TypeVar("_A", bound=Cost)
 class Client(QueryMethods):
     """Scene served by another process; a context manager, thread-safe, with the methods of `Scene`.
 
-    endpoint: where the server listens.  scene: the name under which it serves the scene.
-    timeout: time limit of one request [s]; a long list of poses is several requests.
-    key_file: holds the server's key, as given to `solidcloud serve --key-file`; None: use the key
-    that a server of the same user on the same host has left. With a key, a reply that is not sealed
-    with it is ignored.
+    endpoint: endpoint of the server, such as tcp/127.0.0.1:7447.
+    scene: name under which the server serves the scene.
+    timeout: time limit of one request [s]; a long list of poses is sent in several requests.
+    key_file: file with the server's key, as given to `solidcloud serve --key-file`; None: the key
+    that a server of the same user on the same host has stored. With a key, replies that are not
+    sealed with it are ignored.
 
     Entering raises UnknownSceneError if servers answer and none serves this scene. It succeeds
-    without a server: queries then return `UNKNOWN`, and right answers as soon as there is a server.
+    without a server: queries then return `UNKNOWN` until there is a server.
     The client remembers its avatars and adds them again to a server that does not know them. If a
-    server with a key answers about other avatars than the client added, the answer is ignored, and
-    the client takes another id, which no other program knows.
+    sealed answer is about avatars that differ from those the client added, another program uses the
+    client's id: the answer is ignored, and the client takes a new id that no other program knows.
 
-    The query methods raise what the server refuses: BadRequestError, BadTransformError,
+    The query methods raise the errors of the server: BadRequestError, BadTransformError,
     UnknownAvatarError, BusyError and others.
 
     unanswered: number of poses, rays, points, motions and objects so far that are `UNKNOWN` because
@@ -101,7 +102,7 @@ class Client(QueryMethods):
         return decode_answer(SceneInfo, self._connection.require("info"))
 
     def reload(self) -> ReloadAnswer:
-        """Have the server reload the archive's folder; requests after this use the new content.
+        """Make the server reload the archives' folders; later requests use the new content.
 
         Raise BusyError if no server answers, or the generation before the served one is still in
         use. Raise FormatError and others if the folder's content is invalid; the server then
@@ -117,7 +118,7 @@ class Client(QueryMethods):
         return decode_answer(StatsAnswer, self._connection.require("stats", encode(StatsRequest(keys))))
 
     def silence(self, operation: str) -> str:
-        """Return why an operation may not have been answered, and what to do."""
+        """Return a message on why no server answered an operation, and what to do."""
         return self._connection.explain_silence(operation)
 
     def add_avatar(self, name: str, points: Any, radius: float | None = None) -> AvatarInfo:
@@ -125,8 +126,8 @@ class Client(QueryMethods):
 
         points: (n, 3) float64, the avatar's frame [m].  radius: see AddAvatarRequest [m].
         If no server answers, the avatar is remembered and added later; the answer then has `radius`
-        as given here and no `bounding_radius`. Raise BadRequestError or TooLargeError if the avatar
-        is refused, or another one has the name.
+        as given here and no `bounding_radius`. Raise BadRequestError if another avatar has the name
+        or this one is invalid, TooLargeError beyond the server's limits.
         """
         avatar = AddedAvatar(make_positions(points).copy(), None if radius is None else float(radius))
         request = avatar.request(name)
@@ -145,9 +146,11 @@ class Client(QueryMethods):
         return avatars.accepted(name, payload)
 
     def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A:
-        """Ask a question, in several requests if it is about many items.
+        """Answer a question, in several requests if it has many items.
 
-        Items that no server answers are `UNKNOWN`; of `objects`, every pair is listed then.
+        arguments, options: as for `QueryMethods.ask`.
+        Items that no server answers are `UNKNOWN`. If no server answers `objects`, every pair is
+        listed as `UNKNOWN`.
         """
         fields = request_fields(question, arguments, options)
         return self._ask_in_batches(question, fields, options)
@@ -155,12 +158,12 @@ class Client(QueryMethods):
     def _ask_in_batches(
         self, question: Question[_A], fields: Mapping[str, Any], options: Mapping[str, Any]
     ) -> _A:
-        """Ask in requests of at most a batch of items, and join their answers.
+        """Send requests of at most one batch of items each, and join their answers.
 
-        fields: of the request for all items.  options: of every question; the time that earlier
-        requests took is subtracted from the budget of later ones. If an answer exceeds a message,
-        its items are asked about again in smaller requests, unless the question is about all items
-        together.
+        fields: of the request for all items.  options: query options; the time that earlier
+        requests took is subtracted from the time budget of later ones. If an answer exceeds the
+        largest message, its items are sent again in smaller requests, unless the question is about
+        all items together.
         """
         k, arrays = len(fields[question.counted]), question.arrays
         batch = SLOW_BATCH if question.slow else BATCH_POSES
@@ -187,7 +190,7 @@ class Client(QueryMethods):
                     rest = max(0.0, budget - (time.monotonic() - begin) * 1e3)
                     left = {**options, "budget_ms": rest}
             if payload is None:
-                # The rest is not asked: a frozen server would cost a timeout for every batch.
+                # Skip the remaining batches: with a frozen server each would cost a timeout.
                 self._count_unanswered(k - start)
                 bounded = has_tolerance_or_budget(options)
                 parts.append(question.unknown(k - start, bounded=bounded))
@@ -202,10 +205,10 @@ class Client(QueryMethods):
             self.unanswered += count
 
     def move(self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS) -> Moved:
-        """Return where an avatar gets from one pose (1, 4, 4) towards another in a frame.
+        """Return the pose that an avatar reaches from one pose (1, 4, 4) to another in a frame.
 
         The scene's effects apply, and nothing is stored. seconds: duration of the frame. If no
-        server answers, the avatar stays at `pose_from`, `UNKNOWN`.
+        server answers, the result is `pose_from` with the verdict `UNKNOWN`.
         """
         request = MoveRequest(
             avatar=name,
@@ -222,12 +225,14 @@ class Client(QueryMethods):
         return decode_answer(Moved, payload)
 
     def path(self, name: str, poses: Any, op: str = "collide", **parameters: Any) -> Iterator[Part]:
-        """Ask `op` (collide, distance, contacts, sweep) along up to 100,000 poses, in one request.
+        """Answer `op` (collide, distance, contacts, sweep) along up to 100,000 poses, in a request.
 
-        parameters: of `op` besides the poses, tolerance and budgets included; `budget_ms` is for the
-        whole path. A sweep has k - 1 motions, each from one pose to the next. Yields answers for
-        items [first, first + n) of `total` as they arrive, in order and without gaps: items of parts
-        that do not arrive within `timeout` of the last one are `UNKNOWN`.
+        name: of the avatar.  poses: (k, 4, 4), avatar to world. A sweep has k - 1 motions, each
+        from one pose to the next.
+        parameters: of `op` besides the poses, including tolerance and budgets; `budget_ms` is for
+        the whole path.
+        Yield answers for items [first, first + n) of `total` as they arrive, in order and without
+        gaps. If no part arrives for `timeout`, the remaining items are `UNKNOWN`.
         """
         array = make_poses(poses)
         check_path_parameters(op, parameters)
@@ -241,7 +246,7 @@ class Client(QueryMethods):
     def _parts(
         self, question: Question[Any], request: bytes, name: str, total: int, bounded: bool
     ) -> Iterator[Part]:
-        """Yield the parts of a path, each once and in order; missing ones are unknown."""
+        """Yield the parts of a path, each once and in order; items of missing parts are unknown."""
 
         def missing(stop: int) -> Part:
             self._count_unanswered(stop - expected)
@@ -259,7 +264,9 @@ class Client(QueryMethods):
                     f"expected some of {total}"
                 )
             if part.first < expected or (len(part) == 0 and total):
-                log.warning("part of a path for %d of %d came twice, or late: left out", part.first, total)
+                log.warning(
+                    "part of a path at %d of %d arrived twice or too late: ignored", part.first, total
+                )
                 continue
             if part.first > expected:
                 yield missing(part.first)
@@ -272,9 +279,9 @@ class Client(QueryMethods):
             yield missing(total)
 
     def session(self, avatar: str) -> ClientSession:
-        """Return a session of an avatar, of this client or of the scene, for a `with`.
+        """Return a session of an avatar of this client or of the scene, for a `with`.
 
-        It sends motion commands and receives the resulting states. The scene's server simulates the
+        It sends motion commands and receives the resulting states. The server simulates the scene's
         effects. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
         """
         connection = self._connection

@@ -1,4 +1,4 @@
-"""Scene: placed archives opened in this process, and their queries. It has the methods of `Client`."""
+"""Scene: placed archives opened in this process, with the query methods of `Client`."""
 
 import threading
 import time
@@ -41,11 +41,10 @@ DEFAULT_BUDGET = 512 << 20
 
 
 class Scene(SceneQuestions):
-    """One or more placed archives, served as one. Thread-safe; a context manager.
+    """One or more placed archives, queried as one. Thread-safe; a context manager.
 
-    name: what clients call it; the name in the scene file, or that of the file or folder, unless
-    given. Answers are those of the archives' content at opening, whatever happens to the folders,
-    until `reload`.
+    name: name of the scene for clients. Until `reload`, answers are those of the archives' content
+    at opening, whatever happens to the folders.
     """
 
     def __init__(
@@ -56,12 +55,12 @@ class Scene(SceneQuestions):
         file: SceneFile | None = None,
         avatars: Mapping[str, tuple[ArrayLike, float | None]] | None = None,
     ) -> None:
-        """Serve archives, which are closed with this scene; call `Scene.open` instead.
+        """Serve archives, which this scene closes with itself; callers use `Scene.open`.
 
-        metrics: counts what is answered, and the loads of these archives.
+        metrics: statistics of answers, and of the loads of these archives; None: new ones.
         file: declares effects, objects and limits; None: the effect `stop` alone.
-        avatars: the scene's own, which every client may ask about: points (n, 3) [m] and radius, by
-        name. Raises BadRequestError if there is no archive, or an avatar is invalid.
+        avatars: avatars that every client may use, by name: points (n, 3) [m] and radius [m].
+        Raise BadRequestError if there is no archive, or an avatar is invalid.
         """
         if not archives:
             raise BadRequestError(f"{name}: a scene without archives: expected at least one")
@@ -89,15 +88,16 @@ class Scene(SceneQuestions):
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
 
         name: for clients; None: the name in the scene file, else that of the file or folder.
-        budget_bytes: maximum of decoded voxels in memory, all archives together.
-        policy: of eviction, and whether voxels are prefetched; see eviction.py.
-        open_store: opens the folder of an archive, now and at each reload; None: as it is.
-        radius_model: of questions that name none, see schemas/archive/radius_model.py; None: the
-        archive's single radius. Both are for an archive; a scene file declares them.
-        read_points: returns the points (n, 3) of a file of an avatar [m]; None: reads scans and
-        meshes.
-        Raises FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
-        invalid scene file, or too small a budget.
+        budget_bytes: limit of decoded voxels in memory, all archives together.
+        policy: eviction policy, and whether voxels are prefetched; see eviction.py.
+        open_store: function that opens the folder, now and at each reload; None: `VoxelStore`.
+        radius_model: default radius model, see schemas/archive/radius_model.py; None: the archive's
+        single radius. `open_store` and `radius_model` are refused for a scene file, which declares
+        them itself.
+        read_points: returns the points (n, 3) of an avatar's file [m]; None: `read_avatar`, which
+        reads scans and meshes.
+        Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
+        invalid scene file or a budget that is too small.
         """
         path = Path(path)
         if is_scene_file(path):
@@ -150,22 +150,24 @@ class Scene(SceneQuestions):
         self.close()
 
     def close(self) -> None:
-        """Close the archives' files, once no part of a path is computed and no reload is in progress."""
+        """Wait for parts of paths and reloads in progress, then close the archives' files."""
         self._path_threads.close()
         with ExitStack() as stack:
             for archive in self.archives:
                 stack.callback(archive.close)
 
     def reload(self) -> ReloadAnswer:
-        """Serve what is in the archives' folders now, opened and warmed beside what is served, then swapped.
+        """Serve the current content of the archives' folders.
 
-        Requests that began before are answered from the old generation, requests that begin after
-        this returns from the new one; avatars stay. The old one is closed with its last reader:
-        until then both keep voxels in memory, `budget_bytes` each. Several archives are reloaded one
-        after the other. If one cannot be opened, the archives before it are new, and it and those
-        after it are served unchanged.
-        Raises FormatError, CorruptError or BadRequestError, saying why, when a new one cannot be
-        opened, and BusyError when the generation before the old one is still being read.
+        A new generation of each archive is opened and warmed while the old one is served, and then
+        replaces it. Requests that began before are answered from the old generation, requests that
+        begin after this returns from the new one. Avatars stay. The old generation is closed when
+        its last reader leaves; until then both keep voxels in memory, `budget_bytes` each.
+
+        Several archives are reloaded one after the other. If one cannot be opened, the archives
+        before it are new, and it and those after it are served unchanged.
+        Raise FormatError, CorruptError or BadRequestError if a new generation cannot be opened, and
+        BusyError if the generation before the old one is still being read.
         """
         begin = time.perf_counter()
         each: list[ReloadAnswer] = []
@@ -187,28 +189,28 @@ class Scene(SceneQuestions):
 
     @property
     def _data(self) -> SceneData:
-        """Return what a question without a radius model reads of the first archive."""
+        """Return the scene data of the first archive, with the default radius model."""
         with self.archives[0].take() as opened:
             return opened.data
 
     @property
     def residency(self) -> VoxelCache:
-        """Return the resident voxels of the first archive, for counters and checks."""
+        """Return the voxel cache of the first archive, for counters and checks."""
         return self.archives[0].residency
 
     def warm(self) -> None:
-        """Ask one of every question of each archive, so that no request waits for compilation; start the threads."""
+        """Run every query on each archive, to compile before the first request; start threads."""
         self._path_threads.start()
         for archive in self.archives:
             archive.warm()
 
     def info(self) -> SceneInfo:
-        """Return what is served, all archives together, and which effects its frames simulate."""
+        """Return the description of all archives together, with the effects of the scene file."""
         found = join_infos(self.name, [(archive.info(), archive.pose) for archive in self.archives])
         return describe_scene(found, self._file, self._own)
 
     def stats(self, keys: bool = False) -> StatsAnswer:
-        """Return what is in memory, what was asked, and what had to be waited for. keys: list resident voxels too."""
+        """Return statistics of cache, requests and waits. keys: also list the resident voxels."""
         with ExitStack() as stack:
             each = [stack.enter_context(archive.take()) for archive in self.archives]
             return make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
@@ -218,9 +220,9 @@ class Scene(SceneQuestions):
         self._avatars.limits = limits
 
     def drop_unused_avatars(self, alive: Collection[str], seconds: float) -> None:
-        """Forget avatars that were not used for so long [s].
+        """Drop avatars that were not used for `seconds` [s].
 
-        Those of clients in `alive`, and of clients whose users have bodies, stay.
+        Avatars of clients in `alive`, and of clients whose users have bodies, stay.
         """
         if self._simulation is not None:
             alive = {*alive, *(user.client for user in self._simulation.users)}
@@ -232,17 +234,19 @@ class Scene(SceneQuestions):
     ) -> AvatarInfo:
         """Add an avatar of points (n, 3) float64, avatar frame [m].
 
-        radius: of each point's sphere [m]; None: half the mean closest-point distance of the points.
-        client: whose it is; avatars of different clients do not meet. The same name again with the
-        same points and radius changes nothing; with others it is a BadRequestError. TooLargeError:
-        over the limits.
+        radius: of each point's sphere [m]; None: half the mean closest-point distance of the
+        points.
+        client: owner; clients may use the same names for different avatars. Adding the same avatar
+        again changes nothing.
+        Raise BadRequestError if the name belongs to a different avatar, TooLargeError beyond the
+        limits.
         """
         model = self._avatars.add(name, points, radius, client)
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
     @property
     def simulation(self) -> Simulation:
-        """Return what simulates the frames of this scene's users; made at its first use."""
+        """Return the simulation of this scene's users, which is made at its first use."""
         with self._making:
             if self._simulation is None:
                 self._simulation = make_simulation(self, self._file)
@@ -258,31 +262,34 @@ class Scene(SceneQuestions):
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
-        """Return where avatar `name` gets from one pose (1, 4, 4) towards another in a frame.
+        """Return the pose that an avatar reaches from one pose (1, 4, 4) to another in a frame.
 
-        Nothing is remembered. See `Simulation.move`.
+        seconds: duration of the frame. Nothing is stored. See `Simulation.move`.
         """
         return self.simulation.move(name, pose_from, pose_to, seconds, client=client, stop=stop)
 
     def session(self, avatar: str, *, client: str = "") -> LocalSession:
-        """Return a session of an avatar, a client's or one of the scene's own, for a `with`.
+        """Return a session of an avatar of the client or of the scene, for a `with`.
 
-        It sends motion commands and receives the resulting states; each command is a frame of its
-        own. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
+        It takes motion commands and returns the resulting states. Each command is simulated in a
+        separate frame. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
         """
         return LocalSession(self.simulation, User(client, check_name(avatar, "avatar of a session")))
 
     def drop_client(self, client: str) -> None:
-        """Forget the bodies and avatars of a client that is gone."""
+        """Drop the bodies and avatars of a disconnected client, and stop keeping voxels for it."""
         if self._simulation is None:
             self.forget_client(client)
         else:
             self._simulation.drop_client(client)
 
     def forget_client(self, client: str) -> None:
-        """Forget the avatars of a client, but not its bodies; for the simulation of this scene."""
+        """Drop the avatars of a client and stop keeping voxels for it; its bodies stay.
+
+        The simulation of this scene calls it.
+        """
         self._avatars.drop_client(client)
         for archive in self.archives:
-            with suppress(BadRequestError):  # closed, it keeps nothing for anybody
+            with suppress(BadRequestError):  # a closed archive keeps no voxels
                 archive.leave_client(client)
         self._metrics.drop_client(client)

@@ -1,7 +1,8 @@
 """Interface of a scene: the query methods of `Scene` and `Client`, and what a server requires.
 
-`QueryMethods` are the methods that both implement. `ServedScene` is the scene that a server serves;
-the types it exchanges with the server follow. No zenoh and no numba here.
+`Scene` and `Client` inherit `QueryMethods`. `ServedScene` is the interface that a server requires
+of a scene; the types before it are exchanged between the two. This file imports neither zenoh nor
+numba.
 """
 
 import threading
@@ -33,7 +34,8 @@ from .runtime.stop_flag import StopFlag
 
 _A = TypeVar("_A", bound=Cost)
 
-# Owner of the avatars that every client may use in requests; no key can name it.
+# Owner of the avatars that every client may use in requests. No client can have this id, because
+# it is not a valid part of a key expression.
 EVERYBODY = "*"
 # Owner of the avatars added in the serving process, not by a client.
 THIS_PROCESS = ""
@@ -52,15 +54,16 @@ class QueryOptions(QuestionOptions, total=False):
 class QueryMethods:
     """The queries that have one answer each. `Scene` and `Client` implement `ask`.
 
-    name: of an avatar.  poses: (k, 4, 4) float64, avatar to world.  margin: distance below which two
-    spheres count as in contact [m].  reach: farthest distance worth reporting [m].
+    name: of an avatar.  poses: (k, 4, 4) float64, avatar to world.  margin: distance below which
+    two spheres count as in contact [m].  reach: farthest distance worth reporting [m].
     options: tolerance [m], budget_ms, budget_visits and radius_model, as in WIRE.md.
     """
 
     def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A:
-        """Ask a question.
+        """Answer a question.
 
-        arguments: the fields of its request, in their order; options may follow by name.
+        arguments: the fields of its request, in their order.  options: further fields and query
+        options, by name.
         """
         raise NotImplementedError
 
@@ -115,7 +118,10 @@ class QueryMethods:
         margin: float = 0.0,
         **options: Unpack[QueryOptions],
     ) -> ObjectsAnswers:
-        """Test avatars (name, pose, group = 1, mask = all) against the scene and each other."""
+        """Test avatars against the scene and against each other.
+
+        objects: (name, pose (4, 4), group = 1, mask = all bits) each.
+        """
         return self.ask(OBJECTS, objects, margin, **options)
 
 
@@ -144,7 +150,7 @@ class LimitReached(Enum):
 class EncodedReply(NamedTuple):
     """Encoded reply: its bytes, their encoding, and whether it is an answer or an error.
 
-    about: the joined digests of the client's own avatars that answered; the seal names them.
+    about: joined digests of the client's avatars that the answer used, for the reply's seal.
     """
 
     payload: bytes
@@ -202,11 +208,11 @@ class ServedSimulation(Protocol):
 
 
 class ServedScene(Protocol):
-    """Scene that answers a server's requests; thread-safe. Refuses one with a SolidcloudError.
+    """Scene that answers a server's requests, or refuses them with a SolidcloudError. Thread-safe.
 
-    `ask`, `path` and `move` take the parameters of those of `Scene`. Each calls `record_avatar` in
-    the calling thread for every avatar that answers, before it returns.
-    simulation: of its users' frames; None if it has none.
+    `ask`, `path` and `move` take the parameters of the same methods of `Scene`. Each calls
+    `record_avatar` in the calling thread for every avatar that it uses, before it returns.
+    simulation: simulation of the users' frames; None for a scene without one.
     """
 
     name: str
@@ -238,11 +244,11 @@ _RECORDED = _Recorded()
 
 @contextmanager
 def recording_avatars(digests: list[bytes]) -> Iterator[None]:
-    """Have `record_avatar` append to `digests` in this thread, for a `with`.
+    """Make `record_avatar` append to `digests` in this thread, for a `with`.
 
-    The seal of a reply names the avatars that answered (WIRE.md, "Seals"), so a client can tell
-    whether they were its own. They are recorded when they are looked up, because an avatar may be
-    dropped and another added under its name while the answer is computed.
+    The seal of a reply names the avatars that the answer used (WIRE.md, "Seals"), so that a client
+    can verify that they are those it added. An avatar is recorded when it is looked up, because it
+    may be dropped and another added under its name while the answer is computed.
     """
     before, _RECORDED.digests = _RECORDED.digests, digests
     try:
@@ -252,6 +258,6 @@ def recording_avatars(digests: list[bytes]) -> Iterator[None]:
 
 
 def record_avatar(digest: bytes) -> None:
-    """Record the digest of an avatar that was looked up; ignore the empty one of a scene's own."""
+    """Record the digest of an avatar that was looked up; ignore the empty one of a scene avatar."""
     if digest and _RECORDED.digests is not None:
         _RECORDED.digests.append(digest)

@@ -330,7 +330,7 @@ def request_fields(
     for first, second in pairwise(question.arrays):
         a, b = len(fields[first]), len(fields[second])
         if a != b:
-            raise BadRequestError(f"{a} {first} and {b} {second}: expected as many of each")
+            raise BadRequestError(f"{a} {first} and {b} {second}: expected equal numbers")
     return fields
 
 

@@ -351,7 +351,7 @@ def _same_length(request: Request, first: str, second: str) -> None:
     """Raise BadRequestError unless two fields have equally many elements."""
     a, b = len(getattr(request, first)), len(getattr(request, second))
     if a != b:
-        raise BadRequestError(f"{a} {first} and {b} {second}: expected as many of each")
+        raise BadRequestError(f"{a} {first} and {b} {second}: expected equal numbers")
 
 
 @cache

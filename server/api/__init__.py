@@ -2,8 +2,8 @@
 
 `open` and `Scene` answer in this process, `connect` and `Client` over zenoh. Each name is imported
 when it is first used: `import solidcloud` alone loads no library, and `Client` loads neither numba
-nor h5py. Setuptools installs this file as the package `solidcloud`; its imports are relative to
-that. May import server/client.py, server/scene.py, schemas.
+nor h5py. Setuptools installs this file as the package `solidcloud`, to which its imports are
+relative. May import server/client.py, server/scene.py, schemas.
 """
 
 import importlib
@@ -68,9 +68,9 @@ _MODULES = {
 
 
 def open(path: "str | Path", **options: Any) -> "Scene":
-    """Open an archive folder or a scene file in this process, for a `with`; see `Scene.open`.
+    """Open an archive folder or a scene file in this process, for a `with`.
 
-    options: name, budget_bytes and policy, as there.
+    options: name, budget_bytes, policy and others, as in `Scene.open`.
     Raises BadRequestError for an invalid scene file or option, FormatError or CorruptError for an
     invalid archive.
     """

@@ -1,4 +1,4 @@
-"""Placed archives of a scene: open generations, hot reload, questions to several, merged answers.
+"""Placed archives of a scene: generations, hot reload, queries over several archives, merging.
 
 May import server.avatars, server.observability, server.queries, server.queries.context,
 server.residency, server.runtime, builder.voxel, schemas.

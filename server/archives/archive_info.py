@@ -1,4 +1,4 @@
-"""Description of an archive, and what a scene file adds to it. Reads no voxel."""
+"""Descriptions (`SceneInfo`) of an archive and of a scene, from headers alone: no voxel is read."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,10 @@ from ..residency.voxel_store import VoxelStore
 
 
 def describe(store: VoxelStore, name: str) -> SceneInfo:
-    """Return the description of an archive: counts, bounds, lattice, radius, sources."""
+    """Return the description of an archive: counts, bounds [m], lattice, radius [m] and sources.
+
+    name: of the scene. Positions are in the archive's own frame.
+    """
     header = store.archive.header
     lattice, now = header.lattice, header.radius_now
     return SceneInfo(
@@ -58,15 +61,19 @@ def describe(store: VoxelStore, name: str) -> SceneInfo:
 
 
 def listed_sources(header: Header) -> int:
-    """Return how many sources an archive lists: all up to the last one that was not left out.
+    """Return the number of sources that an archive lists.
 
-    A point's scan_index is a row of the list, so a source that was left out keeps its row.
+    Sources after the last one that was built are omitted. A source that was left out before it
+    keeps its row, because a point's `scan_index` is a row of the list.
     """
     return max((number for number, s in enumerate(header.sources, 1) if not s.fault), default=0)
 
 
 def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInfo] = ()) -> SceneInfo:
-    """Return the description of a scene with what its file declares. avatars: the scene's own."""
+    """Return a description with the declarations of the scene file: effects, avatars, up, objects.
+
+    info: of the archives.  avatars: those that the scene file names.
+    """
     spawn = file.spawn
     return structs.replace(
         info,
@@ -82,7 +89,7 @@ def describe_scene(info: SceneInfo, file: SceneFile, avatars: Sequence[AvatarInf
 def run_order(file: SceneFile) -> list[str]:
     """Return the names of a scene's effects in the order in which they run.
 
-    `through` is the first: it acts when the archive is opened.
+    `through` comes first, because it acts when the archive is opened.
     """
     declared = {effect_name(effect) for effect in file.effects}
     if len(declared) < 2:

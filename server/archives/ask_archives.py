@@ -1,8 +1,9 @@
-"""One question to all archives of a scene: each is asked in its own frame, and the answers are merged.
+"""Queries over all archives of a scene: each is queried in its own frame, and answers are merged.
 
-A pose is in contact if it is with any archive, unknown if it is for any, and clear if it is clear of
-all. It is `outside` if it is outside of all. A budget is for all archives together: each gets what
-the archives before it left. With one archive at the identity, nothing is transformed or merged.
+A pose is in contact if it touches any archive. Otherwise it is unknown if any archive's verdict is
+unknown, and clear if all archives are clear. It is `outside` if it is outside of all archives. A
+budget is shared by all archives: each gets what the archives before it left. With one archive at
+the identity, nothing is transformed or merged.
 """
 
 import math
@@ -28,11 +29,11 @@ from .rigid_transform import Pose
 from .scene_info import count_sources
 
 _A = TypeVar("_A", bound=Cost)
-# Some rows of a request; None: all.
+# Range of rows of a request; None: all rows.
 Rows = slice | None
-# Asks one archive about some rows of a request.
+# Function that queries one archive for some rows of a request.
 AskRows = Callable[[SceneData, QueryBudget, Rows], _A]
-# Function that asks an archive, and whether its voxels are used in passing (`QueryBudget.scan`).
+# The same function, and whether its voxels are used in passing (`QueryBudget.scan`).
 PreparedQuery = tuple[Callable[[SceneData, QueryBudget, Rows], Any], bool]
 PrepareQuery = Callable[[PlacedArchive, ArchiveGeneration], PreparedQuery]
 # Pairs that `contacts` lists per pose by default.
@@ -40,11 +41,11 @@ DEFAULT_LIMIT = 100
 
 
 class PathLeg(NamedTuple):
-    """A path through one archive.
+    """All poses of a path in the frame of one archive.
 
-    data: of the archive.  pose: archive to world; None: the identity.  poses: (k, 4, 4) in the
-    archive's frame.
+    data: of the archive.  pose: (4, 4), archive to world; None: the identity.
     first_source: number of the archive's first source among those of the scene.
+    poses: (k, 4, 4), avatar to archive.
     """
 
     data: SceneData
@@ -64,7 +65,13 @@ def ask_each(
     radius_model: str | None = None,
     stop: StopFlag = NO_STOP,
 ) -> _A:
-    """Ask every archive a question of k poses (rays, points, motions, objects), and merge the answers."""
+    """Query every archive for k items (poses, rays, points, motions or objects); merge the answers.
+
+    prepare: returns, for an archive and its current generation, the function that queries it.
+    tolerance, budget_ms, budget_visits, stop: as for `make_budget`.
+    radius_model: see schemas/archive/radius_model.py; None: that of each archive.
+    Raise BadRequestError, and the errors of the query.
+    """
     budget = make_budget(tolerance, budget_ms, budget_visits, stop)
     if len(archives) == 1 and archives[0].pose is None:
         with archives[0].take() as opened:
@@ -91,10 +98,11 @@ def ask_each(
 def ask_within_budget(
     ask: AskRows[_A], data: SceneData, budget: QueryBudget, visits: NDArray[np.int64]
 ) -> _A:
-    """Ask an archive within the budget of each pose less the node visits (k,) that others made.
+    """Query an archive with what other archives left of the budget of each pose.
 
-    Consecutive poses with the same budget are asked about together: nearly always all poses that no
-    other archive is near.
+    visits: (k,) node visits that the other archives made for each pose.
+    Consecutive poses with the same remaining budget share one call. They are nearly always the
+    poses that no other archive is near.
     """
     if budget.visits == NO_LIMIT or not visits.any():
         return ask(data, budget, None)
@@ -115,7 +123,10 @@ def make_legs(
     radius_model: str | None,
     poses: NDArray[np.float64],
 ) -> list[PathLeg]:
-    """Return a path's leg through each archive. taken: the archives' generations, in their order."""
+    """Return the leg of a path (poses (k, 4, 4), world) for each archive.
+
+    taken: the current generation of each archive, in the order of `archives`.
+    """
     firsts = [0, *np.cumsum([count_sources(opened) for opened in taken]).tolist()]
     return [
         PathLeg(opened.radius_model(radius_model), archive.pose, first, archive.poses_in(poses))
@@ -124,7 +135,7 @@ def make_legs(
 
 
 def rows_of(column: Any, rows: Rows) -> Any:
-    """Return some rows of an argument; None: the argument as it is."""
+    """Return some rows of an argument; the argument itself if `rows` is None."""
     return column if rows is None else column[rows]
 
 
@@ -135,22 +146,27 @@ def ask_along(
     parameters: dict[str, Any],
     stop: StopFlag = NO_STOP,
 ) -> tuple[Callable[[int, int], Cost], int]:
-    """Return what answers [start, stop) of a path through all archives, and how many answers there are.
+    """Return a function that answers items [start, end) of a path, and the total number of items.
 
-    The time of a part, `stop.part_seconds`, is that of all archives together.
+    op, parameters: the query, and its arguments beside avatar and poses.
+    stop: its `part_seconds` limits a part's time, all archives together.
+    Raise the errors of `path_question`.
     """
     begin = time.perf_counter()
-    # All poses are checked here, so that an error names one by its place on the path.
+    # All poses are checked here, so that an error names a pose by its position on the path.
     asks = [path_question(leg.data, avatar, leg.poses, op, parameters, stop) for leg in legs]
     visits, budget_ms = parameters.get("budget_visits"), parameters.get("budget_ms")
     limit = parameters.get("limit")
 
     def ask_bounded(leg: PathLeg, start: int, spent: NDArray[np.int64], part: StopFlag | None) -> Cost:
-        """Ask with what is left of the visits of each answer from `start` on, and of the time."""
+        """Query the items from `start` on with what is left of their visits and of the time.
+
+        spent: (n,) node visits that other archives made for each item.
+        """
 
         def ask(data: SceneData, budget: QueryBudget, rows: Rows) -> Cost:
             k = slice(0, len(spent)) if rows is None else rows
-            # The motions of a path end where the next begin.
+            # n motions need n + 1 poses: each motion ends where the next one begins.
             own = leg.poses[start + k.start : start + k.stop + QUESTIONS[op].moving]
             options = parameters | {"budget_visits": budget.visits}
             if budget_ms is not None:
@@ -161,7 +177,7 @@ def ask_along(
 
     def ask(start: int, end: int) -> Cost:
         spent = np.zeros(end - start, np.int64)
-        # Without a limit each archive's own flag remains, which a budget may set.
+        # Without a limit on a part, each archive keeps its own flag, which a time budget may set.
         part = None if stop.part_seconds == math.inf else part_stop(stop, stop.part_seconds)
         answers: list[Cost] = []
         for leg, (ask_all, _) in zip(legs, asks, strict=True):
@@ -180,22 +196,22 @@ def ask_along(
 
 
 class PathParts(Iterator[Part]):
-    """Parts of a path. Reads the generations that they come from until the last part, or until it is closed."""
+    """Parts of a path. Holds the archive generations that it reads until its end or `close`."""
 
     def __init__(self, parts: Generator[Part, None, None], taken: Sequence[ArchiveGeneration]) -> None:
-        """Release `taken`, generations that were taken for these parts, at the end."""
+        """Yield `parts`. taken: the generations that they read, released at the end."""
         self._parts = parts
         self._taken = list(taken)
 
     def __next__(self) -> Part:
         try:
             return next(self._parts)
-        except BaseException:  # the end, too
+        except BaseException:  # including StopIteration
             self.close()
             raise
 
     def close(self) -> None:
-        """End the path."""
+        """End the path and release its generations. Closing twice is allowed."""
         taken, self._taken = self._taken, []
         if taken:
             self._parts.close()

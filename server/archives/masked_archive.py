@@ -1,15 +1,15 @@
-"""An archive without its points in some boxes, as if they had never been scanned, for the effect `through`.
+"""Archive opened without the points inside some boxes, for the effect `through`.
 
-A point is in a box if its world coordinates, as every answer gives them (`Lattice.to_world`, then the
-archive's pose, rigid_transform.py), are within low to high on each axis, both included.
+Answers are those of an archive whose scans never had these points. A point is in a box if its world
+coordinates lie between low and high on each axis, both included. World coordinates are computed as
+for every answer: `Lattice.to_world`, then the archive's pose (rigid_transform.py).
 
-Only the few voxels that a box intersects are rebuilt, by the builder's code, when the archive is
-opened. Their records are kept in an unnamed temporary file, so that a load costs what it always
-does, no memory is used that is not counted, and the size of a voxel is known before it is loaded.
-Voxels whose cell lies inside a box are dropped unread: a large box costs only what its borders
-intersect. Rebuilding a voxel takes 90 bytes a point. The header is unchanged, with its bounds
-(`outside`), counts and radius, and so are the regions of scans left out, which are unknown inside a
-box too.
+The builder's code rebuilds the few voxels that a box intersects when the archive is opened. Their
+records are kept in an unnamed temporary file: a load takes the usual time, the cache's budget
+counts all memory, and the size of a voxel is known before it is loaded. Voxels whose cell lies
+inside a box are dropped unread, so a large box costs only what its borders intersect. Rebuilding a
+voxel takes 90 bytes a point. The header keeps its bounds (`outside`), counts and radius. Regions of
+scans that were left out remain unknown inside a box.
 """
 
 import io
@@ -30,8 +30,8 @@ from .rigid_transform import archive_pose, transform_boxes, transform_points
 
 log = logging.getLogger(__name__)
 
-# Rounding error of a transformed corner, as a share of the largest coordinate. Boxes of voxels only
-# decide which voxels are read.
+# Upper bound of the rounding error of a transformed corner, relative to the largest coordinate. A
+# larger value only makes more voxels be read, because their points are tested one by one.
 _ROUNDING = 1e-14
 # Interval between two lines of progress in the log [s].
 _LOG_SECONDS = 10.0
@@ -41,7 +41,7 @@ _Place = list[tuple[int, int]]
 
 
 class MaskedArchive(Archive):
-    """An archive opened for reading, without the points in some boxes."""
+    """Archive opened for reading, without the points inside some boxes."""
 
     def __init__(
         self, folder: str | os.PathLike[str], boxes: Sequence[ArrayLike], pose: ArrayLike | None = None
@@ -49,9 +49,10 @@ class MaskedArchive(Archive):
         """Open the archive in `folder`, at `pose` in the world; None: at the identity.
 
         boxes: (2, 3) each, low and high, world [m]. The voxels that they intersect are read.
-        Raises FormatError as `Archive` does, and for a voxel that cannot be read now,
-        SolidcloudError without room for the rebuilt records, BadRequestError if the boxes hold all
-        points. A corrupt record stays corrupt: the request that loads the voxel gets the error.
+        Raise FormatError as `Archive` does, and for a voxel that cannot be read. Raise
+        SolidcloudError if there is no disk space for the rebuilt records, BadRequestError if the
+        boxes contain all points. A corrupt record is no error here: the request that loads the
+        voxel gets it.
         """
         self._boxes = [np.asarray(box, np.float64) for box in boxes]
         self._pose = archive_pose(pose)
@@ -100,8 +101,8 @@ class MaskedArchive(Archive):
         kept = np.flatnonzero(~gone)
         if len(voxels) and not len(kept):
             raise BadRequestError(
-                f"{self.folder}: the boxes that are passed through hold all of its points: leave the archive out of "
-                "the scene, or give smaller boxes"
+                f"{self.folder}: the boxes of the effect `through` contain all of its points: leave the archive out "
+                "of the scene, or give smaller boxes"
             )
         now = {row: at for at, row in enumerate(kept.tolist())}
         self.voxels, self.coordinates = voxels[kept], self.coordinates[kept]
@@ -109,11 +110,11 @@ class MaskedArchive(Archive):
         self._corrupt = {now[row]: said for row, said in corrupt.items()}
 
     def _intersected(self) -> tuple[dict[int, list[NDArray[np.float64]]], NDArray[np.bool_]]:
-        """Return the boxes that intersect voxels, by row, and the mask (v,) of voxels inside one box.
+        """Return the boxes that intersect voxels, by row, and the mask (v,) of voxels inside a box.
 
-        A box intersects a voxel by the bounds of its points in the index. A voxel inside a box is
-        never read, so the voxel's cell decides, which no forged index can shrink
-        (server/residency/index_proof.py).
+        A box intersects a voxel if it intersects the bounds of the voxel's points in the index. For
+        "inside", the voxel's whole cell counts, because the voxel is never read and a forged index
+        cannot shrink a cell (server/residency/index_proof.py).
         """
         steps = self.header.lattice.voxel_steps
         base = self.coordinates * steps
@@ -143,20 +144,23 @@ class MaskedArchive(Archive):
     def _log_progress(
         self, partial: dict[int, list[NDArray[np.float64]]]
     ) -> Iterator[tuple[int, list[NDArray[np.float64]]]]:
-        """Yield the voxels to rebuild, and log the progress if it takes long."""
+        """Yield the voxels to rebuild, and log the progress every `_LOG_SECONDS`."""
         logged = time.monotonic()
         for number, (row, boxes) in enumerate(partial.items()):
             if time.monotonic() - logged > _LOG_SECONDS:
                 logged = time.monotonic()
                 log.info(
-                    "%s: %d of %d voxels that boxes intersect are rebuilt", self.folder, number, len(partial)
+                    "%s: rebuilt %d of %d voxels that boxes intersect", self.folder, number, len(partial)
                 )
             yield row, boxes
 
     def _in_boxes(
         self, row: int, local: NDArray[np.int32], boxes: list[NDArray[np.float64]]
     ) -> NDArray[np.bool_]:
-        """Return the mask of the points (n, 3) of a voxel [steps from its corner] that are in a box."""
+        """Return the mask (n,) of points that are in a box.
+
+        local: (n, 3), points of the voxel [steps from its corner].
+        """
         lattice = self.header.lattice
         world = lattice.to_world(local + self.coordinates[row] * lattice.voxel_steps)
         if self._pose is not None:
@@ -167,7 +171,7 @@ class MaskedArchive(Archive):
         return within
 
     def _store(self, built: BuiltVoxel) -> _Place:
-        """Write a record into the temporary file."""
+        """Append a record to the temporary file. Return its place. Raise SolidcloudError."""
         frames: _Place = []
         try:
             if self._file is None:
@@ -180,15 +184,16 @@ class MaskedArchive(Archive):
                 self._end += pwrite_all(self._file.fileno(), data, self._end)
         except OSError as error:
             raise SolidcloudError(
-                f"{tempfile.gettempdir()}: {error.strerror}: the voxels that boxes cut are kept there: make room, or "
-                "set TMPDIR"
+                f"{tempfile.gettempdir()}: {error.strerror}: rebuilt voxels of the effect `through` are stored there: "
+                "free disk space, or set TMPDIR"
             ) from error
         return frames
 
     def _read_frame(self, row: int, i: int) -> bytes:
-        """Return the frame of dataset `i` of a voxel; of a rebuilt voxel, that of its new record."""
+        """Return the frame of dataset `i` of a voxel, from the temporary file if it was rebuilt."""
         if row in self._corrupt:
-            # Do not read it again: if it was repaired meanwhile, its points in boxes would be served.
+            # A record that was repaired meanwhile would contain its points in boxes: do not reread
+            # it.
             error = self._corrupt[row]
             raise type(error)(str(error), error.paths)
         place = self._rebuilt.get(row)
@@ -199,7 +204,7 @@ class MaskedArchive(Archive):
 
 
 def _update_row(voxels: NDArray, row: int, built: BuiltVoxel) -> None:
-    """Write the sizes and bounds of a rebuilt record into the index's row; its place in the shard stays."""
+    """Write the sizes and bounds of a rebuilt record into a row of the index, except its place."""
     record = built.record
     voxels["rows"][row] = record.cell_rows, record.node_rows, record.point_rows
     voxels["leaves"][row] = record.leaf_rows

@@ -1,7 +1,8 @@
-"""Answers of several archives as those of one scene: transformed to the world, merged by the rules of columns.
+"""Transform and merge the answers of several archives into those of one scene.
 
-Pure functions. Of equal distances, the nearest is the one with the least scan point (x, y, z), then
-the least avatar centre, as in the answers of one archive.
+`ColumnRules.frame` and `ColumnRules.merge` of each column declare how. All functions are pure. Ties
+of the nearest are broken by the least scan point (x, y, z), then the least avatar centre, as in one
+archive.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,9 +49,10 @@ def answers_in_world(answers: _A, pose: Pose | None, first_source: int = 0) -> _
 
 
 def merge_answers(answers: Sequence[_A]) -> _A:
-    """Return the answers of several archives to the same items, in the world, as those of one scene.
+    """Merge the answers of several archives to the same items, in the world, into those of a scene.
 
-    What is no column, and no cost, is that of the first archive.
+    answers: at least one, in the order of the archives. Fields that are neither columns nor costs
+    are taken from the first archive.
     """
     first = answers[0]
     if len(answers) == 1:
@@ -74,7 +76,7 @@ def merge_answers(answers: Sequence[_A]) -> _A:
 
 
 def limit_pairs(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
-    """Return the answers with at most `limit` pairs listed for a pose, the first ones."""
+    """Return the answers with only the first `limit` listed pairs of each pose."""
     counts = np.minimum(np.diff(answers.pair_starts), limit)
     if int(counts.sum()) == len(answers.signed_distance):
         return answers
@@ -85,9 +87,10 @@ def limit_pairs(answers: ContactsAnswers, limit: int) -> ContactsAnswers:
 
 
 class _Merged(NamedTuple):
-    """Answers of several archives to one question.
+    """Input of the merge rules: the answers of several archives to one question.
 
-    verdict: (k,), merged.  nearest: (k,), which archive is the nearest; empty if the question does not ask for it.
+    verdict: (k,), merged.  nearest: (k,), number of the nearest archive; empty for questions
+    without a nearest.
     """
 
     answers: Sequence[Cost]
@@ -96,23 +99,23 @@ class _Merged(NamedTuple):
     nearest: NDArray[np.int64]
 
     def stack(self, name: str) -> NDArray[Any]:
-        """Return a column of each archive's answers, one row an archive."""
+        """Return a column of all archives (archives, k, ...)."""
         return np.stack([_column(a, name) for a in self.answers])
 
 
 def _column(answers: Cost, name: str) -> NDArray[Any]:
-    """Return a column of answers."""
+    """Return a column of answers, typed as an array."""
     column: NDArray[Any] = getattr(answers, name)
     return column
 
 
 def _stack(answers: Sequence[Cost], name: str) -> NDArray[Any]:
-    """Return a column of each archive's answers, one row an archive."""
+    """Return a column of all archives (archives, k, ...)."""
     return np.stack([_column(a, name) for a in answers])
 
 
 def _cost(answers: Sequence[Cost]) -> dict[str, Any]:
-    """Return the cost of all answers together, and what is in memory of all archives."""
+    """Return the fields of `Cost`: sums, distinct faults and late voxels, the first stop reason."""
     total: dict[str, Any] = {
         name: sum(getattr(a, name) for a in answers)
         for name in ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "wait_seconds")
@@ -124,14 +127,14 @@ def _cost(answers: Sequence[Cost]) -> dict[str, Any]:
 
 
 def _verdict(answers: Sequence[Cost]) -> NDArray[np.uint8]:
-    """Return the merged verdicts: contact with any is contact; clear is what is clear of all."""
+    """Return the merged verdicts (k,): contact if any is, else unknown if any is, else clear."""
     verdicts = _stack(answers, "verdict")
     unknown = np.where((verdicts == Verdict.UNKNOWN).any(axis=0), Verdict.UNKNOWN, Verdict.CLEAR)
     return np.where((verdicts == Verdict.CONTACT).any(axis=0), Verdict.CONTACT, unknown).astype(np.uint8)
 
 
 def _nearest(answers: Sequence[Cost], question: Question[Any]) -> NDArray[np.int64]:
-    """Return which archive has the least value (k,); of equals the one with the least witnesses."""
+    """Return the number of the archive with the least value (k,), of equals by least witnesses."""
     if question.nearest is None:
         return np.zeros(0, np.int64)
     value, names = question.nearest
@@ -145,13 +148,13 @@ def _nearest(answers: Sequence[Cost], question: Question[Any]) -> NDArray[np.int
             for axis in range(3):
                 own, other = places[number, :, axis], places[found, poses, axis]
                 better |= undecided & (own < other)
-                undecided &= own == other  # false where there are none, NaN
+                undecided &= own == other  # false where there is no witness, because NaN != NaN
         found[better] = number
     return found
 
 
 def _sum(found: _Merged, name: str) -> NDArray[Any]:
-    """Return the sums of a column, at most the largest number of its type."""
+    """Return the sums of a column, clipped to the largest value of its dtype."""
     dtype = array_fields(type(found.answers[0]))[name].dtype
     total = sum(_column(a, name).astype(np.int64) for a in found.answers)
     return np.minimum(total, np.iinfo(dtype).max).astype(dtype)
@@ -163,30 +166,33 @@ def _of_nearest(found: _Merged, name: str) -> NDArray[Any]:
 
 
 def _exact_verdict(found: _Merged, name: str) -> NDArray[np.bool_]:
-    """Return which verdicts are those of tolerance 0: an exact contact with one, or all exact."""
+    """Return which merged verdicts are exact (k,).
+
+    A contact is exact if that with any archive is; another verdict, if those of all archives are.
+    """
     verdicts, exact = found.stack("verdict"), found.stack(name)
     touches = (exact & (verdicts == Verdict.CONTACT)).any(axis=0)
     return np.asarray(np.where(found.verdict == Verdict.CONTACT, touches, exact.all(axis=0)))
 
 
 def _exact_nearest(found: _Merged, name: str) -> NDArray[np.bool_]:
-    """Return where the nearest is exact, and no other archive may hold a nearer one."""
+    """Return where the nearest is exact, and no other archive can contain a nearer one (k,)."""
     value, _ = found.question.nearest or ("", ())
     exact = found.stack(name)
-    # Where another archive is not exact, nothing in it is nearer than its lower bound.
+    # An archive whose answer is not exact contains nothing nearer than its lower bound.
     known = (exact | (found.stack("lower") >= _of_nearest(found, value))).all(axis=0)
     return np.asarray(known & _of_nearest(found, name))
 
 
 def _exact_interval(found: _Merged, name: str) -> NDArray[np.bool_]:
-    """Return where the first contact is within the tolerance, or where all is clear."""
+    """Return where the interval of the first contact is exact, or all archives are clear (k,)."""
     verdicts, lower = found.stack("verdict"), found.stack("lower")
-    # The interval that begins first ends no earlier than the merged one, which is thus within the tolerance.
+    # The merged interval begins with the first interval and ends no later, so it is no longer.
     first = found.stack(name) & (verdicts == Verdict.CONTACT) & (lower == lower.min(axis=0))
     return np.asarray(first.any(axis=0) | (verdicts == Verdict.CLEAR).all(axis=0))
 
 
-# Merge.LISTED is missing: its columns depend on one another, see `_contacts`.
+# Merge.LISTED is missing, because its columns depend on one another: see `_contacts`.
 _RULES: dict[Merge, Callable[[_Merged, str], NDArray[Any]]] = {
     Merge.VERDICT: lambda found, _: found.verdict,
     Merge.ALL: lambda found, name: np.asarray(found.stack(name).all(axis=0)),
@@ -201,9 +207,9 @@ _RULES: dict[Merge, Callable[[_Merged, str], NDArray[Any]]] = {
 
 
 def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
-    """Return the listed rows of `ContactsAnswers`: pairs and clusters of all archives, each by depth.
+    """Return the listed columns of `ContactsAnswers`: pairs and clusters of all archives by depth.
 
-    No cluster is of two archives.
+    Clusters of different archives are not joined.
     """
     k = len(answers[0])
     clusters, cluster_starts, cluster_rows = _by_pose(answers, "cluster_starts", k)
@@ -213,7 +219,7 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
     clusters = clusters[order]
     fields = {name: np.concatenate([_column(a, name) for a in answers])[clusters] for name in _CLUSTERS}
     fields["cluster_starts"] = cluster_starts
-    # Where each archive's own cluster of each pose went, from the pose's first.
+    # New number of each archive's cluster within its pose.
     place = np.empty(len(clusters), np.int64)
     place[clusters] = np.arange(len(clusters)) - cluster_starts[cluster_rows[order]]
     pairs, pair_starts, pair_rows = _by_pose(answers, "pair_starts", k)
@@ -227,9 +233,11 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
 def _by_pose(
     answers: Sequence[ContactsAnswers], starts: str, k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of the archives' columns joined, in the order of the k poses.
+    """Order the rows of the archives' concatenated columns by pose.
 
-    Also returns the starts of the poses' rows (k + 1,), and the pose of each row.
+    starts: name of the column with the first row of each pose, "pair_starts" or "cluster_starts".
+    Return the rows (n,) in the order of the k poses, the starts of the poses' rows (k + 1,), and
+    the pose of each row (n,).
     """
     poses = np.concatenate([np.repeat(np.arange(k), np.diff(_column(a, starts))) for a in answers])
     order = np.argsort(poses, kind="stable")
@@ -238,7 +246,7 @@ def _by_pose(
 
 
 def _own_clusters(answers: Sequence[ContactsAnswers]) -> NDArray[np.int64]:
-    """Return, for each pair of the archives' columns joined, its cluster's row in the joined columns."""
+    """Return the row of each pair's cluster; rows are of the archives' concatenated columns."""
     rows, first = [], 0
     for a in answers:
         rows.append(np.repeat(a.cluster_starts[:-1], np.diff(a.pair_starts)) + a.cluster + first)

@@ -1,13 +1,14 @@
-"""One archive of a scene, at a pose in the world: the generation that answers now, and its hot reload.
+"""One archive of a scene at a pose in the world: its current generation and its hot reload.
 
-An archive at the identity is asked with the very poses of a request, so the archives of two halves
-of a scan, on one lattice, answer as the archive of the whole. An archive at a pose is asked with
-inverse(pose) @ pose, in float64, rounded once: exact for a signed permutation and shifts that float64
-adds exactly, within some nanometres for others. Witnesses are transformed back in the same way.
+An archive at the identity is queried with the poses of a request unchanged. The archives of two
+halves of a scan, on one lattice, therefore answer as the archive of the whole. An archive at a pose
+is queried with inverse(archive pose) @ pose, in float64, rounded once. This is exact if the archive
+pose is a signed permutation with a shift that float64 adds exactly, and within some nanometres
+otherwise. Witnesses are transformed back in the same way.
 
-A generation is what one opening of the folder found. A reload opens the next one and swaps them; a
-request is answered from the one that it began with. A generation counts its readers, and its files
-and memory are released with the last one.
+A generation is the content of the folder at one opening. A reload opens the next generation and
+swaps the two. Each request is answered from the generation that it began with. A generation counts
+its readers; the last one to leave closes its files and releases its memory.
 """
 
 import math
@@ -44,34 +45,34 @@ from .rigid_transform import archive_pose, inverse_pose, rotate_vectors, transfo
 
 _Floats = NDArray[np.float64]
 
-# How long a reload waits for the last reader of the generation before the current one [s]: a third
-# open generation would mean three budgets in memory.
+# How long a reload waits for the last reader of the generation before the current one [s]. A third
+# open generation would take a third budget of memory.
 RELOAD_WAIT = 10.0
-# A request of more poses does not show where a user is.
+# A request of more poses does not update the user's position: its last pose may be anywhere.
 _MAX_USER_POSES = 8
-# Limits of a user's request, as in kernels/core/voxels_in_reach.py: others will be refused. Margin or
-# reach [m], scale of the avatar.
+# Limits of margin or reach [m] and of the avatar's scale, as in kernels/core/voxels_in_reach.py.
+# Requests beyond them will be refused.
 _MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
-_FLOAT64 = np.dtype(np.float64)  # compared faster than the type
-_NUMBER = (float, int)  # `float | int` would be made anew for each request
+_FLOAT64 = np.dtype(np.float64)  # comparing dtypes is faster than comparing with the type
+_NUMBER = (float, int)  # `float | int` would be constructed for each request
 # Voxels within this distance of a user are prefetched, however far its requests reach [m].
 _USER_REACH = 1.0
 # Share of the budget for coarse bounds, 6 KB a voxel.
 _COARSE_SHARE = 1 / 16
-# Radius models whose tables are cached. Clients choose them by name, so there may be any number.
+# Number of radius models whose tables are cached. Clients may name any number of models.
 _MAX_MODELS = 64
 
 
 class ArchiveGeneration:
-    """An archive's store and resident voxels, open until the last reader has released it. Thread-safe.
+    """Store and resident voxels of an archive, open until its last reader leaves. Thread-safe.
 
-    data: what every query reads, with the scene's default radius model.
-    radius_model: returns the same with a radius model, by its name; None: the default. It raises
-    BadRequestError for an invalid model, or one that the archive does not store.
-    Only readers may use both.
-    kept: data that other modules store with this generation, by their names.
-    number: of this archive's generations, from 0.  ended: set once the last reader has released it
-    and everything is closed.
+    data: scene data that every query reads, with the scene's default radius model.
+    radius_model: function that returns the scene data with the radius model of a name; None: the
+    default. It raises BadRequestError for an invalid model, or one that the archive does not store.
+    Only readers may use `data` and `radius_model`.
+    kept: data that other modules store with this generation, by module name.
+    number: counts the generations of this archive, from 0.
+    ended: event that is set when the last reader has left and everything is closed.
     """
 
     data: SceneData
@@ -86,10 +87,11 @@ class ArchiveGeneration:
         took: Callable[[float], None] | None = None,
         radius_model: str | None = None,
     ) -> None:
-        """Open a generation with a first reader, the scene, which must `release` it.
+        """Open a generation whose first reader is the caller, which must `release` it.
 
-        policy: see eviction.py.  took: called with the duration of each load [s].
-        radius_model: the default; None: the archive's single radius. Raises BadRequestError for one
+        budget_bytes: limit of memory for voxels and coarse bounds.  policy: see eviction.py.
+        number: of this generation.  took: called with the duration of each load [s].
+        radius_model: the default; None: the archive's single radius. Raise BadRequestError for one
         that the archive does not store.
         """
         self.store, self.number = store, number
@@ -106,7 +108,7 @@ class ArchiveGeneration:
         if coarse is not None:
             arena, remember = residency.buffer.arena, coarse.store_from_arena
             residency.on_loaded = lambda row, where: remember(row, arena, where)
-        # Without room for all voxels, the room is for those that requests load.
+        # If coarse bounds of all voxels do not fit, only those of requested voxels are stored.
         fill = _coarse_filling(coarse, store) if coarse is not None and coarse.has_room_for_all else None
         self.prefetcher = Prefetcher(residency, around, prefetch=ahead, idle=fill)
         figure = make_scene_data(store.archive, residency, bounds, coarse)
@@ -123,7 +125,7 @@ class ArchiveGeneration:
         self._ending: threading.Thread | None = None
 
     def take(self) -> bool:
-        """Become a reader until `release`. Return False if the last reader has released it."""
+        """Add a reader, which must `release`. Return False if the last reader has already left."""
         with self._lock:
             if self._readers:
                 self._readers += 1
@@ -131,51 +133,56 @@ class ArchiveGeneration:
         return False
 
     def release(self) -> None:
-        """Stop reading. The last reader closes the files and frees the memory."""
+        """Remove a reader. The last one closes the files and frees the memory."""
         with self._lock:
             self._readers -= 1
             if self._readers:
                 return
         if self.prefetcher.running:
-            # Ending waits for its thread. This thread may be collecting garbage, and hold any lock.
+            # `_end` waits for the prefetcher's thread. The calling thread may be in garbage
+            # collection with any lock held, so another thread waits.
             self._ending = start_thread("end", self._end)
         else:
             self._end()
 
     def join(self) -> None:
-        """Wait until everything is closed if the last reader has left; not during garbage collection."""
+        """Wait until everything is closed, if the last reader has left.
+
+        Do not call it during garbage collection, which may hold a lock that closing needs.
+        """
         if self._ending is not None:
             self._ending.join()
 
     def _end(self) -> None:
-        """Stop loading and close everything."""
+        """Stop prefetching, drop the memory and close the files."""
         self.prefetcher.stop()
         del self.data, self.radius_model, self.prefetcher, self.kept
         self.store.close()
         self.ended.set()
 
     def __enter__(self) -> Self:
-        """Return this generation, which the caller reads."""
+        """Return this generation; the caller is already a reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release it."""
+        """Release this generation."""
         self.release()
 
     def taken(self) -> Self:
-        """Return this generation with one more reader. Raises BadRequestError if it has ended."""
+        """Add a reader and return this generation. Raise BadRequestError if it has ended."""
         if not self.take():
             raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
         return self
 
     def record_user(self, user: User, avatar: AvatarModel, poses: Any, around: float) -> bool:
-        """Record where a user is: the last of a few poses of its avatar.
+        """Record the position of a user: the last of at most _MAX_USER_POSES poses of its avatar.
 
+        poses: (k, 4, 4), avatar to archive, not checked yet.
         around: margin or reach, in addition to the radii of avatar and scan [m].
-        Return whether the voxels in reach are used in passing: there are many poses, or the user
-        teleported.
+        Return whether the voxels in reach are used in passing (`QueryBudget.scan`), because there
+        are more poses or the user teleported.
         """
-        # Other arguments will be refused, or have no voxels to prefetch.
+        # A request with other arguments will be refused, or has no voxels to prefetch.
         if not isinstance(poses, np.ndarray) or poses.dtype != _FLOAT64 or poses.shape[1:] != (4, 4):
             return False
         if not len(poses) or not len(avatar.points):
@@ -200,7 +207,7 @@ class ArchiveGeneration:
     def warm(self) -> None:
         """Run every query once, with a load, so that no request waits for compilation."""
         archive = self.store.archive
-        self.data.bounds.trees()  # before the first load, which tightens them
+        self.data.bounds.trees()  # made before the first load, which tightens the bounds
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         x, y, z = place = archive.header.lattice.to_world(corner).tolist()
@@ -208,9 +215,10 @@ class ArchiveGeneration:
         warm_engines(self.data, place)
 
     def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:
-        """Load the voxels that `other` has in memory, the last used ones if not all fit; until `stopped`.
+        """Load the voxels that are resident in `other`, until `stopped` returns True.
 
-        After a reload, users do not wait for the disk where they are.
+        If not all fit, load those that were used last. After a reload, requests at the users'
+        positions then do not wait for the disk.
         """
         residency, keys = self.data.residency, self.store.archive.voxels["key"]
         wanted = other.store.archive.voxels["key"][other.data.residency.recent()]
@@ -229,9 +237,9 @@ class ArchiveGeneration:
 
 
 def _make_coarse(store: VoxelStore, budget_bytes: int) -> CoarseBounds | None:
-    """Return storage for the coarse bounds of all voxels, or of as many as their share of the budget holds.
+    """Return storage for coarse bounds of all voxels, or of as many as their budget share holds.
 
-    None if the budget has no room for any beside the largest voxel.
+    Return None if the budget holds no coarse bounds beside the largest voxel.
     """
     voxels, largest = len(store.sizes), int(store.sizes.max(initial=0))
     most = min(int(budget_bytes * _COARSE_SHARE), budget_bytes - ArenaBuffer.rounded(largest))
@@ -240,14 +248,17 @@ def _make_coarse(store: VoxelStore, budget_bytes: int) -> CoarseBounds | None:
 
 
 def _coarse_filling(coarse: CoarseBounds, store: VoxelStore) -> Callable[[], bool]:
-    """Return a function that stores the coarse bounds of one more voxel; False if none is left."""
+    """Return a function that stores the coarse bounds of the next voxel without them.
+
+    It returns False when all voxels have them.
+    """
     missing = coarse.rows_without_bounds()
 
     def fill_one() -> bool:
         row = next(missing, None)
         if row is None:
             return False
-        # An unreadable voxel has none; the request that loads it gets the error.
+        # An unreadable voxel gets no coarse bounds. The request that loads it reports the error.
         with suppress(CorruptError, OSError):
             coarse.store_from_archive(store, row)
         return True
@@ -256,10 +267,10 @@ def _coarse_filling(coarse: CoarseBounds, store: VoxelStore) -> Callable[[], boo
 
 
 class PlacedArchive:
-    """An archive that a scene serves. Thread-safe.
+    """Archive that a scene serves. Thread-safe.
 
-    The content of the folder at opening answers, whatever becomes of the folder, until `reload`.
-    pose, inverse: (4, 4), archive to world and back; None: at the identity.
+    Until `reload`, answers are those of the folder's content at opening, whatever happens to it.
+    pose, inverse: (4, 4) float64, archive to world and back; None: the identity.
     """
 
     def __init__(
@@ -273,10 +284,12 @@ class PlacedArchive:
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
     ) -> None:
-        """Serve the voxels of `store`; call `PlacedArchive.open` instead.
+        """Serve the voxels of `store`; callers use `PlacedArchive.open`.
 
-        name: of the scene, for messages.  took: called with the duration of each voxel load [s].
-        Raises BadRequestError or BadTransformError for a pose that is not rigid.
+        name: of the scene, for messages.  open_store: opens the folder at each reload.
+        pose: (4, 4), archive to world; None: the identity.
+        took: called with the duration of each voxel load [s].
+        Raise BadRequestError or BadTransformError for a pose that is not rigid.
         """
         self.name, self._folder, self._open_store = name, store.archive.folder, open_store
         self._budget_bytes, self._policy, self._radius_model = budget_bytes, policy, radius_model
@@ -284,7 +297,8 @@ class PlacedArchive:
         self.pose = archive_pose(pose)
         self.inverse = None if self.pose is None else inverse_pose(self.pose)
         self._opened = self._open(store, 0)
-        self._before: ArchiveGeneration | None = None  # replaced; some requests may still read it
+        # Generation replaced by the last reload; some requests may still read it.
+        self._before: ArchiveGeneration | None = None
         self._info = describe(store, name)
         self._closed = False
         self._lock = threading.Lock()
@@ -313,13 +327,16 @@ class PlacedArchive:
             raise
 
     def _open(self, store: VoxelStore, number: int) -> ArchiveGeneration:
-        """Return a generation, opened as this archive is served."""
+        """Open a generation of `store` with this archive's budget, policy and radius model."""
         return ArchiveGeneration(
             store, self._budget_bytes, self._policy, number, self._took, self._radius_model
         )
 
     def take(self) -> ArchiveGeneration:
-        """Return the current generation for a `with`, which releases it. BadRequestError when closed."""
+        """Return the current generation with one more reader, for a `with`.
+
+        Raise BadRequestError if the archive is closed.
+        """
         while True:
             opened = self._opened
             if opened.take():
@@ -329,30 +346,30 @@ class PlacedArchive:
 
     @property
     def residency(self) -> VoxelCache:
-        """Return the resident voxels, for counters and checks."""
+        """Return the cache of the current generation, for counters and checks."""
         return self._opened.data.residency
 
     def info(self) -> SceneInfo:
-        """Return the description of the archive alone, in its own frame."""
+        """Return the description of the archive, in its own frame."""
         return self._info
 
     def warm(self) -> None:
-        """Ask one of every question, with a load, so that no request waits for compilation."""
+        """Run every query once, with a load, so that no request waits for compilation."""
         with self.take() as opened:
             opened.warm()
 
     def leave_client(self, client: str) -> None:
-        """Hold no voxels for a client that is gone. BadRequestError when closed."""
+        """Stop keeping voxels for a disconnected client. Raise BadRequestError if closed."""
         with self.take() as opened:
             opened.prefetcher.leave_client(client)
 
     def reload(self) -> ReloadAnswer:
-        """Serve what is in the folder now; see `Scene.reload`."""
+        """Serve the current content of the folder; see `Scene.reload`."""
         begin = time.perf_counter()
         with self._reloading, self.take() as old:
             if self._before is not None and not self._before.ended.wait(RELOAD_WAIT):
                 raise BusyError(
-                    f"{self.name}: the generation before the one served is still asked, by a path perhaps: reload later"
+                    f"{self.name}: the previous generation is still in use, perhaps by a path: reload later"
                 )
             store = self._open_store(self._folder)
             try:
@@ -378,7 +395,7 @@ class PlacedArchive:
         )
 
     def close(self) -> None:
-        """Close the files once no reload is in progress. Closing twice is allowed."""
+        """Wait for a reload in progress, then close the files. Closing twice is allowed."""
         with self._lock:
             closed, self._closed = self._closed, True
         if not closed:
@@ -387,13 +404,17 @@ class PlacedArchive:
                 self._opened.join()
 
     def poses_in(self, poses: _Floats) -> _Floats:
-        """Return poses (k, 4, 4) of the world in the archive's frame."""
+        """Transform poses (k, 4, 4) from the world to the archive's frame."""
         return poses if self.inverse is None else transform_poses(self.inverse, poses)
 
     def points_in(self, points: _Floats) -> _Floats:
-        """Return points (k, 3) of the world in the archive's frame."""
+        """Transform points (k, 3) from the world to the archive's frame [m]."""
         return points if self.inverse is None else transform_points(self.inverse, points)
 
     def directions_in(self, vectors: _Floats) -> _Floats:
-        """Return directions (k, 3) of the world, of any length, in the archive's frame."""
+        """Transform directions (k, 3) from the world to the archive's frame.
+
+        At the identity their length is unchanged; otherwise it is 1. Raise BadRequestError for a
+        zero vector.
+        """
         return vectors if self.inverse is None else rotate_vectors(self.inverse, make_directions(vectors))

@@ -1,4 +1,4 @@
-"""Answers of `info` and `stats` for all archives of a scene together."""
+"""Answers of `info` and `stats` for a scene of several archives."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,10 +17,10 @@ from .rigid_transform import Pose, transform_boxes, transform_poses
 def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> SceneInfo:
     """Return the description of all archives as one scene.
 
-    Counts are added, bounds are in the world, and sources are listed archive by archive. Lattice and
-    trees, of which each archive has its own, are those of the first; radii and the distance by which
-    points were moved are the largest. The radius models are those that all archives hold.
-    each: the description of one archive, and its pose; None: at the identity.
+    each: description and pose of each archive; None: the identity.
+    Counts are summed, bounds are in the world [m], and sources are listed archive by archive. Each
+    archive has its own lattice and trees; those of the first are given. Radii and the distance by
+    which points were moved are the largest ones. Radius models are those that all archives store.
     """
     infos = [info for info, _ in each]
     first = infos[0]
@@ -28,7 +28,7 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
         return first
     bounds = np.array([_box(info.bounds, pose) for info, pose in each])
     largest = max(infos, key=lambda info: info.radius)
-    # A generation of the scene is a change of any archive.
+    # A change of any archive increases the sum, so the sum is the scene's generation.
     return structs.replace(
         first,
         scene=name,
@@ -61,7 +61,7 @@ def join_infos(name: str, each: Sequence[tuple[SceneInfo, Pose | None]]) -> Scen
 
 
 def count_sources(opened: ArchiveGeneration) -> int:
-    """Return how many sources a generation lists; the sources of the next archive follow them."""
+    """Return the number of sources that a generation lists; those of the next archive follow."""
     count = opened.kept.get("sources")
     if count is None:
         count = opened.kept["sources"] = listed_sources(opened.store.archive.header)
@@ -69,7 +69,7 @@ def count_sources(opened: ArchiveGeneration) -> int:
 
 
 def _box(box: list[list[float]], pose: Pose | None) -> Any:
-    """Return a box (2, 3), or the box around it transformed by a pose."""
+    """Return a box (2, 3), or the box that encloses it after transformation by a pose."""
     sides = np.array(box)
     return sides if pose is None else np.concatenate(transform_boxes(pose, sides[:1], sides[1:]))
 
@@ -82,9 +82,10 @@ def make_stats(
     *,
     keys: bool = False,
 ) -> StatsAnswer:
-    """Return what a scene keeps in memory, all archives together, and what it answered so far.
+    """Return cache statistics summed over the archives of a scene, and its request statistics.
 
-    avatars: of the clients.  keys: list the resident voxels, each by its key in its own archive.
+    metrics: the requests answered so far.  avatars: statistics of the clients' avatars.
+    keys: also list the resident voxels, each by its key in its own archive.
     """
     total, users = metrics.snapshot()
     counts = total.counts

@@ -17,13 +17,13 @@ DEGREE = 8
 
 
 class AvatarModel(NamedTuple):
-    """Avatar as added.
+    """Avatar with its sphere hierarchy.
 
     points: (n, 3) float64, avatar frame [m], as given.  radius: of each point's sphere [m].
-    bounding_radius: of a sphere around all of the avatar's spheres [m].
-    arrays: what the kernels read.
+    arrays: arrays that the kernels read.
     rows: (b, LANES) int32, the row of `points` in each lane of a block.
-    digest: `avatar_digest` of an avatar that a client added; empty for one of the scene's own.
+    bounding_radius: of a sphere that encloses all spheres of the avatar [m].
+    digest: `avatar_digest` of an avatar that a client added; empty for an avatar of the scene file.
     """
 
     points: NDArray[np.float64]
@@ -35,11 +35,11 @@ class AvatarModel(NamedTuple):
 
 
 def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
-    """Build an avatar from points (n, 3) [m]. n may be 0; the avatar then touches nothing.
+    """Build an avatar from points (n, 3), avatar frame [m]. One without points touches nothing.
 
     radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance
-    ([Fig12] section 7), over distinct points on their own lattice of 2^-20 m. A single point needs
-    a radius.
+    ([Fig12] section 7) of the distinct points, rounded to a lattice of 2^-20 m. A single distinct
+    point needs a radius. Raise BadRequestError.
     """
     array = make_positions(points).copy()  # the caller may still write into the original
     if len(array) and np.abs(array).max() > MAX_COORDINATE:
@@ -64,7 +64,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         radius = mean_closest_distance(local) / 2
         if radius == 0.0:
             raise BadRequestError(
-                "avatar of a single distinct point: no closest-point distance: give a radius"
+                "avatar of a single distinct point has no closest-point distance: give a radius"
             )
     tree, bounds = local.hierarchy.tree, local.hierarchy.bounds
     leaves = int(tree.levels[-2])
@@ -73,15 +73,16 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
     )
     first[leaves:] = ~np.arange(len(tree.begin) - leaves)
-    # The last point of a block fills its remaining lanes.
+    # Unused lanes of a block repeat its last point.
     last = tree.end[leaves:, None] - 1
     rows = tree.order[np.minimum(tree.begin[leaves:, None] + np.arange(LANES), last)]
     lanes = array[rows].transpose(0, 2, 1)
-    # A lattice point lies within sqrt(3) steps of the given point: two more steps enclose the given
-    # point, rounding included.
+    # Rounding moves a point by less than sqrt(3) lattice steps. Two more steps in the radius
+    # therefore enclose the given points, including the rounding of these sums.
     center = np.asarray(local.low + bounds.center * local.step)
     node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
-    # The deepest level that fits: the leaf nodes, for avatars of up to some 8,000 points.
+    # The flat list of nodes is the deepest level that fits: the leaf nodes, up to some 8,000
+    # points.
     sizes = np.diff(tree.levels)
     level = int(np.flatnonzero(sizes <= MAX_FRONT)[-1])
     front = slice(int(tree.levels[level]), int(tree.levels[level + 1]))
@@ -91,8 +92,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         first,
         tree.count.astype(np.int32),
         np.ascontiguousarray(lanes),
-        # `concatenate` may return another memory order, for which numba would recompile every
-        # kernel.
+        # `concatenate` may return another memory order, and numba would recompile every kernel.
         np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
     )

@@ -1,4 +1,4 @@
-"""Registry of the avatars of a scene's clients, with their memory and its limits."""
+"""Registry of the avatars of a scene and of its clients, with limits on number and memory."""
 
 import threading
 import time
@@ -16,16 +16,19 @@ from ...schemas.wire.stats import AvatarStats
 from ..scene_interface import EVERYBODY, THIS_PROCESS, AvatarLimits, record_avatar
 from .avatar_model import AvatarModel, make_avatar
 
-# Upper bound of the arrays of an avatar [bytes]: measured 53.5 a point, and one block for a few
-# points.
+# Upper bounds of an avatar's arrays [bytes]: for each point (53.5 measured), and for the single
+# block of an avatar of a few points.
 _BYTES_A_POINT, _LEAST_BYTES = 56, 1200
 _OWN = (EVERYBODY, THIS_PROCESS)
-# Avatars of more points are built one at a time: building one takes three times its bytes.
+# Avatars of more points are built one at a time, because building takes three times their bytes.
 _LARGE = 50_000
 
 
 class _Held(NamedTuple):
-    """Memory and number of all clients' avatars. bytes: of their arrays."""
+    """Totals over the avatars of all clients.
+
+    bytes: of their arrays.  avatars: their number.  clients: number of clients with avatars.
+    """
 
     bytes: int
     avatars: int
@@ -33,10 +36,10 @@ class _Held(NamedTuple):
 
 
 class _Entry:
-    """One avatar.
+    """Avatar in the registry.
 
-    model: None while it is being built.  asked: the radius it was added with.
-    used: time of the last use [s].
+    model: None while it is being built.  asked: radius in the request that added it [m].
+    bytes: of its arrays.  used: time of the last use [s].
     """
 
     __slots__ = ("asked", "bytes", "model", "used")
@@ -51,20 +54,23 @@ class _Entry:
 class Avatars:
     """Avatars by client and name. Thread-safe.
 
-    limits: None for no limits. The avatars of the scene and of this process (`EVERYBODY`,
-    `THIS_PROCESS`) are never dropped, limited or counted.
+    limits: None for no limits. Avatars owned by `EVERYBODY` (the scene file's) and `THIS_PROCESS`
+    are never dropped, limited or counted.
     """
 
     def __init__(self, limits: AvatarLimits | None = None) -> None:
         """Make an empty registry."""
         self.limits = limits
-        self._lock = threading.RLock()  # of `_changed`; entered faster by itself
+        self._lock = threading.RLock()  # lock of `_changed`; entering it directly is faster
         self._changed = threading.Condition(self._lock)
         self._large = threading.Lock()  # held while a large avatar is built
         self._clients: dict[str, dict[str, _Entry]] = {}
 
     def get(self, name: str, client: str) -> AvatarModel:
-        """Return a client's or the scene's avatar, and note its use. Raise UnknownAvatarError."""
+        """Return an avatar of a client or of the scene, and record its use.
+
+        Raise UnknownAvatarError.
+        """
         with self._lock:
             for owner in (client, EVERYBODY):
                 entry = self._clients.get(owner, {}).get(name)
@@ -77,9 +83,9 @@ class Avatars:
     def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
         """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
 
-        An avatar with the name of one of the scene's own must equal it, and shares its arrays.
-        Raise BadRequestError if the name belongs to a different avatar, TooLargeError beyond the
-        limits.
+        radius: as for `make_avatar`. An avatar with the name of a scene avatar must equal it, and
+        shares its arrays. Raise BadRequestError if the name belongs to a different avatar,
+        TooLargeError beyond the limits.
         """
         array = make_positions(points)
         shared = None if client == EVERYBODY else self._scene_avatar(name)
@@ -100,7 +106,7 @@ class Avatars:
         return known
 
     def _scene_avatar(self, name: str) -> _Entry | None:
-        """Return the entry of one of the scene's own avatars; None if none has this name."""
+        """Return the entry of the scene avatar with this name, or None."""
         with self._changed:
             entry = self._clients.get(EVERYBODY, {}).get(name)
             return None if entry is None or entry.model is None else entry
@@ -113,7 +119,7 @@ class Avatars:
         assert known is not None
         same = np.array_equal(known.points, points)
         if same and radius is None and entry.asked is not None:
-            # The default radius of the points may equal the requested one: only building tells.
+            # One radius is given and one is the default of the points, which only building yields.
             radius = _built(self._large, points, None).radius
         if not same or (radius is not None and radius != known.radius):
             raise BadRequestError(
@@ -126,7 +132,7 @@ class Avatars:
             self._clients.pop(client, None)
 
     def drop_unused(self, alive: Collection[str], seconds: float) -> int:
-        """Drop avatars unused for `seconds`, except of clients in `alive`; return how many."""
+        """Drop avatars unused for `seconds`, except of clients in `alive`. Return their number."""
         before, dropped = time.monotonic() - seconds, 0
         with self._changed:
             for client, entries in list(self._clients.items()):
@@ -162,10 +168,11 @@ class Avatars:
 
     @contextmanager
     def _reserved(self, name: str, client: str, count: int, new: _Entry) -> Iterator[_Entry]:
-        """Yield the entry of a name, known or new.
+        """Yield the entry of a name for a `with`, known or new.
 
-        A new entry is counted while its avatar is built, and kept if it was built.
-        count: of the avatar's points.
+        A new entry counts towards the limits while its avatar is built in the block, and is removed
+        if the block fails.
+        count: number of the avatar's points. Raise TooLargeError.
         """
         with self._changed:
             while True:
@@ -223,7 +230,7 @@ class Avatars:
 
 
 def _built(large: threading.Lock, points: NDArray[np.float64], radius: float | None) -> AvatarModel:
-    """Build an avatar. large: lock held while a large one is built."""
+    """Build an avatar. large: lock that is held while an avatar of over _LARGE points is built."""
     with large if len(points) > _LARGE else nullcontext():
         return make_avatar(points, radius)
 

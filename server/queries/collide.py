@@ -32,8 +32,8 @@ def collide(
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
-    budget: with a budget, see `collide_bounded`; with a tolerance alone the answer is exact, and
-    has bounds.
+    budget: a limited one is passed to `collide_bounded`. With a tolerance alone the answer is exact
+    and has bounds.
     The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read or
     a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
@@ -54,7 +54,7 @@ def collide(
 
     reach = find_proved_reach(data, avatar, array, other_units, budget, spent, settled)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    # An empty avatar is clear, whatever else is unknown.
+    # An avatar without points is clear, even if the index is wrong or a scan was left out.
     for which, rows, part in (
         pieces(reach, residency, budget.share, budget.stop) if len(avatar.points) else ()
     ):

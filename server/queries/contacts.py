@@ -1,7 +1,7 @@
 """Query `contacts`: pairs of spheres in contact, the deepest listed, all gathered into clusters.
 
-It serves clash detection: where and how deep two bodies touch, and at how many places. `collide`
-only tells that they touch.
+It serves clash detection: it returns where and how deep two bodies touch, and at how many places.
+`collide` only returns whether they touch.
 """
 
 import math
@@ -173,7 +173,11 @@ def _gather(
     memory: ContactState,
     tally: ContactResults,
 ) -> ContactState:
-    """Answer one piece, to its end or to the deadline; mark poses left over as cut."""
+    """Search one piece until it is complete or the deadline passes; mark unfinished poses as cut.
+
+    part: voxels in reach of the poses `which`.  closes: whether the piece completes its last pose.
+    memory: state of the search between pieces, in and out.  tally: results, written.
+    """
     memory.cursor[:] = 0, -1, 0
     pause = SIZE_VISITS if budget.deadline == math.inf else SLICE_VISITS
     while memory.cursor[0] < len(which):
@@ -218,7 +222,7 @@ def _columns(
 ) -> dict[str, Any]:
     """Return the fields of `ContactsAnswers` except the cost of the request."""
     exact = ~tally.cut & (tally.counts[0] == 0)
-    if has_points:  # an empty avatar is clear, whatever else is unknown
+    if has_points:  # an avatar without points is clear, even if the index is wrong
         exact &= ~in_unknown(reach.boxes, data.unknown, data.nothing_clear)
     verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)
     verdict[tally.pairs > 0] = Verdict.CONTACT

@@ -1,7 +1,7 @@
-"""The function that answers each question of schemas/wire/question_table.py.
+"""Table of the engines: the function that answers each question of schemas/wire/question_table.py.
 
-Each takes the data of one archive, the avatar if the question is about one, the arguments of the
-request in their order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
+An engine takes the data of one archive, the avatar if the question is about one, the arguments of
+the request in their order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
 """
 
 import time
@@ -74,10 +74,10 @@ def warm_engines(data: SceneData, place: Sequence[float]) -> None:
         "avatar": avatar, "poses": pose, "pose_from": pose, "pose_to": pose, "points": points, "origins": points,
         "directions": np.array([[0.0, 0.0, 1.0]]), "reach": 0.01,
     }  # fmt: skip
-    # Queries with a limit have kernels of their own. These limits are hardly ever reached.
+    # Queries with a limit use separate kernels. These limits are too large to be reached here.
     limits = QueryBudget(tolerance=1e-3, visits=1 << 20), QueryBudget(deadline=time.perf_counter() + 3600.0)
     for budget in (EXACT, *limits):
-        collide(data, avatar, poses, 0.0, budget)  # several poses take other kernels than one
+        collide(data, avatar, poses, 0.0, budget)  # several poses use other kernels than one pose
         for question in (one for one in QUESTIONS.values() if not one.whole):
             arguments = [samples[name] for name in question.arguments if name in question.required]
             tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))

@@ -123,7 +123,7 @@ def _check(
     group, mask = np.asarray(groups, np.uint32), np.asarray(masks, np.uint32)
     if not len(avatars) == n == len(group) == len(mask):
         raise BadRequestError(
-            f"{len(avatars)} avatars, {n} poses, {len(group)} groups, {len(mask)} masks: expected as many of each"
+            f"{len(avatars)} avatars, {n} poses, {len(group)} groups, {len(mask)} masks: expected equal numbers"
         )
     distinct = {id(avatar): avatar for avatar in avatars}
     numbers = {key: number for number, key in enumerate(distinct)}

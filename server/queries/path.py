@@ -62,8 +62,8 @@ def path_question(
 
     The budget's time begins with this call.
     poses: (k, 4, 4) float64.  parameters: of `op`, including tolerance and budgets.
-    stop: ends the path early; a part that takes longer than its `part_seconds` is stopped alone,
-    see `AskPart`.
+    stop: ends the path early. A part that takes longer than `stop.part_seconds` is stopped without
+    the rest of the path; see `AskPart`.
     All poses are checked here, so that an error names a pose by its position on the path. Raise
     BadRequestError, BadTransformError, TooLargeError.
     """
@@ -120,9 +120,9 @@ def path_parts(
 ) -> Generator[Part, None, None]:
     """Yield the parts of a path in order; one empty part if the path is empty.
 
-    most: answers in a part.  pool: computes up to `ahead` parts before they are consumed; None:
-    each part is computed on demand. Closing the generator cancels waiting parts; running ones end
-    by themselves.
+    most: limit of answers in a part.  pool: executor that computes up to `ahead` parts before they
+    are consumed; None: each part is computed on demand. Closing the generator cancels waiting
+    parts; running ones complete.
     """
     waiting: deque[tuple[int, Future[Cost]]] = deque()
     size, start = min(FIRST_PART, most), 0

@@ -53,7 +53,7 @@ def raycast(
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):
-        raise BadRequestError(f"{len(world)} origins and {len(unit)} directions: expected as many")
+        raise BadRequestError(f"{len(world)} origins and {len(unit)} directions: expected equal numbers")
     if not 0 <= reach <= MAX_RAY_REACH:
         raise BadRequestError(f"reach {reach!r}: expected 0 to {MAX_RAY_REACH:g} metres")
     if data.radius_units > MAX_REACH_UNITS:

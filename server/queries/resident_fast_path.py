@@ -1,16 +1,17 @@
-"""Questions about one pose whose voxels are all resident: one kernel call, without the general machinery.
+"""Fast path of queries of one pose whose voxels are all resident: a single kernel call.
 
 The answers equal those of the engines bit for bit, cost counters included, except engine_seconds.
 The engine is called instead if
 
 - a voxel in reach has to be loaded, or more than MAX_FAST_VOXELS are in reach,
-- the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds MAX_FAST_REACH,
+- the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds
+MAX_FAST_REACH,
 - the request has a budget of time or visits, or
 - a scan was left out of the archive, or a load proved its index wrong (not for `sweep`).
 
-The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half of
-the overhead of such a call (scripts/bench_walk). Other requests wait meanwhile, so the limits keep it
-to some tens of microseconds.
+The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half
+of the overhead of such a call (scripts/bench_walk). Other requests wait meanwhile, so the limits
+keep it to some tens of microseconds.
 """
 
 import time
@@ -36,7 +37,8 @@ from .sweep import sweep
 Vec = NDArray[np.float64]
 Pose = NDArray[np.float64]
 
-# 20 µs for the 3,617 points of the walk. Larger avatars could block other requests, and gain little.
+# 20 µs for the 3,617 points of the walk. Larger avatars could block other requests, and gain
+# little.
 MAX_FAST_POINTS = 1 << 13
 # With nothing near, the time grows with the number of voxels in reach [voxels], [m].
 MAX_FAST_VOXELS, MAX_FAST_REACH = 64, 2.0
@@ -137,11 +139,11 @@ class SweepResult(NamedTuple):
 
     avatar, cloud: (3,) the witness's centres, world [m]; None unless the verdict is CONTACT.
     archive: number of the touched archive in its scene.
-    exact: whether nothing else can be touched before: no point moves farther than the tolerance
-    between `lower` and `upper`.
+    exact: whether no other contact can come first, and no avatar point moves farther than the
+    tolerance between `lower` and `upper`.
     visits: node visits.  missing: voxels that could not be examined.
-    unknown: whether something in reach could not be or was not examined. If it is false, a contact
-    that is not exact may be a graze, with everything examined.
+    unknown: whether something in reach was not examined. If it is false, a contact that is not
+    exact may be a graze.
     """
 
     verdict: Verdict

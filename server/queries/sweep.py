@@ -32,8 +32,9 @@ def _check(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Check the poses of k motions, and return scales, reaches and their variation, (k,) each.
 
-    Scale and reach are the larger ones of both ends; the reach is in exact units, up to the scan's
-    largest sphere. The variation is by how many units the reach may differ during the motion.
+    Scale and reach are the larger of those at both ends. The reach is in exact units and includes
+    the scan's largest sphere. The variation bounds how much the reach changes during the motion
+    [exact units].
     """
     k = len(first)
     scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some unchanged
@@ -82,7 +83,7 @@ def _answers(
 ) -> SweepAnswers:  # fmt: skip
     """Make the answers from the progress of each motion.
 
-    frozen: (k,) fraction up to which nothing is proved to touch.
+    frozen: (k,) fraction up to which the motion is proved clear.
     """
     touches = progress.upper < np.inf
     verdict = np.full(len(frozen), Verdict.UNKNOWN, np.uint8)
@@ -130,7 +131,9 @@ def sweep(
     tolerance = max(tolerance, budget.tolerance)
     first, last = kernel_poses(pose_from), kernel_poses(pose_to)
     if len(first) != len(last):
-        raise BadRequestError(f"{len(first)} poses to begin at and {len(last)} to end at: expected as many")
+        raise BadRequestError(
+            f"{len(first)} poses to begin at and {len(last)} to end at: expected equal numbers"
+        )
     k = len(first)
     other_units = data.radius_units + to_units(margin, "margin")
     scales, units, loose = _check(data, avatar, first, last, other_units)
@@ -198,7 +201,7 @@ def sweep(
         which = _next_round(which, progress, proved)
         if budget.stop:
             break
-    # Motions that were stopped before their end: nothing is known beyond.
+    # Beyond the place where a motion was stopped, nothing is known.
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)

@@ -1,4 +1,4 @@
-"""What a scene consists of: its questions, and the archives and avatars that a scene file names.
+"""Parts of a scene: its queries, and the archives and avatars that a scene file names.
 
 May import server.archives, server.avatars, server.kernels, server.observability, server.queries,
 server.queries.context, server.residency, server.runtime, server/scene_interface.py,

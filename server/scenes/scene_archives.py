@@ -1,6 +1,7 @@
-"""The archives and avatars that a scene file names: found, checked, opened.
+"""Finding, checking and opening the archives and avatars that a scene file names.
 
-Errors name the file and the place in it. Masked archives are imported only if the scene has them.
+Errors name the file and the place in it. masked_archive.py is imported only for scenes with the
+effect `through`.
 """
 
 from collections.abc import Callable, Iterator
@@ -35,11 +36,11 @@ ReadPoints = Callable[[Path], NDArray[np.float64]]
 
 
 class FoundArchive(NamedTuple):
-    """One archive of a scene.
+    """Archive that a scene file names, described before it is opened.
 
     info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
-    keeps_scan: it stores the scan of each point.
-    normal_reach: of the normals it stores [m]; 0: it stores none.
+    keeps_scan: whether it stores the scan of each point.
+    normal_reach: reach of the stored normals [m]; 0: no normals are stored.
     """
 
     folder: Path
@@ -50,7 +51,7 @@ class FoundArchive(NamedTuple):
 
 
 class FoundAvatar(NamedTuple):
-    """One avatar of a scene. points: (n, 3), of its file [m]."""
+    """Avatar that a scene file names. points: (n, 3), of its file, avatar frame [m]."""
 
     file: Path
     points: NDArray[np.float64]
@@ -58,7 +59,7 @@ class FoundAvatar(NamedTuple):
 
 
 def is_scene_file(path: Path) -> bool:
-    """Return whether a path is that of a scene file, existing or not; else it is an archive's."""
+    """Return whether a path names a scene file and not an archive folder. It need not exist."""
     return path.suffix == SUFFIX and not path.is_dir()
 
 
@@ -127,7 +128,7 @@ def store_opener(file: SceneFile, number: int) -> OpenStore:
 
 
 def normals_asked(file: SceneFile) -> float | None:
-    """Return the reach of the normals that a scene's effects need [m]; None: they need none."""
+    """Return the reach of the normals that a scene's effects need [m]; None if they need none."""
     for effect in file.effects:
         if isinstance(effect, Slide):
             return effect.normal_reach
@@ -166,9 +167,9 @@ def open_archives(
 ) -> list[PlacedArchive]:
     """Open the archives of a scene, which the caller closes.
 
-    name: of the scene.  budget_bytes: of decoded voxels, all archives together.  policy: eviction
-    policy, see eviction.py.  took: called with the duration of each voxel load [s].
-    Raises the errors of opening, with the place in the scene file; then none stays open.
+    name: of the scene.  budget_bytes: limit of decoded voxels, all archives together.
+    policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
+    [s]. Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """
     with error_location(path, "$.archives"):
         budgets = share_budget(budget_bytes, [each.sizes for each in found])
@@ -195,7 +196,7 @@ def open_archives(
 def _resolve_relative(path: Path, named: str) -> Path:
     """Return a path that a scene file names, which is relative to the file's folder.
 
-    Links in it are not resolved here. They are followed at each opening, and a reload finds their
+    Symbolic links are not resolved here: each opening follows them, so that a reload finds their
     new targets.
     """
     folder, there = path.parent.resolve(), Path(named)
@@ -205,7 +206,7 @@ def _resolve_relative(path: Path, named: str) -> Path:
 
 
 def _check_noise(file: SceneFile, path: Path, found: list[FoundArchive]) -> None:
-    """Raise BadRequestError if the effect `uncertainty` gives noise for an unknown scan."""
+    """Raise BadRequestError if the effect `uncertainty` names a scan that no archive lists."""
     for number, effect in enumerate(file.effects):
         if isinstance(effect, Uncertainty):
             from ..simulation.effects.uncertainty_effect import check

@@ -1,4 +1,4 @@
-"""The queries of a scene in this process: each archive is asked in its own frame, and the answers are merged."""
+"""Queries of a scene in this process, over all of its archives."""
 
 import os
 from collections.abc import Iterator, Sequence, Sized
@@ -33,7 +33,7 @@ _A = TypeVar("_A", bound=Cost)
 
 
 class SceneQuestions(QueryMethods):
-    """The archives of a scene, the avatars of its clients, and the questions. Thread-safe.
+    """Archives of a scene, avatars of its clients, and the query methods. Thread-safe.
 
     name: of the scene.  archives: at least one.
     """
@@ -41,29 +41,37 @@ class SceneQuestions(QueryMethods):
     def __init__(self, archives: Sequence[PlacedArchive], name: str, metrics: RequestStats) -> None:
         """Query these archives; see `Scene`."""
         self.name, self.archives = name, list(archives)
-        # A single archive at the identity: its questions take a request as it is.
+        # A single archive at the identity takes the arguments of a request unchanged.
         self._alone = self.archives[0] if len(archives) == 1 and archives[0].pose is None else None
         self._metrics, self._avatars = metrics, Avatars()
         self._path_threads = PathThreads(name, max(PATH_THREADS, os.cpu_count() or 1))
 
     def path_threads(self, client: str) -> Executor:
-        """Return what computes the parts of a client's paths: threads, one a core, shared by all clients in turn."""
+        """Return the executor of a client's paths.
+
+        All clients share its threads, one a core, in turn.
+        """
         return self._path_threads.of(client)
 
     def avatar(self, name: str, client: str) -> AvatarModel:
-        """Return a client's avatar, or the scene's own. Raises UnknownAvatarError."""
+        """Return an avatar of the client or of the scene. Raise UnknownAvatarError."""
         return self._avatars.get(name, client)
 
     def ask(self, question: Question[_A], *arguments: Any, client: str = "", **options: Any) -> _A:
-        """Ask a question of all archives together.
+        """Answer a question for all archives together; server/queries defines each answer.
 
-        client: whose avatars the names are of. Other options: tolerance [m], budget_ms and
-        budget_visits limit the cost of the answer, see server/queries/context/query_budget.py;
-        radius_model sets the size of the scan's spheres, see schemas/archive/radius_model.py, None:
-        as the scene was opened; stop ends the work early. server/queries has the definition of each
-        answer. A cluster of `contacts` has the points of one archive; depths in several archives are
-        compared as rounded. `objects` are tested against one another in the frame of the first
-        archive.
+        arguments: the fields of its request, in their order, avatars by name.
+        client: owner of the avatars.
+        options: the remaining fields by name, and
+
+        - tolerance [m], budget_ms and budget_visits: see server/queries/context/query_budget.py,
+        - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
+          scene's default,
+        - stop: stop flag that ends the work early.
+
+        A cluster of `contacts` contains points of one archive only; depths in different archives
+        are compared after rounding. `objects` are tested against one another in the frame of the
+        first archive. Raise UnknownAvatarError and the errors of the query.
         """
         complete = len(arguments) == len(question.arguments)
         given = arguments if complete else question.all_arguments(arguments, options)
@@ -71,14 +79,15 @@ class SceneQuestions(QueryMethods):
             options = question.other_defaults | options
         if self._alone is None or question.whole:
             return self._ask_placed(question, given, client, options)
-        # No transformation and no merging. Every call counts: one pose takes 30 µs in all.
+        # Neither transformation nor merging. A request of one pose takes 30 µs in all, so every
+        # function call counts here.
         rows = given[len(question.arrays) - (not question.about_avatars)]  # of the last array
         with self._alone.take() as opened:
             data, budget = _terms(opened, **options) if options else (opened.data, EXACT)
             user = ("", "")
             subject: Any = given
             if question.about_avatars:
-                # The last pose says where the user is.
+                # `record_user` takes the user's position from the last pose.
                 user = client, given[0]
                 avatar = self._avatars.get(given[0], client)
                 around = 0.0 if question.around is None else given[question.around]
@@ -98,7 +107,7 @@ class SceneQuestions(QueryMethods):
     def _ask_placed(
         self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
     ) -> _A:
-        """Ask archives at poses, or several; see `ask`."""
+        """Answer `ask` for archives that are several or not at the identity."""
         if question.whole:
             return self._ask_objects(question, given, client, options)
         if not question.about_avatars:
@@ -111,13 +120,13 @@ class SceneQuestions(QueryMethods):
     def _ask_avatar(
         self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
     ) -> _A:
-        """Ask about an avatar in each archive's own frame."""
+        """Answer a question about an avatar in each archive's own frame."""
         count, name, engine = len(question.arrays), given[0], ENGINES[question.name]
         avatar, arrays, what = self.avatar(name, client), given[1 : 1 + count], given[1 + count :]
         arrays = tuple(make_poses(each) for each in arrays)
         if len(arrays[0]) != len(arrays[-1]):
             raise BadRequestError(
-                f"{len(arrays[0])} poses to begin at and {len(arrays[-1])} to end at: expected as many"
+                f"{len(arrays[0])} poses to begin at and {len(arrays[-1])} to end at: expected equal numbers"
             )
 
         around = 0.0 if question.around is None else given[question.around]
@@ -138,13 +147,13 @@ class SceneQuestions(QueryMethods):
         return answers
 
     def _ask_vectors(self, question: Question[_A], given: tuple[Any, ...], options: dict[str, Any]) -> _A:
-        """Ask about vectors (k, 3), points or directions."""
+        """Answer a question about points or rays, (k, 3) arrays, in each archive's own frame."""
         engine, names = ENGINES[question.name], tuple(question.arrays)
         arrays, what = given[: len(names)], given[len(names) :]
         arrays = tuple(make_vectors(each, name) for each, name in zip(arrays, names, strict=True))
         if len(arrays[0]) != len(arrays[-1]):
             raise BadRequestError(
-                f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected as many"
+                f"{len(arrays[0])} {names[0]} and {len(arrays[-1])} {names[-1]}: expected equal numbers"
             )
 
         def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
@@ -166,7 +175,7 @@ class SceneQuestions(QueryMethods):
     def _ask_objects(
         self, question: Question[_A], given: tuple[Any, ...], client: str, options: dict[str, Any]
     ) -> _A:
-        """Ask about objects; they are tested against one another in the frame of the first archive."""
+        """Answer `objects`. Pairs of objects are tested in the frame of the first archive only."""
         engine, what = ENGINES[question.name], given[1:]
         items, poses = make_objects(given[0])
         avatars = [self.avatar(item.avatar, client) for item in items]
@@ -174,7 +183,7 @@ class SceneQuestions(QueryMethods):
         masks = np.array([item.mask for item in items], np.uint32)
 
         def prepare(archive: PlacedArchive, _: ArchiveGeneration) -> PreparedQuery:
-            # Objects without a group are tested against the scene only.
+            # For other archives, groups are 0: objects are tested against the scene only.
             first = archive is self.archives[0]
             own, group = archive.poses_in(poses), groups if first else groups & np.uint32(0)
             mask = masks if first else masks & np.uint32(SCENE_GROUP)
@@ -202,13 +211,14 @@ class SceneQuestions(QueryMethods):
         stop: StopFlag = NO_STOP,
         **parameters: Any,
     ) -> Iterator[Part]:
-        """Ask `op` (collide, distance, contacts, sweep) along the poses; the answers come in parts, in order.
+        """Answer `op` (collide, distance, contacts, sweep) along poses (k, 4, 4), in ordered parts.
 
-        parameters: of `op` beside the poses, tolerance and budgets included; `budget_ms` is for the
-        whole path.
-        threads: parts computed at a time.  sweep: k - 1 motions, from each pose to the next. Every
-        part is the answer of its question for [first, first + n) of `total`. All poses are checked
-        before the first part.
+        name: of the avatar.  op: a sweep has k - 1 motions, from each pose to the next.
+        threads: parts computed at a time.  client: owner of the avatar.
+        parameters: of `op` besides the poses, including tolerance and budgets. `budget_ms` is for
+        the whole path.
+        Each part answers the items [first, first + n) of `total`. All poses are checked before the
+        first part. Raise UnknownAvatarError and the errors of `op`.
         """
         taken: list[ArchiveGeneration] = []
         try:
@@ -219,9 +229,8 @@ class SceneQuestions(QueryMethods):
             ask, total = ask_along(legs, avatar, op, parameters, stop)
 
             def ask_held(start: int, end: int) -> Cost:
-                with (
-                    ExitStack() as stack
-                ):  # the consumer may have closed the path and released its generations
+                # Hold the generations: the consumer may close the path, which releases `taken`.
+                with ExitStack() as stack:
                     for opened in taken:
                         stack.enter_context(opened.taken())
                     part = ask(start, end)
@@ -245,12 +254,12 @@ def _terms(
     radius_model: str | None = None,
     stop: StopFlag = NO_STOP,
 ) -> tuple[SceneData, QueryBudget]:
-    """Return what a question with these options reads, and what it may cost."""
+    """Return the scene data and the budget of a request with these options."""
     budget = make_budget(tolerance, budget_ms, budget_visits, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
     return with_stop(data, budget.stop), budget
 
 
 def _count(rows: ArrayLike) -> int:
-    """Return how many rows an argument has; 0 for one that the question is about to refuse."""
+    """Return the number of rows of an argument; 0 for one that has no length."""
     return len(rows) if isinstance(rows, Sized) else 0

@@ -114,8 +114,8 @@ def search_front_to_back(
                 break
             rows = _next_rows(data, lists, cursor, open_)
             if doubts is None and unproved and bounds.unsettled(rows, unproved).any():
-                # By the boxes of the index they may be out of reach: restart with those boxes, and
-                # finally examine the voxels that they exclude.
+                # By the boxes of the index, unproved voxels may be out of reach: restart with those
+                # boxes, and finally examine the voxels that they exclude.
                 doubts = lists
                 _forget(part)
                 lists = _list(data, index_tree, *ways, reach_units, radius_units, part)
@@ -230,9 +230,9 @@ def _next_rows(
 ) -> NDArray[np.int64]:
     """Return the voxels to hold in the next round.
 
-    These are the voxels needed next, those of most rays first, and then resident voxels needed
-    later. At least one of the former fits, because the cache can hold every single voxel;
-    therefore each round makes progress.
+    First come the next voxels of the unfinished rays, in descending order of the number of rays,
+    then resident voxels that are needed later. At least one of the former fits, because the cache
+    can hold every single voxel. Each round therefore makes progress.
     """
     v = len(data.arrays.where)
     wanted = np.bincount(lists.rows[cursor[open_]], minlength=v)

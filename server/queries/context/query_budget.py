@@ -1,4 +1,4 @@
-"""What a query may cost, what it has cost, and its answer once it was stopped.
+"""Budget and cost of a query, and the answer of a query that was stopped.
 
 Every query takes a `QueryBudget`. Without a limit the work ends when the answer is exact, or known
 within the tolerance. With a limit it also ends when the budget is spent; the answer is then still
@@ -35,15 +35,15 @@ GRACE = 0.05
 class QueryBudget(NamedTuple):
     """Limits on the cost of one request.
 
-    tolerance: separation at which contact may already be reported, and largest distance between
-    bounds [m]. The default 0 means exact, because no search that may stop early is as fast
+    tolerance: separation up to which contact may be reported, and allowed distance between bounds
+    [m]. The default 0 means exact, which is faster than every search that may stop early
     (`solidcloud accuracy`).
-    visits: node visits a pose (ray, point, motion).
+    visits: limit of node visits a pose (ray, point, motion).
     deadline: on time.perf_counter()'s clock [s], inf for none.
     scan: voxels are used in passing, as on a sweep along a path, and should not displace others in
     the cache (eviction.py).
-    share: of the cache, for the voxels held at a time. If not all fit, work counts depend on it;
-    verdicts never do.
+    share: share of the cache for the voxels held at a time. If not all fit, work counts depend on
+    it; verdicts never do.
     stop: ends the work early once it is set; what was not examined by then is unknown.
     """
 
@@ -123,12 +123,12 @@ class CostCounter:
     def __init__(self, begin: float, residency: VoxelCache, keys: NDArray[np.uint64]) -> None:
         """Begin with zero cost.
 
-        begin: start time on time.perf_counter()'s clock [s].  keys: (v,) of the voxels, by their row
-        in the index.
+        begin: start time on time.perf_counter()'s clock [s].  keys: (v,) of the voxels, by their
+        row in the index.
         """
         self.begin, self._residency, self._keys = begin, residency, keys
         self.hits = self.misses = 0
-        self.loaded = 0  # voxels the request itself has loaded for later holds: they are no hits
+        self.loaded = 0  # voxels that the request loaded for later holds, which do not count as hits
         self.waited = 0.0
         self.faults: dict[str, None] = {}
         self.late: dict[int, None] = {}

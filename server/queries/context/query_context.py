@@ -1,10 +1,10 @@
 """Context of every query: the scene data it reads, checked poses, and its voxels in reach.
 
-An answer relies on the index only where a load has proved it. A voxel whose cell is in reach, but by
-its box in the index is not, is therefore loaded first (`find_proved_reach`). If its record agrees
-with the index (index_proof.py), the voxel is not examined, and every answer and work count is that
-of the index. If the record cannot be read, the voxel stays in reach and is missing. Each voxel
-therefore costs at most one additional load, even if nothing comes near its points.
+An answer relies on the index only where a load has proved it. If the cell of a voxel is in reach
+and its box in the index is not, the voxel is loaded first (`find_proved_reach`). If its record
+agrees with the index (index_proof.py), the voxel is not examined, and every answer and work count
+is that of the index. If the record cannot be read, the voxel stays in reach and is missing. Each
+voxel therefore costs at most one additional load, even if nothing comes near its points.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,8 +30,8 @@ from ...residency.voxel_cache import VoxelCache
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .query_budget import CostCounter, QueryBudget
 
-# Most voxels in reach of one request, over all poses: 128 MB of row numbers. For 100,000 poses
-# whose reach covers thousands of voxels, there would be gigabytes.
+# Limit on the voxels in reach of one request, summed over its poses: 128 MB of row numbers. Without
+# it, 100,000 poses with thousands of voxels in reach each would take gigabytes.
 MAX_ROWS = 1 << 24
 # Rows processed between two checks of the stop flag.
 _ROWS_AT_ONCE = 1 << 18
@@ -70,10 +70,10 @@ class SceneData(NamedTuple):
     arrays: what the kernels read.  bounds: boxes around the points of each voxel.
     broad: the index of `bounds`, which the broad phase reads.
     radius_units: of the largest sphere of a scan point, exact units.
-    unknown: (u, 2, 3) int64, lattice boxes of scans left out.
-    unknown_everywhere: whether a scan was left out whose bounds are not known.
-    keeps_scan: whether the arena holds the scan that each point came from.
-    coarse: coarse bounds of voxels that are not in memory; None if there are none.
+    unknown: (u, 2, 3) int64, lattice boxes of scans that the build left out.
+    unknown_everywhere: whether the build left out a scan with unknown bounds.
+    keeps_scan: whether the arena stores the scan of each point.
+    coarse: coarse bounds of voxels that are not in memory; None if the scene has none.
     """
 
     residency: VoxelCache
@@ -90,7 +90,7 @@ class SceneData(NamedTuple):
     def nothing_clear(self) -> bool:
         """Return whether no place is known to be clear.
 
-        This is so if a scan with unknown bounds was left out, or a load proved the index wrong.
+        True if a scan with unknown bounds was left out, or a load proved the index wrong.
         """
         return self.unknown_everywhere or self.residency.misled
 
@@ -122,7 +122,8 @@ def make_scene_data(
 ) -> SceneData:
     """Make the data of an archive whose voxels `residency` holds, with the archive's single radius.
 
-    bounds: those of its voxels if they are shared; None: new ones. Loads prove them from now on.
+    bounds: proved bounds shared with other data of the archive; None: new ones. Each load from now
+    on proves the bounds of its voxel.
     """
     bounds = ProvedBounds(archive) if bounds is None else bounds
     residency.on_proved = bounds.prove
@@ -243,7 +244,7 @@ def find_proved_reach(
     """Return the reach of poses (k, 4, 4) with only voxels that are proved or unreadable.
 
     Otherwise the same as `check_request`, errors included.
-    settled: removes pairs that need not be examined from a reach.
+    settled: function that removes pairs of pose and voxel that need not be examined from a reach.
     """
     bounds, stop = data.bounds, budget.stop
     unproved = bounds.unproved

@@ -121,12 +121,12 @@ def test_a_sweep_defaults_to_a_micrometre():
     ],
 )
 def test_as_many_of_each_are_expected(kind, values):
-    with pytest.raises(BadRequestError, match="as many of each"):
+    with pytest.raises(BadRequestError, match="equal numbers"):
         kind(**values)
     raw = {
         name: value.tobytes() if isinstance(value, np.ndarray) else value for name, value in values.items()
     }
-    with pytest.raises(BadRequestError, match="as many of each"):
+    with pytest.raises(BadRequestError, match="equal numbers"):
         decode_request(kind, msgspec.msgpack.encode(raw))
 
 

@@ -92,7 +92,7 @@ def test_a_pose_that_is_not_rigid_is_refused(whole: Path, pose: NDArray[np.float
     [
         (
             "pwrite_all",
-            ": No space left on device: the voxels that boxes cut are kept there: make room, or set",
+            ": No space left on device: rebuilt voxels of the effect `through` are stored there: free disk",
         ),
         ("read_points", r"voxel \(.*\): cannot be read \(No space left on device\)"),
     ],

@@ -1,8 +1,8 @@
-"""List of the metrics of a scene, by which a monitoring system sees the numbers of `stats`.
+"""Table of the metrics that a monitoring system reads: the figures of `stats`.
 
 Each is a field of `StatsAnswer`, or of `UserStats` for each user. To add a metric, add the field in
-schemas/wire/stats.py, count it in request_stats.py or server/residency/cache_stats.py, and add a row
-here. prometheus_export.py serves the list.
+schemas/wire/stats.py, count it in request_stats.py or server/residency/cache_stats.py, and add a
+row here. prometheus_export.py serves the list.
 """
 
 from typing import Literal, NamedTuple
@@ -11,8 +11,8 @@ from typing import Literal, NamedTuple
 class Metric(NamedTuple):
     """One metric.
 
-    kind: of Prometheus.  name: without the prefix `solidcloud_`.  text: for its help.
-    field: the field of `StatsAnswer`, or of `UserStats`.
+    kind: type in Prometheus.  name: without the prefix `solidcloud_`.  text: help text.
+    field: field of `StatsAnswer`, or of `UserStats`.
     """
 
     kind: Literal["gauge", "counter", "histogram"]

@@ -24,8 +24,8 @@ except ModuleNotFoundError as missing:
 
 log = logging.getLogger(__name__)
 
-# With more users than this there are no metrics per user: the monitoring system would keep one
-# series per client forever, long after the client is gone.
+# With more users there are no metrics per user, because a monitoring system keeps the series of
+# every client that ever connected.
 MAX_USERS_LISTED = 10
 
 _FAMILIES: dict[str, Any] = {

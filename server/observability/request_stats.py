@@ -1,6 +1,6 @@
 """Request statistics: counts and times, per user and in total.
 
-Every request is counted here. Therefore counting is a few additions under a lock, and percentiles
+Every request is counted here. Counting is therefore a few additions under a lock, and percentiles
 are computed only when statistics are read.
 """
 
@@ -23,8 +23,8 @@ from ...schemas.wire.stats import TIME_BOUNDS, Times, UserStats
 # Maximum number of users (pairs of client and avatar) kept: 2 kB each, and one row each in the
 # answer of `stats`.
 MAX_USERS = 256
-# Number of buckets between two of TIME_BOUNDS, which are a factor 2 or 2.5 apart: each bucket is
-# 10 % wide.
+# Number of buckets between two consecutive TIME_BOUNDS, by their ratio (2 or 2.5), so that each
+# bucket is 10 % wide.
 _STEPS = {2.0: 7, 2.5: 10}
 _UNKNOWN = int(Verdict.UNKNOWN)
 
@@ -83,9 +83,9 @@ class Histogram:
         self.max = max(self.max, other.max)
 
     def percentiles(self, *shares: float) -> list[float]:
-        """Return the percentile [s] of each share, in ascending order from 0 to 1.
+        """Return the percentiles [s] for shares from 0 to 1 in ascending order.
 
-        A percentile is at most 10 % above the true one. It is 0 if it is at most a microsecond, and
+        A percentile is at most 10 % above the true one. It is 0 if it is at most a microsecond, or
         if the histogram is empty.
         """
         found: list[float] = []
@@ -160,7 +160,7 @@ class Counts:
 
 
 class _UserCounts(Counts):
-    """Counters of one user. seen: time of its last answer, by the clock of its `RequestStats` [s]."""
+    """Counters of one user. seen: time of its last answer, on the clock of `RequestStats` [s]."""
 
     __slots__ = ("seen",)
 
@@ -181,8 +181,8 @@ class StatsTotals(NamedTuple):
 class RequestStats:
     """Counters of one scene. Thread-safe.
 
-    At most MAX_USERS users have counters of their own. A new user replaces the least recently
-    active one, whose counts remain in the total.
+    At most MAX_USERS users have separate counters. A new user replaces the least recently active
+    one, whose counts remain in the total.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -190,11 +190,11 @@ class RequestStats:
         self._clock = clock
         self._lock = threading.Lock()
         self._users: OrderedDict[tuple[str, str], _UserCounts] = OrderedDict()  # least recently active first
-        self._gone = Counts()  # of users without counters of their own
+        self._gone = Counts()  # of users without separate counters
         self._engine, self._loads = Histogram(), Histogram()
 
     def answered(self, client: str, avatar: str, answers: Cost) -> None:
-        """Count an answered request of a client about an avatar; "": about none or several."""
+        """Count an answered request of a client about an avatar; "" for no avatar or several."""
         verdict: Any = getattr(answers, "verdict", None)
         count = unknown = 0
         if verdict is not None:

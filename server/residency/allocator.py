@@ -21,11 +21,11 @@ Which = Callable[[int], bool]
 # makes the cost of a load independent of the number of resident voxels: searching 64 runs takes
 # some 20 µs.
 AROUND = 32
-# The same distance in bytes, as a multiple of the requested size. A large voxel may replace many
-# small ones, and loading it takes long enough to justify the longer search.
+# Bytes on either side that are searched in addition, as a multiple of the requested size. A large
+# voxel may replace many small ones, and loading it takes long enough to justify the longer search.
 AROUND_SIZES = 16
-# Victims that one search finds beyond those it needs. A search skips all pinned voxels at the front
-# of the policy's order, so it is not repeated for each victim.
+# Number of victims that a search finds beyond those it needs. Every search skips the pinned voxels
+# at the front of the policy's order again, so it is not repeated for each victim.
 SPARE_VICTIMS = 32
 # Share of the buffer that may be evicted beyond the requested bytes before all runs are searched.
 SLACK = 1 / 32
@@ -67,10 +67,11 @@ class VoxelAllocator:
 
         Return whether the voxel has a run now.
         may_evict, may_move: whether the voxel of a row may be evicted or moved.
-        gone: called with each evicted row.  most: rows examined to find victims; None: all.
+        gone: called with each evicted row.  scan: see `EvictionPolicy.added`.
+        most: limit of rows examined to find victims; None: all rows.
         Nothing is evicted if evicting everything allowed would free too few bytes. If free bytes
-        are fragmented, more voxels are evicted than the size requires; if voxels that must stay lie
-        between the free runs, voxels may be evicted and the allocation still fail.
+        are fragmented, more voxels are evicted than the size requires. If voxels that must stay lie
+        between the free runs, the allocation may fail although voxels were evicted.
         """
         size = self.sizes[row]
         offset = self.buffer.allocate(size)
@@ -90,8 +91,8 @@ class VoxelAllocator:
         """Evict and move voxels for a run of `size` bytes; return its offset, or None on failure.
 
         See `allocate` for the parameters. Free runs are joined around the last victim and around
-        the largest free run. While that yields too little, more voxels are evicted, up to SLACK of
-        the buffer; then all runs are searched.
+        the largest free run. While that does not suffice, more voxels are evicted, up to SLACK of
+        the buffer. After that, all runs are searched.
         """
         found = self._select_victims(size, may_evict, most)
         if found is None:
@@ -121,9 +122,9 @@ class VoxelAllocator:
     def _select_victims(
         self, size: int, may_evict: Which, most: int | None
     ) -> tuple[list[int], deque[int]] | None:
-        """Select the voxels to evict for a run of `size` bytes, in order, and some further ones.
+        """Select the voxels to evict for a run of `size` bytes, in order, and SPARE_VICTIMS more.
 
-        Return None if all voxels that may be evicted are too small together.
+        Return None if all voxels that may be evicted free too few bytes together.
         """
         free, found = self.buffer.total_bytes - self.used_bytes, list[int]()
         candidates = filter(may_evict, islice(self.policy.victims(), most))
@@ -168,7 +169,8 @@ class VoxelAllocator:
         low = self._end(some.start - 1) if some.start else 0
         high = self._runs[some.stop][0] if some.stop < len(self._runs) else self.buffer.total_bytes
         best, moves = None, 0
-        begin, at, free, held = 0, low, 0, 0  # stretch from run `begin` on; free and used bytes in it
+        # The stretch begins at run `begin`; `free` and `held` are its free and used bytes.
+        begin, at, free, held = 0, low, 0, 0
         first = low
         for number, (offset, row) in enumerate([*runs, (high, -1)]):
             free += offset - at
@@ -213,7 +215,8 @@ class VoxelAllocator:
         ctypes.memmove(self._address + to, self._address + offset, size)
         self.buffer.release(offset, size)
         self.buffer.take(to, size)
-        self._runs[bisect.bisect_left(self._runs, (offset, row))] = (to, row)  # the order stays
+        # The order of the runs stays, because a voxel moves into the free bytes before it.
+        self._runs[bisect.bisect_left(self._runs, (offset, row))] = (to, row)
         self.offsets[row] = to
         shift = offset - to
         self.where[row] -= (shift // 4, shift // 4, shift // 2)

@@ -12,9 +12,10 @@ ALIGNMENT = 64  # a cache line: a row of the arena straddles as few cache lines 
 class ArenaBuffer:
     """Best-fit allocator of a buffer of fixed size.
 
-    A run is a contiguous range of bytes. Of the shortest free runs that suffice, the first is used.
-    arena: the views that kernels read. The system commits pages when they are first written, so a
-    large budget costs nothing until it is used.
+    A run is a contiguous range of bytes. An allocation takes the shortest free run that suffices;
+    of equals, the one at the lowest offset.
+    arena: array views that kernels read. The system commits pages when they are first written, so a
+    large budget takes no memory until it is used.
     """
 
     def __init__(self, budget_bytes: int) -> None:
@@ -31,7 +32,7 @@ class ArenaBuffer:
 
     @staticmethod
     def rounded(size: int) -> int:
-        """Return the bytes that a run of `size` takes."""
+        """Return the bytes that a run of `size` bytes takes: whole cache lines."""
         return -(-size // ALIGNMENT) * ALIGNMENT
 
     def allocate(self, size: int) -> int | None:

@@ -41,9 +41,9 @@ LARGEST_CLASS = LOCAL_MASK << CLASS_SHIFT
 class CoarseBounds:
     """Coarse bounds of one scene's voxels. Thread-safe.
 
-    Slots are never evicted or overwritten: once all are taken, further voxels get none. A voxel
-    without a slot costs a load; overwriting a slot would cost a lock, because kernels read slots
-    without one.
+    Slots are never evicted or overwritten: once all are taken, further voxels get no slot. A voxel
+    without a slot has to be loaded. Overwriting slots would require a lock, and kernels read slots
+    without a lock.
 
     arrays: what kernels read.  bytes: size of the arrays, constant and at most the budget.
     """
@@ -102,12 +102,12 @@ class CoarseBounds:
             self._write(row, number, arena, int(where[0]), 0)
 
     def store_from_archive(self, store: VoxelStore, row: int) -> None:
-        """Store the coarse bounds of a voxel of the archive, as `store_from_arena`, without points.
+        """Read the nodes of a voxel from the archive, without points, and store its coarse bounds.
 
         The radius class of a node is computed from its points. If the archive has radius classes,
         these bounds therefore assume the largest class, and prove slightly less than those stored
         by `store_from_arena`.
-        Raise CorruptError or OSError as `VoxelStore.load` does; the voxel then has no slot, and the
+        Raise CorruptError or OSError as `VoxelStore.load` does. The voxel then has no slot, and the
         call may be repeated.
         """
         number = self._take(row)
@@ -121,7 +121,10 @@ class CoarseBounds:
         self._write(row, number, arena, 0, LARGEST_CLASS if store.archive.header.radius_class else 0)
 
     def _take(self, row: int) -> int:
-        """Assign a slot to a voxel; return -1 if it has or is being given one, or none is free."""
+        """Assign a slot to a voxel and return its number.
+
+        Return -1 if the voxel has a slot, another thread is writing it, or no slot is free.
+        """
         with self._lock:
             if not self._has_free_slot or self.arrays.slot[row] >= 0 or row in self._making:
                 return -1
@@ -146,9 +149,8 @@ class CoarseBounds:
         except BaseException:
             self._give_back(row, number)
             raise
-        # The interpreter's lock is released and this lock is taken between the writes above and
-        # below. A thread that sees the slot's number, by which it finds the rows, therefore sees
-        # the rows too.
+        # Taking this lock orders the writes above before those below. A thread that sees the slot's
+        # number, by which it finds the rows, therefore sees the rows too.
         with self._lock:
             self.arrays.count[number] = count
             self.arrays.slot[row] = number

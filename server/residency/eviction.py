@@ -2,8 +2,7 @@
 
 A policy uses no threads, no clock and no voxel data: `VoxelCache` calls it under its lock, and
 scripts/simulate_cache replays traces with the same objects. A policy does not know about pins or
-predictions. Its caller does: `victims` yields every resident row, and the caller skips those in
-use.
+prefetches: `victims` yields every resident row, and the caller skips those that must stay.
 """
 
 from collections import OrderedDict, deque
@@ -19,10 +18,10 @@ POLICIES = ("lru", "lru+prefetch", "distance", "s3fifo")
 
 # Share of the budget that scans may fill while other requests need room. Scans are sweeps along a
 # path, and requests right after a teleport. Without a limit, one sweep through the archive evicts
-# the voxels around every user. The share equals that of S3-FIFO's small queue. Ten sweeps in five
-# minutes beside eight strollers, `scripts/simulate_cache --sweeps 10 --kinds stroll` in a town of
-# 4e7 points: the strollers miss 362 voxels, 440 if sweeps are not marked as scans, and 326 without
-# sweeps.
+# the voxels around every user. The share equals that of S3-FIFO's small queue. Measured with
+# `scripts/simulate_cache --sweeps 10 --kinds stroll`, ten sweeps in five minutes beside eight
+# strolling users in a town of 4e7 points: these users miss 362 voxels, 440 if sweeps are not marked
+# as scans, and 326 without sweeps.
 SCAN_SHARE = 0.1
 # S3-FIFO: the small queue's share of the budget, and the largest use count, two bits ([Yang23]).
 SMALL_SHARE = 0.1
@@ -62,15 +61,15 @@ class EvictionPolicy(Protocol):
 
 
 def prefetches(name: str) -> bool:
-    """Return whether voxels are prefetched under this policy: all but `lru`, that of [Fig12]."""
+    """Return whether voxels are prefetched under this policy: True for all but `lru` ([Fig12])."""
     return name != "lru"
 
 
 def make_policy(name: str, budget_bytes: int, path_distances: PathDistances | None = None) -> EvictionPolicy:
     """Make an empty policy by its name.
 
-    nearness: required by `distance`, see `FarthestFirst`.
-    Raise BadRequestError for an unknown name, ValueError for `distance` without nearness.
+    path_distances: required by `distance`, see `FarthestFirst`.
+    Raise BadRequestError for an unknown name, ValueError for `distance` without path_distances.
     """
     if name in ("lru", "lru+prefetch"):
         return Lru(budget_bytes, name)
@@ -79,7 +78,7 @@ def make_policy(name: str, budget_bytes: int, path_distances: PathDistances | No
     if name != "distance":
         raise BadRequestError(f"policy {name!r}: expected one of {', '.join(POLICIES)}")
     if path_distances is None:
-        raise ValueError("policy distance: needs to know how near rows are to users")
+        raise ValueError("policy distance: expected path_distances, the function that measures rows: pass it")
     return FarthestFirst(path_distances)
 
 
@@ -97,7 +96,7 @@ class Lru:
         self._order: OrderedDict[int, int] = (
             OrderedDict()
         )  # row -> bytes, of all rows; least recently used first
-        self._scans: OrderedDict[int, int] = OrderedDict()  # the rows that only scans have used
+        self._scans: OrderedDict[int, int] = OrderedDict()  # the same, of rows used by scans only
         self._scan_bytes = 0
         self._max_scan_bytes = int(budget_bytes * SCAN_SHARE)
 
@@ -151,8 +150,8 @@ class FarthestFirst:
     def __init__(self, path_distances: PathDistances) -> None:
         """Begin without rows.
 
-        nearness: maps rows to the least distance (n,) float64 of each from any user's predicted
-        path [m]; inf without users.
+        path_distances: function that maps rows to the distance (n,) float64 of each from the
+        nearest predicted path of a user [m]; inf without users.
         """
         self._nearness = path_distances
         self._at: dict[int, int] = {}  # row -> its position in the arrays
@@ -191,7 +190,7 @@ class FarthestFirst:
         farthest = np.flatnonzero(far == far.max())
         first = int(rows[farthest[np.argmin(used[farthest])]])
         yield first
-        # A caller that continues could not evict the first rows; it seldom needs more than a few.
+        # The first rows may be in use, and the caller continues, seldom by more than a few rows.
         least = (
             np.partition(far, count - SORTED_ROWS)[count - SORTED_ROWS] if count > SORTED_ROWS else -np.inf
         )
@@ -224,7 +223,7 @@ class _Queues:
         return size
 
     def move_used(self) -> None:
-        """Move used rows until the next victim is at the front of its queue, as in algorithm 1."""
+        """Move used rows until the next victim is at the front of its queue ([Yang23] alg. 1)."""
         while self.small or self.main:
             if self.small and (self.small_bytes >= self.max_small_bytes or not self.main):
                 row = next(iter(self.small))

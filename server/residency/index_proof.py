@@ -1,9 +1,9 @@
-"""Bounding boxes of voxels: those in the index, used once a voxel's record has proved them.
+"""Proved bounding boxes of voxels: a box of the index is used once the voxel's record proves it.
 
 The broad phase does not read a voxel if the box around its points is out of reach. The index stores
-this box, but an index may be forged: its checksum proves only that it is the index that was
-written. A voxel's grid cell cannot be wrong, because a record with a point outside its cell is
-rejected. The broad phase therefore uses the cell as the voxel's box until the record has been
+this box, but an index may be forged: its checksum only proves that the index was not altered after
+it was written. A voxel's grid cell cannot be wrong, because a record with a point outside its cell
+is rejected. The broad phase therefore uses the cell as the voxel's box until the record has been
 loaded and matches the index. From then on it uses the box in the index, even after the voxel is
 evicted.
 """
@@ -32,7 +32,7 @@ class ProvedBounds:
     index of a proved one. A box only shrinks, one number at a time; a reader without the lock may
     see some of its numbers before the change and some after it.
     index_boxes: the boxes in the index, proved or not.
-    proved: (v,) bool, the voxels whose record has its points where the index places them.
+    proved: (v,) bool, voxels whose record contains no point outside its box in the index.
     unproved: the number of voxels not proved. Read it before `index`, and pass it to `unsettled`
     afterwards.
     """
@@ -54,7 +54,7 @@ class ProvedBounds:
         self._trees: tuple[VoxelTree, VoxelTree] | None = None
 
     def prove(self, row: int) -> None:
-        """Mark a voxel as proved: its record has its points where the index places them."""
+        """Mark a voxel as proved: its record matches its box in the index."""
         if self.proved[row]:
             return
         low, high = self.index_boxes.low[row], self.index_boxes.high[row]
@@ -69,10 +69,10 @@ class ProvedBounds:
             self.proved[row] = True  # last: `unsettled` reads it first
 
     def unsettled(self, rows: _Int64, unproved: int) -> NDArray[np.bool_]:
-        """Return (n,) bool: which of n rows may have been read with a box not from the index.
+        """Return the mask (n,) of rows whose box may have been read before it was the index's.
 
-        unproved: its value before the boxes were read. A voxel proved since then is included: its
-        box may have been read while it changed.
+        unproved: its value before the boxes were read. A voxel proved since then is included,
+        because its box may have been read while it changed.
         """
         found = ~self.proved[rows]
         # `prove` decrements `unproved` before it sets `proved`.

@@ -21,7 +21,7 @@ LOADS_WITHOUT_TURN = 4
 
 
 class LoadTurn:
-    """One request's turn, or its place in the queue."""
+    """Turn of one request, or its place in the queue. come: set when the turn begins."""
 
     __slots__ = ("come",)
 
@@ -60,7 +60,7 @@ class LoadTurns:
             if turn in self._queue:
                 self._queue.remove(turn)
                 return None
-        return turn  # granted at the last moment
+        return turn  # granted between the last wait and the deadline
 
     def give_back(self, turn: LoadTurn | None) -> None:
         """End a turn; do nothing for None or a turn that has ended or was superseded."""

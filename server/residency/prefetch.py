@@ -21,17 +21,17 @@ from .voxel_cache import VoxelCache
 
 log = logging.getLogger(__name__)
 
-# The least time between two plans [s]: at 5 m/s a user moves a quarter of a metre in it. With very
-# many users a plan takes longer, and the pause after it is PLAN_REST times as long as it took: 64
-# users take 0.2 ms, 512 take 3 ms (scripts/bench_cache), most of it without the interpreter's lock.
+# Least time between two plans [s], in which a user at 5 m/s moves a quarter of a metre. The pause
+# after a plan is also at least PLAN_REST times the plan's duration: 0.2 ms for 64 users, 3 ms for
+# 512 (scripts/bench_cache), most of it without the interpreter's lock.
 PLAN_SECONDS, PLAN_REST = 0.05, 10.0
 # The voxels of a user are kept for this long after its last pose [s]. A voxel whose prefetch failed
 # is not prefetched again for as long.
 SILENCE = 10.0
 # The longest pause [s].
 MAX_REST = 0.25
-# A pause between pieces of idle work is this many times as long as the work: much of it is Python
-# code, and requests wait for the interpreter's lock meanwhile.
+# A pause between pieces of idle work is this many times as long as the work, because requests wait
+# for the interpreter's lock during its Python code.
 IDLE_REST = 4.0
 # Share of the budget that is kept for users' current positions; the rest is available to all
 # requests.

@@ -35,15 +35,19 @@ class VoxelCache:
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
     on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
     on_loaded: called with the row and the runs of each loaded voxel, by the loading thread, before
-    the voxel is visible to other threads.  on_proved: called before that too, with the row.
-    on_load_time: called afterwards with the duration of the load [s].
+    the voxel is visible to other threads.
+    on_proved: called at the same point with the row of a voxel that matches the index.
+    on_load_time: called after each load with its duration [s].
     stats: counts of the cache, written under its lock.
-    misled: whether a loaded record has points that the index places elsewhere. The index selects
-    the voxels of a query; once it is wrong, it is unknown which voxels it failed to select.
+    misled: whether a loaded record contradicts the index. The index selects the voxels of a query;
+    once it is wrong, it may have failed to select any voxel.
     """
 
     def __init__(self, store: VoxelStore, budget_bytes: int, policy: EvictionPolicy | None = None) -> None:
-        """Reserve the budget; BadRequestError if one voxel exceeds it. policy: `lru` by default."""
+        """Reserve `budget_bytes` for the voxels of `store`. policy: None for `lru`.
+
+        Raise BadRequestError if the largest voxel exceeds the budget.
+        """
         largest = ArenaBuffer.rounded(int(store.sizes.max(initial=0)))
         if budget_bytes < largest:
             raise BadRequestError(
@@ -136,10 +140,12 @@ class VoxelCache:
         """Load the voxels of distinct rows; pin them inside a `with` that yields `HeldVoxels`.
 
         Together they must fit in the budget. Unreadable voxels stay at -1 in `where` and are named
-        in the result's faults; all others are resident. deadline: on time.perf_counter()'s clock
-        [s]; voxels not resident by then are `late`. No load begins after it; one that has begun is
-        finished.  scan: the voxels are used in passing and should not displace those that others
-        use repeatedly (eviction.py).  stop: setting it has the effect of the deadline.
+        in the result's faults; all others are resident.
+        deadline: on time.perf_counter()'s clock [s]. Voxels that are not resident by then are
+        `late`. No load begins after it; a load that has begun is finished.
+        scan: the voxels are used in passing and should not displace those that others use
+        repeatedly (eviction.py).
+        stop: setting it has the effect of the deadline.
         """
         return Hold(self, rows, deadline, scan, stop)
 
@@ -187,7 +193,7 @@ class VoxelCache:
         states = self._states
         mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
         if settled:
-            return HeldVoxels(len(rows), 0, ())  # all are resident, and the pins keep them so
+            return HeldVoxels(len(rows), 0, ())  # all are resident and pinned
         try:
             wanted = mine
             while True:
@@ -242,10 +248,14 @@ class VoxelCache:
     ) -> tuple[list[int], int, bool, bool]:
         """Pin all rows and make room for those that this caller is to load.
 
-        Return the rows to load, none without room before the deadline; how many others are resident
-        or being loaded (a voxel with a fault is neither); whether some are being loaded; and
-        whether all are resident: if not, `_waiting_requests` counts this request. No pins if this
-        raises.
+        Return
+
+        - the rows to load; none if there is no room before the deadline,
+        - the number of other rows that are resident or being loaded (not those with a fault),
+        - whether other threads are loading some of the rows,
+        - whether all rows are resident. If not, `_waiting_requests` counts this request.
+
+        If this raises, nothing is pinned.
         """
         taken = self.bytes_of(rows)
         if taken > self.buffer.total_bytes:
@@ -338,7 +348,7 @@ class VoxelCache:
             if self.on_proved is not None:
                 self.on_proved(row)
             if self.on_loaded is not None:
-                self.on_loaded(row, where)  # now: it may be evicted once it is visible to others
+                self.on_loaded(row, where)  # before `end_load`, after which it may be evicted
         except CorruptError as error:
             fault, corrupt = str(error), True
             self.misled |= isinstance(error, MisleadingIndexError)
@@ -373,10 +383,12 @@ class VoxelCache:
     def load_in_background(
         self, row: int, may_evict: Callable[[int], bool], *, owed: bool = False
     ) -> BackgroundLoad:
-        """Load a voxel that no request waits for; unless it is owed, once no request waits at all.
+        """Load a voxel that no request waits for.
 
-        may_evict: whether a voxel, neither used nor at a user's position, may be evicted for it.
-        owed: whether a request asked for it. Raise load errors that are no faults of the record.
+        Unless it is owed, wait first until no request waits for any voxel.
+        may_evict: whether a voxel that is neither in use nor at a user's position may be evicted.
+        owed: whether an earlier request needed the voxel. Raise errors of the load that are not
+        faults of the record, such as MemoryError.
         """
         with self._changed:
             if not owed:

@@ -1,4 +1,4 @@
-"""States of the voxels of a cache: pinned, being loaded, abandoned, owed, faulty; bytes for a load.
+"""States of the voxels of a cache (pinned, loading, abandoned, owed, faulty) and their allocation.
 
 Not thread-safe: `VoxelCache` calls it under its lock.
 """
@@ -24,8 +24,9 @@ class VoxelStates:
     A voxel whose bytes are allocated is resident, unless it is in `loading`.
 
     pins: row -> number of holds, for held rows.  loading: rows whose load has not ended.
-    abandoned: rows in `loading` that a request left at its deadline; one that waits takes over the
-    load.  owed: rows that a request did not get by its deadline, the earliest first.
+    abandoned: rows in `loading` whose request reached its deadline before the load began. Another
+    request that waits for the row does the load.
+    owed: rows that a request did not get by its deadline, in order of deadlines.
     is_owed_free: whether the last hold on an abandoned voxel whose load is owed has ended.
     kept: rows at users' positions, evicted only if a request would not fit otherwise.
     where, policy: see `VoxelCache`.  sizes: bytes of each row in the arena.
@@ -51,8 +52,8 @@ class VoxelStates:
         self.kept: frozenset[int] = frozenset()
         self._describe = describe
         self._faults: dict[int, str] = {}  # of corrupt records: permanent
-        # Temporary faults. A voxel with one is read again only after all holds on it have ended: it
-        # never becomes resident while a kernel runs that began without it.
+        # Temporary faults. The voxel is read again only after all holds on it have ended, so that
+        # it never becomes resident during a kernel call that began without it.
         self._temporary_faults: dict[int, str] = {}
 
     def fault(self, row: int) -> str:
@@ -75,7 +76,11 @@ class VoxelStates:
         return not (self._faults or self._temporary_faults) or not any(map(self.fault, rows))
 
     def settled(self, rows: Sequence[int]) -> bool:
-        """Return whether none of these is being loaded, or a load was left to this caller."""
+        """Return whether a waiting request can continue.
+
+        True if none of these rows is being loaded, or one of them is abandoned and this caller
+        may load it.
+        """
         loading = [row for row in rows if row in self.loading]
         return not loading or any(row in self.abandoned for row in loading)
 
@@ -113,7 +118,7 @@ class VoxelStates:
     def take_owed(self) -> int | None:
         """Return the voxel whose load has been owed longest; None if no load is owed."""
         for row in list(self.owed):
-            if row in self.abandoned:  # a waiting request may load it; if none does, it is owed again
+            if row in self.abandoned:  # a waiting request may still load it
                 continue
             del self.owed[row]
             if row not in self.allocator.offsets and not self.fault(row):

@@ -64,7 +64,7 @@ class VoxelStore:
     ) -> NDArray[np.int64]:
         """Lay out a voxel like `load`, from frames already read with `Archive.read_frames`.
 
-        Separate so that the benchmark can time it.
+        Return the offsets of its runs (3,) int64. Raise CorruptError.
         """
         record = self.archive.open_voxel(row, frames, self._columns)
         leaves = record.leaves

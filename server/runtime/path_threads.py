@@ -18,7 +18,7 @@ class PathThreads:
     def __init__(self, scene: str, count: int) -> None:
         """Make the queues without threads; `start` or the first part starts the threads.
 
-        scene: its name.  count: of threads.
+        scene: name of the scene, for messages.  count: number of threads.
         """
         self._scene, self._count = scene, count
         self._queues: OrderedDict[str, deque[_Work]] = OrderedDict()  # the client whose turn is next first
@@ -48,7 +48,7 @@ class PathThreads:
         return future
 
     def close(self) -> None:
-        """Cancel the waiting parts, and wait for those being computed."""
+        """Cancel the waiting parts, and wait for those that are being computed."""
         with self._changed:
             self._closed = True
             waiting = [work for queue in self._queues.values() for work in queue]

@@ -14,8 +14,8 @@ _LARGE_BYTES, _ARENAS = 4 << 20, 2
 def give_back_freed_memory() -> None:
     """Return freed memory to the system, if the allocator is glibc's.
 
-    By itself glibc keeps all free memory below the last block in use: after a thousand avatars of
-    100 KB were dropped, all of theirs.
+    By default glibc keeps all free memory below the last block in use. After a thousand avatars of
+    100 KB each were dropped, it kept all of their memory.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another allocator

@@ -28,7 +28,7 @@ class StopFlag:
     """Flag that the kernels of one request read and any thread may set. Thread-safe; never cleared.
 
     flag: (1,) int64, 0 until it is set; kernels read it without a lock.
-    reason: why it was set, for the answer.
+    reason: reason for which it was set, for the answer; "" until then.
     part_seconds: time limit of one part of an answer in parts [s].
     """
 
@@ -75,7 +75,7 @@ class _Never(StopFlag):
     def set(self, reason: str) -> None:
         """Raise RuntimeError: the flag is shared."""
         raise RuntimeError(
-            f"the stop flag of all requests was to be set ({reason}): make a StopFlag for the request"
+            f"NO_STOP is shared by all requests and cannot be set ({reason}): make a StopFlag for the request"
         )
 
     def part(self) -> StopFlag:
@@ -92,7 +92,7 @@ class StoppedError(Exception):
 
 
 def seconds_to(deadline: float, stop: StopFlag) -> float | None:
-    """Return how long a request may wait before it checks again [s]; None: without limit.
+    """Return how long a request may wait before its next check [s]; None: without limit.
 
     deadline: on time.perf_counter()'s clock [s]. The result is 0 after the deadline or once the
     stop flag is set, and at most 5 ms for a request that can be stopped.

@@ -1,4 +1,4 @@
-"""The client's end of zenoh: batches of requests, the client's id and avatars, sessions.
+"""Client side of zenoh: connection to a server, the client's id and avatars, sessions.
 
 May import server.zenoh_common, server/scene_interface.py, schemas.
 Begin with ../client.py, which uses all of it.

@@ -1,4 +1,4 @@
-"""What a client is to its server: an id with a liveliness token, and the avatars that it added."""
+"""Identity of a client on its server: an id with a liveliness token, and the avatars it added."""
 
 import threading
 import uuid
@@ -15,17 +15,17 @@ from ...schemas.wire.encoding import avatar_digest, decode_answer, encode
 from ...schemas.wire.requests import AddAvatarRequest
 from ...schemas.wire.scene_messages import AvatarInfo
 
-# How long the queries of some operations are kept open [s]: that of a path, whose parts must each
-# arrive within the client's timeout; and that of a reload, which opens an archive and fills a cache
-# at some 100 MB/s.
+# How long the queries of some operations are kept open [s]. Each part of a path must arrive within
+# the client's timeout, but all parts take longer. A reload opens an archive and fills a cache at
+# some 100 MB/s.
 OPEN_SECONDS = {"path": 3600.0, "reload": 600.0}
 
 
 class ClientIdentity:
     """One id of a client, declared until `close`, with the queriers of its operations.
 
-    id: a secret of 122 random bits. Whoever knows it may send queries and motion commands in the
-    client's name, and add avatars to a server that has just started. A client that notices this
+    id: a secret of 122 random bits. A program that knows it may send queries and motion commands in
+    the client's name, and add avatars to a server that has just started. A client that detects this
     takes another id.
     """
 
@@ -36,9 +36,9 @@ class ClientIdentity:
             operation: key_expressions.query_key(scene, self.id, operation)
             for operation in key_expressions.operations()
         }
-        # Declared once: the route of a querier is known, an ad hoc `get` looks it up every time. They
-        # are never undeclared, because another thread may be using one: that raises "Already
-        # borrowed". zenoh undeclares each when its last reference is dropped.
+        # A querier is declared once and keeps its route, which `Session.get` looks up every time.
+        # Queriers are not undeclared explicitly, because that raises "Already borrowed" while
+        # another thread uses one. zenoh undeclares each when its last reference is dropped.
         self.queriers = {
             operation: session.declare_querier(
                 key,
@@ -48,12 +48,12 @@ class ClientIdentity:
             )
             for operation, key in self.keys.items()
         }
-        # The token disappears with this process, however it ends: the server then drops the client's
-        # avatars.
+        # The token disappears with this process, even if it is killed. The server then drops the
+        # client's avatars.
         self._token = session.liveliness().declare_token(key_expressions.client_token_key(scene, self.id))
 
     def close(self) -> None:
-        """Undeclare the id: the server then drops it and its avatars."""
+        """Undeclare the id; the server then drops its avatars."""
         self._token.undeclare()
 
     def is_in(self, key_expression: str) -> bool:
@@ -80,7 +80,7 @@ class AddedAvatar(NamedTuple):
 
 
 class AddedAvatars:
-    """Avatars that a client added, by name: to add them again and to recognize them. Thread-safe."""
+    """Avatars that a client added, by name, with their digests. Thread-safe."""
 
     def __init__(self) -> None:
         """Begin without avatars."""
@@ -111,7 +111,7 @@ class AddedAvatars:
             self._digests.pop(name, None)
 
     def accepted(self, name: str, answer: bytes) -> AvatarInfo:
-        """Return the server's answer to the request that added an avatar, and store the radius."""
+        """Decode the server's answer to the request that added an avatar, and store the radius."""
         info = decode_answer(AvatarInfo, answer)
         avatar = self._avatars.get(name)
         if avatar is not None and name not in self._digests and info.radius is not None:
@@ -119,7 +119,7 @@ class AddedAvatars:
         return info
 
     def known(self, names: Sequence[str]) -> dict[str, AddedAvatar]:
-        """Return the avatars of those of these names that were added."""
+        """Return the avatars that were added under some of these names, by name."""
         with self._lock:
             return {name: self._avatars[name] for name in names if name in self._avatars}
 

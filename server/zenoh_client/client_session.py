@@ -39,12 +39,12 @@ log = logging.getLogger(__name__)
 
 # States stored for `states`: some ten seconds. The oldest are dropped.
 _MAX_STATES = 1024
-# Largest number of a motion command that is followed: it is an int64 in most programs.
+# Largest number of a motion command that `CommandNumbers.follow` accepts. Most programs store it as
+# int64, which must not overflow.
 _MAX_NUMBER = 1 << 62
-# How long a motion command may be without a state before it is sent again, and how long it is sent
-# again [s].
+# Interval at which a motion command without a resulting state is sent again, and for how long [s].
 _REPEAT_SECONDS, _MAX_REPEAT_SECONDS = 1.0, 5.0
-# How often in a row the avatar is added again to a server that refuses its motion commands.
+# Number of consecutive refusals of motion commands after each of which the avatar is added again.
 _MAX_REFUSALS = 100
 
 
@@ -74,9 +74,9 @@ class CommandNumbers:
 class ClientSession:
     """Session of one avatar, made by `Client.session`; a context manager, thread-safe.
 
-    `states` yields the server's states and errors in order, `latest` returns the last one. Without a
-    server no states arrive, and the age of `latest` grows. When a server answers again, the session
-    continues at the pose of the last state.
+    `states` yields the server's states and errors in order, `latest` returns the last one. Without
+    a server no states arrive, and the age of `latest` grows. When a server answers again, the
+    session continues at the pose of the last state.
     """
 
     def __init__(
@@ -94,8 +94,8 @@ class ClientSession:
             connection.anchor,
             lambda: connection.avatars.digests([avatar]),
         )
-        self._publishing = threading.Lock()  # so that motion commands are sent in the order of their numbers
-        self._target: Any = None  # the pose last commanded, until a velocity continues from a state
+        self._publishing = threading.Lock()  # held from numbering to sending, to keep the order
+        self._target: Any = None  # the pose last commanded; None after a velocity
         self._time = 0.0
         self._published = -math.inf  # time of the last one, on the monotonic clock
         self._last: Wish | None = None  # as it was sent
@@ -110,7 +110,7 @@ class ClientSession:
         self._stack: ExitStack | None = None
 
     def _present_user(self) -> key_expressions.User:
-        """Return the user of this session; its client may take another id."""
+        """Return the user of this session under the client's present id."""
         return key_expressions.User(self._connection.client_id, self._avatar)
 
     def __enter__(self) -> Self:
@@ -148,7 +148,7 @@ class ClientSession:
             log.debug("leaving: %s", error)
 
     def _follow_client(self) -> None:
-        """Continue under the client's id if it has taken another. Runs in the receiving thread."""
+        """Continue under the client's new id if it has taken one. Runs in the receiving thread."""
         user = self._present_user()
         if user == self._user:
             return
@@ -264,7 +264,7 @@ class ClientSession:
             if self._latest is None or self._latest.seq < seq:
                 raise BusyError(
                     f"no state of wish {seq} of avatar {self._avatar!r} in scene {self._scene!r} within "
-                    f"{timeout:g} s: no server heard it, or it is behind: wish on"
+                    f"{timeout:g} s: no server received it, or the server is slow: send further commands"
                 )
             return self._latest
 
@@ -281,8 +281,8 @@ class ClientSession:
     def states(self, timeout: float = 5.0) -> Iterator[State]:
         """Yield states in order, until none arrives for `timeout` [s] or the session is closed.
 
-        Of more than 1,024 states not taken, the oldest are dropped. Raise an error of the server at
-        its place among the states.
+        At most 1,024 states are stored; the oldest are dropped. Raise an error of the server at its
+        place among the states.
         """
         while True:
             with self._changed:
@@ -316,7 +316,7 @@ class ClientSession:
                 self._error = found
                 self._answered = 0 if self._last is None else self._last.seq
             elif self._latest is not None and _is_same(found, self._latest):
-                return  # repeated by the server
+                return  # the server sent it twice
             else:
                 self._answered = max(self._answered, found.seq)
                 self._latest, self._error = found, None
@@ -326,10 +326,11 @@ class ClientSession:
             self._changed.notify_all()
 
     def _begin_again(self, unknown: UnknownAvatarError) -> None:
-        """Add the avatar again, and send its pose, to a server that does not know one of them.
+        """Add the avatar and send its pose again to a server that does not know them.
 
-        The server was restarted, has dropped this client's avatars or has another avatar of the
-        name; or a velocity replaced the pose that was to be the first motion command.
+        unknown: the server's error; raised after too many attempts. The server was restarted, has
+        dropped this client's avatars or has another avatar of the name. Or a velocity replaced the
+        first motion command, which had the pose.
         """
         self._refusals += 1
         try:

@@ -1,8 +1,8 @@
 """Connection of a client to its server: requests and replies of one scene, under the client's id.
 
 A server that does not know the client's avatars, because it was restarted or has dropped them,
-receives them again. An empty reply looks the same whether no server is there, a server died or a
-message was dropped (WIRE.md, "Empty replies"): it is returned as None.
+receives them again. A query without any reply returns None: it may have reached no server, the
+server may have died, or a message may have been dropped (WIRE.md, "Empty replies").
 """
 
 import logging
@@ -36,8 +36,8 @@ from .client_identity import OPEN_SECONDS, AddedAvatar, AddedAvatars, ClientIden
 
 log = logging.getLogger(__name__)
 
-# Share of the time for which a query is kept open that must pass before a missing reply counts as a
-# slow server: clocks differ slightly.
+# If a query ends without a reply after this share of the time for which it was kept open, or later,
+# the server is assumed to be slow and not absent. The share is below 1, because clocks differ.
 _NEARLY = 0.9
 # Attempts to ask about avatars that the server does not know.
 _MAX_ATTEMPTS = 3
@@ -48,7 +48,7 @@ _ENCODING = zenoh.Encoding(MSGPACK)
 class ServerConnection:
     """Connection to the server of one scene, from `open` until `close`. Thread-safe.
 
-    avatars: those that the client added.  anchor: recognizes the server's replies.
+    avatars: avatars that the client added.  anchor: holds the key that the server's replies need.
     timeout: time limit of one request [s].
     """
 
@@ -83,14 +83,15 @@ class ServerConnection:
     def check_open(self) -> None:
         """Raise BadRequestError if the connection is closed."""
         if self._stack is None:
-            raise BadRequestError("this client is closed: ask inside `with Client(...) as scene`")
+            raise BadRequestError("this client is closed: send requests inside `with Client(...) as scene`")
 
     @property
     def client_id(self) -> str:
-        """Return the id that the client has at present."""
+        """Return the client's present id."""
         return self._identity.id
 
-    # --- one request -----------------------------------------------------------------------------------------
+    # --- one request
+    # -----------------------------------------------------------------------------------------
 
     def ask(self, operation: str, request: bytes, names: Sequence[str] = ()) -> bytes | None:
         """Send a request and return the bytes of the answer; None if none arrives in time.
@@ -154,7 +155,8 @@ class ServerConnection:
         )
         return identity.queriers[operation], query
 
-    # --- requests about avatars ------------------------------------------------------------------------------
+    # --- requests about avatars
+    # ------------------------------------------------------------------------------
 
     def ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
         """Ask about avatars, as `ask` does; add them again if the server does not know them."""
@@ -181,9 +183,10 @@ class ServerConnection:
                     return
 
     def _retry(self, names: Sequence[str], unknown: UnknownAvatarError, attempt: int) -> bool:
-        """Return whether to ask again about avatars, which the server then knows.
+        """Add avatars again; return whether the request should be repeated.
 
-        unknown: the server's error; raised after the last attempt.
+        unknown: the server's error; raised after the last attempt.  attempt: number of attempts so
+        far.
         """
         if attempt < _MAX_ATTEMPTS:
             return self.add_again(names, unknown)
@@ -199,8 +202,8 @@ class ServerConnection:
         """
         added = self.avatars.known(names)
         if isinstance(unknown, OtherAvatarError):
-            # If a digest is missing, the avatars may be the client's own: the client does not know
-            # their radius before they are added.
+            # Without a digest the server's avatars may be those of this client, which learns their
+            # radius, and thus the digest, only from the answer to adding them.
             if self.avatars.digests(names) is not None:
                 self._take_new_id(unknown.key_expression)
         elif len(added) < len(set(names)):
@@ -210,7 +213,7 @@ class ServerConnection:
             return self._add(added)
         except TooLargeError:
             raise
-        except BadRequestError:  # another program may have added one of that name first
+        except BadRequestError:  # another program may have added an avatar under this name first
             self._take_new_id(identity.keys["add_avatar"])
             return self._add(added)
 
@@ -224,30 +227,31 @@ class ServerConnection:
         return True
 
     def _take_new_id(self, key_expression: str) -> None:
-        """Take a new id if a key expression has the present one: another program knows that id."""
+        """Take a new id if a key expression contains the present id: another program knows it."""
         with self._renewing:
             self.check_open()
             before = self._identity
             if not before.is_in(key_expression):
                 return
             log.warning(
-                "scene %s at %s: the server has other avatars under this client's id than it added: another program "
-                "knows the id; going on under a fresh one",
+                "scene %s at %s: the server's avatars under this client's id differ from those it added, so another "
+                "program knows the id: continuing with a new id",
                 self._scene,
                 self._endpoint,
             )
             self._identity = ClientIdentity(self.session, self._scene, self.timeout)
             before.close()
 
-    # --- missing replies -------------------------------------------------------------------------------------
+    # --- missing replies
+    # -------------------------------------------------------------------------------------
 
     def explain_silence(self, operation: str) -> str:
-        """Return why an operation may not have been answered, and what to do."""
+        """Return a message on why no server answered an operation, and what to do."""
         if not self._answered:
             return self._explain_silence(operation, self.timeout, 0.0)
         return (
             f"the server of scene {self._scene!r} at {self._endpoint} is gone, or has not answered {operation!r} "
-            f"within {self.timeout:g} s: ask again, or start one with: {self._start_command()}"
+            f"within {self.timeout:g} s: try again, or start one with: {self._start_command()}"
         )
 
     def _start_command(self) -> str:
@@ -255,14 +259,17 @@ class ServerConnection:
         return f"solidcloud serve ARCHIVE --name {self._scene} --listen {self._endpoint}"
 
     def _explain_silence(self, operation: str, seconds: float, waited: float) -> str:
-        """Return why a request may not have been answered. seconds: the longest wait."""
+        """Return a message on why no server answered a request.
+
+        seconds: how long the query was kept open.  waited: how long it took to end.
+        """
         where = f"scene {self._scene!r} at {self._endpoint}"
         # A query that reaches no server ends at once, and one whose server dies soon after.
         if self._answered and waited > _NEARLY * seconds:
             then = ", and its log says when it is done" if operation == "reload" else ""
             return (
                 f"the server of {where} has not answered {operation!r} within {seconds:g} s: it may still be at work"
-                f"{then}: ask again, or start it anew"
+                f"{then}: try again, or restart it"
             )
         start = self._start_command()
         if self._answered:

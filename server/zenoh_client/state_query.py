@@ -13,10 +13,9 @@ from ..zenoh_common.sealed_replies import OtherAvatarError, SealedQuery, TrustAn
 
 log = logging.getLogger(__name__)
 
-# How long the query may have no replies, although motion commands are sent, before it is sent again
-# [s].
+# If motion commands are sent and no reply arrives for this long, the query is sent again [s].
 _SILENCE = 1.0
-# Pause before the query is sent again after one without replies [s]: the first, and the longest.
+# First and longest pause before a query that ended without replies is sent again [s].
 _PAUSE, _MAX_PAUSE = 0.01, 0.2
 # How long one query is kept open [s].
 _QUERY_SECONDS = 3600.0
@@ -28,7 +27,10 @@ class StateQuery:
     def __init__(
         self, session: zenoh.Session, key: str, anchor: TrustAnchor, about: Callable[[], bytes | None]
     ) -> None:
-        """Make a query that is not sent yet. key: of the user's states.  about: as in `SealedQuery`."""
+        """Make a query that is not sent yet.
+
+        key: key expression of the user's states.  about: as in `SealedQuery`.
+        """
         self._session, self._key, self._anchor, self._about = session, key, anchor, about
         # Unbounded: replies are taken at once, except while an avatar is added again.
         self._arrived: queue.SimpleQueue[tuple[SealedQuery, Any] | None] = queue.SimpleQueue()
@@ -45,8 +47,8 @@ class StateQuery:
 
     def move(self, key: str) -> None:
         """Query for the states of another user from now on. key: of these states."""
-        # The old querier is dropped and not undeclared: while another thread uses it, that raises
-        # "Already borrowed". zenoh undeclares it with its last reference.
+        # The old querier is not undeclared explicitly, because that raises "Already borrowed" while
+        # another thread uses it. zenoh undeclares it when its last reference is dropped.
         self._key, self._pause = key, _PAUSE
         self._declare()
         self._send()
@@ -56,13 +58,14 @@ class StateQuery:
             self._key,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=_QUERY_SECONDS,
-            # As motion commands have it, so that the query is not behind the first of them.
+            # The priority of motion commands, so that the first of them does not overtake the
+            # query.
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
         )
 
     def end(self) -> None:
-        """Have `take` return None after the replies that have arrived."""
+        """Make `take` return None after the replies that have arrived."""
         self._arrived.put(None)
 
     def close(self) -> None:

@@ -1,15 +1,15 @@
 """Access control of a server's zenoh session: all messages not listed here are denied both ways.
 
-zenoh decides by inclusion: a message passes if one of the listed key expressions includes the
-message's own. A list of allowed keys therefore also blocks wider keys (`**`,
-`solidcloud/*/scene/**`); a list of denied keys would not.
+zenoh passes a message if one of the listed key expressions includes the key expression of the
+message. A list of allowed keys therefore also blocks wider keys (`**`, `solidcloud/*/scene/**`); a
+list of denied keys would not.
 """
 
 from typing import Any
 
 from ...schemas.wire.key_expressions import ROOT
 
-# All operations pass: the server answers an unknown one with an error.
+# Queries of every operation pass. The server answers those of an unknown operation with an error.
 _QUESTIONS = [f"{ROOT}/scenes", f"{ROOT}/scene/*/*/*"]
 _STATES = [f"{ROOT}/state/*/*/*"]
 _WISHES = [f"{ROOT}/wish/*/*/*"]
@@ -27,7 +27,7 @@ _FROM_CLIENTS = {
     "liveliness_query": _SERVERS,
     "declare_liveliness_subscriber": _SERVERS,
 }
-# Messages of the server; the last two make clients send it their tokens.
+# Messages from the server. The last two make clients send their tokens.
 _TO_CLIENTS = {
     "reply": [*_QUESTIONS, *_STATES],
     "declare_queryable": [*_QUESTIONS, *_STATES],

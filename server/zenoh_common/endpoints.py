@@ -20,7 +20,7 @@ _SAME_AS_LOOPBACK = ("localhost", "0.0.0.0", "[::]")
 def check_endpoint(endpoint: str, what: str) -> str:
     """Return the endpoint; raise BadRequestError if zenoh cannot open it.
 
-    what: names it in the error.
+    what: name of the endpoint in the error message.
     """
     expected = f"expected one such as {DEFAULT_ENDPOINT}"
     match = _ENDPOINT.fullmatch(endpoint)
@@ -56,9 +56,9 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def canonical(endpoint: str) -> str:
-    """Return one canonical text for the endpoints of this host that lead to the same server.
+    """Return a canonical text, equal for endpoints of this host that lead to the same server.
 
-    Not all such endpoints are recognized.
+    Some such endpoints have different texts, for example other names of the same host.
     """
     protocol, _, address = endpoint.partition("/")
     match = _HOST_AND_PORT.fullmatch(re.split("[?#]", address)[0])

@@ -1,4 +1,4 @@
-"""Key files, in which a server leaves the key of its seals for clients of the same user."""
+"""Key files, in which a server stores the key of its seals for clients of the same user."""
 
 import hashlib
 import logging
@@ -31,10 +31,10 @@ class KeyFile(NamedTuple):
 
 
 def key_paths(endpoint: str) -> list[Path]:
-    """Return the possible key files of a server at an endpoint; the server writes the first it can.
+    """Return the possible key files of a server at an endpoint. The server writes one of them.
 
-    Both folders belong to the user. The file name contains the host's name, because several hosts
-    may share a home folder.
+    It takes the first that it can write. Both folders belong to the user. The file name contains
+    the host's name, because several hosts may share a home folder.
     """
     name = _file_name(socket.gethostname(), endpoint)
     folders = []
@@ -55,10 +55,11 @@ def _file_name(host: str, endpoint: str) -> str:
 
 @contextmanager
 def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
-    """Yield a server's key, which the user's clients find inside the `with`.
+    """Yield a server's key, and store it for the user's clients during the `with`.
 
-    Enter it after the endpoint was opened.
-    key_file: holds the key; None: a random one. BadRequestError: the file is not usable.
+    Enter it after opening the endpoint, so that the key of a running server is not overwritten.
+    key_file: file with the key; None: a random key is made. Raise BadRequestError if the file is
+    not usable.
     """
     key = secrets.token_bytes(KEY_BYTES) if key_file is None else read_given_key(key_file)
     written: Path | None = None
@@ -72,8 +73,8 @@ def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
             break
     if written is None:
         log.warning(
-            "no key file could be written: clients cannot tell this server from another program at its endpoint: "
-            "give both --key-file"
+            "no key file could be written: clients cannot distinguish this server from another program at its "
+            "endpoint: give --key-file to server and clients"
         )
     try:
         yield key
@@ -83,7 +84,7 @@ def published_key(endpoint: str, key_file: Path | None) -> Iterator[bytes]:
 
 
 def find_key(endpoint: str, known: KeyFile | None = None, unusable: set[Any] | None = None) -> KeyFile | None:
-    """Return the newest key that this user's server at an endpoint left; None if none is usable.
+    """Return the newest key that this user's server at an endpoint stored; None if none is usable.
 
     known: returned if its file is still the newest.  unusable: files found unusable before, which
     are not read again; further ones are added. A file that other users can read or write is
@@ -124,7 +125,7 @@ def read_given_key(path: Path) -> bytes:
 def _parse_key(text: str, where: str) -> bytes:
     """Return the key in a key file's text.
 
-    where: the file, for the BadRequestError that says what is wrong with the key.
+    where: name of the file, for messages. Raise BadRequestError for an invalid key.
     """
     found = text.strip()
     if not _HEX_KEY.fullmatch(found):
@@ -149,7 +150,9 @@ def _read(path: Path, *, private: bool) -> KeyFile:
                 f"{path}: others have access to it: expected a file of mode 600: chmod 600 {path}"
             )
         if private and status.st_uid != os.getuid():
-            raise BadRequestError(f"{path}: of another user (id {status.st_uid}): expected this user's own")
+            raise BadRequestError(
+                f"{path}: owned by another user (id {status.st_uid}): expected a file of this user"
+            )
         return KeyFile(_parse_key(file.read(1024).decode("ascii", "replace"), str(path)), _version(status))
 
 

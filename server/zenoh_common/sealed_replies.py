@@ -1,9 +1,9 @@
-"""Sealed replies: signatures that prove that a reply is the server's, to the client's own request.
+"""Sealed replies: keyed hashes that prove that the server sent a reply, and to which request.
 
-A *seal* is a keyed hash (WIRE.md, "Seals", has the layout and a worked example). A client sends a
-nonce with its query. Whoever has the server's key can hash nonce, key expression and request
-together with the reply and the avatars that it is about; nobody else can. The server seals its
-replies with `sealer_of` and `send_reply`; a client checks them with `SealedQuery`.
+WIRE.md, "Seals", has the layout of a seal and a worked example. A client sends a nonce with its
+query. The seal is a hash of nonce, key expression, request, reply and the avatars that the reply is
+about, under the server's key, which only the server and the user's clients know. The server seals
+its replies with `sealer_of` and `send_reply`; a client checks them with `SealedQuery`.
 """
 
 import hashlib
@@ -53,10 +53,10 @@ class Sealer:
     def seal(self, number: int, ok: bool, encoding: str, payload: bytes, about: bytes = b"") -> bytes:
         """Return the seal of a reply, SEAL_BYTES.
 
-        number: of the reply among the replies to its query, counted from 0.  ok: it is not an
-        error.
-        about: the digests of the client's own avatars that answered (`avatar_digest`), in the
-        request's order, concatenated.
+        number: of the reply among the replies to its query, counted from 0.
+        ok: whether the reply is an answer and not an error.
+        about: concatenated digests (`avatar_digest`) of the client's avatars that the answer used,
+        in the request's order.
         """
         hashed = hash_of(about)
         return _NUMBER.pack(number) + hashed + self._hash(number, ok, encoding, payload, hashed)
@@ -143,7 +143,7 @@ def send_reply(
 
 
 class OtherAvatarError(UnknownAvatarError):
-    """Reply about another avatar than the client added: another program uses the client's id.
+    """Reply about an avatar that the client did not add: another program uses the client's id.
 
     key_expression: of the query, with the id.
     """
@@ -159,18 +159,18 @@ def _no_avatars() -> bytes:
 
 
 class TrustAnchor:
-    """Trust anchor of one client: the key by which it recognizes its server's replies.
+    """Trust anchor of one client: the key that the seals of its server's replies need.
 
-    The key is given, or found in the user's key files. Once there is a key, this object ignores
-    every reply without the right seal. The key is replaced only from the file, where a restarted
-    server leaves a new one. Without a key, all replies are accepted, with one warning. Thread-safe:
-    assignments are atomic.
+    The key is given, or found in the user's key files. With a key, replies without a valid seal are
+    ignored. Only the file can replace the key: a restarted server stores a new one there. Without a
+    key, all replies are accepted, with one warning. Thread-safe: assignments are atomic.
     """
 
     def __init__(self, endpoint: str, key_file: Path | str | None = None) -> None:
         """Read or find the key.
 
-        key_file: holds the key; BadRequestError if it does not. None: search the user's key files.
+        key_file: file with the key; None: search the user's key files. Raise BadRequestError if the
+        given file contains no key.
         """
         self._endpoint = endpoint
         self._given = None if key_file is None else Path(key_file)
@@ -188,7 +188,7 @@ class TrustAnchor:
         return None if self._known is None else self._known.key
 
     def look_again(self) -> bytes | None:
-        """Return the key after rereading its file, in which a new server may have left another."""
+        """Return the key after rereading its file, where a new server may have stored another."""
         if self._given is None:
             self._known = find_key(self._endpoint, self._known, self._unusable) or self._known
         return self.key
@@ -198,8 +198,8 @@ class TrustAnchor:
         if "unsealed" not in self._said:
             self._said.add("unsealed")
             log.warning(
-                "no key of the server at %s: its replies are accepted unchecked; give its --key-file to tell it from "
-                "another program at that endpoint",
+                "no key of the server at %s: its replies are accepted unchecked; give its --key-file to distinguish it "
+                "from another program at that endpoint",
                 self._endpoint,
             )
 
@@ -258,9 +258,9 @@ class SealedQuery:
     def read(self, reply: zenoh.Reply) -> tuple[bool, bytes] | None:
         """Return (whether a reply is an answer, its bytes); None if the server did not send it.
 
-        A reply that is no answer is an error. The server replies only under the exact key of the
-        query, never under a wider one. Raise OtherAvatarError for the server's reply about other
-        avatars; an error may also be about none.
+        A reply that is not an answer is an error. The server replies only under the exact key of
+        the query, never under a wider one. Raise OtherAvatarError for a sealed reply about other
+        avatars; an error reply may also name no avatars.
         """
         sample: Any = reply.ok
         if sample is None:
@@ -300,7 +300,7 @@ class SealedQuery:
         return fresh is not None and fresh != key and self._is_sealed(fresh, seal, ok, encoding, payload)
 
     def _is_about_ours(self, seal: bytes, ok: bool) -> bool:
-        """Return whether a sealed reply is about the client's avatars; errors may be about none."""
+        """Return whether a sealed reply names the client's avatars; an error may name none."""
         about = self._about()
         return (about is not None and is_about(seal, about)) or (not ok and is_about(seal, b""))
 

@@ -19,11 +19,11 @@ FRAME_QOS: dict[str, Any] = {
 def session_config(*, listen: str | None = None, connect: str | None = None) -> zenoh.Config:
     """Return the configuration of a server's or client's session: one endpoint, no discovery."""
     settings: dict[str, Any] = {
-        # A peer opens without a server and keeps trying to connect; a zenoh "client" fails instead.
+        # A zenoh "peer" opens without a server and keeps trying to connect; a zenoh "client" fails.
         "mode": "peer",
         "listen/endpoints": [listen] if listen else [],
         "connect/endpoints": [connect] if connect else [],
-        # The default of 1 s, growing to 4 s, would prolong each outage by as much.
+        # The default of 1 s, growing to 4 s, would prolong each outage by this time.
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2},
         # How long opening waits for the connection [ms]; default 500. Opening sometimes waits this
         # long although the connection exists at once.

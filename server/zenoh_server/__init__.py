@@ -1,4 +1,4 @@
-"""The server's end of zenoh: transport, fair queues, sessions, dispatch, start and stop.
+"""Server side of zenoh: transport, fair queues, sessions, dispatch, start and stop.
 
 May import server.zenoh_common, server.observability, server.runtime, server/scene_interface.py,
 schemas.

@@ -1,9 +1,9 @@
 """Motion commands on a server: queues, mailboxes and the thread that simulates frames.
 
 Received motion commands (`Wish` on the wire) wait in `WaitingCommands` until they are decoded. A
-mailbox for each user then holds its latest one. A thread empties all mailboxes, has one frame
-simulated and publishes the resulting states. It waits while there are no motion commands, so frames
-come at most as fast as motion commands do.
+mailbox for each user then holds its latest one. A thread empties all mailboxes, simulates one frame
+and publishes the resulting states. It waits while there are no motion commands, so there are at
+most as many frames as motion commands.
 """
 
 import logging
@@ -45,7 +45,8 @@ _WaitingCommand = tuple[User, Any, int]
 class WaitingCommands:
     """Queue of motion commands for each turn. Not thread-safe.
 
-    If a turn exceeds its bytes, its oldest motion commands are dropped: newer ones replace them
+    A turn is a client, or all clients without a liveliness token (fair_queues.py). If a turn
+    exceeds its bytes, its oldest motion commands are dropped, because newer ones replace them
     anyway.
     """
 
@@ -118,8 +119,8 @@ class Mailboxes:
     def __init__(self, most: int, turn: Callable[[str], str] = str) -> None:
         """Make an empty set of mailboxes.
 
-        most: mailboxes at a time.
-        turn: returns the turn of a client (fair_queues.py); by default each has its own.
+        most: limit of mailboxes at a time.
+        turn: returns the turn of a client (fair_queues.py); by default each client has its own.
         """
         self._most, self._turn = most, turn
         self._boxes: dict[User, _Box] = {}
@@ -160,7 +161,10 @@ class Mailboxes:
             return False
 
     def leave(self, user: User) -> None:
-        """Have a user leave; drop its waiting motion command. Ignore a user without a mailbox."""
+        """Queue the departure of a user; drop its waiting motion command.
+
+        A user without a mailbox is ignored.
+        """
         with self._changed:
             if user not in self._boxes:
                 return
@@ -169,7 +173,7 @@ class Mailboxes:
             self._changed.notify()
 
     def leave_client(self, client: str) -> None:
-        """Have all users of a client leave."""
+        """Queue the departure of all users of a client."""
         with self._changed:
             self._forget([user for user in self._boxes if user.client == client])
             self._gone[client] = None
@@ -258,11 +262,11 @@ class FrameLoop:
         return size <= MAX_COMMAND_BYTES
 
     def leave(self, user: User) -> None:
-        """Have a user leave the scene."""
+        """Remove a user from the scene with the next frame."""
         self._boxes.leave(user)
 
     def client_gone(self, client: str) -> None:
-        """Have all users of a client leave the scene."""
+        """Remove all users of a client from the scene with the next frame."""
         self._boxes.leave_client(client)
 
     def run(self) -> None:

@@ -1,8 +1,9 @@
 """Fair queues of requests: one request of each client at a time, clients round-robin.
 
-A request is *quick* until it has been running for longer than its watchdog allows, or *slow* from
-the start. Quick requests share the workers. Slow ones keep their client's turn but hold no worker;
-their number is bounded too.
+A *turn* is a queue that is served one request at a time: that of one client, or of all clients
+without a liveliness token. A request is *quick* until it has been running for longer than the
+watchdog allows, or *slow* from the start. Quick requests share the workers. Slow ones keep their
+turn but hold no worker; their number is bounded too.
 """
 
 import threading
@@ -42,9 +43,9 @@ class QueueLimits(NamedTuple):
     waits: requests that hold no worker because they wait, for example for their client to accept
     the reply.
     requests, size: requests accepted and not yet answered, and their bytes.
-    by_turn: requests of one turn.
-    first: a turn's only request is always accepted up to this size [bytes], so that no client can
-    lock out a new one.
+    by_turn: requests in flight of one turn.
+    first: a turn without requests in flight may always add one of up to this size [bytes], so that
+    no client can lock out another.
     """
 
     workers: int
@@ -62,7 +63,7 @@ class Ticket:
     client: the client that sent it.  turn: the turn it takes, by default its client's.
     size: its bytes.  slow: whether it needs a slow place to run.
     request: any object; the queues do not use it.
-    left: whether the request has given up its worker; the thread that runs it must then not start
+    left: whether the request no longer holds a worker. The thread that runs it must then not start
     another request.
     """
 
@@ -98,9 +99,9 @@ class FairQueues:
     in order: while it has requests in flight, new ones take the same turn. The caller bounds the
     number of turns: a small request of a turn that has nothing in flight is always accepted.
 
-    Methods that free a place return the tickets to start. For each of them, and for each offer
-    answered with RUN or START, the caller must call `finished` or `put_back` once, or `detach` and
-    later `release`. This guarantees that every waiting request is started.
+    Methods that free a place return the tickets to start. For each of these tickets, and for each
+    offer answered with RUN or START, the caller must call `finished` or `put_back` once, or
+    `detach` and later `release`. Every waiting request is then started.
     """
 
     def __init__(self, bounds: QueueLimits) -> None:
@@ -148,7 +149,7 @@ class FairQueues:
     def put_back(self, ticket: Ticket) -> list[Ticket]:
         """Requeue a running request as slow, with a new ticket, before all others of its turn.
 
-        The old ticket has ended and its `left` stays as it is. Return the tickets to start.
+        The old ticket ends with its `left` unchanged. Return the tickets to start.
         """
         again = Ticket(ticket.client, ticket.request, ticket.size, turn=ticket.turn, slow=True)
         with self._lock:
@@ -158,7 +159,7 @@ class FairQueues:
             return self._start_waiting()
 
     def move_to_slow(self, ticket: Ticket) -> list[Ticket] | None:
-        """Move a request that has been computing for long to a slow place; it keeps its turn.
+        """Move a request that has been computing for too long to a slow place; it keeps its turn.
 
         Return the tickets to start; None if it has a slow place, does not run, or all slow places
         are taken.
@@ -219,9 +220,9 @@ class FairQueues:
             return dropped, self._start_waiting()
 
     def give_own_turn(self, client: str) -> list[Ticket]:
-        """Move the waiting requests of a client from a shared turn to its own; return those to start.
+        """Move a client's waiting requests from a shared turn to its own; return those to start.
 
-        Nothing moves while another of its requests has begun: its requests stay in order.
+        Nothing moves while one of its requests is running, so that its requests stay in order.
         """
         with self._lock:
             name, count = self._clients.get(client, (client, 0))
@@ -307,15 +308,15 @@ class FairQueues:
 
 
 class LivelinessTokens:
-    """Liveliness tokens of one scene's clients. One thread calls `here` and `gone`; any thread reads.
+    """Liveliness tokens of a scene's clients. One thread calls `here` and `gone`; any thread reads.
 
-    A client with a token has its own turn in the fair queues; all clients without a token share one.
-    zenoh does not report which session a query comes from: `Query.source_info` holds what the
+    A client with a token has its own turn in the fair queues; all clients without a token share
+    one. zenoh does not report which session a query comes from: `Query.source_info` holds what the
     sender put there, by default nothing.
 
-    Any process can declare any number of tokens, so their number is bounded: the first `most` are
-    heeded, and as many more wait until one of the heeded tokens disappears. A client whose token is
-    not heeded is treated as one without a token.
+    Any process can declare any number of tokens, so their number is bounded. The first `most`
+    tokens are *heeded*, and up to `most` further ones wait until a heeded token disappears. A
+    client whose token is not heeded is treated as one without a token.
     """
 
     def __init__(self, most: int) -> None:

@@ -1,4 +1,4 @@
-"""Dispatch of requests: from the bytes of a request to the scene that answers it, and back to bytes."""
+"""Dispatch of requests: decode a request, pass it to its scene, and encode the answer."""
 
 import logging
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -33,11 +33,12 @@ log = logging.getLogger(__name__)
 
 
 class _Operation(NamedTuple):
-    """How an operation with a payload is answered.
+    """Operation with a payload.
 
-    request: its type.  counted: the field whose length is bounded by `ServerConfig.max_poses`, ""
-    for none. ask: a scene, the request, the client and the stop flag to an answer, or to the parts
-    of one.
+    request: type of its request.  counted: field whose length `ServerConfig.max_poses` bounds; ""
+    for none.
+    ask: function of scene, request, client and stop flag that returns the answer, or an iterator of
+    its parts.
     """
 
     request: type
@@ -65,7 +66,7 @@ _OTHERS = {
 
 @cache
 def _operation(name: str) -> _Operation | None:
-    """Return how an operation is answered; None for one without a payload."""
+    """Return the description of an operation; None for one without a payload."""
     question = QUESTIONS.get(name)
     if question is None:
         return _OTHERS.get(name)
@@ -84,11 +85,11 @@ class RequestDispatcher:
     def __init__(self, scenes: Sequence[ServedScene], config: ServerConfig) -> None:
         names = [key_expressions.check_name(scene.name, "scene") for scene in scenes]
         if len(set(names)) != len(names):
-            raise BadRequestError(f"scenes {', '.join(names)}: each needs a name of its own")
+            raise BadRequestError(f"scenes {', '.join(names)}: expected distinct names: rename one")
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
         self._frames: dict[str, FrameLoop] = {}
-        self.left_at_work = False  # after serving: whether a request did not end in time
+        self.left_at_work = False  # set at the end of serving if a request did not end in time
         for scene in scenes:
             scene.limit_avatars(config.avatar_limits)
 
@@ -130,9 +131,9 @@ class RequestDispatcher:
             yield self._failed(key, encoding, error, about)
 
     def _encoded(self, message: Any, encoding: str, about: bytes) -> EncodedReply:
-        """Encode a message as an answer. TooLargeError: its receiver would drop it unread."""
+        """Encode a message as an answer. Raise TooLargeError if its receiver would drop it."""
         payload = encode(message, encoding)
-        # The margin is far more than zenoh's own part of a message takes.
+        # The margin is far larger than zenoh's headers.
         if len(payload) > MAX_MESSAGE_BYTES - (1 << 16):
             raise TooLargeError(
                 f"the answer takes {len(payload)} bytes, a message holds {MAX_MESSAGE_BYTES}: ask for less at a time"
@@ -140,16 +141,18 @@ class RequestDispatcher:
         return EncodedReply(payload, encoding, True, about)
 
     def _failed(self, key: str, encoding: str | None, error: Exception, about: bytes) -> EncodedReply:
-        """Return an error as an answer; log one that is no SolidcloudError and send its type only.
+        """Return an error as an answer.
 
-        about: of the avatars that were looked up; if one is unknown, the answer is about none.
+        An error that is not a SolidcloudError is logged, and only its type is sent.
+        about: digests of the avatars that were looked up; if one is unknown, the answer names no
+        avatars.
         """
         if isinstance(error, SolidcloudError):
             answer = self._error(encoding, error.code, str(error))
             return answer if isinstance(error, UnknownAvatarError) else answer._replace(about=about)
         log.error("a request failed with an internal error: %s", key, exc_info=error)
         answer = self._error(
-            encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: its log says more"
+            encoding, ErrorCode.INTERNAL, f"{type(error).__name__} in the server: see the server's log"
         )
         return answer._replace(about=about)
 
@@ -167,7 +170,7 @@ class RequestDispatcher:
                 f"this server answers up to {config.max_paths} paths at a time, {max(1, config.max_paths // 2)} of one "
                 f"client {as_one}: ask again when one has ended"
             ),
-            LimitReached.STATES: "as many queries for states are open as this scene has room for: ask again later",
+            LimitReached.STATES: "this scene has the maximum number of open queries for states: try again later",
         }[full]
         return self._error(encoding, ErrorCode.BUSY, message)
 
@@ -187,7 +190,7 @@ class RequestDispatcher:
         publish: Callable[[key_expressions.User, EncodedReply], None],
         turn: Callable[[str], str] = str,
     ) -> FrameLoop | None:
-        """Return the sessions of a scene, which send states with `publish`; None if it has none.
+        """Return the frame loop of a scene, which sends states with `publish`; None without one.
 
         turn: returns the turn of a client (fair_queues.py); by default each has its own.
         """
@@ -221,7 +224,8 @@ class RequestDispatcher:
                 raise BadRequestError(
                     f"{route.operation} with a payload of {len(payload)} bytes: expected none"
                 )
-            # `reload` answers in one part: parts are sent by a separate thread, so no worker waits.
+            # `reload` answers as a path of one part, because a separate thread sends parts and no
+            # worker has to wait.
             return self._reload(scene) if route.operation == "reload" else scene.info()
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
@@ -241,7 +245,7 @@ class RequestDispatcher:
         yield answer
 
     def reload(self) -> None:
-        """Reload every scene in turn; log errors, and serve the scene concerned as before."""
+        """Reload every scene in turn. Log errors; a scene that fails is served as before."""
         for scene in self._scenes.values():
             with suppress(Exception):
                 next(self._reload(scene))

@@ -1,8 +1,8 @@
-"""Lanes: carry the requests about one scene from its queryable to the dispatcher, and the replies back.
+"""Lanes: each carries the requests for a scene from zenoh to the dispatcher, and the replies back.
 
 A fixed number of worker threads take queries from zenoh's channel and answer them. A request that
-runs for long, or whose answer its client does not accept, keeps its thread and its client's turn,
-but its thread is no longer a worker: a new thread replaces it, and the slow one ends after its
+runs for long, or whose answer its client does not accept, keeps its thread and its client's turn.
+Its thread is then no longer a worker: a new thread replaces it, and the slow one ends after its
 request (watchdog.py).
 """
 
@@ -28,8 +28,8 @@ from .watchdog import JobSupervisor, RequestJob, Watchdog, lower_priority
 
 log = logging.getLogger(__name__)
 
-# Most threads that wait without a worker, for a voxel, or for a client to accept a reply (zenoh
-# closes its link after `wait_before_close`).
+# Limit on the threads that are not workers and wait: for a voxel, or for a client to accept a reply
+# (zenoh closes its link after `wait_before_close`).
 _MAX_WAITING = 64
 # Interval at which unused avatars are dropped [s].
 _DROP_SECONDS = 5.0
@@ -37,8 +37,8 @@ _DROP_SECONDS = 5.0
 # it took them one by one, the query of a new client would wait behind all earlier ones.
 _EMPTY_SECONDS = 0.002
 _MAX_TAKEN = 256
-# Payloads from this size on are slow [bytes]: building an avatar of 5,000 points takes 20 ms,
-# reading JSON 50 ns a byte. The second size is that of avatars and JSON.
+# Size from which on a request is slow [bytes]: of most payloads, and of avatars and JSON. Building
+# an avatar of 5,000 points takes 20 ms, reading JSON 50 ns a byte.
 _SLOW_BYTES, _SLOW_AVATAR_BYTES = 1 << 20, 1 << 17
 
 
@@ -67,7 +67,7 @@ class ReceivedRequest:
             route = key_expressions.parse_query_key(self.key)
             self.client, self.operation = route.client, route.operation
         except BadRequestError:
-            self.client = self.operation = ""  # no client: the dispatcher will refuse it
+            self.client = self.operation = ""  # the dispatcher will refuse the key expression
         payload = query.payload
         self.payload = b"" if payload is None else payload.to_bytes()
         self._sealer = sealer_of(query, server_key, self.key, self.payload)
@@ -166,7 +166,7 @@ class Lane:
             self._start(self._queues.give_own_turn(client))
 
     def client_gone(self, client: str) -> None:
-        """Stop and drop all requests of a disconnected client, then have the dispatcher forget it."""
+        """Stop and drop all requests of a disconnected client, then notify the dispatcher."""
         dropped, started = self._queues.drop(client)
         self._start(started)
         for ticket in dropped:
@@ -182,7 +182,8 @@ class Lane:
         if self._queues.offer(ticket, always=True) is Offer.RUN:
             self._start([ticket])
 
-    # --- threads ---------------------------------------------------------------------------------------------
+    # --- threads
+    # ---------------------------------------------------------------------------------------------
 
     def _start_worker(self) -> None:
         self._start_thread(self._scene, self._take_all)
@@ -193,7 +194,7 @@ class Lane:
             self._start_thread(self._scene, self._run, ticket)
 
     def _start_later(self, name: str, run: Callable[..., object], *arguments: Any) -> None:
-        """Have the watchdog start a thread: a slow thread would pass on its low priority."""
+        """Let the watchdog start a thread, which would inherit a slow thread's low priority."""
         self._supervisor.start_later(name, run, *arguments)
         self._watchdog.wake()
 
@@ -269,7 +270,8 @@ class Lane:
             self._supervisor.remove(job)
         return not job.left
 
-    # --- requests --------------------------------------------------------------------------------------------
+    # --- requests
+    # --------------------------------------------------------------------------------------------
 
     def _work(self, ticket: Ticket, takes: bool) -> bool:
         """Carry out a request, and then those that wait, until none does.
@@ -313,7 +315,7 @@ class Lane:
         return ticket.left, started
 
     def _enter(self, job: RequestJob) -> None:
-        """Have the watchdog supervise a job."""
+        """Supervise a job with the watchdog."""
         self._supervisor.add(job)
         if self._watchdog.asleep:
             self._watchdog.wake()
@@ -366,7 +368,8 @@ class Lane:
             self._streaming.pop(request, None)
             self._queues.release(ticket)
 
-    # --- the watchdog ----------------------------------------------------------------------------------------
+    # --- the watchdog
+    # ----------------------------------------------------------------------------------------
 
     def _check(self, now: float) -> bool:
         """Check all jobs and paths; return whether there are any jobs."""
@@ -381,7 +384,8 @@ class Lane:
     def _end_unheard(self, job: RequestJob, now: float) -> None:
         """Stop a path of a client without a token after the time for which its avatars are kept.
 
-        zenoh accepts replies for a closed link, so nothing reports that this client is gone.
+        zenoh accepts replies for a closed link, so the server cannot detect that the client is
+        gone.
         """
         most = self._config.avatar_seconds
         if now - job.begun >= most and self._tokens.turn(job.client) == ANONYMOUS:

@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 def serving(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[RequestDispatcher]:
     """Serve scenes inside a `with`; the caller closes them afterwards.
 
-    Everything is warm and reachable once entered. SolidcloudError: a scene or endpoint is unusable.
+    All scenes are warm and reachable once entered. Raise SolidcloudError if a scene or endpoint is
+    not usable.
     """
     dispatcher = RequestDispatcher(scenes, config)
     dispatcher.warm()
@@ -46,7 +47,8 @@ def serve(
     ready: called once all is warm and reachable.  SIGHUP: reload all scenes, see `Scene.reload`.
     """
     give_back_large_blocks()
-    # By default, a pure Python thread may hold the interpreter's lock for 5 ms while a reply waits.
+    # By default, a thread in Python code may keep the interpreter's lock for 5 ms while a reply
+    # waits.
     sys.setswitchinterval(0.0005)
     if config.insecure:
         log.warning("--insecure: every client that reaches %s may send requests", config.listen)
@@ -65,7 +67,7 @@ def serve(
 
 @contextmanager
 def _metrics(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[None]:
-    """Serve the metrics of scenes if configured; from the start, so that errors show early."""
+    """Serve the metrics of scenes if configured, before warming, so that errors appear early."""
     if not config.metrics_port:
         yield
         return
@@ -99,8 +101,8 @@ def _reloader(dispatcher: RequestDispatcher) -> Iterator[threading.Event]:
 def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
     """Replace the signals' handlers and yield a socket that becomes readable when a signal arrives.
 
-    An event set by a handler would not do: the system may deliver the signal to one of zenoh's
-    threads, and a main thread that waits for a lock is not woken then to run the handler.
+    An event set by a handler does not suffice: the system may deliver the signal to one of zenoh's
+    threads, and a main thread that waits for a lock is then not woken to run the handler.
     """
     reader, writer = socket.socketpair()
     with reader, writer:

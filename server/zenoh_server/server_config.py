@@ -12,13 +12,13 @@ from ..zenoh_common.endpoints import DEFAULT_ENDPOINT, check_endpoint, is_loopba
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """Configuration of one server. BadRequestError names an invalid value.
+    """Configuration of one server. Raise BadRequestError for an invalid value.
 
     listen: zenoh endpoint of the server. It must be on loopback unless `insecure` is set, because
     every client that reaches it may send requests.
     insecure: allow an endpoint that other hosts reach; there is no authentication yet.
-    workers: requests answered at the same time. The default is 2, because a client that does not
-    accept its replies holds one.
+    workers: number of requests answered at the same time. The default is 2, because a client that
+    does not accept its replies occupies one worker for a time.
     max_slow: requests that run for longer than some 10 ms; they hold no worker. Further ones wait.
     max_request_seconds: time limit for one request or one part of a path; what was not computed by
     then is `unknown`.

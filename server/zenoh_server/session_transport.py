@@ -1,9 +1,9 @@
 """Server side of sessions over zenoh: clients publish motion commands and query for states.
 
-A motion command is a `Wish` on the wire; one long query a user receives all its states. zenoh
+A motion command is a `Wish` on the wire. All states of a user are replies to one long query. zenoh
 passes motion commands and queries to bounded channels. One thread moves motion commands into
-mailboxes, one opens streams of states, and another simulates frames and sends their states
-(command_mailboxes.py).
+mailboxes, a second one opens streams of states, and a third one simulates frames and sends their
+states (command_mailboxes.py).
 """
 
 import logging
@@ -24,7 +24,7 @@ from .state_streams import StateStreams
 
 log = logging.getLogger(__name__)
 
-# Motion commands that the channel holds until the thread takes them: one each of a thousand users.
+# Capacity of the channel in motion commands: one from each of a thousand users.
 _CHANNEL = 1024
 # Open queries for states, for each user that a scene has room for.
 _STREAMS_A_USER = 2
@@ -146,7 +146,7 @@ class SceneSessions:
             log.exception("a motion command failed")
 
     def _take_wish(self, user: key_expressions.User, sample: zenoh.Sample, frames: FrameLoop) -> None:
-        """Accept one motion command, or have a user leave."""
+        """Pass one motion command to the frames; the deletion of a key removes its user."""
         try:
             if sample.kind == zenoh.SampleKind.DELETE:
                 frames.leave(user)

@@ -17,8 +17,8 @@ from ..zenoh_common.sealed_replies import Sealer, send_reply
 
 # A query without a reply for this long may be ended to make room for another one [s].
 IDLE_SECONDS = 60.0
-# How long a state is kept for a query that has not arrived [s]: a first motion command may overtake
-# it.
+# How long a state is kept for a query that has not arrived [s]. A user's first motion command may
+# overtake its query.
 _KEPT_SECONDS = 5.0
 
 
@@ -89,7 +89,7 @@ class StateStreams:
                 self._end(user)
 
     def send_again(self, user: User) -> None:
-        """Repeat the last answer to a user: it may have been dropped on the way."""
+        """Send the last answer to a user again, because it may have been dropped on the way."""
         with self._lock:
             stream = self._streams.get(user)
             if stream is not None and stream.last is not None and not stream.reply(stream.last):

@@ -30,9 +30,8 @@ from .session_transport import SceneSessions
 
 log = logging.getLogger(__name__)
 
-# Queries that the channel holds until a thread takes them. A full channel blocks zenoh's receiver,
-# which bounds memory under overload. The threads empty it at once, into `FairQueues` or with
-# `busy`.
+# Capacity of the channel in queries. A full channel blocks zenoh's receiver, which bounds memory
+# under overload. The threads empty it at once: they queue a query in `FairQueues` or answer `busy`.
 _CHANNEL = 1024
 # How long a stop waits, twice, for threads whose requests were stopped [s]. Kernels check the stop
 # flag every few milliseconds; a reply that its client does not accept waits for
@@ -47,7 +46,7 @@ _RUNTIME = "(tx: (worker_threads: 16))"
 
 
 class Transport:
-    """Carrier of requests to a dispatcher and of its answers back, from `__enter__` until `__exit__`.
+    """Carrier of requests to a dispatcher and of its answers back, inside a `with`.
 
     Entering raises SolidcloudError if the server cannot listen on the endpoint. Leaving stops
     accepting requests, answers the accepted ones for up to `config.stop_seconds`, stops the rest
@@ -61,17 +60,18 @@ class Transport:
         self._declared: list[Any] = []
         self._lanes: list[Lane] = []
         self._sessions: list[SceneSessions] = []
-        self.left_at_work = False  # after leaving: whether threads did not end in time
+        self.left_at_work = False  # set on leaving if threads did not end in time
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             session = stack.enter_context(self._open())
-            # After opening the endpoint: this must not overwrite the key of a server still running.
+            # The key is stored after opening the endpoint, which fails if another server is still
+            # running: its key must not be overwritten.
             self._key = stack.enter_context(published_key(self._config.listen, self._config.key_file))
             for scene in self._scenes:
                 stack.callback(self._declare_scene(session, scene).close)
             self._declare_scenes(session)
-            # Last: a client that sees the token may send requests at once.
+            # Tokens come last: a client that sees the token may send requests at once.
             for scene in self._scenes:
                 key = key_expressions.server_token_key(scene, str(session.zid()))
                 self._declared.append(session.liveliness().declare_token(key))
@@ -82,8 +82,8 @@ class Transport:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._stack:
-            # Tokens first. The channel of an undeclared queryable still yields its queries, then
-            # ends.
+            # Undeclare in reverse order, tokens first. The channel of an undeclared queryable still
+            # yields its queries and then ends.
             for declared in reversed(self._declared):
                 declared.undeclare()
             if not self._wait(self._config.stop_seconds):
@@ -180,7 +180,7 @@ class Transport:
 
 
 def _watch(samples: Any, tokens: LivelinessTokens, lane: Lane, sessions: SceneSessions) -> None:
-    """Tell a lane and its scene's sessions which clients come and go. Runs in a thread."""
+    """Notify lane and sessions of a scene of clients that connect or leave. Runs in a thread."""
     for sample in samples:
         try:
             client = key_expressions.parse_client_token(str(sample.key_expr))

@@ -1,7 +1,7 @@
 """Watchdog: a thread that checks running work every few milliseconds, such as the jobs of requests.
 
 A request that computes for long keeps its thread, but another thread replaces it as a worker. The
-watchdog starts all such threads, because a slow thread would pass on its low priority.
+watchdog starts these threads, because a thread inherits the low priority of a slow one.
 """
 
 import logging
@@ -36,8 +36,9 @@ SLOW_SECONDS = 0.01
 class Watchdog:
     """Calls a function at intervals while work is running.
 
-    look: takes the time on `time.monotonic`'s clock [s] and returns whether any work is running. It
-    is called every `period` seconds while that is so, and every `idle` seconds otherwise.
+    look: function of the time on `time.monotonic`'s clock [s] that returns whether any work is
+    running. While it returns True, and for LINGER afterwards, it is called every `period` seconds;
+    otherwise every `idle` seconds and after `wake`.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Watchdog:
         self.asleep = True
 
     def wake(self) -> None:
-        """Have the thread check now, and regularly from now on."""
+        """Wake the thread to check now, and regularly from now on."""
         self.asleep = False
         self._woken.set()
 
@@ -90,12 +91,13 @@ class Watchdog:
 class RequestJob:
     """Current work of one thread.
 
-    ticket: of the request; None if the thread refuses one.
-    takes: whether the thread takes queries from the channel, and must be replaced when it is slow.
+    ticket: of the request; None if the thread refuses a request.
+    takes: whether the thread is a worker, which must be replaced when it is slow.
+    sending: whether the thread sends the answer.  stop: stop flag of the request.
     begun: when the work or the sending of the answer began [s].
-    again: whether the request is to be carried out again.
-    ended: whether the answer is no longer wanted.
-    left: of a refusal, whether its thread was replaced.
+    again: whether the request must be carried out again.
+    ended: whether the answer is no longer needed.
+    left: for a refusal, whether its thread was replaced.
     cpu: processor time of the thread at the beginning [s].
     low: whether the thread has a lower priority.
     """
@@ -188,7 +190,7 @@ class JobSupervisor:
         return len(self._to_start)
 
     def start_later(self, name: str, run: Callable[..., object], *arguments: Any) -> None:
-        """Have the next check start a thread. It retries while the system has no thread left."""
+        """Let the next check start a thread. It retries while the system has no thread left."""
         self._to_start.append((name, run, arguments))
 
     def add(self, job: RequestJob) -> None:
@@ -246,7 +248,7 @@ class JobSupervisor:
                 self._start_worker()
             self._start_tickets(started)
         elif computing and not job.stop and ticket.state in (TicketState.WORKING, TicketState.WAITS):
-            # All slow places are taken: the request waits for one without a worker, and restarts.
+            # All slow places are taken: stop the request, which restarts when one becomes free.
             with self.lock:
                 job.again = not job.sending
             if job.again:

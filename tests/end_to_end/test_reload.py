@@ -239,7 +239,7 @@ def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
             client.reload()
         assert str(told.value) == (
             f"the server of scene 'hall' at {endpoint} has not answered 'reload' within 1.5 s: it may still be at "
-            "work, and its log says when it is done: ask again, or start it anew"
+            "work, and its log says when it is done: try again, or restart it"
         )
     monkeypatch.setitem(OPEN_SECONDS, "reload", DEADLINE)
     os.kill(server.pid, signal.SIGCONT)

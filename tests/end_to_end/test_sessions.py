@@ -222,7 +222,7 @@ def test_an_avatar_that_nobody_knows_is_said_to_be_unknown(served, endpoint):
 def test_an_effect_that_fails_is_an_error_of_the_servers(served, endpoint):
     with walking(endpoint, "crash") as session:
         seq = session.wish(pose_at(0.0, 1.0))
-        with pytest.raises(InternalError, match="its log says more"):
+        with pytest.raises(InternalError, match="see the server's log"):
             session.wait(seq, DEADLINE)
 
 

@@ -150,7 +150,7 @@ def test_where_some_answers_do_not_come_the_others_are_printed(
     assert line.startswith(
         f"error: 4 of 6 poses were not answered: the server of scene 'floor' at {endpoint} is gone"
     )
-    assert "within 5 s: ask again, or start one with: solidcloud serve ARCHIVE" in line
+    assert "within 5 s: try again, or start one with: solidcloud serve ARCHIVE" in line
 
 
 class Doubts(FloorScene):

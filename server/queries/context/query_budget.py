@@ -128,7 +128,7 @@ class CostCounter:
         """
         self.begin, self._residency, self._keys = begin, residency, keys
         self.hits = self.misses = 0
-        self.loaded = 0  # voxels that the request loaded for later holds, which do not count as hits
+        self.loaded = 0  # voxels that the request loaded for later holds: they are not hits
         self.waited = 0.0
         self.faults: dict[str, None] = {}
         self.late: dict[int, None] = {}
@@ -162,7 +162,7 @@ class CostCounter:
 
 
 def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: Callable[[], _A]) -> _A:
-    """Run a query of k items with `ask`. If the request is stopped, add the reason to the answer."""
+    """Run a query of k items with `ask`. Add the reason to the answer if the request is stopped."""
     try:
         answers = ask()
     except StoppedError:
@@ -171,6 +171,6 @@ def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: 
 
 
 def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
-    """Return `Question.unknown` for the k items of a stopped request, with the reason of the stop."""
+    """Return `Question.unknown` for the k items of a stopped request, with the reason."""
     answers = question.unknown(k, bounded=budget.limited or budget.tolerance > 0.0)
     return structs.replace(answers, stopped=budget.stop.reason)

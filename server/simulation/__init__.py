@@ -1,4 +1,4 @@
-"""Frames: motion commands in, poses out; the replay log.
+"""Simulation of frames, which turn motion commands into poses, and the replay log.
 
 May import server.archives, server.avatars, server.queries, server.queries.context, server.runtime,
 server/scene_interface.py, server.simulation.effects, server.simulation.world, schemas.

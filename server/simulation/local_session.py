@@ -1,4 +1,4 @@
-"""A session in this process: an avatar of a client sends motion commands and receives states.
+"""Session in this process: it takes motion commands for one avatar and returns the states.
 
 It has the methods of the session that `Client.session` returns. Each command is simulated as a
 separate frame before `wish` returns, so its state is available at once.
@@ -64,14 +64,14 @@ class LocalSession:
         objects: Mapping[str, list[list[float]]] | None = None,
         time: float | None = None,
     ) -> int:
-        """Command a pose, (4, 4) or (1, 4, 4), or a velocity (3,) [m/s]; one of the two. Simulate the frame.
+        """Simulate one frame with a motion command: either a pose or a velocity.
 
-        Returns the number of the command, which its state has as `seq`.
-        turn: with a velocity, about the scene's up axis [rad/s].  objects: poses of the scene's
-        objects that this user moves.  time: of the command, on a clock that does not go back [s];
-        None: of this process.
-        Raises BadRequestError for an invalid command, or if the session is closed. If the frame is
-        refused, `latest`, `wait` and `states` raise its error.
+        pose: (4, 4) or (1, 4, 4) float64.  velocity: (3,) [m/s].  turn: with a velocity, about the
+        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves.
+        time: of the command, on a clock that does not go backwards [s]; None: this process's clock.
+        Return the number of the command, which its state has as `seq`. Raise BadRequestError for an
+        invalid command, or if the session is closed. If the frame is refused, `latest`, `wait` and
+        `states` raise its error.
         """
         array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
         speed = None if velocity is None else tuple(float(part) for part in velocity)
@@ -107,13 +107,19 @@ class LocalSession:
             self._changed.notify_all()
 
     def _raise_error(self) -> None:
-        """Raise, once, the error of a frame refused since the last state. Call with `_changed` held."""
+        """Raise, once, the error of a frame refused since the last state.
+
+        The caller holds `_changed`.
+        """
         error, self._error = self._error, None
         if error is not None:
             raise error
 
     def latest(self) -> LatestState | None:
-        """Return the last state and its age, or None before the first. Raise, once, a later error."""
+        """Return the last state and its age, or None before the first one.
+
+        Raise, once, the error of a frame refused since then.
+        """
         with self._changed:
             self._raise_error()
             return None if self._latest is None else LatestState(self._latest, monotonic() - self._when)
@@ -138,8 +144,8 @@ class LocalSession:
     def states(self, timeout: float = 5.0) -> Iterator[State]:
         """Yield each state in order, until none came for `timeout` [s] or the session is closed.
 
-        At most 1,024 states are kept; of more, the oldest are dropped. Raises the error of a refused
-        frame at its place among them.
+        At most 1,024 states are kept; of more, the oldest are dropped. Raises the error of a
+        refused frame at its place among them.
         """
         while True:
             with self._changed:

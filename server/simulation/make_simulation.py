@@ -1,4 +1,4 @@
-"""Make the simulation of a scene: its collision world, and the effects that its file declares."""
+"""Construction of a scene's simulation from its collision world and the effects of its file."""
 
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from .simulation import SimulatedScene, Simulation
 
 def make_simulation(scene: SimulatedScene, file: SceneFile) -> Simulation:
     """Return the simulation of a scene's frames, with the effects that `file` declares."""
-    # Imported here: a scene that is only queried needs neither effects nor their kernels.
+    # Imported here, because a scene that is only queried needs neither effects nor their kernels.
     from .effects.pipeline import make_pipeline
     from .world.collision_world import World
 

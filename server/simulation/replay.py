@@ -1,8 +1,8 @@
 """Replay of a log: the same motion commands must give the same poses, bit for bit.
 
-This also holds on another machine: kernels round as NUMERICS.md states, and effects add and multiply
-in a fixed order (vectors.py). Only the probability of `uncertainty` depends on the machine's own
-error function, and no pose depends on it.
+This also holds on another machine: kernels round as NUMERICS.md states, and effects add and
+multiply in a fixed order (vectors.py). Only the probability of `uncertainty` depends on the
+machine's own error function, and no pose depends on it.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -34,7 +34,7 @@ from .simulation import Simulation
 
 
 class TurnDifference(NamedTuple):
-    """FrameCommand whose replay differs from the log. logged, found: its results."""
+    """Motion command whose replay differs from the log. logged, found: its results."""
 
     frame: int
     user: User
@@ -56,10 +56,10 @@ class TurnDifference(NamedTuple):
 class Replayed(NamedTuple):
     """Result of a replay.
 
-    frames, turns: numbers of those simulated.  different: number of turns with another result;
-    first: the first of them.
-    reloaded: the frame before which the replay ended, because the log's scene was reloaded then;
-    None: it was not.
+    frames, turns: numbers of simulated frames and turns (motion commands of one user).
+    different: number of turns whose result differs.  first: the first such turn.
+    reloaded: the frame before which the replay ended, because the log's scene was reloaded there;
+    None if it was not.
     """
 
     frames: int
@@ -104,7 +104,8 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
 def _differences(simulation: Simulation, record: FrameRecord) -> list[TurnDifference]:
     """Simulate one frame; return the turns with another result."""
     turns = [FrameCommand(User(*user), decode_request(Wish, wish)) for user, wish in record.turns]
-    # A turn that the server ended early depended on a clock: it is ended again, and moves no user.
+    # A turn that the server stopped early depended on a clock. It is stopped here too, and moves no
+    # user.
     ended = StopFlag()
     ended.set("ended early when it was logged")
     stops = [ended if logged.error == ErrorCode.EXPIRED else NO_STOP for logged in record.said]
@@ -128,12 +129,15 @@ class _LoggedAvatars:
         """Add an avatar before its user's first turn."""
         user = User(*entered.user)
         if self._added.get(user, entered.digest) != entered.digest:
-            # The client reconnected with another avatar of that name: its other avatars are gone too.
+            # The client reconnected with another avatar of that name, so its other avatars were
+            # dropped too.
             self.drop(user.client)
         if user not in self._added:
             record = self.known.get(entered.digest)
             if record is None:
-                raise BadRequestError(f"avatar {user.avatar!r} of the log: its points are not in it")
+                raise BadRequestError(
+                    f"avatar {user.avatar!r}: its points are not in the log: record the log anew"
+                )
             points = np.frombuffer(record.points, "<f8").reshape(-1, 3)
             try:
                 self._simulation.scene.add_avatar(user.avatar, points, record.radius, client=user.client)
@@ -187,8 +191,8 @@ def check_same(begin: Begin, simulation: Simulation, path: Path) -> bool:
     found = archives_of(simulation)
     if [tuple(each) for each in begin.archives] != found:
         raise BadRequestError(
-            f"{path}: holds {_describe_archives(found)}: expected {_describe_archives(begin.archives)}, which "
-            f"the log is of ({begin.path})"
+            f"{path}: has {_describe_archives(found)}: expected {_describe_archives(begin.archives)}, of which "
+            f"the log is ({begin.path})"
         )
     return begin.file == (path.read_bytes() if path.is_file() else b"")
 

@@ -1,11 +1,11 @@
-"""The log of a scene's frames: everything that decides the results of motion commands, and the results.
+"""Log of a scene's frames: motion commands, everything else that decides results, and the results.
 
 It is written frame by frame and read for a replay.
 
-A file begins with MAGIC. A record is a head of 12 bytes and a body. The head holds three
+A file begins with MAGIC. A record is a head of 12 bytes and a body. The head consists of three
 little-endian uint32: the length of the body, the CRC-32 of these four bytes, and the CRC-32 of the
-body. The body is MessagePack. Each record is written by one unbuffered call: a killed server leaves
-whole records, of which the last may be cut off.
+body. The body is MessagePack. Each record is written by one unbuffered call. After a server was
+killed, all records but the last are therefore complete.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 MAGIC = b"solidcloud frames 1\n"
 _HEAD = struct.Struct("<III")
-# A frame of a thousand users takes a megabyte; an avatar of a million points 24.
+# Limit on a record. A frame of a thousand users takes 1 MB, an avatar of a million points 24 MB.
 _MAX_BYTES = 1 << 28
 
 
@@ -83,9 +83,8 @@ class Reloaded(msgspec.Struct, frozen=True, tag="reloaded"):
 class TurnResult(msgspec.Struct, frozen=True, array_like=True):
     """Result of a turn.
 
-    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.  skipped: effects.
-    opened: how often each archive had been reloaded when the user last moved; empty if it never
-    moved.
+    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.  skipped: skipped effects.
+    opened: number of reloads of each archive when the user last moved; empty if it never moved.
     """
 
     pose: bytes
@@ -95,7 +94,7 @@ class TurnResult(msgspec.Struct, frozen=True, array_like=True):
 
 
 class FrameRecord(msgspec.Struct, frozen=True, tag="frame"):
-    """One frame. turns: user and `Wish` (WIRE.md, MessagePack), in order.  said: result of each turn."""
+    """One frame. turns: user and `Wish` (MessagePack, WIRE.md), in order.  said: their results."""
 
     number: int
     turns: list[tuple[User, bytes]]
@@ -109,14 +108,14 @@ _DECODER = msgspec.msgpack.Decoder(Record)
 
 
 def turn_result(outcome: FrameResult, opened: Sequence[int] = ()) -> TurnResult:
-    """Return an outcome as it is logged. opened: how often each archive had been reloaded."""
+    """Return the logged form of an outcome. opened: number of reloads of each archive."""
     if isinstance(outcome.state, SolidcloudError):
         return TurnResult(b"", str(outcome.state.code))
     return TurnResult(pose_bytes(outcome.state.pose), "", list(outcome.state.skipped), list(opened))
 
 
 def pose_bytes(pose: Any) -> bytes:
-    """Return a pose as it is logged."""
+    """Return the logged form of a pose (4, 4): its float64 bytes, little-endian."""
     return np.ascontiguousarray(pose, "<f8").tobytes()
 
 
@@ -133,7 +132,7 @@ class FrameLog:
             self._file: BinaryIO | None = open(path, "xb", buffering=0)  # noqa: SIM115
         except FileExistsError:
             raise BadRequestError(
-                f"{path}: exists: expected none, a log is not written over: name another"
+                f"{path}: exists, and a log is not overwritten: expected a new file: choose another name"
             ) from None
         except OSError as error:
             raise BadRequestError(
@@ -185,7 +184,7 @@ class FrameLog:
         outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
     ) -> None:
-        """Record one frame. opened: for each turn, how often each archive had been reloaded."""
+        """Record one frame. opened: for each turn, the number of reloads of each archive."""
         commands = [(turn.user, encode(turn.wish)) for turn in turns]
         results = [turn_result(*each) for each in zip(outcomes, opened, strict=True)]
         self._write(FrameRecord(number, commands, results))
@@ -204,31 +203,29 @@ class FrameLog:
             while data:
                 data = data[self._file.write(data) :]
         except OSError as error:
-            log.error("%s: %s: what comes after is not in the log", self._path, error.strerror)
+            log.error("%s: %s: later frames are not in the log", self._path, error.strerror)
             self.close()
 
 
 def read_log(path: str | Path) -> Iterator[Record]:
-    """Yield the whole records of a log, the first of them a `Begin`; omit one that is cut off at the end.
+    """Yield the complete records of a log, beginning with a `Begin`; omit one cut off at the end.
 
-    Raises FormatError if it is no log, and CorruptError if a record was changed, with its number and
-    position.
+    Raise FormatError if the file is not a log, CorruptError with number and position of a record
+    that was altered.
     """
     try:
         file = open(path, "rb")  # noqa: SIM115
     except OSError as error:
-        raise FormatError(f"{path}: {error.strerror}: expected a log, as serve --log writes it") from None
+        raise FormatError(f"{path}: {error.strerror}: expected a log written by serve --log") from None
     with file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise FormatError(
-                f"{path}: begins with other bytes than {MAGIC!r}: expected a log of serve --log"
-            )
+            raise FormatError(f"{path}: does not begin with {MAGIC!r}: expected a log written by serve --log")
         for number in _count_from_zero():
             where = f"{path}: record {number} at byte {file.tell()}"
             record = _read_record(file, where)
             if record is None:
                 if number == 0:
-                    raise FormatError(f"{where}: cut off: expected what was simulated")
+                    raise FormatError(f"{where}: cut off: expected a complete first record")
                 return
             if isinstance(record, Begin) != (number == 0):
                 raise CorruptError(f"{where}: {type(record).__name__}: expected Begin first, and only there")
@@ -243,19 +240,19 @@ def _count_from_zero() -> Iterator[int]:
 
 
 def _read_record(file: BinaryIO, where: str) -> Record | None:
-    """Return the next record; None at the end, or if it is cut off."""
+    """Read the next record; return None at the end, or if the record is cut off."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
     length, of_length, of_body = _HEAD.unpack(head)
     if zlib.crc32(head[:4]) != of_length or length > _MAX_BYTES:
-        raise CorruptError(f"{where}: its length, {length}, is not what was written: the file was changed")
+        raise CorruptError(f"{where}: its length {length} has another checksum: expected an unaltered file")
     body = file.read(length)
     if len(body) < length:
         return None
     if zlib.crc32(body) != of_body:
         raise CorruptError(
-            f"{where}: its bytes have checksum {zlib.crc32(body):08x}, expected {of_body:08x}: the file was changed"
+            f"{where}: its bytes have checksum {zlib.crc32(body):08x}: expected {of_body:08x} as in an unaltered file"
         )
     try:
         return _DECODER.decode(body)

@@ -44,9 +44,10 @@ if TYPE_CHECKING:  # a scene that is only queried imports neither
 
 log = logging.getLogger(__name__)
 
-# A user that has sent no motion command for this long has left: others may walk where it stood [s].
+# A user that has sent no motion command for this long is removed with its body [s].
 SILENT_SECONDS = 30.0
-# A longer pause is not one frame: a viewer that stood still continues as after a pause [s].
+# Limit on the duration of a frame: after a longer pause, a viewer continues as after a short one
+# [s].
 LONGEST_FRAME = 0.1
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
@@ -67,7 +68,7 @@ class SimulatedScene(Protocol):
 
 
 class Recorder(Protocol):
-    """Receives everything that decides the results of motion commands, in order; see replay_log.py."""
+    """Receiver of all inputs that determine the results of frames, in order; see replay_log.py."""
 
     def entered(self, user: User, avatar: AvatarModel) -> None: ...
     def ended(self, users: list[User]) -> None: ...
@@ -83,7 +84,11 @@ class Recorder(Protocol):
 
 
 class _Presence:
-    """User in the scene: its body, and the time of its last command by its own and by the server's clock."""
+    """User in the scene.
+
+    body: its body.  time, heard: time of its last command, on its own and on the server's clock
+    [s].
+    """
 
     __slots__ = ("body", "heard", "time")
 
@@ -96,8 +101,9 @@ class _Presence:
 class Simulation:
     """Frames of a scene. Thread-safe.
 
-    scene: whose users are simulated.  file: what it declares.  pipeline: its effects.
-    bodies: updated where users can meet.  place: returns some scan point, (3,) world [m].
+    scene: the scene of the users.  file: scene file.  pipeline: the effects that it declares.
+    bodies: updated after each frame; None if users cannot collide.
+    place: returns some scan point, (3,) world [m], for `warm`.
     """
 
     def __init__(
@@ -127,7 +133,7 @@ class Simulation:
         return list(self._present)
 
     def record(self, recorder: Recorder | None) -> None:
-        """Record every frame from now on with `recorder`; call this before users enter. None: stop."""
+        """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""
         with self._frame:
             self._recorder = recorder
 
@@ -170,15 +176,16 @@ class Simulation:
         skips: Sequence[Collection[str]] | None = None,
         stops: Sequence[StopFlag] | None = None,
     ) -> list[FrameResult]:
-        """Simulate one frame of all users with a motion command, in the order of `turns`; return the outcomes.
+        """Simulate one frame: the motion commands of `turns`, in order. Return their outcomes.
 
-        A user's first command places its body at the scene's spawn, or else where the command leads.
-        The outcome of a refused command is its error; the others are simulated.
-        now: on a clock of the caller's [s]; users without a command for SILENT_SECONDS of it end
-        first; None: no user does.
-        skips: for each turn, the effects to skip, as a recorded frame states; None: those that do
-        not fit the frame's budget.
-        stops: for each turn, ends it early: its user stays, and the outcome is ExpiredError.
+        A user's first command places its body at the scene's spawn, or without one at the commanded
+        pose. The outcome of a refused command is its error; the others are simulated.
+        now: time on the caller's clock [s]. Users without a command for SILENT_SECONDS are removed
+        first; None: no user is removed.
+        skips: for each turn, the effects to skip, as in a recorded frame; None: those that do not
+        fit the frame's budget.
+        stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
+        ExpiredError.
         """
         with self._frame:
             if now is not None:
@@ -210,9 +217,9 @@ class Simulation:
             return error
         except StoppedError:
             return ExpiredError(f"{stop.reason}: the user stays where it was")
-        except Exception as error:  # must not end the frames of the other users
+        except Exception as error:  # the frames of the other users must continue
             log.exception("a frame of %s in %s", _public_name(turn.user), self.scene.name)
-            return InternalError(f"{type(error).__name__} in the server: its log says more")
+            return InternalError(f"{type(error).__name__} in the server: see the server's log")
         command = turn.wish
         return State(
             **{name: getattr(moved, name) for name in Moved.__struct_fields__},
@@ -234,7 +241,9 @@ class Simulation:
         with ExitStack() as undo:
             if command.objects:
                 if self._bodies is None:
-                    raise BadRequestError(f"{self.scene.name}: a wish moves objects: this scene has none")
+                    raise BadRequestError(
+                        f"{self.scene.name}: a wish moves objects: this scene has no objects"
+                    )
                 undo.callback(self._bodies.place_objects(command.objects, stop))
             moved = self._pipeline.run(present.body, target, seconds, QueryBudget(stop=stop), skip=skip)
             undo.pop_all()
@@ -249,7 +258,7 @@ class Simulation:
         """Return the presence of a new user. Raises BusyError if the scene is full."""
         if len(self._present) >= self.most_users:
             raise BusyError(
-                f"{self.scene.name}: {len(self._present)} users walk it, as many as its limits allow: come again later"
+                f"{self.scene.name}: {len(self._present)} users are in it, the maximum of its limits: try again later"
             )
         avatar = self.scene.avatar(user.avatar, user.client)
         if self._recorder is not None:
@@ -267,7 +276,7 @@ class Simulation:
             self._recorder.ended(users)
 
     def end(self, user: User) -> None:
-        """Remove a user: others may walk where it stood. Its next command is again a first one."""
+        """Remove a user and its body. Its next command is again a first one."""
         with self._frame:
             self._remove([user])
 
@@ -287,7 +296,8 @@ class Simulation:
     def warm(self) -> None:
         """Simulate some frames, so that no user waits for compilation.
 
-        They move onto a scan point from above, out of it and past it, and onto another user.
+        Their motions lead onto a scan point from above, away from it, past it, and into another
+        user.
         """
         place = np.array(self.scene.info().bounds[0]) if self._place is None else self._place()
         user, other = User(_WARM, "warm"), User(_WARM, "other")
@@ -298,7 +308,7 @@ class Simulation:
             for begin, end in ((way, -way), (-0 * way, way), (way, way + across)):
                 poses = np.tile(np.eye(4), (2, 1, 1, 1))
                 poses[:, 0, :3, 3] = place + far * begin, place + far * end
-                with self._frame, suppress(SolidcloudError):  # a place where no frame is possible
+                with self._frame, suppress(SolidcloudError):  # such a frame may be impossible here
                     body = _make_body(user, self.scene.avatar("warm", _WARM), poses[0, 0])
                     if self._bodies is not None:
                         self._bodies[other] = _make_body(other, body.avatar, poses[:, 0].mean(axis=0))
@@ -326,7 +336,7 @@ def frame_seconds(command: Wish, before: float | None) -> float:
 
 
 def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
-    """Return the pose that a motion command leads to from `pose`. up: unit vector.
+    """Return the target pose (4, 4) of a motion command given at `pose`. up: (3,) unit vector.
 
     A velocity applies for the duration of the frame.
     """
@@ -350,12 +360,12 @@ def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
 def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
     """Return the pose at which a user enters with its first command.
 
-    Raises UnknownAvatarError if neither scene nor command gives one.
+    Raise UnknownAvatarError if neither the scene's spawn nor the command gives one.
     """
     if spawn is not None:
         return spawn_pose(spawn, up)
     if command.velocity is not None:
-        raise UnknownAvatarError("the avatar is nowhere yet, and the scene has no spawn: begin with a pose")
+        raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
     return check_rigid(command.pose[0].copy(), "pose")
 
 

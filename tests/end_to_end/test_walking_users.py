@@ -268,7 +268,7 @@ def test_a_log_is_not_written_over(
 ) -> None:
     before = logged[1].read_bytes()
     assert run(["serve", str(archive), "--listen", endpoint, "--log", str(logged[1])]) == 2
-    assert "frames.log: exists: expected none" in capsys.readouterr().err
+    assert "frames.log: exists, and a log is not overwritten" in capsys.readouterr().err
     assert logged[1].read_bytes() == before
 
 

@@ -1,9 +1,9 @@
 """Effect `crowd`: users do not walk through one another.
 
-The other users stand where they are now. Those whose turn came earlier in this frame have already
-moved, in the order of the simulation, which its log records. A user that is met blocks, and does
-not move. Users that overlap, for example because they began in one place, may separate but not move
-deeper (body_obstacles.py).
+The other users are obstacles at their current poses. Users whose turn came earlier in this frame
+have already moved; the replay log records the order. A user blocks the others and is not moved by
+them. Users that overlap, for example because they entered at the same place, may separate but not
+move deeper (body_obstacles.py).
 """
 
 from typing import Any
@@ -50,10 +50,10 @@ class CrowdRunner:
 
 
 class UserObstacle(BodyObstacle):
-    """Obstacle of the other users; counts those that ended a motion."""
+    """Obstacle formed by the other users; it counts those that ended a motion."""
 
     def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
-        """Create the obstacle for a frame's mover."""
+        """Create the obstacle for one frame of one user."""
         body, stop = frame.body, frame.budget.stop
         super().__init__(
             name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
@@ -61,7 +61,7 @@ class UserObstacle(BodyObstacle):
         self._met: set[str] = set()
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Count the user that was met; return False, as users do not give way."""
+        """Count the user that ended the motion; return False, because users do not give way."""
         if self.is_own(hit):
             self._met.add(hit.what)
             frame.reports[self.name] = CrowdReport(len(self._met))

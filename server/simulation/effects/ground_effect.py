@@ -1,18 +1,18 @@
-"""Effect `ground`: gravity, with feet held slightly above the ground, or falling.
+"""Effect `ground`: gravity; the avatar stands slightly above the ground, or falls.
 
-Each frame, the avatar is swept straight down from where it arrived. It stands on what it meets
-within reach, if that is no steeper than `slope`. It is held `clearance` above the ground, so that a
-floor's bumps do not stop it, and low sills are walked over. Anything steeper is not ground: gravity
-continues along it. With nothing below, the avatar falls: v t + g t^2 / 2 in a frame of t, at most
-at `fall_speed`, swept like any motion, so that it lands in the frame that reaches the ground.
+In each frame, the avatar is swept straight down from the pose that the earlier effects gave it. It
+stands on the first surface within reach, if that is no steeper than `slope`. It is held `clearance`
+above the ground, so that bumps of a floor do not stop it and it walks over low sills. A steeper
+surface is not ground: the avatar slides down along it. Without ground, the avatar falls by
+v t + g t^2 / 2 in a frame of duration t, with a speed of at most `fall_speed`. The fall is swept
+like any motion, so the avatar lands in the frame in which it reaches the ground.
 
-Scans have holes, above all in floors behind columns and under furniture. An avatar that stood and
-has nothing to stand on falls only if its feet would land. Where nothing at all was scanned below,
-or where the rest of the body would be caught by a hole's rim or the ledge just left, the avatar
-walks on at its height, until there is ground again or it is clear of the ledge.
+Scans have holes, above all in floors behind columns and under furniture. An avatar that stood in
+the last frame and has no ground below falls only if its feet would land. It keeps its height
+instead if nothing below was scanned, or if the rim of a hole, or the ledge just left, would catch
+the rest of the body. It then falls or stands again when there is ground or it has left the ledge.
 
-The vertical part of a motion command is ignored, standing and falling: a body with weight does not
-choose its height.
+The vertical part of a motion command is ignored, both when standing and when falling.
 """
 
 import math
@@ -37,47 +37,47 @@ from ..world.frame import (
 )
 from ..world.vectors import dot, norm
 
-# Feet this near to their target height stay there [m]: at rest nothing moves.
+# Feet this near to their target height are not moved [m], so that an avatar at rest stays at rest.
 DEAD_BAND = 1e-4
 # A standing avatar that moves keeps its height within this share of `clearance`. A floor's bumps
 # would otherwise move it up and down in every frame, each time by a swept motion. Of the 1,200
 # frames of the façade's walk, 1,017 take two queries with this band, 558 without it.
 HEIGHT_BAND = 0.2
-# The same beside a wall, whose bumps are in the way up and down [m].
+# The same band beside a wall, whose bumps obstruct motion up and down [m].
 WALL_BAND = 5e-3
-# A frame of gravity lasts no longer than this [s].
+# Longest time for which gravity acts in one frame [s].
 LONGEST_FRAME = 0.1
-# Radius around the touched point of the points that form the ground's normal [m]. With `slide`, its
-# radius is used instead, because an archive keeps normals for one radius.
+# Points within this distance of the touched point determine the ground's normal [m]. With `slide`,
+# its distance is used instead, because an archive stores normals for one distance.
 NORMAL_REACH = 0.08
 # Distance past an edge at which the surface behind it is tested, and the radius of that test [m].
 EDGE_DISTANCE, EDGE_REACH = 0.08, 0.04
-# Anything steeper is not an edge but the side of an object: points of both sides of an edge give
-# some 45 degrees.
+# Least vertical component of a normal at an edge. A normal that is nearer to level belongs to the
+# side of an object: points of both sides of an edge give a normal of some 45 degrees.
 _EDGE_RISES = 0.15
-# Ground is searched for within this many clearances first.
+# The first search for ground extends this many clearances down.
 _NEAR_CLEARANCES = 2.0
 # Distance from a wall at which ground is searched for [m], and the number of walls tried.
 _WALL_OFFSET, _MAX_WALLS = 0.01, 3
-# A point within these distances of the plane, and of the place, of the last ground belongs to it
-# [m].
+# A point belongs to the last ground if it is within these distances of its plane and of the point
+# where the avatar stood [m].
 _SAME_FLOOR, _SAME_FLOOR_REACH = 5e-3, 0.3
-# Normals are stored to a third of a degree: the corresponding error of a cosine.
+# Error of a cosine that results from storing normals to a third of a degree.
 _ROUNDING = 0.005
-# The body is swept down to this distance below the scene's lowest sphere [m]; the tolerance of that
-# sweep [m].
+# A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
+# tolerance of that sweep [m].
 _FALL_MARGIN, _FALL_TOLERANCE = 0.1, 1e-2
 # Tolerance without `sweep` [m].
 _TOLERANCE = 1e-5
 
 
 class GroundSearch(NamedTuple):
-    """Result of a search straight down.
+    """Result of a search for ground straight down.
 
-    hit: None: nothing.  reach: distance searched [m].  free: nothing is met before this distance
-    [m].
-    normal: (3,) of the ground; None: no ground, or too steep.  aside: found slightly aside, where
-    nothing steep is met.
+    hit: end of the downward motion; None if nothing is touched.  reach: distance searched [m].
+    free: distance within which nothing is touched [m].
+    normal: (3,) unit, of the ground; None if there is none or it is too steep.
+    aside: whether the ground was found slightly aside, away from a steep surface.
     """
 
     hit: Hit | None
@@ -88,15 +88,15 @@ class GroundSearch(NamedTuple):
 
 
 class GroundRunner:
-    """Effect `ground` of one scene. clearance: of `Ground`."""
+    """Effect `ground` of one scene. clearance: height of the feet above the ground [m]."""
 
     name = "ground"
 
     def __init__(self, effect: Ground, up: Vec, step: float, tolerance: float, sliding: Any) -> None:
         """Create the effect.
 
-        up: unit.  step: how far below the next step may be [m].  sliding: effect `slide`, where the
-        scene declares it.
+        up: (3,) unit vector.  step: largest height of a step down [m].
+        tolerance: of sweeps [m].  sliding: runner of the effect `slide`, or None.
         """
         along = np.flatnonzero(up)
         self._axis = int(along[0]) if len(along) == 1 else None
@@ -125,7 +125,7 @@ class GroundRunner:
         frame.target[:3, 3] = begin + level
 
     def run(self, frame: Frame) -> None:
-        """Stand, or fall."""
+        """Move the avatar to its height above the ground, or let it fall."""
         stood, seconds = frame.body.on_ground, min(frame.seconds, LONGEST_FRAME)
         speed = 0.0 if stood else frame.body.fall_speed
         after = min(speed + self._gravity * seconds, self._max_speed)
@@ -138,7 +138,7 @@ class GroundRunner:
         elif hit is None:
             self.lower(frame, below, fall)
         elif hit.verdict == Verdict.UNKNOWN:
-            # It is not known whether there is ground: nothing falls into the unknown.
+            # Something below is unknown, so there may be ground: the avatar does not fall.
             record_hit(frame, hit)
             self.lower(frame, below, min(fall, below.free - self.clearance))
             frame.on_ground, frame.fall_speed = stood, 0.0
@@ -159,20 +159,20 @@ class GroundRunner:
         frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
 
     def _store_ground(self, frame: Frame, hit: Hit, normal: Vec) -> None:
-        """Store what the avatar stands on, unless that plane is stored already."""
+        """Store the plane that the avatar stands on, unless it is stored already."""
         stood = frame.body.effect_state.get(self.name)
         if hit.archive >= 0 and hit.cloud is not None and (stood is None or normal is not stood[1]):
             frame.effect_state[self.name] = hit.cloud, normal
 
     def search_below(self, frame: Frame, reach: float) -> GroundSearch:
-        """Find what is met first straight down from frame.pose within a reach [m].
+        """Find the first contact straight down from frame.pose within `reach` [m].
 
-        Beside a wall, its bumps are in the way down: the search is repeated slightly away from
-        anything too steep.
+        Bumps of a wall beside the avatar may end the motion. After a contact that is too steep, the
+        search is therefore repeated slightly away from it.
         """
         first: GroundSearch | None = None
         aside = np.zeros(3)
-        for met in frame.hits[-_MAX_WALLS:]:  # what the avatar stands beside now
+        for met in frame.hits[-_MAX_WALLS:]:  # walls beside the avatar
             if met.normal is not None and abs(dot(met.normal, frame.world.up)) < _EDGE_RISES:
                 aside = _WALL_OFFSET * met.normal
         beside = bool(aside.any())
@@ -208,7 +208,7 @@ class GroundRunner:
         return find_first_hit(frame, translated(frame.pose, -reach * frame.world.up), self._tolerance)
 
     def _away(self, frame: Frame, hit: Hit) -> Vec | None:
-        """Return the level direction away from something steep."""
+        """Return the horizontal unit vector (3,) away from a steep surface; None if unknown."""
         if hit.avatar is None or hit.cloud is None:
             return None
         out = frame.world.normal(hit, self._normal_reach)
@@ -219,7 +219,7 @@ class GroundRunner:
         return None if length == 0.0 else level / length
 
     def lower(self, frame: Frame, below: GroundSearch, way: float) -> None:
-        """Move straight down by a distance `way` [m], within what was found free."""
+        """Move straight down by a distance `way` [m], within the distance found free."""
         assert frame.advance is not None
         if way <= 0.0:
             return
@@ -230,7 +230,7 @@ class GroundRunner:
         self.slide(frame, -way * frame.world.up)
 
     def slide(self, frame: Frame, way: Vec) -> None:
-        """Move by a displacement `way` (3,) [m], sliding along what is met."""
+        """Move by a displacement `way` (3,) [m], sliding along touched surfaces."""
         assert frame.advance is not None
         begin, hits = frame.pose[:3, 3], len(frame.hits)
         hit = frame.advance(frame, translated(frame.pose, way))
@@ -239,7 +239,10 @@ class GroundRunner:
         del frame.hits[hits:]
 
     def _would_land(self, frame: Frame, reach: float, *, stood: bool) -> bool:
-        """Return whether an avatar with nothing within reach below its feet would or may land."""
+        """Return whether an avatar without ground within `reach` [m] of its feet may land.
+
+        stood: whether it stood in the last frame.
+        """
         world, avatar, up = frame.world, frame.body.avatar, frame.world.up
         if not len(avatar.points):
             return False
@@ -252,11 +255,11 @@ class GroundRunner:
         )
         if swept.verdict != Verdict.CONTACT:
             return bool(swept.verdict == Verdict.UNKNOWN)
-        # A hole's rim, or the ledge behind it, is met by the parts above the feet, which are wider.
+        # The rim of a hole, or the ledge behind, stops the parts above the feet, which are wider.
         return not stood or dot(swept.cloud, up) < feet - reach
 
     def walkable_normal(self, frame: Frame, hit: Hit) -> Vec | None:
-        """Return the normal of what was met, if it can be stood on; None: it is too steep.
+        """Return the normal (3,) of a touched surface that can be stood on; None if too steep.
 
         The points around an edge, for example of a stair, have a slanting normal. An avatar can
         stand on an edge if the surface farther in, at its height, is ground.
@@ -267,7 +270,7 @@ class GroundRunner:
         if stood is not None and hit.archive >= 0:
             way = hit.cloud - stood[0]
             if abs(dot(way, stood[1])) <= _SAME_FLOOR and norm(way) <= _SAME_FLOOR_REACH:
-                return stood[1]  # the last ground: a normal takes as long as half a sweep
+                return stood[1]  # reuse the last ground: estimating a normal takes half a sweep's time
         up, out = frame.world.up, hit.avatar - hit.cloud
         length = norm(out)
         normal: Vec | None = frame.world.normal(hit, self._normal_reach)
@@ -290,7 +293,10 @@ class GroundRunner:
         return top if top is not None and dot(top, up) >= self._walkable else None
 
     def _fall_along(self, frame: Frame, fall: float, seconds: float) -> None:
-        """Fall onto something steep, and along it; distance not fallen reduces the speed."""
+        """Fall onto a steep surface and along it; a shorter fall reduces the speed.
+
+        fall: distance of a free fall in this frame [m].  seconds: duration of the frame.
+        """
         begin = frame.pose[:3, 3]
         self.slide(frame, -fall * frame.world.up)
         fell = -dot(frame.pose[:3, 3] - begin, frame.world.up)
@@ -306,7 +312,7 @@ def make(effect: Ground, world: World) -> GroundRunner:
     step, sweep, slide = declared.get(Step), declared.get(Sweep), declared.get(Slide)
     sliding = None
     if isinstance(slide, Slide):
-        # Imported here: what no effect needs is not imported.
+        # Imported here, so that scenes without `slide` do not import it.
         from .slide_effect import make as make_sliding
 
         sliding = make_sliding(slide, world)

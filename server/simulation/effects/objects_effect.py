@@ -1,12 +1,12 @@
 """Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
 
-Motion commands place a kinematic object (`Bodies.place_objects`), even into users. A pushed object
-is moved by the user whose motion it ended: by the remaining translation, level, as far as the
-object touches nothing on its way. Then the user follows. The object has no momentum: it never moves
-farther than its user's motion command, and stands when nobody pushes. An object that touches the
-scene where it stands, such as the floor, does not move: place it clear of the scene.
+Motion commands place a kinematic object (`Bodies.place_objects`), even into users. The user whose
+motion ends at a pushable object moves it: by the horizontal part of the remaining translation, as
+far as the object touches nothing. Then the user follows. The object has no momentum: it never moves
+farther than the motion command, and does not move by itself. An object that touches the scene at
+its pose, for example the floor, cannot be pushed, so it must be placed clear of the scene.
 
-Contacts of objects are recomputed only for those that have moved (contact as in server/queries/objects.py).
+Contacts are recomputed only for objects that have moved. server/queries/objects.py defines contact.
 """
 
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ from ..world.body_obstacles import BodyObstacle, warm_kernels
 from ..world.frame import Frame, Hit, Pose, Vec, translated
 from ..world.vectors import dot, horizontal, norm
 
-# A pushed object keeps this distance from what stops it, along its way [m], as `stop` does for
+# A pushed object stops this far before whatever stops it, along its way [m], as `stop` does for
 # users.
 _SKIN = 0.002
-# Largest distance any point may move between the last moment known to be clear and a touch [m].
+# Largest distance that any point may move between the last time proved clear and the contact [m].
 _TOLERANCE = 1e-5
-# A push that would move an object by less than this does not move it [m].
+# Shorter pushes do not move an object [m].
 _MIN_PUSH = 1e-4
-# Cosine: an object moves where it is pushed within 60 degrees of head on; otherwise users slide
-# along it.
+# Cosine of 60 degrees, the largest angle between a push and the surface's inward normal. At larger
+# angles users slide along the object.
 _HEAD_ON_COSINE = 0.5
 
 
@@ -48,8 +48,8 @@ def make(effect: Objects, world: Any) -> "ObjectsRunner":
 class ObjectsRunner:
     """Effect that adds the scene's objects to the obstacles of a frame.
 
-    bodies: the simulation updates its users in them.  world: of the scene.  Not thread-safe, except
-    for queries of `Bodies`.
+    bodies: objects and users; the simulation updates the users.  world: of the scene.
+    Not thread-safe, except for queries of `Bodies`.
     """
 
     name = "objects"
@@ -60,7 +60,7 @@ class ObjectsRunner:
         with world as seen:
             self.bodies = Bodies(seen[0].data.arrays.origin, world.up, self._add_initial)
         self._items = list(items)
-        # By row: the clock of its last move, and the archives, when its contacts were computed.
+        # State for which the contacts of each row were computed: clock of its last move, archives.
         self._computed_for: dict[int, tuple[int, tuple[int, ...]]] = {}
         self._contacts: set[tuple[int, int]] = set()  # rows, the lesser first; -1: the scene
 
@@ -118,15 +118,15 @@ class ObjectsRunner:
             for other in near[bodies.touching(shape, pose, near, 0, budget.stop)].tolist():
                 self._contacts.add((min(row, other), max(row, other)))
             if verdict == Verdict.UNKNOWN or budget.stop:
-                continue  # query again, once missing voxels may be there
+                continue  # compute again in a later frame, when missing voxels may be resident
             self._computed_for[row] = now
         return sorted(self._contacts)
 
     def push(self, name: str, way: Vec, user: str, budget: QueryBudget) -> bool:
-        """Move an object by a level displacement; return whether it moved.
+        """Move an object by a horizontal displacement (3,) [m], as far as it touches nothing.
 
-        It moves as far as nothing is touched.
-        user: the one who pushes, and follows; it is no obstacle.
+        Return whether it moved.
+        user: name of the user that pushes and follows; it is not an obstacle of the object.
         """
         bodies = self.bodies
         row, length = bodies.row_of(name, user=False), norm(way)
@@ -154,10 +154,10 @@ class ObjectsRunner:
 
 
 class ObjectObstacle(BodyObstacle):
-    """Obstacle of the objects, for one user's frame. Pushable objects give way."""
+    """Obstacle formed by the objects, for one frame of one user. Pushable objects give way."""
 
     def __init__(self, runner: ObjectsRunner, frame: Frame, since: int) -> None:
-        """Create the obstacle for a frame. since: the count of moves its user knows of."""
+        """Create the obstacle for a frame. since: clock of the last moves reported to its user."""
         body, stop = frame.body, frame.budget.stop
         super().__init__(
             runner.name, runner.bodies, KINEMATIC | PUSHED, body.name, body.avatar, body.pose, stop=stop
@@ -165,9 +165,9 @@ class ObjectObstacle(BodyObstacle):
         self._runner, self._since = runner, since
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Push the object that was met by the rest of the way; return whether it moved.
+        """Push the object that ended the motion by the rest of the way; return whether it moved.
 
-        Only pushable objects move, and a move that keeps no state pushes nothing.
+        Only pushable objects move. `Simulation.move`, which keeps no state, pushes no object.
         """
         bodies = self._runner.bodies
         if not self.is_own(hit):

@@ -1,7 +1,7 @@
 """Effect `proximity`: report the nearest scan point and the contact normal.
 
-It reports each frame, for haptics and warnings, on the scene as scanned; users and dynamic objects
-are not included.
+It reports in each frame, for haptics and warnings. Distances are from the scan only, not from users
+or dynamic objects.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ def make(effect: Proximity, world: Any) -> "ProximityRunner":
 class ProximityRunner:
     """Effect that reports the answer of `distance` at the frame's pose.
 
-    The report has witnesses where something is within reach.
+    The report has witnesses if something is within reach.
     """
 
     name = "proximity"

@@ -1,20 +1,20 @@
-"""Effect `slide`: continue a stopped motion along the surfaces touched, their creases and corners.
+"""Effect `slide`: continue a stopped motion along the touched surfaces, their creases and corners.
 
-This is collide and slide with the planes of a frame. The remaining translation is clipped against
-every surface met in the frame, so that it goes into none of them: along the crease of two, and
-nowhere between three. It never goes against the motion command, and never farther than the
-remainder: no energy appears.
+The method is "collide and slide" with the planes of one frame. The remaining translation is clipped
+against every surface touched in the frame, so that it leads into none of them: it follows the
+crease of two, and is zero between three. It is never directed against the motion command, and never
+longer than the remainder.
 
-A surface is a plane with the smoothed normal of the scan points around the one that was touched.
-The scan's spheres make a flat wall bumpy, by up to their radius. If the frame has already met the
-same plane, a bump is in the way. The avatar then moves off the surface by a few millimetres, and
-on; the result is kept if it led farther along the motion command. Each frame of one motion command
-therefore improves on the previous one or changes nothing, and an avatar that keeps pushing does not
-tremble for ever. For a nearly head-on push, the remainder along a surface is mostly the error of
-the normal: the avatar then stays, as by friction (MIN_SLIDE_SHARE).
+A surface is a plane with the smoothed normal of the scan points around the touched one. The scan's
+spheres make a flat wall bumpy, by up to their radius. If a motion touches a plane that the frame
+has touched before, a bump obstructs it. The avatar then moves off the surface by a few millimetres
+and continues; the result is kept if it led farther along the motion command. Repeated frames of one
+motion command therefore improve the position or keep it, and an avatar that keeps pushing does not
+tremble. In a nearly head-on push, the remainder along the surface is mostly the error of the
+normal, and the avatar stays, as by friction (MIN_SLIDE_SHARE).
 
-For turns, the screw motion of the motion command is tried first. The rest of its translation slides
-at the orientation reached. Then the rest of the turn is tried on the spot.
+If the command turns the avatar, its screw motion is tried first. The rest of its translation then
+slides at the orientation reached. Finally, the rest of the rotation is tried in place.
 """
 
 import math
@@ -29,29 +29,27 @@ from ..world.collision_world import World
 from ..world.frame import Frame, Hit, Vec, translated
 from ..world.vectors import dot, norm
 
-# A smaller share of the remainder along the surfaces is not followed: 6 degrees off head on, or
-# less. Smoothed normals are off by a few degrees: at 0.02, an avatar pushed straight at a flat wall
+# Least share of the remainder that must lie along the surfaces to slide: 6 degrees off head on.
+# Smoothed normals are wrong by a few degrees: at 0.02, an avatar pushed straight at a flat wall
 # crept along it.
 MIN_SLIDE_SHARE = 0.1
-# A shorter way is not followed either [m]: an avatar in a corner would tremble.
+# Least length of a sliding motion [m]. With shorter ones an avatar in a corner would tremble.
 MIN_SLIDE = 5e-5
-# Normals this close belong to one plane: 8 degrees.
+# Least cosine between the normals of one plane: 8 degrees.
 SAME_PLANE_COSINE = 0.99
 # Distances to move off a surface with a bump, as multiples of `skin`, tried in turn, and the least
 # distance [m].
 LIFT_FACTORS, MIN_LIFT = (1.0, 3.0), 5e-4
-# Moving over a bump counts if it leads this much farther along the motion command, as a share of
-# the way.
+# Least gain along the motion command for which moving over a bump is kept, as a share of the way.
 MIN_GAIN = 1e-3
-# Motions of a frame for each surface: bumps take some of them.
+# Limit of motions in a frame, for each of `surfaces`. Moving over bumps takes some of them.
 _MOTIONS_PER_SURFACE = 2
-# A way that goes into a surface by no more than this share of itself, its rounding, does not go
-# into it.
+# A displacement may lead into a surface by this share of its length, which is rounding.
 _ROUNDING = 1e-9
 
 
 class SlideRunner:
-    """Effect `slide` of one scene. surfaces, normal_reach: of `Slide`."""
+    """Effect `slide` of one scene. surfaces, normal_reach: as in `Slide`."""
 
     name = "slide"
 
@@ -60,7 +58,8 @@ class SlideRunner:
     ) -> None:
         """Create the effect.
 
-        skin: of `stop` [m].  slope: anything steeper is a wall [degrees]; None: there is no ground.
+        skin: distance that `stop` keeps [m].  slope: surfaces steeper than this are walls
+        [degrees]; None: the scene has no effect `ground`.
         """
         self._lift = max(skin, MIN_LIFT)
         self.surfaces, self.normal_reach = surfaces, normal_reach
@@ -68,7 +67,7 @@ class SlideRunner:
         self._walkable = None if slope is None else math.cos(math.radians(slope))
 
     def run(self, frame: Frame) -> None:
-        """Slide, then turn on the spot."""
+        """Slide, then turn in place."""
         hit = frame.blocked
         if hit is None or frame.advance is None:
             return
@@ -76,7 +75,7 @@ class SlideRunner:
         command, rest = frame.target[:3, 3] - begin, frame.target[:3, 3] - frame.pose[:3, 3]
         far = norm(rest)
         if far > 0.0:
-            # A turning avatar moves along an arc: with the whole remainder it could get farther
+            # A turning avatar moves along an arc. With the whole remainder it could move farther
             # than commanded.
             rest = rest * min(1.0, max(0.0, norm(command) - norm(frame.pose[:3, 3] - begin)) / far)
             self.slide_along(frame, hit, rest, command, upright=True)
@@ -87,11 +86,11 @@ class SlideRunner:
         frame.remaining = frame.target[:3, 3] - frame.pose[:3, 3]
 
     def slide_along(self, frame: Frame, hit: Hit, rest: Vec, command: Vec, *, upright: bool) -> Hit | None:
-        """Continue along what ended a motion.
+        """Continue a motion along the surface that ended it, and along further ones.
 
-        rest: (3,), the rest of its translation.  command: (3,), the whole translation [m].  upright:
-        treat what is too steep to walk on as a wall, where there is ground. Returns what ended the
-        motion finally, or None.
+        rest: (3,), the rest of the translation [m].  command: (3,), the whole translation [m].
+        upright: treat a surface that is too steep to walk on as vertical, with `ground`.
+        Return the hit that ended the motion, or None.
         """
         assert frame.advance is not None
         start, most = frame.pose[:3, 3] - (command - rest), norm(command)
@@ -136,10 +135,12 @@ class SlideRunner:
     def _over_bump(
         self, frame: Frame, out: Vec, way: Vec, command: Vec, start: Vec
     ) -> tuple[bool, Hit | None]:
-        """Move over a bump of a surface that was met: off it a little, then on.
+        """Move over a bump of a touched surface: away from it by a little, then on.
 
-        out: (3,), its normal.  start: (3,), where the motion command began. Returns whether that
-        led farther along the motion command, and what ended it; otherwise everything is as before.
+        out: (3,), normal of the surface.  way, command: (3,), displacement to try and that of the
+        motion command [m].  start: (3,), position where the motion command began.
+        Return whether that led farther along the motion command, and the hit that ended it. If not,
+        the frame is restored.
         """
         assert frame.advance is not None
         before, hits, ended = frame.pose, len(frame.hits), None
@@ -157,7 +158,7 @@ class SlideRunner:
         return False, ended
 
     def _surface(self, frame: Frame, hit: Hit, *, upright: bool) -> Vec | None:
-        """Return the unit normal of the plane that was met, stored in the hit; None if unknown."""
+        """Return the unit normal (3,) of a touched plane, stored in the hit; None if unknown."""
         if hit.verdict == Verdict.UNKNOWN or hit.avatar is None or hit.cloud is None:
             return None
         normal: Vec | None = frame.world.normal(hit, self.normal_reach)
@@ -172,7 +173,7 @@ class SlideRunner:
         return self._wall(normal) if upright else normal
 
     def _wall(self, normal: Vec) -> Vec:
-        """Return a plane as a walking avatar meets it: vertical if too steep to walk on."""
+        """Return the normal (3,) of a plane for a walking avatar: horizontal if it is too steep."""
         rises = dot(normal, self._up)
         if self._walkable is None or rises >= self._walkable:
             return normal
@@ -182,7 +183,7 @@ class SlideRunner:
 
 
 def limit_displacement(gone: Vec, way: Vec, most: float) -> Vec:
-    """Shorten a displacement so that the total of it and `gone` is at most `most` long [m].
+    """Shorten a displacement so that its sum with `gone` is at most `most` long [m].
 
     gone, way: (3,). The direction of `way` is kept.
     """
@@ -196,10 +197,11 @@ def limit_displacement(gone: Vec, way: Vec, most: float) -> Vec:
 
 
 def clip(rest: Vec, planes: list[Vec]) -> Vec | None:
-    """Return the longest part of a displacement (3,) that goes into none of the planes.
+    """Return the longest projection of a displacement (3,) that leads into none of the planes.
 
-    planes: unit normals, on the free side. The part is the whole displacement, else along one
-    plane, else along the crease of two; None if there is none.
+    planes: unit normals (3,) that point to the free side. The candidates are the displacement
+    itself, then its projections onto one plane, then those onto the crease of two. Return None if
+    all lead into a plane.
     """
     least = -_ROUNDING * norm(rest)
 

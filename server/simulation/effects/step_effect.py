@@ -1,9 +1,9 @@
-"""Effect `step`: climb what is no higher than `height`, and descend without a fall.
+"""Effect `step`: climb steps of at most `height`, and descend them without falling.
 
-An avatar that stands and was stopped moves up by `height`, as far as nothing is touched, forward by
-the rest of the motion command, and down. The result is kept if it led farther along the motion
-command than sliding did, ends on ground, and rose by no more than `height`; otherwise everything is
-as before. `ground` does the descending: it searches that far down for ground.
+A standing avatar whose motion was stopped moves up by `height`, as far as nothing is touched, then
+forward by the rest of the motion command, and down. The result is kept if it led farther along the
+motion command than sliding did, ends on ground, and rose by no more than `height`. Otherwise the
+frame is restored. The effect `ground` handles steps down: it searches for ground down to `height`.
 """
 
 from ....schemas.scene.effect_table import Ground, Step
@@ -26,7 +26,7 @@ class StepRunner:
         self._height, self._ground = height, ground
 
     def run(self, frame: Frame) -> None:
-        """Climb what stopped the motion command, if possible."""
+        """Climb the obstacle that stopped the motion command, if possible."""
         hit, blocked_pose = frame.blocked, frame.blocked_pose
         if hit is None or blocked_pose is None or not frame.body.on_ground or hit.cloud is None:
             return
@@ -56,11 +56,12 @@ class StepRunner:
     def _climb(self, frame: Frame, along: Vec, length: float, least: float) -> float | None:
         """Move up, forward and down from frame.pose.
 
-        Returns how far it rose [m], None: not onto ground, or too far.
+        along: (3,) unit, horizontal direction.  length: [m].  least: least gain along it [m].
+        Return the height gained [m]; None if the motion does not end on ground, or rose too far.
         """
         assert frame.advance is not None
         up, begin, start = frame.world.up, frame.body.pose[:3, 3], frame.pose
-        self._ground.slide(frame, self._height * up)  # beside a riser, its bumps are in the way up
+        self._ground.slide(frame, self._height * up)  # sliding avoids the bumps of the riser
         rose = self._rise(start, frame.pose, up)
         if rose < MIN_MOTION:
             return None
@@ -74,7 +75,7 @@ class StepRunner:
         if rose - lower > self._height + DEAD_BAND:
             return None
         self._ground.lower(frame, below, lower)
-        # On the way down beside something, the avatar may have been led back.
+        # Sliding down along a surface may have moved the avatar back.
         if dot(frame.pose[:3, 3] - begin, along) < least:
             return None
         return self._rise(start, frame.pose, up)

@@ -1,13 +1,14 @@
-"""Effect `stop`: touched things block; the avatar stays at the last clear pose.
+"""Effect `stop`: contact blocks motion; the avatar stays at the last clear pose.
 
-Alone it is discrete: the commanded pose is taken if nothing is touched there, and otherwise the
-avatar stays where it is. With `sweep`, it moves as far as it can.
+Alone it is discrete: the avatar takes the commanded pose if nothing is touched there, and otherwise
+stays. With `sweep`, it moves up to the first contact.
 
 An avatar that touches something before it moves (because it was placed there, or the archive was
-hot-reloaded) gets free first. It moves by the motion command, if that does not go deeper into the
-deepest contact, or by the shortest of a few ways, along the contact normal and up, of at most
-MAX_ESCAPE, whose end is clear. What lies between is not tested: an avatar in a wall has no clear
-side to stay on. If no end is clear, it stays, and the verdict says so.
+hot-reloaded) first escapes. The candidates are the displacement of the motion command, if it does
+not lead deeper into the deepest contact, and displacements of up to MAX_ESCAPE along the contact
+normal and upwards, shortest first. The first with a clear end is taken. The way to it is not
+tested, because an avatar in a wall has no clear side to stay on. If no end is clear, the avatar
+stays, and the verdict reports the contact.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
@@ -27,7 +28,7 @@ from ..world.frame import (
 )
 from ..world.vectors import dot, norm
 
-# How far an avatar gets free by itself [m], and the distances it tries.
+# Longest displacement of an escape from contact [m], and the distances that are tried.
 MAX_ESCAPE = 0.5
 _ESCAPE_DISTANCES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MAX_ESCAPE)
 
@@ -38,11 +39,11 @@ class StopRunner:
     name = "stop"
 
     def __init__(self, continuous: bool) -> None:
-        """Create the effect. continuous: `sweep` follows the motion command."""
+        """Create the effect. continuous: whether the effect `sweep` follows the motion command."""
         self._continuous = continuous
 
     def run(self, frame: Frame) -> None:
-        """Begin clear; without `sweep`, move to the commanded pose."""
+        """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
         frame.advance = move_if_clear
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
@@ -52,7 +53,7 @@ class StopRunner:
 
 
 def move_if_clear(frame: Frame, to: Pose) -> Hit | None:
-    """Move to a pose if nothing is touched there; return what is touched."""
+    """Move to a pose if nothing is touched there; otherwise return the hit."""
     if frame.pose.tobytes() == to.tobytes():
         return None
     hit = find_touched(frame, to)
@@ -68,7 +69,7 @@ def move_if_clear(frame: Frame, to: Pose) -> Hit | None:
 
 
 def escape_contact(frame: Frame) -> None:
-    """Leave what is touched at frame.pose, if anything is, for a near clear pose."""
+    """Move to a near clear pose if anything is touched at frame.pose."""
     hit = find_touched(frame, frame.pose)
     frame.clear = hit is None
     if hit is None:
@@ -82,7 +83,7 @@ def escape_contact(frame: Frame) -> None:
 
 
 def _escape_displacements(frame: Frame, hit: Hit) -> list[Vec]:
-    """Return the ways to get free, shortest first."""
+    """Return the displacements (3,) [m] to try, the commanded one first, then shortest first."""
     directions: list[Vec] = [frame.world.up]
     commanded = frame.target[:3, 3] - frame.pose[:3, 3]
     deeper = False
@@ -91,7 +92,7 @@ def _escape_displacements(frame: Frame, hit: Hit) -> list[Vec]:
         across = norm(out)
         if across > 0.0:
             directions.insert(0, out / across)
-            deeper = dot(commanded, out) < 0.0  # it might lead through what is touched
+            deeper = dot(commanded, out) < 0.0  # it might lead through the touched surface
     ways = [way * direction for way in _ESCAPE_DISTANCES for direction in directions]
     if not deeper and 0.0 < norm(commanded) <= MAX_ESCAPE:
         ways.insert(0, commanded)

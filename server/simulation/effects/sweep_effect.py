@@ -1,8 +1,8 @@
 """Effect `sweep`: continuous motion; nothing is passed through between two frames at any speed.
 
-The way from one pose to the next is the screw motion of server/queries/sweep.py. What it meets ends it
-`skin` before (`stop`), at a pose that is clear by `collide`. The sweep proves that where the pose
-is the sweep's bit for bit; otherwise it is queried.
+The way from one pose to the next is the screw motion of server/queries/sweep.py. What it meets ends
+it `skin` before (`stop`), at a pose that is clear by `collide`. The sweep proves that where the
+pose is the sweep's bit for bit; otherwise it is queried.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
@@ -19,12 +19,12 @@ from ..world.frame import (
     skin_fraction,
 )
 
-# Largest number of pushes of what gives way, in one motion.
+# Limit of pushes of obstacles in one motion.
 _MAX_PUSHES = 4
 
 
 class SweepRunner:
-    """Effect `sweep` of one scene. skin, tolerance: of `Stop` and `Sweep`."""
+    """Effect `sweep` of one scene. skin, tolerance: as in `Stop` and `Sweep` [m]."""
 
     name = "sweep"
 
@@ -37,7 +37,7 @@ class SweepRunner:
         follow_command(frame)
 
     def sweep_towards(self, frame: Frame, to: Pose) -> Hit | None:
-        """Move towards a pose as far as nothing is touched; return what ended the motion."""
+        """Move towards a pose as far as nothing is touched; return the hit that ended it."""
         hit: Hit | None = None
         for _ in range(_MAX_PUSHES):
             if frame.pose.tobytes() == to.tobytes():

@@ -1,8 +1,8 @@
 """Effect `through`: named boxes where contact is ignored, such as a door or a portal.
 
-A door is one that is known to open. The scan points in the boxes, borders included, are masked in
-what is served (server/archives/masked_archive.py): every query answers as for a scan that never had them. This
-effect has no part in a frame and therefore no runner.
+The scan points in the boxes, borders included, are masked (server/archives/masked_archive.py):
+every query answers as for a scan that never had them. The effect acts when the scene is opened and
+has no runner, because it does nothing in a frame.
 """
 
 from functools import partial

@@ -1,17 +1,18 @@
 """Effect `uncertainty`: report the probability of contact, for scans with range noise.
 
-It reports each frame, on the scene as scanned; users and dynamic objects are not included.
+It reports in each frame. Contact is with the scan only, not with users or dynamic objects.
 
 The model:
 - Each scan s has one error, normally distributed with mean 0 and standard deviation sigma_s [m]. It
-  is the same for all points of the scan near the avatar: they were measured in quick succession, at
-  similar ranges and angles. The remaining error of the scan there is that of its calibration and
-  registration, which move a patch as a whole. (With an error for each point, contact would become
-  more certain the denser the scan is, which it does not in reality.)
-- The error acts along the separation of the nearest pair of spheres of that scan. That pair
-  therefore decides: the scan is touched if g_s + error <= 0, where g_s is its least signed
-  separation [m]. The probability is Phi(-g_s / sigma_s). If a scan saw the surface at an angle, its
-  error is along its ray, and smaller along the separation: the result is then too close to 1/2.
+  is the same for all points of the scan near the avatar, because they were measured in quick
+  succession, at similar ranges and angles. The remaining error there is that of calibration and
+  registration, which moves a patch as a whole. (With an independent error for each point, a denser
+  scan would make contact more certain, which it does not in reality.)
+- The error acts along the separation of the nearest pair of spheres of that scan. The scan is
+  touched if g_s + error <= 0, where g_s is its least signed separation [m]. The probability is
+  Phi(-g_s / sigma_s). If a scan saw the surface at an angle, its error is along its ray, and
+  smaller
+  along the separation: the result is then too close to 1/2.
 - Scans are independent, so P(contact) = 1 - prod_s Phi(g_s / sigma_s).
 - The avatar has no error.
 
@@ -50,7 +51,8 @@ MAX_SIGMAS = 4.0
 _SQRT_2 = math.sqrt(2.0)
 # Number of names listed in an error message.
 MAX_NAMES_LISTED = 8
-# A margin is rounded to exact units: one unit more, so that nothing within four sigma is omitted.
+# Added to the margin, which is rounded to exact units, so that nothing within four sigma is
+# omitted.
 EXACT_UNIT = 1.0 / UNITS_PER_METRE
 
 # Names of a source, shortest first: a later one distinguishes sources that an earlier one does not.
@@ -98,10 +100,9 @@ def combined_probability(alone: Iterable[float]) -> float:
 
 
 def scan_names(sources: Sequence[SourceInfo]) -> list[str]:
-    """Return the name of each source in reports.
+    """Return the name of each source in reports, the first of these that is unique.
 
-    It is the file's name; where others share it, the path; for one scan of several in a file, the
-    path with its index.
+    The candidates are the file's name, the path, and the path with the scan's index in the file.
     """
     counts = [Counter(name(source) for source in sources) for name in _NAMES]
     return [
@@ -114,9 +115,9 @@ def scan_names(sources: Sequence[SourceInfo]) -> list[str]:
 
 
 def _sigma_of(effect: Uncertainty, source: SourceInfo) -> float | None:
-    """Return the standard deviation [m] that `scans` gives a source, or None.
+    """Return the standard deviation [m] that `Uncertainty.scans` gives a source, or None.
 
-    The longest of its names decides.
+    If several of its names are listed, the longest decides.
     """
     own = [effect.scans[name(source)] for name in reversed(_NAMES) if name(source) in effect.scans]
     return own[0] if own else None
@@ -134,7 +135,7 @@ def check(effect: Uncertainty, *infos: SceneInfo) -> None:
             listed = sorted({_NAMES[0](source) for source in sources})
             more = f", and {len(listed) - MAX_NAMES_LISTED} more" if len(listed) > MAX_NAMES_LISTED else ""
             raise BadRequestError(
-                f"uncertainty: scans: {name!r} is no scan of {', '.join(info.scene for info in infos)}: expected "
+                f"uncertainty: scans: {name!r} is not a scan of {', '.join(info.scene for info in infos)}: expected "
                 f"{', '.join(listed[:MAX_NAMES_LISTED])}{more}: `solidcloud info` lists them"
             )
 
@@ -142,9 +143,9 @@ def check(effect: Uncertainty, *infos: SceneInfo) -> None:
 class ArchiveScans(NamedTuple):
     """Scans of one archive.
 
-    sigmas: [m], by their rows in `SceneInfo.sources`.  names: of each row, in reports.
-    single_scan: the number of the only scan; ANY_SCAN where the archive has several and does not store the
-    scan of a point, and one sigma holds for all; None where it stores the scan.
+    sigmas: [m], by row of `SceneInfo.sources`.  names: of each row, in reports.
+    single_scan: number of the only scan; ANY_SCAN if the archive has several scans with one sigma
+    and does not store the scan of each point; None if it stores the scan of each point.
     """
 
     sigmas: dict[int, float]
@@ -182,10 +183,7 @@ def make(effect: Uncertainty, world: Any) -> "UncertaintyRunner":
 
 
 def _warm(data: SceneData) -> None:
-    """Compile the kernel before the first request needs it.
-
-    Without this, it would be compiled in the first frame in which something is near.
-    """
+    """Compile the kernel now, and not in the first frame in which something is near."""
     nowhere = np.eye(4)
     nowhere[:3, 3] = MAX_COORDINATE / 2
     separation_per_scan(data, make_avatar([[0.0, 0.0, 0.0]], 0.1), nowhere, 0.0, 1)

@@ -1,8 +1,8 @@
 """Bodies: everything that moves in one scene, users and objects, with their current poses.
 
-Each simulation has one. It updates the bodies like a dict of its users (`bodies[user] = body` after
-each frame, `pop`), and passes on the poses at which motion commands place objects (`place_objects`). Effects
-query it through `BodyObstacle` (body_obstacles.py).
+A simulation has at most one `Bodies`. It updates the users as in a dict (`bodies[user] = body`
+after each frame, `pop`), and the objects that motion commands place (`place_objects`). Effects
+query the bodies through `BodyObstacle` (body_obstacles.py).
 """
 
 import threading
@@ -27,8 +27,8 @@ from .frame import Body, Pose, Vec
 from .vectors import horizontal, rotate, rotate_back
 
 USER, KINEMATIC, PUSHED = 1, 2, 4  # kinds, one bit each
-# Points this near to one another form a body's surface [m], as `slide` and `ground` define it for
-# scans.
+# Points within this distance determine the normal of a body's surface [m]; `slide` and `ground` use
+# the same distance for scans.
 _SURFACE = 0.08
 # Number of cached shapes of avatars that belong to no body, beyond which they are dropped.
 _MAX_LOOSE_SHAPES = 64
@@ -37,8 +37,9 @@ _MAX_LOOSE_SHAPES = 64
 class Shape(NamedTuple):
     """Avatar's model with the data of the broad phase.
 
-    box: (2, 3) of its points [m], zeros where it has none.  units: its radius, exact units.
-    number: of it among its `Bodies`.  normals: those computed so far, by point.
+    box: (2, 3) around its points, avatar frame [m]; zeros if it has no points.
+    units: its radius, exact units.  number: of this shape among its `Bodies`.
+    normals: normals computed so far, by point.
     """
 
     model: AvatarModel
@@ -53,9 +54,9 @@ class Shape(NamedTuple):
         return placed
 
     def normal_at(self, point: int) -> Vec | None:
-        """Return the unit normal of its surface at a point, or its opposite; None if none.
+        """Return a unit normal (3,) of the surface at a point, of either sign, avatar frame.
 
-        The normal is in the avatar frame. It is computed as for a scan
+        Return None if the points form no surface. The normal is computed as for a scan
         (schemas/kernels/normal_codes.py), with exact units as the lattice.
         """
         if point not in self.normals:
@@ -77,9 +78,10 @@ class Bodies:
     origin: (3,), the scene's origin, relative to which bodies are placed [m].  up: (3,) unit.
     lock: held during queries and changes, because a move that keeps no state may run at the same
     time as a frame.
-    Rows: names; kinds (n,) uint8; poses (n, 4, 4), world; bounds (n, 2, 3), relative to the origin,
-    radius included; shapes; numbers (n,) of shapes; changed: the clock at the last move.
-    clock: counts moves.  layout: counts arrivals and departures of bodies, after which rows change.
+    names, kinds (n,) uint8, shapes: by row.  poses: (n, 4, 4), world.
+    bounds: (n, 2, 3), relative to the origin, radius included [m].  numbers: (n,), of shapes.
+    changed: value of `clock` at the last move of each row.
+    clock: counts moves.  layout: counts arrivals and departures of bodies, which change rows.
     """
 
     def __init__(self, origin: Vec, up: Vec, begin: "Callable[[Bodies], None] | None" = None) -> None:
@@ -287,14 +289,14 @@ class Bodies:
             told = [each for each, kind in zip(self.names, self.kinds, strict=True) if kind == KINEMATIC]
             found = "is not in this scene" if row < 0 else "is pushed by users and cannot be placed"
             raise BadRequestError(
-                f"object {name!r} {found}: expected a kinematic object: {', '.join(told) or 'there is none'}"
+                f"object {name!r} {found}: expected a kinematic object: {', '.join(told) or 'the scene has none'}"
             )
         return row
 
     def _remember_origin(self, thing: int, before: Pose, stop: StopFlag) -> None:
-        """Store the direction from which a placed object has moved into users.
+        """Store the direction from which a placed object moved into each user that it touches.
 
-        The direction is in the object's frame; `escape_direction` uses it.
+        The direction is in the object's frame. `escape_direction` uses it.
         """
         bounds, now = self.bounds, self.poses[thing]
         apart = (bounds[:, 0] > bounds[thing, 1]) | (bounds[:, 1] < bounds[thing, 0])
@@ -309,11 +311,12 @@ class Bodies:
             self._came_from[self.names[row], self.names[thing]] = own[0] - own[1]
 
     def escape_direction(self, row: int, user: str, center: Vec) -> Vec:
-        """Return the level direction in which a mover gets free of a body it overlaps; zeros: any.
+        """Return the horizontal direction (3,) in which a mover separates from a body it overlaps.
 
         The direction is away from the body's centre. For an object that was moved into a user, it
-        is the direction the object came from, which does not lead through it.
-        center: of the mover.  user: the mover's name, "" for an object.
+        is the direction from which the object came, which does not lead through it. Zeros: every
+        direction is allowed.
+        center: (3,) of the mover.  user: the mover's name, "" for an object.
         """
         came_from = self._came_from.get((user, self.names[row])) if self.kinds[row] != USER else None
         pose = self.poses[row]
@@ -323,9 +326,10 @@ class Bodies:
     def touching(
         self, shape: Shape, pose: Pose, rows: NDArray[np.int64], margin_units: int, stop: StopFlag = NO_STOP
     ) -> NDArray[np.bool_]:
-        """Return whether an avatar at a pose touches the bodies of each of rows (m,).
+        """Return the mask (m,) of rows (m,) whose bodies an avatar at a pose touches.
 
-        The definition decides. The result is meaningless once `stop` is set.
+        The test is exact, by the definition of contact. The result is meaningless once `stop` is
+        set.
         """
         found = np.zeros(len(rows), bool)
         if not len(shape.model.points):

@@ -1,13 +1,13 @@
 """BodyObstacle: the bodies of a scene that obstruct one mover, as an `Obstacle` of one frame.
 
 First, one kernel call of some microseconds tests the bounds of all bodies against those of the
-motion; usually none is near. Then the near bodies are tested exactly (kernels/bodies/body_sweep.py,
+motion; usually no body is near. Near bodies are then tested exactly (kernels/bodies/body_sweep.py,
 kernels/bodies/body_pairs.py).
 
 A body that the mover overlaps when the frame begins blocks only a translation against
-`Bodies.escape_direction`. A translation along it, across it, up or down is permitted, and so is a turn.
-Bodies that came to overlap, by their initial poses or because a motion command placed an object
-there, can therefore separate, and none is ever trapped.
+`Bodies.escape_direction`. A translation along it, across it, up or down is permitted, and so is a
+turn. Bodies that overlap, by their initial poses or because a motion command placed an object
+there, can therefore always separate.
 """
 
 from typing import NamedTuple
@@ -32,8 +32,8 @@ _ACROSS = 1e-9
 class _FirstHit(NamedTuple):
     """First body that ends a motion.
 
-    row: of the body.  witness: (2, 3) centres of the two spheres, world [m].  point: of the body's
-    model that touches.
+    row: of the body.  fraction: of the motion.  witness: (2, 3) centres of the two spheres, world
+    [m].  point: number of the touching point of the body's model.
     """
 
     row: int
@@ -51,11 +51,11 @@ class BodyObstacle:
     ) -> None:  # fmt: skip
         """Prepare the obstacle.
 
-        name: of the effect.  wanted: kinds, bits.  mover: its name.  user: whether the mover is a
-        user, or an object.
-        start: its pose when the frame begins.  margin_units: distance to keep, exact units.  skip:
-        a user that does not block.
-        stop: of the frame; once it is set, results are meaningless.
+        name: of the effect.  wanted: kinds of bodies, bits.  mover: name of the mover.
+        model, start: of the mover: its avatar, and its pose (4, 4) when the frame begins.
+        user: whether the mover is a user; False for an object.
+        margin_units: distance to keep, exact units.  skip: name of a user that does not block.
+        stop: stop flag of the frame; once it is set, results are meaningless.
         """
         self.name = name
         self._bodies, self._wanted, self._margin_units = bodies, wanted, margin_units
@@ -66,16 +66,16 @@ class BodyObstacle:
         self._hits: list[Hit] = []
 
     def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """Return what ends the motion first; see `Obstacle`. Ties go to the lowest row."""
+        """Return the hit that ends the motion first; of equals, that of the lowest row."""
         hit = self._sweep(avatar, pose_from, pose_to, tolerance)
         if hit is not None:
             self._hits.append(hit)
         return hit
 
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """Return what is touched at a pose, the lowest row.
+        """Return the hit of the touched body with the lowest row; None if no body is touched.
 
-        avatar and cloud of the hit are the two bodies' centres, level.
+        `avatar` and `cloud` of the hit are the two bodies' centres at the same height.
         """
         hit = self._touches(avatar, pose)
         if hit is not None:
@@ -117,7 +117,7 @@ class BodyObstacle:
             return self._deepening_hit(shape, self._start, pose)
 
     def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
-        """Return whether any body is touched at a pose, whatever the margin.
+        """Return whether any body is touched at a pose, without the margin.
 
         Bodies that were touched when the frame began count too.
         """
@@ -133,7 +133,7 @@ class BodyObstacle:
         return False
 
     def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:
-        """Return the rows that a motion, relative to the origin, could meet."""
+        """Return the rows (m,) whose bounds a motion, relative to the origin, may touch."""
         bodies = self._bodies
         rows = np.empty(len(bodies.names), np.int64)
         if not len(rows) or not len(shape.model.points):
@@ -165,7 +165,7 @@ class BodyObstacle:
     def _first(
         self, shape: Shape, ends: tuple[Pose, Pose], rows: NDArray[np.int64], tolerance: float
     ) -> "_FirstHit | None":
-        """Return what ends a motion first among the bodies of these rows."""
+        """Return the first hit of a motion with the bodies of these rows; None if there is none."""
         bodies, numbers = self._bodies, self._bodies.numbers[rows]
         best: _FirstHit | None = None
         until = np.inf
@@ -207,9 +207,9 @@ class BodyObstacle:
         return found
 
     def _deepening_hit(self, shape: Shape, pose_from: Pose, pose_to: Pose) -> Hit | None:
-        """Return a hit of a body, overlapped at the start, that a motion goes deeper into.
+        """Return a hit if a motion leads deeper into a body that was overlapped at the start.
 
-        A motion does so if its translation is directed against the body's `_out`. None: no body.
+        It does if its translation is directed against the body's `_out`. Return None otherwise.
         """
         way = pose_to[:3, 3] - pose_from[:3, 3]
         for row in sorted(row for row, overlapped in self._overlapped.items() if overlapped):
@@ -228,8 +228,8 @@ class BodyObstacle:
     def _hit_at(self, shape: Shape, pose: Pose, row: int) -> Hit:
         """Return the hit of a body touched at a pose.
 
-        The time of contact is unknown; the body's centre therefore gives the position, as seen from
-        the frame's start.
+        The contact point is unknown, so the position is derived from the body's centre and the
+        frame's start.
         """
         bodies, center = self._bodies, shape.center(pose)
         out = shape.center(self._start) - bodies.shapes[row].center(bodies.poses[row])

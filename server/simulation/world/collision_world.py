@@ -1,4 +1,4 @@
-"""The archives of a scene as one: the queries of effects, for one avatar at a time.
+"""Collision world: the archives of a scene as one, queried by effects for one avatar at a time.
 
 An archive with a pose in the world is queried under the inverse of that pose, and witnesses are
 transformed back. A single archive at the identity, by far the most frequent case, is queried
@@ -32,9 +32,9 @@ from .frame import Hit, Pose, Vec
 from .least_answer import comes_first, merge_distances, merge_swept
 from .vectors import min_height, unit_vector
 
-# Largest number of avatars for which a thread keeps probes: users of one scene, and its objects.
+# Limit on the avatars (of users and objects) for which a thread keeps a `ResidentQueries`.
 _MAX_PROBES = 256
-# Largest number of their points: dropped avatars must not fill the memory. Some 100 MB a thread.
+# Limit on the points of these avatars, some 100 MB a thread: those of dropped avatars also count.
 _MAX_PROBED_POINTS = 1 << 20
 _NO_ORIGIN = np.zeros(3)
 # If the points near a touched one form no surface, because the scan is sparse, the reach of its
@@ -65,13 +65,13 @@ class _Held(threading.local):
 
 
 class World:
-    """Scene as effects query it. Thread-safe.
+    """Collision world of one scene. Thread-safe.
 
-    file: the scene file.  up: (3,) unit, against gravity.  archives: of the scene.
+    file: the scene file.  up: (3,) unit vector against gravity.  archives: of the scene.
     """
 
     def __init__(self, scene: Any, file: SceneFile) -> None:
-        """Create the world of a scene. scene: has `archives` and `avatar`, as a `Scene` has."""
+        """Create the world of a scene, an object with `archives` and `avatar` such as `Scene`."""
         self.file, self._scene = file, scene
         self.up: Vec = unit_vector(file.up)
         self.archives: list[PlacedArchive] = list(scene.archives)
@@ -79,7 +79,7 @@ class World:
         self._held = _Held()
 
     def __enter__(self) -> list[HeldArchive]:
-        """Hold the current archive generations, which this thread then queries inside the `with` block."""
+        """Hold the current archive generations, which this thread queries inside the `with`."""
         held = self._held
         if not held.depth:
             seen: list[HeldArchive] = []
@@ -98,7 +98,7 @@ class World:
         return held.seen
 
     def begin(self, stop: StopFlag) -> None:
-        """Begin a frame of this thread. stop: ends its queries early, from the next hold on."""
+        """Begin a frame of this thread. stop: flag for its queries from the next hold on."""
         self._held.stop, self._held.unknown = stop, False
 
     @property
@@ -125,7 +125,7 @@ class World:
                 each.opened.release()
 
     def avatar(self, name: str) -> AvatarModel:
-        """Return one of the scene's own avatars. Raises UnknownAvatarError until they are added."""
+        """Return an avatar of the scene file. Raise UnknownAvatarError until they are added."""
         model: AvatarModel = self._scene.avatar(name, EVERYBODY)
         return model
 
@@ -145,13 +145,16 @@ class World:
             return tuple([each.opened.number for each in seen])
 
     def saw(self, user: tuple[str, str], avatar: AvatarModel, pose: Pose, around: float = 0.0) -> None:
-        """Record a user's pose, around which voxels are prefetched. around: distance beyond the avatar [m]."""
+        """Record a user's pose, around which voxels are prefetched.
+
+        around: distance beyond the avatar's spheres [m].
+        """
         with self as seen:
             for each in seen:
                 each.opened.record_user(user, avatar, _to_archive(each, pose)[None], around)
 
     def _probe(self, avatar: AvatarModel) -> ResidentQueries:
-        """Return this thread's probe of an avatar."""
+        """Return this thread's `ResidentQueries` of an avatar."""
         probes, key = self._held.probes, id(avatar.points)
         probe = probes.get(key)
         if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
@@ -165,7 +168,7 @@ class World:
         return probe
 
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
-        """Return whether the avatar touches any archive at a pose (4, 4); see server/queries/collide.py."""
+        """Return the verdict at a pose (4, 4) over all archives; see server/queries/collide.py."""
         found, probe = Verdict.CLEAR, self._probe(avatar)
         with self as seen:
             for each in seen:
@@ -187,8 +190,8 @@ class World:
     ) -> SweepResult:
         """Return when the avatar first touches any archive on its way between two poses.
 
-        See server/queries/sweep.py. Of several archives: `lower` is the least, and `upper` and
-        witness are those of the earliest contact, at the same time of the least witness.
+        See server/queries/sweep.py. Of several archives, `lower` is the least; `upper` and witness
+        are those of the earliest contact, of simultaneous ones that with the least witness.
         """
         probe, held = self._probe(avatar), self._held
         if self._alone and held.depth:
@@ -211,7 +214,7 @@ class World:
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
     ) -> tuple[Pose, bool]:
-        """Return the pose at a fraction of a motion, and whether the proof of `sweep` applies to it."""
+        """Return the pose at a fraction of a motion, and whether the proof of `sweep` covers it."""
         with self as seen:
             origin = seen[0].data.arrays.origin if self._alone else _NO_ORIGIN
             pose, same = self._probe(avatar).between(origin, pose_from, pose_to, fraction)
@@ -232,7 +235,10 @@ class World:
         return least
 
     def deepest(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Hit | None:
-        """Return the deepest contact at a pose, with fraction 0, or None; of equals the least witness."""
+        """Return the deepest contact at a pose, with fraction 0, or None.
+
+        Of equally deep contacts, it is that with the least witness.
+        """
         found: Hit | None = None
         depth = np.inf
         with self as seen:
@@ -249,9 +255,10 @@ class World:
         return found
 
     def nearest(self, place: Vec, reach: float, budget: QueryBudget = EXACT) -> Hit | None:
-        """Return the scan point nearest to a place (3,), within a reach [m], as a Hit without an avatar.
+        """Return the scan point nearest to a place (3,) within `reach` [m], as a Hit.
 
-        Of several at the same distance, the least (x, y, z).
+        Of several points at the same distance, it is the least (x, y, z). Return None if there is
+        none within `reach`.
         """
         found: Hit | None = None
         least = np.inf
@@ -323,13 +330,13 @@ class World:
         return found
 
     def normal(self, hit: Hit, reach: float) -> Vec | None:
-        """Return the unit normal of the touched surface, towards the avatar; None if the points form none.
+        """Return the unit normal (3,) of the touched surface, towards the avatar, or None.
 
         reach: distance within which points form the surface of the touched one [m]. If they form
         none, it is multiplied by SPARSE_FACTOR, up to MAX_NORMAL_REACH.
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
-            return hit.normal  # of a body, which has its own normal
+            return hit.normal  # hit of a body, whose normal is known
         held = self._held
         with self as seen:
             each = seen[hit.archive]

@@ -1,4 +1,4 @@
-"""One frame of one user: its state, what ends a motion, and the motions that effects make of it."""
+"""One frame of one user: its state, the hits that end motions, and the motions of effects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,27 +15,27 @@ from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 Vec = NDArray[np.float64]  # (3,) [m]
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
-# A motion that would be shorter is not begun [m]: otherwise a pushing avatar would tremble by the
-# error of `lower`.
+# Least length of a motion [m]. With shorter ones a pushing avatar would tremble by the error of
+# `lower`.
 MIN_MOTION = 2e-5
-# Along a wall that is grazed, the way back that keeps `skin` is long: at most this many times
-# `skin`.
+# Limit on the distance by which a motion stops before a contact, as a multiple of `skin`. In a
+# grazing motion, the distance that keeps `skin` from the wall would be long.
 MAX_SKIN_FACTOR = 4.0
-# If a motion is undecided for more than this distance before its contact, the undecided part ends
-# it [m].
+# If a motion is undecided for more than this distance before its contact, it ends where the
+# undecided part begins [m].
 MAX_UNDECIDED = 1e-4
-# First way back from a pose that proves not to be clear [m], and its growth factor.
+# First step back from a pose that turns out not to be clear [m], and its growth factor.
 _FIRST_STEP_BACK, _STEP_GROWTH = 1e-7, 4.0
 
 
 class Hit(NamedTuple):
     """End of a motion.
 
-    fraction: of the motion, completed.  verdict: CONTACT or UNKNOWN.
-    avatar, cloud: (3,) centres of the two spheres that touch, world [m]; None where UNKNOWN.  what:
-    "" for the scene, else the object or user.  archive: index among the scene's archives; -1: none
-    of them.  normal: (3,) unit, of the surface touched, towards the avatar; None where it was not
-    estimated.
+    fraction: completed share of the motion.  verdict: CONTACT or UNKNOWN.
+    avatar, cloud: (3,) centres of the two touching spheres, world [m]; None if UNKNOWN.
+    what: "" for the scene, otherwise the name of the object or user.
+    archive: index among the scene's archives; -1 if the hit is not of the scan.
+    normal: (3,) unit, of the touched surface, towards the avatar; None if it was not estimated.
     """
 
     fraction: float
@@ -58,16 +58,16 @@ class Obstacle(Protocol):
     name: str
 
     def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """Return what ends the motion against it, or None.
+        """Return the hit that ends the motion at this obstacle, or None.
 
         Nothing is touched before the hit's fraction.
         """
 
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """Return what an avatar at a pose touches of it, or None."""
+        """Return a hit if an avatar at a pose touches this obstacle, or None."""
 
     def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
-        """Return whether an avatar at a pose touches it.
+        """Return whether an avatar at a pose touches this obstacle.
 
         Bodies that were touched when the frame began count too.
         """
@@ -83,12 +83,12 @@ class Obstacle(Protocol):
 class Body:
     """State of a user between frames.
 
-    name: as other users see it.  avatar: its model.  pose: its current pose.
+    name: as other users see it.  avatar: its model.  pose: (4, 4), its current pose.
     fall_speed: [m/s], 0 on the ground.  on_ground: whether the avatar stood at the end of the last
-    frame.  clear: whether `pose` was found clear, for the archives `generations`
-    (World.generations).  effect_state: what effects store for
-    themselves, by effect name.  user: client and
-    avatar.
+    frame.
+    clear: whether `pose` was found clear, for the archives `generations` (World.generations).
+    effect_state: data that effects keep between frames, by effect name.
+    user: client and avatar.
     """
 
     name: str
@@ -106,15 +106,19 @@ class Body:
 class Frame:
     """One frame of one user.
 
-    body: as the previous frame left it; written once, when the frame is finished (pipeline.py).
-    target: the commanded pose.  seconds: since the previous frame.  world: answers the queries
-    (collision_world.py).  pose, verdict: so far.
-    generations: of the archives in use.  clear: whether nothing is touched at `pose`; queried once,
-    then maintained by `advance`.
-    remaining: (3,), the part of the commanded translation not completed yet [m].  hits: what ended
-    motions, in order.  blocked, blocked_pose: what ended the commanded motion first, and the pose there;
-    None: nothing did.  obstacles: what else blocks.
-    advance: moves as far as nothing is touched; set by `stop` or `sweep`.  reports: fields of `Moved`.
+    body: as the previous frame left it; written once, when the frame is finished.
+    target: the commanded pose (4, 4).  seconds: time since the previous frame.
+    world: answers the queries (collision_world.py).  budget: of the queries.
+    pose, verdict: reached so far.  generations: of the archives in use.
+    clear: whether nothing is touched at `pose`; queried once, then maintained by `advance`.
+    remaining: (3,), part of the commanded translation that is not completed yet [m].
+    hits: hits that ended motions, in order.
+    blocked, blocked_pose: hit that ended the commanded motion first, and the pose there; None if
+    nothing ended it.
+    obstacles: obstacles besides the scan.
+    advance: function that moves as far as nothing is touched; set by `stop` or `sweep`.
+    fall_speed, on_ground: new values of `Body`.
+    simulated, skipped: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
     """
 
@@ -141,8 +145,8 @@ class Frame:
     effect_state: dict[str, Any] = field(default_factory=dict)
 
 
-# Move towards a pose from `frame.pose`, as far as nothing is touched; set frame.pose and return
-# what ended it.
+# Function that moves from `frame.pose` towards a pose as far as nothing is touched, sets frame.pose
+# and returns the hit that ended the motion, or None.
 Advance = Callable[[Frame, Pose], Hit | None]
 
 
@@ -175,7 +179,7 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
 
 
 def find_first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
-    """Return what would first end the motion from frame.pose to a pose, scene or obstacle."""
+    """Return the first hit of the motion from frame.pose to a pose with scene or obstacles."""
     avatar, found = frame.body.avatar, None
     swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget)
     if swept.verdict != Verdict.CLEAR:
@@ -193,7 +197,7 @@ def find_first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
 
 
 def find_touched(frame: Frame, pose: Pose) -> Hit | None:
-    """Return what is touched at a pose, with fraction 0, or a hit with UNKNOWN, or None."""
+    """Return a hit with fraction 0 if a pose touches something or is unknown, or None."""
     avatar = frame.body.avatar
     verdict = frame.world.collide(avatar, pose, frame.budget)
     if verdict == Verdict.CONTACT:
@@ -206,7 +210,7 @@ def find_touched(frame: Frame, pose: Pose) -> Hit | None:
 def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
     """Return whether it is known that nothing is touched at a pose.
 
-    proved: known for the scene; only the other obstacles are then tested.
+    proved: whether this is already proved for the scene; then only obstacles are tested.
     """
     avatar = frame.body.avatar
     if not proved and frame.world.collide(avatar, pose, frame.budget) != Verdict.CLEAR:
@@ -215,7 +219,10 @@ def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
 
 
 def max_displacement(frame: Frame, to: Pose) -> float:
-    """Return how far any avatar point moves from frame.pose to a pose, at most or nearly so [m]."""
+    """Return an approximate bound of the distance that any avatar point moves to a pose [m].
+
+    The motion begins at frame.pose.
+    """
     avatar, begin = frame.body.avatar, frame.pose
     if not len(avatar.points):
         return 0.0
@@ -230,7 +237,7 @@ def max_displacement(frame: Frame, to: Pose) -> float:
 def skin_fraction(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
     """Return the share of the motion by which to stop before `hit`.
 
-    The tangent plane of the two spheres is then `skin` away.
+    The avatar is then `skin` [m] away from the tangent plane of the two spheres.
     """
     way = max_displacement(frame, to)
     if way <= 0.0 or skin <= 0.0:
@@ -250,9 +257,9 @@ def skin_fraction(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
 
 
 def settle_before(frame: Frame, to: Pose, fraction: float, proved: float) -> None:
-    """Set frame.pose to that at `fraction` of the way to a pose, or before it where that is clear.
+    """Set frame.pose to the pose at `fraction` of the way to a pose, or to a clear one before it.
 
-    proved: nothing touches before this fraction. The pose stays unchanged if the way is shorter
+    proved: fraction before which nothing touches. The pose stays unchanged if the way is shorter
     than MIN_MOTION.
     """
     begin, way = frame.pose, max_displacement(frame, to)
@@ -266,12 +273,12 @@ def settle_before(frame: Frame, to: Pose, fraction: float, proved: float) -> Non
 
 
 def pushes_on(frame: Frame, hit: Hit, to: Pose) -> bool:
-    """Return whether what was met was pushed on, which makes the motion worth trying again."""
+    """Let the touched obstacle give way; return whether the motion should be tried again."""
     return bool(hit.what) and any(obstacle.give_way(frame, hit, to) for obstacle in frame.obstacles)
 
 
 def record_hit(frame: Frame, hit: Hit) -> None:
-    """Record what ended a motion."""
+    """Record the hit that ended a motion."""
     frame.hits.append(hit)
     if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
         frame.verdict = Verdict.UNKNOWN

@@ -1,6 +1,6 @@
-"""Answers of several archives to one query of an effect, merged: the least, with one rule for ties.
+"""Merging of the answers of several archives to one query of an effect: the least, with a tie rule.
 
-archives/merge_answers.py does the same for the answers of queries, many poses at a time.
+archives/merge_answers.py does the same for the answers of requests, with many poses at a time.
 """
 
 import msgspec
@@ -14,10 +14,11 @@ from .frame import Vec
 def comes_first(
     value: float, witness: tuple[Vec | None, ...], other: float, other_witness: tuple[Vec | None, ...]
 ) -> bool:
-    """Return whether an answer comes before that of an earlier archive (NUMERICS.md N11).
+    """Return whether an answer replaces that of an earlier archive (NUMERICS.md N11).
 
-    The lesser value does; of equal values the one with the least witness: scan point, then avatar
-    centre, as in merge_answers.py.
+    value, witness: of the answer.  other, other_witness: of the earlier archive. The lesser value
+    comes first; of equal values, that with the least witness: scan point, then avatar centre, as in
+    merge_answers.py.
     """
     if value != other:
         return value < other

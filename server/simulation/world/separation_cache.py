@@ -1,10 +1,10 @@
 """Separation of an avatar from the scene, queried once a frame for all reporting effects.
 
-The result is cached. A result at one pose bounds the next: spheres that were a distance apart and
-have moved are at least the difference apart. Where that exceeds the distance an effect needs, no
-search runs. A cached result is true, and stays true whatever becomes of the frame that found it. No
-answer depends on the cache, only the cost, and therefore, where a budget is too small for a search,
-whether the separation is known.
+The result is cached. A result at one pose bounds the separation at the next: it decreases by at
+most the distance that the avatar's spheres moved. If the bound exceeds the distance that an effect
+needs, no search runs. A cached result remains valid even if the frame that found it is discarded.
+The cache changes no answer, only its cost. If a budget is too small for a search, the cache may
+therefore decide whether the separation is known.
 """
 
 import math
@@ -17,11 +17,11 @@ from .frame import Frame
 
 CACHE_KEY = "separation"
 # If nothing was in reach so far, a search extends farther by this distance, or to twice the reach
-# where that is less [m]. The extra cost saves searches in later frames, as many as the avatar needs
-# for that distance.
+# if that is less [m]. The extra cost saves the searches of later frames, until the avatar has moved
+# that distance.
 EXTRA_REACH = 1.0
-# Distances are rounded, reaches to exact units of 15 nm: below this difference, only a search can
-# decide [m].
+# Distances are rounded, and reaches are rounded to exact units of 15 nm. Below this difference,
+# only a search decides [m].
 ROUNDING = 1e-7
 # Largest error of placing a point, at 1e9 m from the origin [m].
 PLACEMENT_ERROR = 1e-5
@@ -99,24 +99,24 @@ def nearest(frame: Frame, reach: float) -> DistanceAnswers | None:
 
 
 def _search_farther(frame: Frame, reach: float, searched_reach: float) -> DistanceAnswers | None:
-    """Return the answer of a search up to `searched_reach` if it also answers for `reach`, else None."""
+    """Search up to `searched_reach`; return the answer if it also holds for `reach`, else None."""
     try:
         answers: DistanceAnswers = frame.world.distance(
             frame.body.avatar, frame.pose, searched_reach, budget=frame.budget
         )
-    except SolidcloudError:  # too far to search; `reach` may not be
+    except SolidcloudError:  # this reach exceeds the limits; `reach` may not exceed them
         return None
     # A voxel that is missing beyond `reach` must not make the answer less certain.
     return answers if answers.exact[0] and abs(answers.lower[0] - reach) > ROUNDING else None
 
 
 def is_farther_than(answers: DistanceAnswers | None, metres: float) -> bool:
-    """Return whether the spheres are surely more than `metres` apart, by an answer of `nearest`."""
+    """Return whether an answer of `nearest` proves that the spheres are over `metres` apart."""
     return answers is None or bool(answers.exact[0] and answers.signed_distance[0] > metres + ROUNDING)
 
 
 def scene_is_farther_than(frame: Frame, metres: float) -> bool:
-    """Return whether the avatar is surely more than `metres` from the scene.
+    """Return whether the avatar is provably more than `metres` from the scene.
 
     The distance is that of its spheres from all spheres of the scan.
     """

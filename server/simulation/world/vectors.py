@@ -1,7 +1,7 @@
-"""Vectors and rotations of a frame, a few at a time, computed with Python's floats in a fixed order of sums.
+"""Vectors and rotations of a frame, computed with Python's floats in a fixed order of operations.
 
-numpy multiplies matrices by a library that adds and contracts as the processor allows. Another
-machine could get other bits, and the same motion commands would lead elsewhere. No library
+numpy multiplies matrices with a library whose order of sums and use of fused operations depend on
+the processor. The same motion commands could give other poses on another machine. No library
 guarantees the bits of a sine either. For three numbers this is also faster: a product by numpy
 takes a microsecond.
 """
@@ -61,10 +61,7 @@ def multiply(one: Matrix, other: Matrix) -> Matrix:
 
 
 def frobenius_norm(matrix: Matrix) -> float:
-    """Return the root of the sum of the squares of a matrix (3, 3).
-
-    The matrix makes no vector longer by a larger factor.
-    """
+    """Return the Frobenius norm of a matrix (3, 3), which bounds its largest singular value."""
     return math.sqrt(sum(x * x for row in matrix.tolist() for x in row[:3]))
 
 

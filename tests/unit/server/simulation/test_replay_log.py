@@ -97,7 +97,7 @@ def test_what_is_cut_off_anywhere_leaves_the_records_before(tmp_path):
         try:
             found.append(len(list(read_log(tmp_path / "cut"))))
         except FormatError as error:
-            assert "cut off: expected what was simulated" in str(error)
+            assert "cut off: expected a complete first record" in str(error)
             found.append(0)
         assert list(read_log(tmp_path / "cut")) == records[: found[-1]] if found[-1] else True
     assert found == sorted(found) and set(found) == set(range(len(records)))

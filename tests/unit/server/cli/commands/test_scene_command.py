@@ -213,7 +213,7 @@ def test_what_is_perhaps_not_meant_is_noted(
         (TOP + VISITOR.replace("visitor", "point"), 2, "hall.toml: $.avatars[0]: avatar of a single distinct point"),
         (
             TOP + '[[effects]]\neffect = "uncertainty"\nscans = {"other.las" = 0.01}\n', 2,
-            "hall.toml: $.effects[0]: uncertainty: scans: 'other.las' is no scan of hall: expected scan-",
+            "hall.toml: $.effects[0]: uncertainty: scans: 'other.las' is not a scan of hall: expected scan-",
         ),
         (
             TOP + '[[effects]]\neffect = "through"\n'

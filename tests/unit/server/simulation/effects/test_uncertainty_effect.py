@@ -208,7 +208,7 @@ def test_a_name_that_no_scan_has_is_refused_when_the_scene_is_opened(tmp_path: P
         for good in ("scan1.ply", paths[0], f"{paths[0]}:0"):
             check(Uncertainty(scans={good: 0.01}), info)
         with pytest.raises(
-            BadRequestError, match=r"'scan2.ply' is no scan of scene: expected scan0.ply, scan1.ply"
+            BadRequestError, match=r"'scan2.ply' is not a scan of scene: expected scan0.ply, scan1.ply"
         ):
             make(Uncertainty(scans={"scan2.ply": 0.01}), world_of(scene))
     other = structs.replace(
@@ -216,7 +216,7 @@ def test_a_name_that_no_scan_has_is_refused_when_the_scene_is_opened(tmp_path: P
     )
     check(Uncertainty(scans={"hall.e57": 0.01, "scan1.ply": 0.02}), info, other)
     lost = structs.replace(other, sources=[structs.replace(other.sources[0], fault="unreadable")])
-    with pytest.raises(BadRequestError, match=r"'hall.e57' is no scan of other"):
+    with pytest.raises(BadRequestError, match=r"'hall.e57' is not a scan of other"):
         check(Uncertainty(scans={"hall.e57": 0.01}), lost)
     many = [structs.replace(info.sources[0], path=f"s{number}.e57") for number in range(20)]
     with pytest.raises(BadRequestError, match="and 12 more"):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 class ErrorCode(StrEnum):
-    """Codes that an error reply may carry. The set is closed, so that a client can branch on them."""
+    """Codes of error replies. The set is closed, so that a client can branch on them."""
 
     BAD_REQUEST = "bad_request"
     BAD_TRANSFORM = "bad_transform"
@@ -26,7 +26,7 @@ class ErrorCode(StrEnum):
 
 
 class SolidcloudError(Exception):
-    """Base class of every error that this project raises on purpose."""
+    """Base class of all errors that this package raises deliberately."""
 
     code = ErrorCode.INTERNAL
     exit_code = 1
@@ -46,7 +46,7 @@ class BadTransformError(BadRequestError):
 
 
 class UnknownSceneError(SolidcloudError):
-    """Scene name that none of the servers reached serves."""
+    """Name of a scene that none of the reached servers serves."""
 
     code = ErrorCode.UNKNOWN_SCENE
 
@@ -99,7 +99,7 @@ class ScanError(BadDataError):
 
 
 class FormatError(BadDataError):
-    """Archive that cannot be read: not an archive, of another version, truncated or inconsistent."""
+    """Archive that cannot be read: no archive, of another version, truncated or inconsistent."""
 
 
 class CorruptError(FormatError):
@@ -118,8 +118,8 @@ class MisleadingIndexError(CorruptError):
     """Record that contradicts the index.
 
     Queries have already relied on the index for the voxel's identity, the bounds of its points and
-    the largest radius class. An index that is wrong once may be wrong about any voxel that has not
-    been read, so nothing is known to be clear.
+    the largest radius class. An index that is wrong about one voxel may be wrong about any voxel
+    that has not been read, so no place is known to be clear.
     """
 
 

@@ -194,7 +194,7 @@ class Archive:
 
     @contextlib.contextmanager
     def locating(self, row: int) -> Iterator[None]:
-        """Add the location of row `row`'s record, and what to do, to a CorruptError raised inside."""
+        """Add the location of row `row`'s record, and what to do, to a CorruptError of the block."""
         try:
             yield
         except CorruptError as error:
@@ -212,7 +212,7 @@ class Archive:
         """Decompress the voxel in index row `row`; its points stay unread.
 
         frames: the voxel's frames if they have been read already.
-        columns: optional columns wanted; others are not held.
+        columns: optional columns to decompress.
         Raises CorruptError naming the location.
         """
         frames = frames or self.read_frames(row)
@@ -288,11 +288,11 @@ def _number_attribute(file: h5py.File, name: str, dtype: str, shape: tuple[int, 
 
 
 def read_index(path: Path) -> tuple[bytes, dict[str, NDArray]]:
-    """Return the archive's id and every dataset of an index, as `check_columns` accepts them.
+    """Return the archive's id and every dataset of an index, checked with `check_columns`.
 
-    No dataset links elsewhere or claims more bytes than the file holds. Raises FormatError or
-    CorruptError naming the file, ValueError for an invalid number, and whatever HDF5 raises for a
-    damaged file.
+    Datasets that link elsewhere, or that claim more bytes than the file has, are refused. Raises
+    FormatError or CorruptError naming the file, ValueError for an invalid number, and any error of
+    HDF5 for a damaged file.
     """
     size = path.stat().st_size
     columns: dict[str, NDArray] = {}

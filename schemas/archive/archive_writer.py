@@ -1,7 +1,7 @@
 """Writer of an archive's HDF5 files: shards with the records of many voxels, and the index.
 
-A shard is verified by offsets before it is given its name. The index is written last. FORMAT.md
-documents the same; change both together. archive.py reads these files.
+A shard is read back by offsets and verified before it gets its final name. The index is written
+last. FORMAT.md documents the same; change both together. archive.py reads these files.
 """
 
 import base64
@@ -28,9 +28,9 @@ ZSTD_FILTER = 32015  # registered with the HDF Group
 # Block size for reading back a shard that was just written [bytes].
 READ_BYTES = 1 << 20
 
-# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk; made with a filter class
-# registered as "zstd" through ctypes. h5py has no other way to name a filter. Without a name, HDF5
-# writes the name that a loaded plugin gives itself, or none, so two builds would differ.
+# An HDF5 file of 463 bytes with one dataset, x, of one int8 in one chunk. It was made with a filter
+# class registered as "zstd" through ctypes, because h5py cannot set the name of a filter. Without a
+# set name, HDF5 writes the name that a loaded plugin states, or no name, and builds would differ.
 _PROPERTIES = (
     rb"c-rgqaB<`1lHy|K;9!7(|4?wA5yCfsinmX3)${jo31U*1u$&<q8CNg~A!~#IE+z(`5o|mRK#H;AFwA@p2C4zY86rtwCjl*B6"
     rb"k%XsVgv%H9E@h>VPF*CfblsPSb?r$=H`}VU}RzfIgk-7!(Yn^W>poJq%bgp6v{9#umDvcnTQfP480743lx@TKLG&yO*Ul"

@@ -52,9 +52,9 @@ NODE_DTYPE = np.dtype(
     ]
 )
 
-# Limits of the decompressed size of a frame of cells or nodes. The points need none: there are at
-# most 32 per leaf node. Scanners return many points in one place where nothing reflects, and their
-# nodes are all alike: the first 16 MB of nodes are therefore exempt from the ratio.
+# Limits of the decompressed size of a frame of cells or nodes. The number of leaf nodes limits the
+# points, at most 32 each. A scanner may return many points at one place where nothing reflects, and
+# their equal nodes compress without limit: the first 16 MB of nodes are exempt from the ratio.
 CELL_EXPANSION = Expansion(1 << 20, 256)
 NODE_EXPANSION = Expansion(1 << 24, 256)
 
@@ -82,7 +82,7 @@ def voxel_point_dtype(voxel: VoxelData) -> np.dtype:
 
 
 class Record(NamedTuple):
-    """Compressed bytes of one voxel: a zstd frame and a row count per dataset, and the leaf count."""
+    """Compressed voxel: a zstd frame and a row count per dataset, and the number of leaf nodes."""
 
     cells: Frame
     nodes: Frame
@@ -100,7 +100,7 @@ class RecordShape(NamedTuple):
     point_dtype: with the optional columns.  leaves: number of leaf nodes.
     bounds: (2, 3) int, least and greatest coordinates of the points [voxel steps].
     classes: bit c is set if points of the archive have radius class c.
-    None: not known, and not compared with the record.
+    A field that is None is not known, and not compared with the record.
     """
 
     cell_rows: int
@@ -166,7 +166,7 @@ def point_rows(
 
 
 class DecompressedTree(NamedTuple):
-    """Content of a record besides its points, decompressed and checked. Fields as in DecompressedRecord."""
+    """Decompressed and checked record without its points. Fields as in DecompressedRecord."""
 
     cells: LeafCells
     nodes: Nodes
@@ -329,7 +329,7 @@ def decompress_record(
     """Decompress a record and check everything but the points.
 
     `DecompressedRecord.read_points` checks the points as it reads them.
-    columns: optional columns wanted; the result holds no others.
+    columns: optional columns to decompress; the result has no others.
     Raises CorruptError if a frame is damaged, has another size than `shape`, belongs to another
     voxel or archive, or contains what `check_voxel` refuses.
     """

@@ -1,8 +1,8 @@
 """Content of an archive's index: the dataset as a whole, and every voxel. Pure: no HDF5 here.
 
-`INDEX_COLUMNS` declares the index's datasets. `index_columns` makes them of a `Header`, `read_header`
-parses them, `index_digest` computes their checksum. index_limits.py checks their numbers. FORMAT.md,
-"index.h5", documents the same; change both together.
+`INDEX_COLUMNS` declares the index's datasets. `index_columns` makes them of a `Header`,
+`read_header` parses them, `index_digest` computes their checksum. index_limits.py checks their
+numbers. FORMAT.md, "index.h5", documents the same; change both together.
 """
 
 import hashlib
@@ -60,12 +60,12 @@ class Source:
     index: index of the scan inside its file.  sha256: of the file.
     pose: (4, 4) float64, scan to world.
     count: points stored.  skipped: reason -> points left out.
-    fault: why the whole scan was left out, or "".
+    fault: why the whole scan was left out or removed, or "".
     crs: text of the coordinate reference system that the file names, or "".
     units, up: the unit of length and the up axis assumed for the file; `pose` includes both.
-    unknown: row of the header's `unknown` where a scan that was left out may have had points; -1 if
-    that is not known; None: nothing was lost with it.
-    one_place: all its points, two or more, lay at one place.
+    unknown: row of `Header.unknown` with the box where a scan that was left out may have had
+    points; -1 if its bounds are not known; None if no points are missing.
+    one_place: whether all its points, two or more, were at one place.
     """
 
     path: str
@@ -105,24 +105,25 @@ class RadiusNow:
 class Header:
     """Index data of the dataset as a whole.
 
-    archive_id: 16 bytes, determined by the points and options alone.
+    archive_id: 16 bytes that depend only on the points and options.
     low, high: (3,) int64, least and greatest lattice coordinates of the points, inclusive.
     radius: half the mean closest-point distance [m].
     radius_error: its standard error [m], 0 if all points were sampled.
     radius_sample: number of points sampled.
     moved_max: farthest distance that quantising moved a point along an axis [m].
     lattice_source: "sources", "given" or "default".
-    models: the radius models stored, in the order of STORED_MODELS.
-    radius_counts: (32,) int64, the points of each radius class, zeros if none are stored.
-    radius_capped: points that had too few neighbours for a local class and were given the largest.
-    options: the build's.
-    unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans left out.
-    unknown_everywhere: a scan was left out whose bounds are not known.
+    models: the stored radius models, in the order of STORED_MODELS.
+    radius_counts: (32,) int64, number of points of each radius class; zeros if none are stored.
+    radius_capped: number of points with too few neighbours for a local class, which have the
+    largest.
+    options: options of the build.
+    unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans that were left out.
+    unknown_everywhere: whether a scan with unknown bounds was left out.
     generation: how often scans were added or removed since the build.
-    radius_now: what `radius` would be if it were measured now; None in generation 0, where `radius`
-    is that value, and if the radius was given.
-    normal_reach: estimation distance of the points' normals [m] (kernels/normal_codes.py); 0: no
-    normals.
+    radius_now: `radius` as measured over the points of this generation; None in generation 0, where
+    it equals `radius`, and if the radius was given.
+    normal_reach: points within this distance determine a normal [m] (kernels/normal_codes.py); 0:
+    no normals are stored.
     """
 
     archive_id: bytes
@@ -198,7 +199,7 @@ def _texts(header: Header) -> bytes:
 
 
 def _point_columns(header: Header) -> list[bool]:
-    """Return which optional columns the points have: `columns` in FORMAT.md."""
+    """Return a flag for each optional column of the points (`columns` in FORMAT.md)."""
     flags = [header.scan_index, header.intensity]
     if header.radius_class or header.normals:
         flags += ["local" in header.models, "border" in header.models]
@@ -214,8 +215,9 @@ class IndexColumn(NamedTuple):
     """Dataset of the index.
 
     dtype, shape: as stored; -1 stands for any length.
-    values: its values from the header; None: `index_columns` is given them.
-    requires: property of the header without which an index has no such dataset; "": every index
+    values: function that returns its values from the header; None: they are arguments of
+    `index_columns`.
+    requires: property of the header that must be true for the dataset to exist; "" if every index
     has it.
     """
 
@@ -228,8 +230,8 @@ class IndexColumn(NamedTuple):
 _F8, _I8, _U8, _U4, _U1 = (np.dtype(name) for name in ("<f8", "<i8", "<u8", "<u4", "|u1"))
 
 # Every dataset that an index may have, in the order in which they are written. To add one, add a
-# row, a field of `Header` (which builder/passes/dataset_header.py fills in), a line in `read_header`,
-# a check in index_limits.py and a row in FORMAT.md.
+# row, a field of `Header` (which builder/passes/dataset_header.py fills in), a line in
+# `read_header`, a check in index_limits.py and a row in FORMAT.md.
 INDEX_COLUMNS = {
     "origin": IndexColumn(_F8, (3,), lambda header: header.lattice.origin),
     "step": IndexColumn(_F8, (1,), lambda header: header.lattice.step),
@@ -272,7 +274,7 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
             columns[name] = tables[name]
         elif not column.requires or getattr(header, column.requires):
             value = np.asarray(column.values(header), column.dtype)
-            # Any other array keeps its shape, for a reader to refuse if it is wrong.
+            # Any other array keeps its shape, so that a reader refuses a wrong one.
             columns[name] = value if value.ndim and value.size else value.reshape(column.shape)
     return columns
 
@@ -332,14 +334,16 @@ def _read_texts(columns: dict[str, NDArray]) -> _Texts:
         raise ValueError(f"texts of {sources} sources: expected {len(columns['source_pose'])}")
     rows = [s.unknown for s in texts.sources if s.unknown is not None and s.unknown != -1]
     if len(set(rows)) < len(rows) or not all(0 <= row < boxes for row in rows):
-        raise ValueError(f"sources with boxes {rows} of {boxes}: expected a different one each, or -1")
+        raise ValueError(f"sources with boxes {rows} of {boxes}: expected distinct boxes, or -1")
     if any(s.unknown == -1 for s in texts.sources) and not columns["unknown_everywhere"][0]:
-        raise ValueError("unknown_everywhere 0: expected 1, as a source was left out that may be anywhere")
+        raise ValueError(
+            "unknown_everywhere 0: expected 1, because a source with unknown bounds was left out"
+        )
     return texts
 
 
 def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
-    """Return the header from the index's datasets, which `check_columns` has accepted.
+    """Make the header from the index's datasets, which `check_columns` has checked.
 
     Raises ValueError.
     """

@@ -1,10 +1,10 @@
 """Checks of the numbers in an index, made before anything uses them.
 
-A checksum proves that an index is the one that was written. It does not prove that its writer was
-correct: a forger computes a new checksum. `check_layout` checks types and shapes before data is
-read, `check_columns` and `check_voxels` check every number. FORMAT.md, "What a reader checks",
-lists the same; change both together. All functions raise ValueError naming the dataset, what was
-found and what was expected.
+A checksum proves that an index was not altered after it was written. It does not prove that its
+writer was correct: a forger computes a new checksum. `check_layout` checks types and shapes before
+data is read, `check_columns` and `check_voxels` check every number. FORMAT.md, "What a reader
+checks", lists the same; change both together. All functions raise ValueError naming the dataset,
+what was found and what was expected.
 """
 
 import math
@@ -106,7 +106,7 @@ def _check_lattice(columns: dict[str, NDArray]) -> None:
 
 
 def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
-    """Check the point columns, the datasets that they require, and the format version that follows."""
+    """Check the point columns, the datasets that they require, and the resulting format version."""
     kept = _numbers(columns, "columns", 0, 1)
     classes, normals, later = len(kept) > 2 and any(kept[2:4]), len(kept) == 5, "generation" in columns
     if len(kept) not in (2, 4, 5) or (len(kept) == 4 and not classes) or (normals and not kept[4]):
@@ -131,11 +131,12 @@ def _check_radius(columns: dict[str, NDArray]) -> None:
     """
     _numbers(columns, "radius", 0.0, MAX_COORDINATE)
     (points,) = _numbers(columns, "points", 1, 1 << 62)
-    # `radius_sample` is as it was built: in a later generation, sampled points may have been
-    # removed.
+    # `radius_sample` is that of the build. In a later generation it may exceed the number of
+    # points, because points were removed.
     _numbers(columns, "radius_sample", 0, _MAX_SAMPLE if "generation" in columns else points)
     if "radius_counts" in columns:
-        # Every point has exactly one radius class. Radii and the reach of a query depend on these counts.
+        # Every point has exactly one radius class. Radii and the reach of a query depend on these
+        # counts.
         counts, capped = columns["radius_counts"].tolist(), int(columns["radius_capped"][0])
         if sum(counts) != points or capped > points:
             _refuse(f"radius_counts {counts}, radius_capped", capped, f"those of {points} points")
@@ -169,7 +170,7 @@ def _check_sources(columns: dict[str, NDArray]) -> None:
 def check_voxels(columns: dict[str, NDArray], point_bytes: int) -> None:
     """Check every number of an index that describes one voxel, also against those of the dataset.
 
-    columns: as `check_columns` accepts them.  point_bytes: size of a row of the points dataset.
+    columns: checked with `check_columns`.  point_bytes: size of a row of the points dataset.
     """
     voxels, sizes = columns["voxels"], columns["shards"]["bytes"]
     key = voxels["key"]
@@ -187,9 +188,9 @@ def check_voxels(columns: dict[str, NDArray], point_bytes: int) -> None:
 
 
 def _at(voxels: NDArray, wrong: NDArray[np.bool_]) -> str:
-    """Return the name of the first voxel with something wrong, for messages.
+    """Return the name of the first voxel with a fault, for messages.
 
-    wrong: (v,) or (v, k), true where something is wrong.
+    wrong: (v,) or (v, k), mask of faults.
     """
     row = int(np.flatnonzero(wrong.reshape(len(voxels), -1).any(axis=1))[0])
     return f"voxel {voxels['key'][row]:#x}"

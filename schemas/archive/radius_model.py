@@ -1,10 +1,10 @@
 """Radius models: they determine the radius of the sphere around each scan point for a query.
 
-`mean` is the paper's: one radius for all points of a dataset ([Fig12] section 7). `local` and
-`border` are its future work (section 8): radii that follow the spacing around each point, and
-smaller ones on the rim of a surface. The archive stores one byte per point for them, the radius
+`mean` is that of the paper: one radius for all points of a dataset ([Fig12] section 7). `local` and
+`border` implement its future work (section 8): radii that follow the spacing around each point, and
+smaller radii on the rim of a surface. The archive stores one byte per point for them, the radius
 class: the local class in the low four bits, and RIM_BIT if the point is on a rim. A model maps
-classes to radii only at query time, so one archive serves all models.
+classes to radii at query time, so one archive serves all models.
 """
 
 import re
@@ -24,17 +24,17 @@ STORED_MODELS = ("mean", "local", "border")
 LOCAL_CLASSES = 16
 RIM_BIT = 16
 RADIUS_CLASSES = 32
-# Radius of each local class [micrometres]: 1 mm to 32 mm, each 2^(1/3) of the one before, so that
-# rounding up adds 26 % at most. The table is the same in every archive, so that a class depends on
-# nothing but a point's neighbours. Integers, so that every builder separates two classes at exactly
-# the same distance.
+# Radius of each local class [micrometres]: 1 mm to 32 mm, each 2^(1/3) times the one before, so
+# that rounding up adds at most 26 %. The table is the same in every archive, so that a class
+# depends only on a point's neighbours. The radii are integers, so that every builder separates two
+# classes at exactly the same distance.
 LOCAL_RADII = (
     1000, 1260, 1587, 2000, 2520, 3175, 4000, 5040, 6350, 8000, 10079, 12699, 16000, 20159, 25398, 32000
 )  # fmt: skip
-# A pair reaches 16 m at most, both radii and the margin together (server/kernels/core/placed_avatar.py). A
-# scan point may take half of that.
+# Largest radius of a scan point [m]: half of the largest reach of a pair, which is the sum of both
+# radii and the margin (server/kernels/core/placed_avatar.py).
 MAX_RADIUS = 8.0
-# Share of its radius that `border` leaves to a rim point.
+# Factor of `border` for the radius of a rim point.
 BORDER_SHARE = 0.5
 
 # A number as in JSON, with the decimal point also allowed at either end. Python's float would also
@@ -90,20 +90,20 @@ def class_radii(text: str | None, radius: float, stored: Collection[str]) -> NDA
     """Return the radii of scan points under a model, in exact units.
 
     The shape is (1,) if all points have the same radius, else (32,), indexed by radius class.
-    text: as `parse_radius_model` takes it; None: the archive's one radius.
-    radius: that radius [m].  stored: the models that the archive holds.
+    text: see `parse_radius_model`; None: the archive's single radius.
+    radius: that radius [m].  stored: the models that the archive stores.
     A class with a larger local class, or without RIM_BIT, never has a smaller radius. The largest
     local class among some points, with RIM_BIT if all of them have it, therefore gives an upper
-    bound of their radii. The archive's own radius is always accepted, however large; each pose is
-    checked later for the reach that this radius leaves.
-    Raises BadRequestError for a model that the archive does not hold.
+    bound of their radii. The archive's single radius is accepted at any size; each pose is checked
+    later for the reach that remains.
+    Raises BadRequestError for a model that the archive does not store.
     """
     model = RadiusModel(False, False, 1.0, None) if text is None else parse_radius_model(text)
     missing = [name for name in ("local", "border") if getattr(model, name) and name not in stored]
     if missing:
         held = ",".join(name for name in STORED_MODELS if name in stored)
         raise BadRequestError(
-            f"radius model {text!r}: this archive holds {held}: ask for one of those, "
+            f"radius model {text!r}: this archive stores {held}: choose one of those, "
             f"or build it with --radius {','.join([held, *missing])}"
         )
     metres = np.full(1, radius if model.fixed is None else model.fixed)

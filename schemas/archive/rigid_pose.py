@@ -1,7 +1,8 @@
-"""The check that a pose is rigid: a rotation and a translation (NUMERICS.md N6).
+"""Check that a pose is rigid: a rotation and a translation (NUMERICS.md N6).
 
-For poses of archives, of objects and of users in frames, and for those in scene files. Poses of
-queries may also scale, and a kernel checks thousands of them: server/kernels/core/voxels_in_reach.py.
+It applies to poses of archives, of objects, of users in frames, and in scene files. Poses of
+queries
+may also scale: a kernel checks thousands of them (server/kernels/core/voxels_in_reach.py).
 """
 
 from collections.abc import Sequence
@@ -17,12 +18,12 @@ RIGID_TOLERANCE = 1e-9
 
 
 def gram(pose: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Return the Gram matrix of the rows of a pose's rotation; the identity for an exact rotation."""
+    """Return the Gram matrix (3, 3) of the rows of a pose's rotation, the identity if exact."""
     return [[a * d + b * e + c * f for d, e, f, _ in pose[:3]] for a, b, c, _ in pose[:3]]
 
 
 def rigid_fault(pose: Sequence[Sequence[float]], tolerance: float = RIGID_TOLERANCE) -> str | None:
-    """Return what is wrong with a pose of 4 rows of 4 that is not rigid; None if it is rigid."""
+    """Return a description of the fault of a pose of 4 rows of 4; None if the pose is rigid."""
     # In Python's numbers, which takes a fifth of numpy's time for one pose.
     (a, b, c, _), (d, e, f, _), (g, h, i, _), last = pose
     off = (
@@ -31,7 +32,7 @@ def rigid_fault(pose: Sequence[Sequence[float]], tolerance: float = RIGID_TOLERA
     )  # fmt: skip
     if list(last) != [0.0, 0.0, 0.0, 1.0]:
         reason = f"its last row is {list(last)}"
-    elif not sum(off) <= tolerance and not all(each <= tolerance for each in off):  # NaN is not
+    elif not sum(off) <= tolerance and not all(each <= tolerance for each in off):  # true for NaN
         reason = f"off by {np.max(off):.2g}"
     elif a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
         reason = "it mirrors"
@@ -54,10 +55,10 @@ def check_rigid(
 
 
 def rigid_pose(pose: ArrayLike, where: str, tolerance: float = RIGID_TOLERANCE) -> NDArray[np.float64]:
-    """Return a copy (4, 4) of a pose that places something in the world.
+    """Return a copy (4, 4) of a rigid pose, after checking it.
 
-    Raises BadRequestError for a shape, or a position, that no pose has, BadTransformError unless it
-    is rigid.
+    where: start of error messages. Raises BadRequestError for a wrong shape, a number that is not
+    finite or a translation of over 1e9 m, BadTransformError for a pose that is not rigid.
     """
     array = np.array(pose, np.float64, order="C")
     if array.shape != (4, 4):

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from ..errors import CorruptError
 from ..kernels.record_rows import LANES, NO_AXIS, leaf_lanes, link_rows
 
-# A leaf node's points fill at most this many lanes of the vector test (server/kernels/collide/collide_poses.py).
-# LLVM vectorises 32 lanes but not 8 or 16 (see there).
+# Limit of the points of a leaf node: lanes of the vector test. LLVM vectorises 32 lanes but not 8
+# or 16 (server/kernels/collide/collide_poses.py).
 MAX_LEAF = LANES
 MIN_DEGREE, MAX_DEGREE = 2, 16
 # Limit of the levels of nodes from root to leaf. Trees of degree 2 over 2^31 points have 32 levels

@@ -27,7 +27,8 @@ MIN_STEP = 1e-6
 
 # Morton codes hold 21 bits per axis, so the octree of a larger voxel would map distinct points to
 # the same code. Node centres, in voxel steps, must also be exact in float32 for the fast pass of
-# server/kernels/collide/collide_poses.py: a voxel and its neighbours within reach stay below 2^24 steps.
+# server/kernels/collide/collide_poses.py: a voxel and its neighbours within reach stay below 2^24
+# steps.
 MAX_VOXEL_STEPS = 1 << 21
 
 # Input with world coordinates beyond this is refused (NUMERICS.md case 16).
@@ -71,7 +72,8 @@ class Lattice(NamedTuple):
 def make_lattice(origin: ArrayLike, step: float, voxel_size: float) -> Lattice:
     """Make the lattice whose voxels are `voxel_size` [m], rounded to a whole number of steps.
 
-    Raises BadRequestError if step or voxel size are outside what the format can hold.
+    origin: (3,), world [m].  step: [m]. Raises BadRequestError if the format cannot represent step
+    or voxel size.
     """
     if not (np.isfinite(step) and step >= MIN_STEP):
         raise BadRequestError(

@@ -1,9 +1,9 @@
-"""Compression of packed rows to one zstd frame of their byte planes, at once or as a stream; lossless.
+"""Lossless compression of packed rows to a zstd frame of their byte planes, at once or streamed.
 
 This is the only module that uses zstandard. The frame has a checksum and contains the byte planes
-of a packed compound array: HDF5's standard shuffle filter followed by the registered zstd filter
-32015, so that any HDF5 tool reads typed rows. A `RowStream` writes the frame of a voxel that is too
-large to hold in memory.
+of a packed compound array. This equals HDF5's standard shuffle filter followed by the registered
+zstd filter 32015, so that any HDF5 tool reads typed rows. A `RowStream` writes the frame of a voxel
+that is too large for memory.
 """
 
 import mmap
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from ..errors import BadRequestError, CorruptError
 from ..kernels.record_rows import join_planes
 
-# The entropy is in the low bytes, which do not compress; repetitions in the high bytes are long.
-# Longer and fewer matches than those of level 3 decode the paper's voxel 0.6 ms faster, from 2 %
-# fewer bytes.
+# The low bytes are nearly random and do not compress; the high bytes repeat over long runs. Fewer
+# and longer matches than those of level 3 decode the paper's voxel 0.6 ms faster, and save 2 % of
+# the bytes.
 _PARAMETERS = zstandard.ZstdCompressionParameters(
     compression_level=3,
     strategy=zstandard.STRATEGY_LAZY2,
@@ -46,7 +46,7 @@ _MIN_BLOCK_BYTES = 4
 
 
 class Expansion(NamedTuple):
-    """Limit of the content size of a frame: `free` bytes, or `ratio` per byte of the frame if more."""
+    """Limit of a frame's content size: `free` bytes or `ratio` per byte of the frame, if more."""
 
     free: int
     ratio: int
@@ -126,9 +126,8 @@ def _unpack_fields(frame: bytes, dtype: np.dtype, count: int, kept: np.dtype) ->
     """Return the byte planes of the fields of `kept`.
 
     The other fields are decompressed in pieces and discarded, because the checksum covers the whole
-    frame. The caller has checked the declared size and the last bytes, which a stream could do
-    without.
-    Raises ZstdError.
+    frame. The caller has checked the declared size and that there is a checksum, which the stream
+    does not require. Raises ZstdError.
     """
     planes = np.empty((kept.itemsize, count), np.uint8)
     past = np.empty(min(count, 1 << 16), np.uint8)
@@ -166,7 +165,7 @@ def _fill(stream: zstandard.ZstdDecompressionReader, out: NDArray[np.uint8]) -> 
 def _decompressor() -> zstandard.ZstdDecompressor:
     """Return this thread's decompressor.
 
-    Making one costs 0.1 ms, and two threads must not use one at once.
+    Making one takes 0.1 ms, and two threads must not use the same one at a time.
     """
     found: zstandard.ZstdDecompressor | None = getattr(_OF_THREAD, "decompressor", None)
     if found is None:
@@ -196,8 +195,8 @@ class RowStream:
     """Dataset of a record whose rows arrive in parts, in any order.
 
     The byte planes are collected in a file and then compressed to one frame. The frame's bytes
-    depend on the rows, not on the parts. They differ from those of `encode_voxel`, which has all
-    rows at once. The temporary files have no name and disappear with the process.
+    depend on the rows and not on the parts. They differ from those of `encode_voxel`, which
+    compresses all rows at once. The temporary files have no name and disappear with the process.
     """
 
     def __init__(

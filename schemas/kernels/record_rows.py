@@ -1,7 +1,7 @@
 """Rows of a record: positions of the nodes' children, byte planes, and the points of leaf nodes.
 
-The children's positions follow from the counts alone, which are checked on the way. Points are
-stored as differences along the sort axis of their leaf node.
+The children's positions follow from the counts alone, which are checked at the same time. Points
+are stored as differences along the sort axis of their leaf node.
 
 Loops that should be vectorised run to a length known only at run time: LLVM unrolls a loop of 32
 constant iterations over bytes and halfwords and then leaves it scalar (3 times as slow). They also

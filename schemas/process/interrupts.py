@@ -1,11 +1,11 @@
 """Interrupts: SIGINT (Ctrl-C) and SIGTERM set a flag; work raises Interrupted where it can stop.
 
-Python raises KeyboardInterrupt at any instruction. Inside a library's callback it comes out as that
-library's error (lazrs: 11 of 16 times), inside an error handler it hides the error, inside a
+Python raises KeyboardInterrupt at any instruction. Inside a library's callback it becomes an error
+of that library (lazrs: 11 of 16 times), inside an error handler it hides the error, inside a
 `finally` it leaves cleanup incomplete. In a block of `deferring_interrupts` a signal sets a flag
 instead. Long work calls `check_interrupt` between blocks, voxels, files and units, which raises
-Interrupted. Once the flag is set, any other exception that ends the block counts as an interrupt
-too, never as a fault of a file.
+Interrupted. Once the flag is set, any other exception that ends the block is also treated as an
+interrupt, never as a fault of a file.
 """
 
 import contextlib
@@ -15,10 +15,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-# Code that calls no `check_interrupt` for GRACE_SECONDS is interrupted at its current instruction:
-# compilation, or a library that reads a whole file in one call. The interrupt is repeated every
-# AGAIN_SECONDS, in case a library swallowed the exception, and after SOON_SECONDS if Python dropped
-# it.
+# Code that does not call `check_interrupt` for GRACE_SECONDS is interrupted at its current
+# instruction, for example compilation, or a library that reads a whole file in one call. The
+# interrupt is repeated every AGAIN_SECONDS, in case a library swallowed the exception, and after
+# SOON_SECONDS if Python dropped it.
 GRACE_SECONDS, AGAIN_SECONDS, SOON_SECONDS = 1.0, 5.0, 0.02
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -27,7 +27,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Interrupted(KeyboardInterrupt):
     """Interruption of the work by a signal.
 
-    The text says what is left of the work, where that is known.
+    The message states what remains of the work, if that is known.
     """
 
 
@@ -66,7 +66,7 @@ def stop_insisting() -> None:
 
 @contextlib.contextmanager
 def deferring_interrupts() -> Iterator[None]:
-    """Note SIGINT and SIGTERM in this block, for `check_interrupt`.
+    """Record SIGINT and SIGTERM during this block, for `check_interrupt`.
 
     If a signal arrived, the block ends with Interrupted, whatever else ends it. A signal that is
     ignored stays ignored, as under nohup. A further signal after GRACE_SECONDS raises at once. A
@@ -114,7 +114,7 @@ def _note(number: int, frame: object) -> None:
 
 
 def _insist(number: int, frame: object) -> None:
-    """Handle the timer that a signal starts: raise, because nothing has called `check_interrupt` for long."""
+    """Handle the timer that a signal starts: raise, as `check_interrupt` was not called in time."""
     if not _State.blocked:
         raise Interrupted
 
@@ -134,11 +134,11 @@ def _swallowed(what: "sys.UnraisableHookArgs") -> None:
 def blocking_interrupts() -> Iterator[Callable[[], None]]:
     """Hold back SIGINT and SIGTERM until the block ends or the yielded function is called.
 
-    For calls of libraries that call Python back: raised in a callback of HDF5, a KeyboardInterrupt
-    came out as a SystemError, or not at all. In a block of `deferring_interrupts`,
-    `check_interrupt` still raises here where our own Python code calls it. Outside
-    `deferring_interrupts`, the original handlers run at that time. Outside the main thread, where
-    Python runs no handlers, this has no effect.
+    It is for libraries that call Python back: a KeyboardInterrupt raised in a callback of HDF5
+    became a SystemError, or was lost. In a block of `deferring_interrupts`, `check_interrupt` still
+    raises where Python code of this package calls it. Outside `deferring_interrupts`, the original
+    handlers run when the block ends. Outside the main thread, where Python runs no handlers, this
+    has no effect.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None

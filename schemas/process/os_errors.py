@@ -42,7 +42,7 @@ def os_error_words(error: OSError) -> str:
 
 
 def os_error_line(error: OSError) -> str:
-    """Return one sentence for an error of the operating system: path if known, meaning, what to do."""
+    """Return one sentence for an OSError: path if known, meaning, what to do."""
     where = error.filename if error.filename2 is None else error.filename2
     return (
         f"{os.fsdecode(where)}: {os_error_words(error)}"
@@ -69,7 +69,7 @@ def naming_write_errors(output: Path) -> Iterator[None]:
 def check_writable(folder: Path) -> None:
     """Raise OSError if no file can be created in a folder.
 
-    This is called before hours of work whose result is written there.
+    Call it before hours of work whose result is written there.
     """
     probe = folder / f".{os.getpid()}.tmp"
     descriptor = os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -91,7 +91,7 @@ def _is_about(error: OSError, output: Path) -> bool:
 
 
 def write_error_words(error: OSError, output: Path) -> str:
-    """Return what prevents writing `output`, and what to do."""
+    """Return a message on what prevents writing `output`, and what to do."""
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
         for folder in output.parents:
             if folder.exists() and not folder.is_dir():

@@ -1,22 +1,23 @@
-"""Table of the effects that a scene file may declare: their options, their order, what no budget skips.
+"""Table of the effects that a scene file may declare: options, order, and which are never skipped.
 
 To add an effect:
 
 1. declare its options here as a class, and add it to `AnyEffect` and `ORDER`;
-2. write server/simulation/effects/<name>_effect.py, with the function `make`; it is found by the name;
-3. describe its options in SCENE.md, and a report, if it adds one to a frame's answer, in WIRE.md.
+2. write server/simulation/effects/<name>_effect.py, with the function `make`; it is found by the
+name; 3. describe its options in SCENE.md, and a report, if it adds one to a frame's answer, in
+WIRE.md.
 
-The parser of scene files, the pipeline of frames, `info` and `solidcloud scene new` read this table.
-Bounds of options catch values in other units: a step of 200, a skin of 2.
+The parser of scene files, the pipeline of frames, `info` and `solidcloud scene new` read this
+table. Bounds of options catch values in other units: a step of 200, a skin of 2.
 """
 
 from typing import Annotated, ClassVar
 
 import msgspec
 
-# A pair reaches 16 m at most, radii and margin or reach together (WIRE.md); this leaves room for
+# Largest reach [m]. Radii and reach together are at most 16 m (WIRE.md); this leaves room for
 # radii. It is an integer because Python merges two equal annotations: with a float elsewhere, the
-# import order would decide if the JSON Schema contains 10.0 or 10.
+# import order would decide whether the JSON Schema contains 10.0 or 10.
 MAX_REACH = 10
 
 Length = Annotated[float, msgspec.Meta(ge=0, le=MAX_REACH)]
@@ -36,7 +37,7 @@ class Effect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 
 
 class Stop(Effect, frozen=True, tag="stop"):
-    """Contact blocks: the avatar stays at the last clear pose.
+    """Contact blocks motion: the avatar stays at the last clear pose.
 
     skin: distance that the avatar keeps, along its way, from the obstacle that stopped it [m].
     """
@@ -59,8 +60,8 @@ class Slide(Effect, frozen=True, tag="slide"):
     """Sliding: the rest of a stopped motion continues along the touched surface.
 
     surfaces: maximum number of surfaces per frame.
-    normal_reach: a surface's normal is estimated from the scan points this near the touched one
-    [m].
+    normal_reach: a surface's normal is estimated from the scan points within this distance of the
+    touched point [m].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
@@ -69,7 +70,7 @@ class Slide(Effect, frozen=True, tag="slide"):
 
 
 class Step(Effect, frozen=True, tag="step"):
-    """Climbing: obstacles up to a height are climbed, and descended without a fall.
+    """Climbing: the avatar climbs steps up to a height, and descends them without falling.
 
     height: of the highest step [m].
     """
@@ -94,7 +95,7 @@ class Ground(Effect, frozen=True, tag="ground"):
 
 
 class Proximity(Effect, frozen=True, tag="proximity"):
-    """Report on the nearest scan point in each frame: distance, place and contact normal.
+    """Report on the nearest scan point in each frame: distance, position and contact normal.
 
     reach: farthest distance worth reporting [m].
     """
@@ -142,7 +143,7 @@ class ThroughBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Through(Effect, frozen=True, tag="through"):
-    """Passage through named boxes: a door known to open, a portal.
+    """Passage through named boxes, for example a door that can be opened, or a portal.
 
     boxes: scan points in them are left out.
     """
@@ -154,8 +155,8 @@ class Uncertainty(Effect, frozen=True, tag="uncertainty"):
     """Report on the probability of contact in each frame, under range noise of the scans.
 
     sigma: standard deviation of the noise [m].
-    scans: that of individual scans, by the file's name as `info` lists it. An archive that does not
-    keep the scan of each point (`build --keep scan`) has one sigma.
+    scans: standard deviation of individual scans, by the file's name as `info` lists it. An archive
+    that does not store the scan of each point (`build --keep scan`) has one sigma for all scans.
     """
 
     sigma: Near = 0.005
@@ -165,7 +166,8 @@ class Uncertainty(Effect, frozen=True, tag="uncertainty"):
 AnyEffect = (
     Stop | Sweep | Slide | Step | Ground | Proximity | Contacts | Objects | Crowd | Through | Uncertainty
 )
-# The order in which a frame runs the effects; server/simulation/effects gives the reasons. `through`
+# The order in which a frame runs the effects; server/simulation/effects gives the reasons.
+# `through`
 # is missing: it acts when an archive is opened.
 ORDER = (
     "objects", "crowd", "stop", "sweep", "slide", "step", "ground", "proximity", "contacts", "uncertainty",

@@ -23,10 +23,10 @@ from .toml_faults import MAX_BYTES, decode, format_value, suggestion, toml_error
 
 SUFFIX = ".toml"
 FORMAT = 1
-# A pose may be written with seven digits: one that is rigid within this is made rigid (NUMERICS.md
-# case 4).
+# A pose that deviates from a rigid one by at most this is made rigid, because a file may state
+# seven digits (NUMERICS.md case 4).
 _ALMOST_RIGID = 1e-6
-# A pose that is rigid within this stays as it is; the server requires 1e-9 (NUMERICS.md N6).
+# A pose that deviates by at most this is unchanged; the server requires 1e-9 (NUMERICS.md N6).
 _RIGID = 1e-12
 
 Matrix = Annotated[list[Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]], msgspec.Meta(min_length=4, max_length=4)]  # fmt: skip  # noqa: E501
@@ -76,7 +76,7 @@ class ObjectItem(_Part, frozen=True):
     """Dynamic object.
 
     avatar: its shape, one of `avatars`.  pose: the initial pose.
-    kind: `kinematic`: a user sets its pose; `pushed`: users push it.
+    kind: `kinematic` if users set its pose, `pushed` if users push it.
     """
 
     name: ItemName
@@ -99,8 +99,8 @@ class Spawn(_Part, frozen=True):
 class SceneLimits(_Part, frozen=True):
     """Limits of a scene's cost.
 
-    users: at the same time.
-    frame_ms: time for one user's frame; effects beyond it are skipped, except `stop`, `sweep`,
+    users: number of users at the same time.
+    frame_ms: time for one user's frame; effects that exceed it are skipped, except `stop`, `sweep`,
     `objects` and `crowd`.
     frame_visits: the same limit in node visits, independent of a clock.
     longest_move: farthest motion of a frame [m].
@@ -116,7 +116,7 @@ class SceneFile(_Part, frozen=True):
     """Content of a scene file.
 
     format: 1.  up: against gravity; any length but zero.
-    radius_model: for the scan's spheres, one that the archives hold; omitted: each archive's one
+    radius_model: of the scan's spheres, stored in all archives; omitted: each archive's single
     radius.
     effects: in any order; the server runs them in a fixed order.
     """
@@ -134,7 +134,7 @@ class SceneFile(_Part, frozen=True):
 
 
 def scene_of(archive: str) -> SceneFile:
-    """Return the scene of an archive without a file: the archive and `stop`."""
+    """Return the scene of an archive without a scene file: the archive and the effect `stop`."""
     return SceneFile(format=1, archives=[ArchiveItem(path=archive)])
 
 
@@ -146,9 +146,9 @@ def up_of(scene: SceneFile) -> Vector:
 
 
 def scene_name(scene: SceneFile, path: Path) -> str:
-    """Return a scene's name for clients: its `name`, else the file's name without suffix.
+    """Return a scene's name for clients: its `name`, or by default the file's name without suffix.
 
-    Raises BadRequestError if the latter is not a valid name.
+    Raises BadRequestError if the file's name is not a valid name.
     """
     if scene.name is not None:
         return scene.name
@@ -165,7 +165,7 @@ def read_scene(path: Path) -> SceneFile:
     """
     if path.suffix != SUFFIX:
         raise BadRequestError(
-            f"{path}: expected a scene file, with a name that ends in {SUFFIX}: `serve` recognises it by that"
+            f"{path}: expected a scene file, with a name that ends in {SUFFIX}, by which `serve` recognises it"
         )
     try:
         with open(path, "rb") as file:
@@ -178,7 +178,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def parse_scene(text: bytes, where: str) -> SceneFile:
-    """Parse a scene file's bytes and orthonormalise its poses to the last digits.
+    """Parse a scene file's bytes and make its poses rigid to the last digits.
 
     where: the file's name, for errors.
     """

@@ -1,4 +1,4 @@
-"""Explanations of invalid TOML files, in one sentence: where, what was found, what was expected.
+"""Messages about invalid TOML files, in one sentence: where, what was found, what was expected.
 
 msgspec reports the place (`$.effects[0].skin`) and the type. This module adds the value found
 there, everything that is allowed, a suggestion of the valid name, and the line.
@@ -110,9 +110,9 @@ def suggestion(name: Any, names: list[str]) -> str:
 def line_of(text: str, place: str) -> int | None:
     """Return the line, from 1, of the statement that defines a place in a TOML file.
 
-    Returns None for the whole file, and for a place that it does not contain. The text up to the
-    beginning of any statement can be parsed. Once the place is defined, it is defined in every
-    longer prefix, so bisection finds the statement.
+    Returns None for the whole file, and for a place that it does not contain. The text before any
+    statement can be parsed. A place that one prefix defines is defined in every longer prefix, so
+    bisection finds the statement.
     """
     tokens = _tokens(place)
     if not tokens or not _has(tomllib.loads(text), tokens):
@@ -136,10 +136,7 @@ def _statements(text: str) -> list[int]:
 
 
 def _tokens(place: str) -> list[str | int]:
-    """Return the steps of a place.
-
-    They end at a table's value, whose key msgspec does not report.
-    """
+    """Return the keys and indices of a place, up to a table's value, whose key msgspec omits."""
     steps: list[str | int] = []
     for name, number in _TOKEN.findall(place):
         if number == "...":

@@ -1,7 +1,7 @@
 """Answer types: structs of arrays with one element per pose, ray, point or motion.
 
-No zenoh, no numba and no wire encoding here: `Scene` makes these, `Client` receives them, and both
-return the same types.
+`Scene` and `Client` both return these types. This module imports neither zenoh nor numba, and does
+not know the wire's encodings.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from .arrays import IndexPairs, Positions
 
 
 class Verdict(IntEnum):
-    """Verdict on one pose. `CLEAR` only if everything in reach was examined (NUMERICS.md case 21)."""
+    """Verdict on a pose. `CLEAR` only if everything in reach was examined (NUMERICS.md case 21)."""
 
     CLEAR = 0
     CONTACT = 1
@@ -27,14 +27,13 @@ class Cost(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Cost of a whole request, and its effect on the cache. Every answer has these fields.
 
     engine_seconds: time between request and answer inside the engine, loads included [s].
-    hits, misses: voxels in reach that were resident, and that had to be loaded, for this request.
+    hits: voxels in reach that were resident.  misses: voxels that were loaded for this request.
     resident, resident_bytes: voxels decoded in memory after this request, and their bytes.
-    faults: one sentence for each voxel that could not be read, with place and reason; empty if
-    there was none.
+    faults: one sentence for each voxel that could not be read, with place and reason.
     wait_seconds: the part of engine_seconds spent waiting for voxels [s].
     late: keys of the voxels that missed the deadline of the budget. Answers that depend on them are
     `UNKNOWN`; their loads continue.
-    stopped: why the request was ended before everything was examined; empty: it was not.
+    stopped: why the request was stopped before everything was examined; empty if it was not.
     """
 
     engine_seconds: float = 0.0
@@ -63,13 +62,13 @@ class CollideAnswers(Cost, frozen=True, eq=False):
 
     Iteration yields one `CollideAnswer` per pose.
     verdict: (k,) uint8, values of `Verdict`.
-    outside: (k,) bool, the reach extends beyond the dataset's bounds.
+    outside: (k,) bool, whether the reach extends beyond the dataset's bounds.
     voxels_missing: (k,) uint32, voxels in reach that could not be examined.
     node_visits: (k,) uint32, pairs of bounding spheres tested.
     point_tests: (k,) uint32, pairs of points tested.
     lower, upper: (k,) float64, bounds of the signed distance [m].
-    exact: (k,) bool, the verdict is that of tolerance 0.
-    The last three are empty if neither a tolerance nor a budget was given: every verdict but
+    exact: (k,) bool, whether the verdict is that of tolerance 0.
+    The last three are empty if neither a tolerance nor a budget was given; every verdict but
     `UNKNOWN` is exact then.
     """
 
@@ -96,11 +95,11 @@ class CollideAnswers(Cost, frozen=True, eq=False):
 class DistanceAnswers(Cost, frozen=True, eq=False):
     """Answers of `distance` for k poses, in their order.
 
-    signed_distance: (k,) float64, least |a - b| - r_a - r_b of a pair within reach [m]; negative
-    when overlapping; inf if no pair is within reach; that of the best pair found where not exact.
-    lower, upper: (k,) float64, bounds of the true signed distance; if it is beyond reach, `lower`
-    is the reach and `upper` inf.
-    exact: (k,) bool: `signed_distance` is the true one, or it is truly beyond reach.
+    signed_distance: (k,) float64, least |a - b| - r_a - r_b of a pair within reach [m]; negative if
+    they overlap; inf if no pair is within reach. Where not exact, that of the best pair found.
+    lower, upper: (k,) float64, bounds of the true signed distance [m]; if it is beyond reach,
+    `lower` is the reach and `upper` inf.
+    exact: (k,) bool, whether `signed_distance` is the true one, or nothing is within reach.
     verdict: (k,) uint8: CONTACT if `upper` <= 0; CLEAR if the pair's integers or `lower` prove that
     nothing touches; else UNKNOWN.
     witness_avatar, witness_cloud: (k, 3) float64, the centres of the nearest pair, world [m]; NaN
@@ -132,8 +131,8 @@ class DistanceAnswers(Cost, frozen=True, eq=False):
 class ContactsAnswers(Cost, frozen=True, eq=False):
     """Answers of `contacts` for k poses: pairs in contact, and their clusters.
 
-    verdict, exact, outside, voxels_missing, node_visits, point_tests: (k,), as in other answers;
-    exact: all pairs in contact were counted.
+    verdict, outside, voxels_missing, node_visits, point_tests: (k,), as in `CollideAnswers`.
+    exact: (k,) bool, whether all pairs in contact were counted.
     pairs_found: (k,) int64, pairs in contact, listed or not.
     pair_starts: (k + 1,) int64. The pairs listed for pose i are rows [pair_starts[i], pair_starts[i
     + 1]) of the pair columns, deepest first, ties by scan point (x, y, z), then by avatar centre:
@@ -187,11 +186,11 @@ class SweepAnswers(Cost, frozen=True, eq=False):
     lower, upper: (k,) float64, fractions of the motion, 0 to 1. Nothing touches before `lower`; the
     pose at `upper` is in contact; `upper` is inf if no contact was found. A motion without contact
     has lower 1.
-    exact: (k,) bool: clear, or no avatar point moves more than the tolerance between `lower` and
-    `upper`.
+    exact: (k,) bool, whether the motion is clear, or no avatar point moves more than the tolerance
+    between `lower` and `upper`.
     witness_avatar, witness_cloud: (k, 3) float64, centres of a pair in contact at `upper`, world
     [m]; NaN if there is none.
-    steps: (k,) uint32, advances.
+    steps: (k,) uint32, number of steps of conservative advancement.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """
 
@@ -215,12 +214,13 @@ class SweepAnswers(Cost, frozen=True, eq=False):
 class RaycastAnswers(Cost, frozen=True, eq=False):
     """Answers of `raycast` for k rays, in their order.
 
-    verdict: (k,) uint8. CONTACT: the ray hits a scan point's sphere within reach. CLEAR: it hits
-    none. UNKNOWN.
+    verdict: (k,) uint8. CONTACT: the ray hits a scan point's sphere within reach. CLEAR: it hits no
+    sphere. UNKNOWN: no hit was found, but not everything in reach was examined.
     distance: (k,) float64, along the ray to the first hit [m]; 0 if the ray starts inside a sphere;
     inf if there is no hit.
-    lower, upper: (k,) float64, bounds of the true distance; beyond reach: the reach, and inf.
-    exact: (k,) bool, `distance` is the true one, or it is truly beyond reach.
+    lower, upper: (k,) float64, bounds of the true distance [m]; if it is beyond reach, `lower` is
+    the reach and `upper` inf.
+    exact: (k,) bool, whether `distance` is the true one, or nothing is hit within reach.
     hit: (k, 3) float64, the point where the ray hits, world [m].
     cloud_point: (k, 3) float64, centre of the sphere hit; among several at equal distance, the
     least (x, y, z).
@@ -250,10 +250,12 @@ class RaycastAnswers(Cost, frozen=True, eq=False):
 class WithinAnswers(Cost, frozen=True, eq=False):
     """Answers of `within` for k points, in their order.
 
-    verdict: (k,) uint8. CONTACT: a scan point lies within reach. CLEAR: none does. UNKNOWN.
+    verdict: (k,) uint8. CONTACT: a scan point lies within reach. CLEAR: no scan point does.
+    UNKNOWN: none was found, but not everything in reach was examined.
     distance: (k,) float64, to the nearest scan point's centre [m]; inf if none is within reach.
-    lower, upper: (k,) float64, bounds of the true distance; beyond reach: the reach, and inf.
-    exact: (k,) bool, `distance` is the true one, or it is truly beyond reach.
+    lower, upper: (k,) float64, bounds of the true distance [m]; if it is beyond reach, `lower` is
+    the reach and `upper` inf.
+    exact: (k,) bool, whether `distance` is the true one, or nothing is within reach.
     cloud_point: (k, 3) float64, the nearest scan point, world [m]; among several, the least (x, y,
     z); NaN if there is none.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
@@ -280,12 +282,12 @@ class ObjectsAnswers(Cost, frozen=True, eq=False):
 
     verdict: (n,) uint8, of each object against the scene; CLEAR if its mask excludes the scene.
     outside, voxels_missing, node_visits, point_tests: (n,), against the scene.
-    pairs: (p, 2) int32, rows of the objects that touch each other, or may where the budget ended
-    first; first < second, in ascending order.
-    pair_verdict: (p,) uint8: CONTACT, or UNKNOWN if the budget ended first.
+    pairs: (p, 2) int32, rows of objects that touch each other, or that the budget left undecided;
+    first < second, in ascending order.
+    pair_verdict: (p,) uint8: CONTACT, or UNKNOWN if the budget left the pair undecided.
     pairs_tested: pairs whose trees were compared.  pairs_filtered: pairs excluded by groups and
     masks.
-    pair_visits, pair_tests: of all pairs together.
+    pair_visits, pair_tests: node visits and point tests of all pairs together.
     """
 
     verdict: NDArray[np.uint8]

@@ -2,8 +2,8 @@
 
 An array is a little-endian, C-ordered bin in MessagePack and nested lists in JSON. Its dtype and
 shape come from the field's type and are not transmitted. Requests contain finite numbers only.
-Answers may contain infinities and NaN: as such in MessagePack, as null in JSON. A reader restores
-them from the meaning of the field (`_of_null`).
+Answers may contain infinities and NaN. MessagePack represents them, JSON has null instead. A reader
+of JSON restores them by the field (`_of_null`).
 """
 
 import hashlib
@@ -28,9 +28,9 @@ from .requests import Request, check_finite
 MSGPACK = "application/msgpack"
 JSON = "application/json"
 
-# Larger data is read and written in pieces, so that other threads can take the interpreter in
-# between: a whole message in JSON would hold it for half a second. The limits are bytes of a bin;
-# bytes of a message in JSON, and of a piece; numbers per piece.
+# Larger data is read and written in pieces, between which other threads can take the interpreter's
+# lock: a whole message in JSON would hold it for half a second. The limits are bytes of a bin,
+# bytes of a message in JSON, bytes of a piece, and numbers in a piece.
 _LARGE_BIN = 1 << 18
 _LARGE_JSON, _JSON_PIECE = 1 << 17, 1 << 16
 _LISTED = 1 << 13
@@ -64,7 +64,7 @@ def encode(message: Any, encoding: str = MSGPACK) -> bytes:
 def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:
     """Decode a request.
 
-    Raises BadRequestError saying which field is wrong, what was found and what was expected.
+    Raises BadRequestError with the wrong field, what was found and what was expected.
     """
     try:
         return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
@@ -75,7 +75,7 @@ def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _
 def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:
     """Decode an answer. Unknown fields are ignored.
 
-    Raises InternalError if the payload is not what WIRE.md specifies.
+    Raises InternalError if the payload differs from what WIRE.md specifies.
     """
     try:
         return _decoder(kind, encoding).decode(payload)  # type: ignore[arg-type, no-any-return]
@@ -114,7 +114,7 @@ def _array_from_bin(name: str, value: bytes, of: ArrayType, request: bool) -> np
     if rest:
         raise ValueError(f"{len(value)} bytes, expected a multiple of {row_bytes}")
     if dtype.kind == "b" and value.translate(None, b"\0\1"):
-        raise ValueError("a byte that is neither 0 nor 1, expected truth values")
+        raise ValueError("a byte that is neither 0 nor 1, expected booleans")
     # A request's array is a copy: bytes are read-only, and numba compiles another kernel for a
     # read-only array.
     if request and len(value) > _LARGE_BIN:
@@ -139,7 +139,7 @@ def _array_from_lists(name: str, value: list[Any], of: ArrayType, request: bool)
     if found.dtype == object and dtype.kind == "f" and not request:
         found = _filled(found, _of_null(name, tail))
     if found.dtype.kind not in {"f": "iuf", "u": "iu", "i": "iu", "b": "b"}[dtype.kind]:
-        raise ValueError(f"expected nested lists of {dtype.name}, found something else among them")
+        raise ValueError(f"expected nested lists of {dtype.name}, found other values in them")
     if found.ndim != 1 + len(tail) or found.shape[1:] != tail:
         expected = ", ".join(["n", *map(str, tail)])
         raise ValueError(f"lists of shape {found.shape}, expected ({expected})")
@@ -239,9 +239,9 @@ def _decoder(kind: type, encoding: str) -> "_Decoder":
 class _Decoder:
     """Decoder of one type.
 
-    msgspec decodes bins or lists into a twin type; one loop here converts them to arrays. A
-    `dec_hook` of msgspec would be called for each array in the middle of decoding: that made
-    decoding an answer three times as slow, and the hook is not told for which field it is called.
+    msgspec decodes bins or lists into a twin type, and one loop here converts them to arrays. A
+    `dec_hook` of msgspec is called for each array during decoding, which made decoding an answer
+    three times as slow, and the hook does not learn the name of the field.
     """
 
     def __init__(self, kind: type, encoding: str) -> None:
@@ -251,7 +251,7 @@ class _Decoder:
         self._convert: Any = _array_from_lists if encoding == JSON else _array_from_bin
         module = msgspec.json if encoding == JSON else msgspec.msgpack
         self._decoder: Any = module.Decoder(self._twin(encoding) if self._arrays else kind)
-        # In a large message in JSON the arrays stay text at first.
+        # In a large message in JSON, msgspec leaves the arrays as text, to be read in pieces.
         in_pieces = encoding == JSON and self._arrays
         self._raw_decoder: Any = module.Decoder(self._twin(encoding, raw=True)) if in_pieces else None
 
@@ -278,7 +278,7 @@ class _Decoder:
         )
 
     def decode(self, payload: bytes) -> Any:
-        """Decode a message. Raises msgspec.DecodeError, naming the field, for an invalid payload."""
+        """Decode a message. Raises msgspec.DecodeError, naming the field, if it is invalid."""
         large = self._raw_decoder is not None and len(payload) > _LARGE_JSON
         message = (self._raw_decoder if large else self._decoder).decode(payload)
         if not self._arrays:

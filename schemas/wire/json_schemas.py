@@ -1,4 +1,4 @@
-"""List of all messages of the wire protocol, and their JSON Schemas. WIRE.md documents them."""
+"""JSON Schemas of all messages of the wire protocol, which WIRE.md documents."""
 
 import inspect
 from typing import Any

@@ -42,7 +42,7 @@ def check_name(name: str, what: str) -> str:
 
 
 def operations() -> tuple[str, ...]:
-    """Return the operations of a scene: all questions, and those that every scene has besides."""
+    """Return the names of a scene's operations: all questions, and the other ones."""
     return ("info", "add_avatar", *QUESTIONS, "path", "move", "reload", "stats")
 
 
@@ -111,7 +111,8 @@ def public_id(client: str) -> str:
     """Return the name by which other clients learn of a client.
 
     It is the first 12 hex digits of the SHA-256 of the client's id, or "" for "". The id itself is
-    a secret: whoever knows it can send queries and motion commands, or leave, in the client's name.
+    a secret: a program that knows it can send queries and motion commands, or leave, in the
+    client's name.
     """
     return hashlib.sha256(client.encode()).hexdigest()[:12] if client else ""
 
@@ -166,9 +167,9 @@ def _user_key(what: str, scene: str, user: User) -> str:
 
 
 def _parse(key: str, what: str, names: tuple[str, ...]) -> list[str]:
-    """Return the chunks of a key after `what`.
+    """Return the chunks of a key after the chunk `what`, one for each of `names`.
 
-    Raises BadRequestError unless they are valid names, as many as expected.
+    Raises BadRequestError for another number of chunks, or an invalid name.
     """
     prefix = f"{ROOT}/{what}/"
     parts = key.removeprefix(prefix).split("/")

@@ -1,8 +1,7 @@
 """Messages of one frame of one avatar: the motion command, and the resulting motion.
 
-WIRE.md says when each is sent.
-What an effect reports is a field of `Moved` that is omitted if the scene does not declare the
-effect.
+WIRE.md states when each is sent. The report of each effect is a field of `Moved`, which is omitted
+if the scene does not declare the effect.
 """
 
 import math
@@ -24,7 +23,7 @@ FRAME_SECONDS = 1 / 30
 
 
 class MoveRequest(Request, frozen=True, kw_only=True):
-    """Compute where an avatar gets from one pose towards another, and what it touches; stateless.
+    """Compute the pose that an avatar reaches towards a target, and what it touches; stateless.
 
     avatar: the name under which it was added.
     pose_from, pose_to: (1, 4, 4) float64, avatar to world, rigid.
@@ -78,7 +77,7 @@ class Wish(Request, frozen=True, kw_only=True):
 
 
 def _check_finite(what: str, numbers: Iterable[float]) -> None:
-    """Raise BadRequestError for NaN or infinity, for which no answer is defined (NUMERICS.md N7)."""
+    """Raise BadRequestError for NaN or infinity, which have no defined answer (NUMERICS.md N7)."""
     for number in numbers:
         if not math.isfinite(number):
             raise BadRequestError(f"{what} holds {number}: expected finite numbers")
@@ -89,7 +88,7 @@ class Touched(msgspec.Struct, frozen=True, omit_defaults=True):
 
     place: of the scan point, world [m].  normal: the contact normal, where estimated.
     what: "" for the scene, else the object or user.
-    unknown: nothing was touched, but the way ahead is not known to be clear.
+    unknown: whether the motion stopped at data that could not be examined, and not at a contact.
     """
 
     place: Vector
@@ -183,15 +182,15 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     """Result of one frame.
 
     pose: (1, 4, 4) float64, the avatar's pose now.
-    verdict: of that pose, a value of `Verdict`; also UNKNOWN if the way ahead is not known to be
-    clear, and the avatar went no farther than it is.
-    left: part of the commanded motion not carried out [m].  touched: obstacles that stopped it.
+    verdict: of that pose, a value of `Verdict`. UNKNOWN also if the motion stopped because the rest
+    of the way is not known to be clear.
+    left: length of the commanded motion not carried out [m].  touched: obstacles that stopped it.
     simulated: effects, in the order in which they ran.
     skipped: effects for which the frame's budget was too small.
     stepped: height climbed by `step` [m].
     ground, proximity, contacts, uncertainty, objects, crowd: the report of each effect.
-    unknown: the frame needed data that could not be examined; with it, any of these fields might
-    differ.
+    unknown: whether the frame needed data that could not be examined. With it, any of these fields
+    might differ.
     """
 
     pose: Poses
@@ -211,7 +210,7 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
 
 
 class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):
-    """`Moved`, as sent to the user who sent the motion command.
+    """Result of one frame (`Moved`) as sent to the user of the motion command.
 
     seq, time: of the motion command.  frame: the server's frame number, increasing.
     late: motion commands dropped so far because a newer one had arrived.

@@ -1,4 +1,4 @@
-"""Messages of a path: the request that asks one question along it, and the parts of its answers."""
+"""Messages of a path: the request of one query along it, and the parts of its answers."""
 
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, TypeVar
@@ -26,8 +26,8 @@ class PathRequest(Request, frozen=True):
     avatar: the name under which it was added.  poses: (k, 4, 4) float64, at most 100,000.
     op: "collide", "distance", "contacts" or "sweep"; a sweep has k - 1 motions, each from one pose
     to the next.
-    The other parameters are null where `op` does not take them, or for their default. "distance"
-    requires `reach`. `budget_ms` is for the whole path.
+    The other parameters are null if `op` does not take them, or for their default. "distance"
+    requires `reach`. `budget_ms` limits the whole path.
     """
 
     avatar: Name
@@ -120,7 +120,7 @@ def answers_to_part(answers: Cost, first: int, total: int) -> Any:
 
 
 def part_to_answers(part: Any) -> Any:
-    """Return the answers of a part as an instance of their own type, without `first` and `total`."""
+    """Return a part as an instance of its question's answer type, without `first` and `total`."""
     fields = asdict(part)
     del fields["first"], fields["total"]
     return question_of(type(part)).answers(**fields)

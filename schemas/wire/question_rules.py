@@ -40,14 +40,14 @@ class Merge(Enum):
     """How the values of several archives become one. server/archives/merge_answers.py has each."""
 
     VERDICT = auto()  # contact with any is contact; clear is what is clear of all
-    ALL = auto()  # true if it is true of every archive
-    SUM = auto()  # at most the largest number of the column's type
+    ALL = auto()  # true if it is true for every archive
+    SUM = auto()  # clipped to the largest value of the column's dtype
     LEAST = auto()
     NEAREST = auto()  # the value of the archive that `Question.nearest` selects
-    FIRST = auto()  # the value of the first archive, which alone was asked
+    FIRST = auto()  # the value of the first archive, the only one that was queried for it
     LISTED = auto()  # rows of all archives, deepest first
     EXACT_VERDICT = auto()  # an exact contact with one archive, or exact answers of all
-    EXACT_NEAREST = auto()  # the nearest is exact, and no archive may hold a nearer one
+    EXACT_NEAREST = auto()  # the nearest is exact, and no archive can contain a nearer one
     EXACT_INTERVAL = auto()  # an exact contact that begins first, or clear of all
 
 
@@ -65,8 +65,8 @@ class ColumnFrame(Enum):
 class ColumnRules(NamedTuple):
     """Rules of one column of answers.
 
-    merge, frame, rows: see there.  of: column of starts of a column with `Rows.LISTED`.
-    unknown: value that means that nothing is known; vectors of floats are NaN then.
+    merge, frame, rows: see these classes.  of: name of the column of starts, for `Rows.LISTED`.
+    unknown: value of the column in unknown answers; vectors of floats are NaN instead.
     """
 
     merge: Merge
@@ -88,19 +88,20 @@ COMMON: dict[str, ColumnRules] = {
 
 @dataclass(frozen=True, eq=False)
 class Question(Generic[A]):
-    """One question.
+    """Declaration of a question: one kind of query with one answer per item.
 
     name: on the wire, of the methods and on the command line.
-    request, answers: message types.  part: type of the answers' parts along a path; None: the
-    question is not asked along paths.
-    items: plural noun for what a request has several of.
+    request, answers: message types.  part: type of a part of the answers along a path; None: paths
+    do not support the question.
+    items: plural noun for the items of a request, such as "poses".
     columns: rules of the answers' array fields, besides `COMMON`.
-    nearest: the column with whose least value an archive is the nearest, and the columns of points
-    that decide among equals; None: no column has `Merge.NEAREST`.
-    slow: an item may take milliseconds, and batches are small.
-    whole: all items are asked about in one request, because they depend on one another.
+    nearest: the column whose least value selects the nearest archive, and the columns of points
+    that break ties; None: no column has `Merge.NEAREST`.
+    slow: whether an item may take milliseconds, so that batches are small.
+    whole: whether all items must be in one request, because they depend on one another.
     directions: array fields of the request whose vectors are directions, and not points.
-    listed: the request's field that limits the rows listed per item, and the bytes of one; None.
+    listed: the request's field that limits the rows listed per item, and the bytes of one row; None
+    if no rows are listed.
     """
 
     name: str
@@ -120,7 +121,7 @@ class Question(Generic[A]):
         expected = set(array_fields(self.answers))
         if set(self.columns) != expected:
             odd = ", ".join(sorted(expected ^ set(self.columns)))
-            raise TypeError(f"{self.name}: {odd}: expected a rule for each array field, and for no other")
+            raise TypeError(f"{self.name}: {odd}: expected one rule for each array field")
 
     @cached_property
     def arrays(self) -> dict[str, ArrayType]:
@@ -140,7 +141,7 @@ class Question(Generic[A]):
 
     @cached_property
     def arguments(self) -> tuple[str, ...]:
-        """Return the arguments of the question's method; `objects` come with their poses."""
+        """Return the names of the method's arguments; `objects` contain their poses."""
         return tuple(name for name in self.fields if not (name == "poses" and "objects" in self.fields))
 
     @cached_property
@@ -156,12 +157,12 @@ class Question(Generic[A]):
 
     @cached_property
     def required(self) -> tuple[str, ...]:
-        """Return those of `fields` that have no default."""
+        """Return the names in `fields` that have no default."""
         return tuple(name for name in self.fields if name not in self._defaults)
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
-        """Return those of `fields` that are the same for all items: neither arrays nor avatars."""
+        """Return the names in `fields` that apply to all items: neither arrays nor avatars."""
         return tuple(name for name in self.fields if name not in (*self.arrays, "avatar", "objects"))
 
     @cached_property
@@ -175,22 +176,22 @@ class Question(Generic[A]):
         return self.about_avatars and len(self.arrays) == 2
 
     def items_along(self, poses: int) -> int:
-        """Return the number of items along a path of so many poses."""
+        """Return the number of items along a path of `poses` poses."""
         return max(0, poses - 1) if self.moving else poses
 
     @cached_property
     def with_rows(self) -> dict[Rows, tuple[str, ...]]:
-        """Return the columns with each number of rows."""
+        """Return the names of the columns by their number of rows."""
         return {
             rows: tuple(name for name, column in self.columns.items() if column.rows is rows)
             for rows in {column.rows for column in self.columns.values()}
         }
 
     def all_arguments(self, given: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
-        """Return all arguments of the method: those given, then those by name or their defaults.
+        """Return all arguments of the method in order, with defaults for missing ones.
 
-        named: arguments and options by name; the arguments are removed. TypeError for too many or
-        too few.
+        given: positional arguments.  named: arguments and options by name; the arguments are
+        removed. Raise TypeError for too many or too few arguments.
         """
         names = self.arguments
         if len(given) == len(names):
@@ -202,17 +203,17 @@ class Question(Generic[A]):
 
     @cached_property
     def around(self) -> int | None:
-        """Return which argument says how far from an avatar the scene matters; None: no argument."""
+        """Return the position of the argument that limits the distance (margin, reach), or None."""
         return next((i for i, name in enumerate(self.arguments) if name in ("margin", "reach")), None)
 
     def rows_of(self, starts: str) -> tuple[str, ...]:
-        """Return the columns whose row ranges a column of starts has."""
+        """Return the names of the columns whose row ranges are in a column of starts."""
         return tuple(name for name, column in self.columns.items() if column.of == starts)
 
     def most_items(self, most: int, most_bytes: int, given: Mapping[str, Any]) -> int:
-        """Return how many items, at most `most`, fit into an answer of `most_bytes`.
+        """Return the number of items, at most `most`, whose answer takes at most `most_bytes`.
 
-        given: fields of the request by name; a missing one has its default.
+        given: fields of the request by name; missing ones have their defaults.
         """
         if self.listed is None:
             return most
@@ -247,9 +248,9 @@ class Question(Generic[A]):
         return self.answers(**columns)
 
     def join(self, parts: Sequence[A]) -> A:
-        """Join the answers of several requests, in order, into the answers of one.
+        """Concatenate the answers of several requests, in order, and sum their costs.
 
-        Residency is that after the last answered request.
+        `resident` and `resident_bytes` are those of the last answered request.
         """
         if len(parts) == 1:
             return parts[0]
@@ -272,7 +273,7 @@ class Question(Generic[A]):
         )
 
     def check(self, answers: A, k: int) -> A:
-        """Return the answers if they are valid answers to k items; raise InternalError otherwise."""
+        """Return the answers if they are valid for k items. Raise InternalError otherwise."""
         kind = type(answers).__name__
         for name, verdict, rule in self._checks:
             column = getattr(answers, name)
@@ -288,14 +289,17 @@ class Question(Generic[A]):
             if rule is None:
                 continue
             if rule.rows is Rows.STARTS and (column[0] != 0 or (np.diff(column) < 0).any()):
-                raise InternalError(f"{kind}: {name!r} does not rise from 0")
+                raise InternalError(f"{kind}: {name!r} does not ascend from 0")
             if rule.rows is Rows.PAIRS and column.ndim == 2 and not ((column >= 0) & (column < k)).all():
                 raise InternalError(f"{kind}: pairs with objects that were not requested, of {k}")
         return answers
 
     @cached_property
     def _checks(self) -> tuple[tuple[str, bool, ColumnRules | None], ...]:
-        """Return each column's name, whether it has verdicts, and its rules; None: a row per item."""
+        """Return for each column its name, whether it has verdicts, and its rules.
+
+        The rules are None for a column with one row per item.
+        """
         rules = self.columns
         return tuple(
             (name, name.endswith("verdict"), None if rules[name].rows is Rows.ITEMS else rules[name])
@@ -303,7 +307,10 @@ class Question(Generic[A]):
         )
 
     def _expected_rows(self, answers: A, rule: ColumnRules, k: int) -> int:
-        """Return how many rows a column of answers to k items has, if not one per item."""
+        """Return the number of rows of a column that does not have one row per item.
+
+        k: number of items.
+        """
         if rule.rows is Rows.STARTS:
             return k + 1
         if rule.rows is Rows.LISTED:
@@ -318,9 +325,9 @@ def request_fields(
 ) -> dict[str, Any]:
     """Return the fields of a question's request for the arguments of its method, by name.
 
-    arguments, named: as `Question.all_arguments` takes them. Arrays become what the wire has, with
-    equally many elements each.
-    Raises BadRequestError for an invalid argument, TypeError for one too many or too few.
+    arguments, named: as in `Question.all_arguments`. Arrays are converted to the wire's types, and
+    checked to have equal lengths.
+    Raises BadRequestError for an invalid argument, TypeError for too many or too few.
     """
     fields = dict(zip(question.arguments, question.all_arguments(arguments, named), strict=True))
     if "objects" in fields:
@@ -336,7 +343,7 @@ def request_fields(
 
 @cache
 def _conversions(kind: type[QuestionRequest]) -> tuple[tuple[str, Callable[[Any, str], Any]], ...]:
-    """Return how each argument becomes a field, by the field's type; others stay as they are."""
+    """Return the conversion of each argument that needs one, with its name, by the field's type."""
     found: list[tuple[str, Callable[[Any, str], Any]]] = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if hint == Poses:
@@ -351,7 +358,7 @@ def _conversions(kind: type[QuestionRequest]) -> tuple[tuple[str, Callable[[Any,
 
 
 def _joined_starts(columns: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Join columns of starts, each rising from 0, into one."""
+    """Join columns of starts, each ascending from 0, into one."""
     total, joined = 0, [np.zeros(1, np.int64)]
     for column in columns:
         joined.append(column[1:] + total)

@@ -1,7 +1,7 @@
 """Declarations of the questions: the types of each, and the rules of each column of its answers.
 
-question_rules.py says what a rule means. Adding a declaration to `QUESTIONS` makes a question known
-to everything generic.
+question_rules.py defines the rules. All generic code reads `QUESTIONS`, so a new question is a new
+declaration there.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ A = TypeVar("A", bound=Cost)
 
 _POINT = ColumnRules(Merge.NEAREST, ColumnFrame.POINT)
 _DIRECTION = ColumnRules(Merge.NEAREST, ColumnFrame.DIRECTION)
-# Columns of the nearest thing along a ray or around a point.
+# Columns that `raycast` and `within` share.
 _NEAREST = {
     "distance": ColumnRules(Merge.NEAREST, unknown=inf),
     "lower": ColumnRules(Merge.LEAST),
@@ -153,14 +153,14 @@ OBJECTS = Question(
     whole=True,
 )
 
-# All questions by name. Adding an entry makes a question known to everything generic.
+# All questions by name.
 QUESTIONS: dict[str, Question[Any]] = {
     question.name: question for question in (COLLIDE, DISTANCE, CONTACTS, SWEEP, RAYCAST, WITHIN, OBJECTS)
 }
 
 
 def path_questions() -> dict[str, Question[Any]]:
-    """Return the questions that are asked along paths, by name."""
+    """Return the questions that paths support, by name."""
     return {name: question for name, question in QUESTIONS.items() if question.part is not None}
 
 

@@ -5,9 +5,9 @@ They bound what one request can cost a server. A server may lower `MAX_POSES` an
 configured there, too.
 """
 
-# Poses, rays, points or motions of one request, or poses of one path: 12.8 MB, of a sweep twice
-# that. If this or the number of points were raised, a server of version 1 would drop the larger
-# messages unanswered.
+# Poses, rays, points or motions of one request, or poses of one path: 12.8 MB, twice that for a
+# sweep. A server of wire version 1 would drop larger messages unanswered, so neither this nor the
+# number of points may be raised.
 MAX_POSES = 100_000
 # Points of an avatar: 24 MB.
 MAX_AVATAR_POINTS = 1_000_000
@@ -20,11 +20,12 @@ MAX_NAME_LENGTH = 64
 # Duration of a frame [s].
 MAX_FRAME_SECONDS = 10.0
 
-# Any message, encoded [bytes]. If this were raised, a peer of version 1 would drop the larger
-# messages unread.
+# Any encoded message [bytes]. A peer of wire version 1 would drop larger messages unread, so this
+# may not be raised.
 MAX_MESSAGE_BYTES = 32 << 20
-# A motion command [bytes]: 2,048 objects take less as MessagePack. A larger one is neither read nor
-# logged.
+# A motion command [bytes]: 2,048 objects take less as MessagePack. A larger one is neither decoded
+# nor logged.
 MAX_COMMAND_BYTES = 512 << 10
-# A request of a client without other requests in flight, which is always accepted [bytes].
+# Size up to which a request is always accepted from a client without other requests in flight
+# [bytes].
 FIRST_REQUEST_BYTES = 1 << 16

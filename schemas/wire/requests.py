@@ -1,6 +1,6 @@
-"""Request types, and the checks that they pass when they are made.
+"""Request types, which check their fields when they are constructed.
 
-A request is checked when it is made, so a client fails before it sends what a server would refuse.
+A client therefore fails before it sends a request that a server would refuse.
 """
 
 import math
@@ -30,9 +30,9 @@ _FLOAT64 = np.dtype("<f8")
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of requests. Unknown fields are refused.
+    """Base class of requests.
 
-    An ignored field could have changed the answer.
+    Unknown fields are refused, because an ignored field could have changed the answer.
     """
 
     def __post_init__(self) -> None:
@@ -58,7 +58,8 @@ class AddAvatarRequest(Request, frozen=True):
 class QuestionRequest(Request, frozen=True, kw_only=True):
     """Parameters that every query takes.
 
-    tolerance: how early contact may be reported, and how far apart bounds may lie [m]; 0: exact.
+    tolerance: separation up to which contact may be reported, and allowed distance between bounds
+    [m]; 0: exact.
     budget_ms: time for loading and computing together [ms]; null: no limit.
     budget_visits: node visits per pose (ray, point, motion); null: no limit.
     radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
@@ -221,7 +222,7 @@ class ObjectsRequest(QuestionRequest, frozen=True):
 
 
 def make_positions(points: Any, what: str = "points") -> Positions:
-    """Return an avatar's points as the wire has them: (n, 3) float64, finite [m].
+    """Convert an avatar's points to the wire's array type: (n, 3) float64, finite [m].
 
     Raises BadRequestError or TooLargeError.
     """
@@ -232,9 +233,9 @@ def make_positions(points: Any, what: str = "points") -> Positions:
 
 
 def make_vectors(vectors: Any, what: str) -> Positions:
-    """Return vectors as the wire has them: (n, 3) float64, finite.
+    """Convert vectors to the wire's array type: (n, 3) float64, finite.
 
-    what: name of the vectors for the BadRequestError raised otherwise.
+    what: name of the vectors, for messages. Raises BadRequestError.
     """
     array = _as_float64(what, vectors)
     if array.ndim != 2 or array.shape[1] != 3:
@@ -247,9 +248,10 @@ def make_vectors(vectors: Any, what: str) -> Positions:
 
 
 def make_poses(poses: Any, what: str = "poses") -> Poses:
-    """Return poses as the wire has them: (k, 4, 4) float64.
+    """Convert poses to the wire's array type: (k, 4, 4) float64. Raises BadRequestError.
 
-    Only the shape is checked here; the server checks that poses are rigid.
+    what: name of the poses, for messages. Only the shape is checked here; the server checks that
+    poses are rigid.
     """
     array = _as_float64(what, poses)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
@@ -264,7 +266,7 @@ def check_one_pose(what: str, poses: Poses) -> None:
 
 
 def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectEntry], Poses]:
-    """Return objects and their poses as the wire has them.
+    """Convert objects and their poses to the wire's types.
 
     objects: (name, pose, group = 1, mask = all groups), poses (4, 4) float64.
     Raises BadRequestError naming an invalid object, TooLargeError for more than `MAX_OBJECTS`.
@@ -283,7 +285,7 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectEntry], P
 
 
 def _check_count(objects: Sequence[Any]) -> None:
-    """Raise TooLargeError for more objects than one request may hold."""
+    """Raise TooLargeError for more than MAX_OBJECTS objects."""
     if len(objects) > MAX_OBJECTS:
         raise TooLargeError(f"{len(objects)} objects: at most {MAX_OBJECTS}: send several requests")
 

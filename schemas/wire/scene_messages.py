@@ -1,4 +1,4 @@
-"""Messages about a scene: the scenes of a server, what a scene is, its avatars, reload and errors."""
+"""Messages about scenes: scenes of a server, description of a scene, avatars, reload and errors."""
 
 from typing import Annotated
 
@@ -22,7 +22,8 @@ class AvatarInfo(msgspec.Struct, frozen=True):
 
     points: number of points.  radius: of every point [m].
     bounding_radius: radius of a sphere around the avatar's points and their radii [m].
-    Both radii are null in what a `Client` returns as long as no server has answered.
+    If no server has answered yet, `Client` returns a `bounding_radius` of null, and the `radius`
+    that was requested.
     """
 
     name: str
@@ -37,7 +38,7 @@ class SourceInfo(msgspec.Struct, frozen=True):
     index: index of the scan inside its file.  sha256: of the file, hexadecimal.
     count: points stored.  pose: 4x4 row-major, scan to world.
     skipped: points left out, by reason.
-    fault: why none of the scan is in the archive (any more), or "".
+    fault: why the scan was left out of or removed from the archive, or "".
     """
 
     path: str
@@ -64,7 +65,7 @@ class ObjectInfo(msgspec.Struct, frozen=True):
     """Dynamic object of a scene.
 
     avatar: its shape, one of the scene's avatars.  pose: 4x4 row-major, the initial pose.
-    kind: `kinematic`: a user sets its pose; `pushed`: users push it. A reader treats any other
+    kind: `kinematic` if users set its pose, `pushed` if users push it. A reader treats any other
     value as kinematic.
     """
 
@@ -84,17 +85,17 @@ class SceneInfo(msgspec.Struct, frozen=True):
     radius_sample: number of points over which the closest-point distance was averaged.
     degree, leaf: of the hierarchies.  skipped: scans left out with `--skip-bad`.
     record_bytes: of all records on disk.  resident_bytes: of the whole archive, decoded.
-    effects: effects that the scene's frames simulate; no others are simulated.
-    unknown: boxes (like `bounds`) of scans left out, where nothing is called clear.
-    unknown_everywhere: true if the bounds of one of these scans are not known.
+    effects: all effects that the scene's frames simulate.
+    unknown: boxes (like `bounds`) of scans that were left out, where no verdict is CLEAR.
+    unknown_everywhere: whether the bounds of one of these scans are not known.
     radius_models: models that are stored and that a query may request.
     generation: how often scans were added or removed since the build.
-    radius_now: what `radius` would be if it were measured over the points of this generation [m];
+    radius_now: `radius` as measured over the points of this generation [m]; null: not known.
     radius_now_error: its standard error [m]; null: not known.
-    avatars: the scene's own avatars, which every client may use by name.
+    avatars: avatars of the scene, which every client may use by name.
     up: unit vector against gravity.  spawn: where users start; null: each user chooses.
     objects: dynamic objects and their initial poses.
-    default_radius_model: model of a query that names none; null: `radius`.
+    default_radius_model: model of queries that do not name one; null: `radius` for all points.
     """
 
     scene: str

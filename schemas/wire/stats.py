@@ -1,4 +1,4 @@
-"""Messages of `stats`: the state of a scene's cache, and what its users had to wait for."""
+"""Messages of `stats`: statistics of a scene's cache, its requests and its users."""
 
 import math
 from itertools import accumulate
@@ -7,8 +7,8 @@ import msgspec
 
 from .requests import Request
 
-# Upper bounds of `Times.buckets` [s]: 1, 2 and 5 of every decade from a microsecond to 100 s. If
-# they change, statistics that a monitoring system collects over months no longer add up.
+# Upper bounds of `Times.buckets` [s]: 1, 2 and 5 of every decade from a microsecond to 100 s. They
+# must not change, because monitoring systems add up buckets over months.
 TIME_BOUNDS = (*(float(f"{m}e{e}") for e in range(-6, 2) for m in (1, 2, 5)), 100.0)
 
 
@@ -26,9 +26,9 @@ class Times(msgspec.Struct, frozen=True):
 
     count, sum: over all measurements.
     p50, p90, p99: percentiles, overestimated by at most a tenth.  max: the longest.
-    buckets: number of measurements at most 1, 2 and 5 µs, 10, 20 and 50 µs, and so on to 100 s, and
-    above the bound before; the last bucket counts those above all bounds. [] if there are no
-    measurements.
+    buckets: number of measurements in each interval between the bounds 0, 1, 2, 5, 10, 20, 50 µs
+    and so on up to 100 s, upper bound included; the last bucket counts those above 100 s. [] if
+    there are no measurements.
     """
 
     count: int = 0
@@ -73,7 +73,7 @@ class AvatarStats(msgspec.Struct, frozen=True):
     """Memory that the avatars of a scene's clients take, and its limits.
 
     bytes: of their arrays.  avatars: their number, including those being built.
-    clients: number of clients that have any.
+    clients: number of clients with avatars.
     max_bytes, max_avatars, max_clients: limits of these.
     max_bytes_by_client, max_avatars_by_client: limits per client. 0: no limit.
     """
@@ -124,16 +124,16 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     budget_bytes: limit for decoded voxels and coarse bounds together.
     resident_bytes: used by decoded voxels, `resident` of the `voxels` in the archive.
     coarse_bytes: used by coarse bounds.  kept: voxels in which users stand.
-    The counters cover this generation, since it is served.
+    The counters of `Counters` begin when this generation is first served.
 
-    The following cover the time since the scene is served.
-    requests: the parts of a path count one by one.
+    The following begin when the scene is first served.
+    requests: number of requests; each part of a path counts as one.
     answers: poses (rays, points, motions, objects) in them.
     unknown: answers that were unknown.  waited: requests that waited for voxels.
     load_seconds: count, sum and buckets of all loads; percentiles and max of the last ones.
     stall_seconds: time that each request waited for voxels.
-    engine_seconds: time that each request took in the engine, waits included.
-    users: users heard of last, the most recent first.
+    engine_seconds: time that each request took in the engine, including waits.
+    users: the most recently active users, the most recent first.
     keys: of the resident voxels, ascending; null: not requested.
     avatars: memory of the clients' avatars.
     """

@@ -1,8 +1,8 @@
-"""Effect `sweep`: continuous motion; nothing is passed through between two frames at any speed.
+"""Effect `sweep`: continuous motion, so that no avatar passes through anything at any speed.
 
-The way from one pose to the next is the screw motion of server/queries/sweep.py. What it meets ends
-it `skin` before (`stop`), at a pose that is clear by `collide`. The sweep proves that where the
-pose is the sweep's bit for bit; otherwise it is queried.
+The avatar follows the screw motion of server/queries/sweep.py from one pose to the next. It stops
+`skin` (of `stop`) before the first contact, at a pose that is clear by `collide`. The sweep proves
+the pose clear if the pose is one of the sweep's bit for bit; otherwise `collide` is queried.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep

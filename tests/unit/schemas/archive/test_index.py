@@ -45,7 +45,7 @@ def test_the_box_of_a_source_that_was_left_out_is_one_of_those_there_are(told: A
     header = replace(header, sources=(lost,), unknown=np.zeros((1, 2, 3), np.int64), unknown_everywhere=True)
     columns = index_columns(header, np.zeros(0, np.uint8), [])
     if not good:
-        with pytest.raises(ValueError, match=r"expected a different one each, or -1|Expected `int"):
+        with pytest.raises(ValueError, match=r"expected distinct boxes, or -1|Expected `int"):
             read_header(header.archive_id, columns)
         return
     assert [s.unknown for s in read_header(header.archive_id, columns).sources] == [told]

@@ -190,7 +190,7 @@ def test_a_reload_that_fails_says_which_archives_are_new(
 
 def test_what_is_refused_says_why(built: Built, both: Scene) -> None:
     here = np.eye(4)[None]
-    with pytest.raises(BadRequestError, match="this archive holds mean"):
+    with pytest.raises(BadRequestError, match="this archive stores mean"):
         both.collide("al", here, radius_model="local")
     with pytest.raises(BadRequestError, match="1 poses to begin at and 2 to end at"):
         both.sweep("al", here, np.repeat(here, 2, axis=0), budget_visits=5)

@@ -269,7 +269,7 @@ def test_normals_are_loaded_where_effects_ask_for_them(
         (TOP + BALL.replace("radius = 0.05", ""), BadRequestError, "$.avatars[0]: avatar of a single distinct point"),
         (
             'format = 1\nradius_model = "local"\n' + TOP[11:], BadRequestError,
-            "$.radius_model: {}/floor: radius model 'local': this archive holds mean",
+            "$.radius_model: {}/floor: radius model 'local': this archive stores mean",
         ),
         (
             TOP + BALL.replace("0.05", "4.5") + STOP + '[[effects]]\neffect = "crowd"\n', BadRequestError,

@@ -207,7 +207,7 @@ def test_what_is_perhaps_not_meant_is_noted(
         (TOP + '[[archives]]\npath = "visitor.xyz"\n', 3, "hall.toml: $.archives[1].path: {folder}/visitor.xyz"),
         (
             TOP.replace("hall", "plain").replace("1\n", '1\nradius_model = "border"\n', 1), 2,
-            "hall.toml: $.radius_model: {folder}/scans/plain: radius model 'border': this archive holds mean",
+            "hall.toml: $.radius_model: {folder}/scans/plain: radius model 'border': this archive stores mean",
         ),
         (TOP + VISITOR.replace("visitor.xyz", "no.ply"), 3, "hall.toml: $.avatars[0].file: {folder}/no.ply"),
         (TOP + VISITOR.replace("visitor", "point"), 2, "hall.toml: $.avatars[0]: avatar of a single distinct point"),

@@ -12,9 +12,9 @@ position:
 An interval that may contain an early contact is halved and quartered until its sagitta is
 negligible beside rounding. A translation has no sagitta and takes one descent.
 
-The answer is only how far nothing touches. Beyond that lies a contact, or a graze within 1.2 units,
-18 nm, of one. All arithmetic is float64: avatars have some thousand points, few of which are near
-one another.
+The answer is the fraction up to which nothing touches. There the bodies are in contact, or graze
+within 1.2 units (18 nm) of contact. All arithmetic is float64: avatars have some thousand points,
+few of which are near one another.
 """
 
 import math
@@ -303,10 +303,10 @@ def sweep_bodies(
     poses: (n, 4, 4), checked, rigid, world.  units_a, units_b, margin_units: radii and margin,
     exact units.  rows: (m,) int64, of poses.  until: contacts at or after it are ignored; inf: none
     is.  stop: (1,) int64, a stop flag; once it is set, the result is meaningless.
-    Returns (row, fraction): none of these bodies touches before the fraction; the row's body
-    touches there or up to `tolerance` [m] of the fastest point's way later, or nearly does. (-1,
-    until) if none touches. Writes witness (2, 3): the centres of the two spheres there, world [m];
-    named (2,) int64: block and lane of the body's point. Adds to scratch.counters.
+    Returns (row, fraction): none of these bodies touches before the fraction. The body of the row
+    touches or grazes there, or before the fastest point has moved `tolerance` [m] farther. Returns
+    (-1, until) if none touches. Writes witness (2, 3): the centres of the two spheres there, world
+    [m]; named (2,) int64: block and lane of the body's point. Adds to scratch.counters.
     """
     motion = make_motion(first, last, box, np.zeros(3))
     shift, shifts = np.empty(3), scratch.shifts

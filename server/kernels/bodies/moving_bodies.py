@@ -83,11 +83,11 @@ class BodySweep(NamedTuple):
 
 
 class BodyChord(NamedTuple):
-    """One interval from t0 on.
+    """Straight approximation of a motion over one interval from t0 on (body_sweep.py).
 
     inner, outer: U - band, U + band, exact units, where U is `BodySweep.units`.  threshold: outer
     with the error [m].
-    final: halving is useless.
+    final: whether halving the interval is useless.
     """
 
     t0: float

@@ -80,9 +80,9 @@ def _with_capacity(rows, used, more, stop):
 def list_pose(state, runs, stop):
     """List the pairs and clusters of the current pose, deepest first, and remove its cells.
 
-    Writes runs (4,) int64: first pair, pairs, first cluster, clusters. Returns the memory, its
-    lists grown, and whether the pose is listed. When the stop flag (1,) is set, the pose has no
-    pairs and no clusters, and the memory must not be used for further poses.
+    Writes runs (4,) int64: first pair, number of pairs, first cluster, number of clusters. Returns
+    the state, whose lists may have grown, and whether the pose is listed. When the stop flag (1,)
+    is set, the pose has no pairs and no clusters, and the state must not be used for further poses.
     """
     cells, heap, sizes = state.cells, state.heap, state.sizes
     table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]

@@ -29,8 +29,8 @@ STACK = 2 * MAX_LEVELS * 15 + 16
 # the avatar's points are then tested against it at once. Values from 0.5 to 2 take the same time on
 # the walk; 8 takes a fifth more.
 FLAT = np.float32(1.0)
-# Most of the avatar's front meets a scene node of more than this many radii of the avatar's root;
-# only the root is tested against it.
+# A scene node of more than this many radii of the avatar's root is tested against the root only,
+# because most of the front's nodes would meet it.
 BROAD = np.float32(2.0)
 
 
@@ -103,8 +103,8 @@ def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farth
 def make_thresholds(units, units_per_step, extent, farthest, voxel_steps):
     """Compute the thresholds for a reach of `units`.
 
-    extent: how far placed avatar points lie from the frame.  farthest: the largest term of a placed
-    coordinate.
+    extent: largest distance of placed avatar points from the frame [steps].  farthest: the largest
+    term of a placed coordinate.
     Errors of a coordinate difference, in steps:
     - rounding to exact units: half a unit for each of the two points;
     - float32 of the avatar's coordinate: U32 of its size, once relative to the frame and once

@@ -1,4 +1,4 @@
-"""Avatar under one pose: where the pose places its points and nodes. The formula of NUMERICS.md N5.
+"""Avatar under one pose: placement of its points and nodes by the formula of NUMERICS.md N5.
 
 A placed coordinate is ((r0 p0 + r1 p1) + r2 p2) + (t - O), float64, in this order, without
 contraction. Multiplied by 2^26 (exact) and rounded half to even, it is the integer that decides.
@@ -6,13 +6,14 @@ Compiled and interpreted code agree bit for bit.
 
 A placed avatar holds float32 distances in lattice steps from the frame, a lattice point near it.
 Relative to the frame, scene coordinates are integers below 2^24 and therefore exact in float32. The
-placed avatar carries an error, which every bound includes (node_overlap.py). Where float32 cannot
-decide, the integers do: `pair_square`.
+placed avatar has a rounding error, which every bound includes (node_overlap.py). Where float32
+cannot decide, the integers do: `pair_square`.
 
-The front is one level of the avatar's tree as a flat list. A descent of two trees tests one pair of
-nodes at a time and branches after each test. Here only the scene's tree is descended. Each of its
-nodes is tested against the list of those front nodes that met its parent: 32 in a vector step, in
-the time of one or two single tests. For the figure of 3,617 points the front is its 114 leaf nodes.
+The *front* is one level of the avatar's tree as a flat list. A descent of two trees tests one pair
+of nodes at a time and branches after each test. Here only the scene's tree is descended. Each of
+its nodes is tested against the list of those front nodes that met its parent: 32 in a vector step,
+in the time of one or two single tests. For the figure of 3,617 points the front is its 114 leaf
+nodes.
 
 Indices are np.uint64 wherever vectorisation matters. LLVM assumes that a signed index may be
 negative; it then computes an address for each lane and loads each lane separately (six times
@@ -37,8 +38,8 @@ MAX_REACH_UNITS = 1 << 30
 MAX_FRONT = 256
 # One list is written for each level of the descent; none is longer than the list above it.
 LIST_CAPACITY = MAX_FRONT * (MAX_LEVELS + 2)
-# Coordinate that pads a list to whole vector steps: so far away that, with radius 0, no test keeps
-# it.
+# Coordinate of the entries that pad a list to whole vector steps. With radius 0, no test keeps a
+# node this far away.
 FAR_AWAY = np.float32(1e30)
 
 

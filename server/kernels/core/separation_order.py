@@ -34,12 +34,11 @@ def _product(a, b):
 
 @njit_no_refcount
 def _compare_roots(square, other, radius_difference):
-    """Return the sign of sqrt(square) - (sqrt(other) + more), int64.
+    """Return the sign of sqrt(square) - (sqrt(other) + d), int64, with d = radius_difference >= 0.
 
-    radius_difference: >= 0. The difference is within 1. Squaring both sides leaves the sign of s -
-    2 more sqrt(other), with s = square - other - more^2; where s is not negative, both sides are
-    squared again. All terms fit, because `radius_difference` is at most slightly larger than the
-    root of `square`.
+    The two sides differ by at most 1. Squaring both leaves the sign of s - 2 d sqrt(other), with
+    s = square - other - d^2. If s is not negative, both sides are squared again. All terms fit,
+    because d is at most slightly larger than the root of `square`.
     """
     s = square - other - radius_difference * radius_difference
     if s < 0:
@@ -56,9 +55,9 @@ def _compare_roots(square, other, radius_difference):
 
 @njit_no_refcount
 def compare_separations(square, radius, other_square, other_radius):
-    """Compare the gaps sqrt(square) - radius of two pairs exactly.
+    """Compare the separations sqrt(square) - radius of two pairs exactly.
 
-    Returns -1, 0 or 1: the first gap is less than, equal to or greater than the other.
+    Returns -1, 0 or 1: the first separation is less than, equal to or greater than the other.
     square, other_square: int64, 0 to 3 * 2^60, from `pair_square`.  radius, other_radius: int64,
     -2^31 to 2^31, exact units. Terms common to both radii may be omitted: `-deficit` serves as well
     as the radius.

@@ -1,6 +1,6 @@
 """Broad phase: check poses, and list the voxels that the avatar could touch under each.
 
-The boxes around the points of voxels decide (server/residency/index_proof.py).
+A voxel is listed by the box around its points (server/residency/index_proof.py).
 """
 
 import math
@@ -69,11 +69,11 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
     Writes scales (k,) and units (k,) int64, the reach of each pose in exact units.
     node_radius: (a,) of the avatar's nodes, root first, may be empty.  radius: of its points [m].
     other_units: the scan's radius plus the margin, exact units.  scene: SceneArrays.
-    A scale within SIMILARITY_TOLERANCE of 1 becomes 1, so that the rounding of a rigid pose changes
-    no radius.
+    A scale within SIMILARITY_TOLERANCE of 1 becomes 1, so that the rounding of a rigid pose does
+    not change a radius.
     Returns (GOOD, 0, 0.0), or the first fault, its pose and the value found. Once scene.stop is
-    set, it also returns (GOOD, 0, 0.0), with the output incomplete: a caller that has a stop flag
-    must check it after this call.
+    set, it also returns (GOOD, 0, 0.0), with the output incomplete: the caller must then check the
+    stop flag.
     """
     for i in range(poses.shape[0]):
         if i % POSES_AT_ONCE == 0 and stopped(scene.stop):

@@ -21,9 +21,10 @@ INFINITE = np.inf
 def pair_times(gap, displacement, inner, outer):
     """Compute when a point moving from `gap` by `displacement` is within `outer` and `inner`.
 
-    Returns (enters, certain, closest), fractions. earliest_possible: when it comes within `outer`,
-    rounded down; inf when it never does in [0, 1]. earliest_certain: when it comes within `inner`,
-    rounded up; inf likewise. closest: the fraction of closest approach, within [0, 1].
+    Returns (earliest_possible, earliest_certain, closest), fractions. earliest_possible: when it
+    comes within `outer`, rounded down; inf if it never does in [0, 1]. earliest_certain: when it
+    comes within `inner`, rounded up; inf likewise. closest: the fraction of closest approach, in
+    [0, 1].
     """
     dot = gap[0] * displacement[0] + gap[1] * displacement[1] + gap[2] * displacement[2]
     length = math.sqrt(
@@ -127,9 +128,9 @@ def _comes_first(sweep, pair, other):
 
 @njit_no_refcount
 def _certain_by_integers(sweep, chord, pair, earliest_possible, earliest_certain, closest):
-    """Return the fraction at which a pair is known to touch, tested by integers at two poses.
+    """Return the fraction at which a pair certainly touches, also tested by integers at two poses.
 
-    The chord is final. The poses are the first pose of the whole motion, whose contacts are those
+    It is for final chords. The poses are the first pose of the whole motion, where contact is that
     of `collide`, and the pose where the pair is closest.
     """
     if (

@@ -31,10 +31,10 @@ class MovingAvatar(NamedTuple):
     pose, shift: (4, 4), (3,), the one pose that is tested with integers.
     pair: (6,) int64, block, lane, voxel, lane_at, block_at, j of one pair of points
     (placed_avatar.py).
-    best: (6,), that of the earliest contact found.
-    first: (3,) float64, fractions of the chord, inf: never: when a contact is first possible; when
-    `pair` certainly touches; the one of the two that prunes. On a chord worth halving, `pair` is
-    the first that may touch; else it is the first that certainly touches.
+    best: (6,), the pair of the earliest contact found.
+    first: (3,) float64, fractions of the chord, inf for never: when a contact is first possible;
+    when `pair` certainly touches; the one of these two that prunes. `pair` is the first pair that
+    may touch or, on a final chord, the first that certainly touches.
     thresholds: (2, c) float32, of the chord by radius class: reach plus error [steps], and `far`
     (placed_avatar.py). It is one array because a sweep is passed on whole: with the four arrays of
     `ClassThresholds`, a motion of the walk took a quarter longer.
@@ -85,11 +85,11 @@ class AvatarSweep(NamedTuple):
 
 
 class AvatarChord(NamedTuple):
-    """One interval.
+    """Straight approximation of a motion over one interval (sweep_interval.py).
 
     t0, t1: fractions.  inner, outer: U - band, U + band, exact units, with U of the scan's largest
     sphere.
-    final: halving is useless.
+    final: whether halving the interval is useless.
     """
 
     t0: float

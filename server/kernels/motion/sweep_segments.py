@@ -261,10 +261,11 @@ def find_unknown_regions(
 ):
     """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, until].
 
-    Writes outside (k,) bool, the reach leaves the scene's bounds; lost (k,) float64, when it first
-    meets one of the boxes unknown (u, 2, 3) int64 [steps], inf: never.
+    Writes outside (k,) bool, whether the reach leaves the scene's bounds, and unknown_from (k,)
+    float64, the fraction at which it first meets one of the boxes unknown (u, 2, 3) int64 [steps];
+    inf if it never does.
     The reach is the cube around the avatar's root sphere, as in `collide`, along chords; neither
-    result depends on voxels. Once the scene's stop flag is set, motions are lost from their
+    result depends on voxels. Once the scene's stop flag is set, motions are unknown from their
     beginning.
     """
     pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)

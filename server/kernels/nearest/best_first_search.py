@@ -52,8 +52,8 @@ from .nearest_pair import (
 from .nearest_search import box_distance
 from .pair_heap import pop_top, sift_up
 
-# The search continues; no pair is open; the answer is known to the requested accuracy; the budget
-# of visits is spent.
+# Status of a search: it continues; it ended because no pair is open, because the answer has the
+# requested accuracy, or because the budget of visits is spent.
 OPEN, DONE, ENOUGH, BUDGET_SPENT = range(4)
 NO_VOXEL = -1  # in place of a row: the voxel has not been visited
 
@@ -326,7 +326,7 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
 
 @nb.njit(nogil=True, cache=True)
 def end_search(search, i, results, counts):
-    """Add the results of a search to what is known of pose i."""
+    """Merge the results of a search into `results` and `counts` of pose i."""
     best = search.best
     results.square[i], results.deficit[i] = best.found[0], best.found[7]
     results.pair[i] = best.found[1:7]
@@ -345,7 +345,7 @@ def resume_search(poses, avatar, scene, index, reach, i, fresh, until, search, g
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of the poses; a voxel in it
     that is not resident is counted as missing.  until: the number of visits, in this piece, at
     which to suspend.
-    Once the search has ended, its results are added to known and counts (3, k) uint32; for a
+    Once the search has ended, its results are merged into `results` and counts (3, k) uint32; for a
     suspended search, `end_search` does that. Returns the status.
     """
     if fresh:

@@ -42,7 +42,7 @@ from .nearest_pair import lower_bound, set_cut
 class NearestPerScan(NamedTuple):
     """Results for each of n scans; the last entry stands for numbers that no scan has.
 
-    gaps: (n,) float64, least signed separation [m], inf: none within the margin.
+    gaps: (n,) float64, least signed separation [m]; inf if no pair is within the margin.
     units: (n,) int64, upper bound of |a - b| + deficit of its nearest pair, exact units
     (nearest_pair.py).
     """

@@ -1,6 +1,6 @@
-"""Nearest pair of points so far, and what it rules out.
+"""Nearest pair of points so far, and the bounds by which it prunes the search.
 
-`distance` and the bounded search share this module.
+`distance` and the best-first search share this module.
 
 The nearest pair is the one with the least separation of its spheres, |a - b| - (r_a + r_b). r_a is
 the same for all pairs, and the scan point's radius is the largest radius minus the `deficit` of its
@@ -50,7 +50,7 @@ class NearestPairs(NamedTuple):
 
 
 class BestPair(NamedTuple):
-    """Nearest pair of one pose so far, and what it rules out; scratch of one call.
+    """Nearest pair of one pose so far, and the bounds by which it prunes; scratch of one call.
 
     found: (8,) int64, square or -1, a row of `NearestPairs.pair`, deficit.
     cut, far: (n,) float32, by radius class: no node pair whose `lower_bound` is above cut[c]

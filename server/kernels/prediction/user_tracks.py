@@ -16,9 +16,9 @@ from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from .track_prediction import PredictionLimits, predict_path, rows_ahead, rows_in_reach
 
-# A displacement since the last pose beyond this limit is a teleport, not a limits: a speed at which
-# nobody walks, runs or drives indoors [m/s], over the time passed but at most one second, plus some
-# slack for poses that arrive late and all at once [m].
+# A displacement since the last pose of more than MAX_SPEED times the time passed (at most
+# MAX_PAUSE), plus SLACK, is a teleport. Nobody walks, runs or drives indoors at MAX_SPEED [m/s].
+# SLACK allows for poses that arrive late and all at once [m].
 MAX_SPEED, MAX_PAUSE, SLACK = 15.0, 1.0, 1.0
 # Without a pose for this long, a user is assumed to stand at the last one [s].
 STALE = 0.5
@@ -30,14 +30,14 @@ LEAST_GAP, MAX_POSES = 0.005, 64
 RELATIVE_SLACK = 1e-6
 # Straight pieces of a predicted path.
 PIECES = 16
-# Rows to find before the soonest are selected, as a multiple of those: the rows of a piece are
-# found in spatial order.
+# Number of rows to find, as a multiple of those to select. More are needed because the rows of a
+# piece are found in spatial order and not by need.
 SPARE = 4
 
 COUNT, NEWEST, SINCE, REACH, LAST, POSES, POSE = 0, 1, 2, 3, 4, 5, 4
 TRACK_WORDS = POSES + POSE * MAX_POSES
-# At most one in SPARSE places of a hash table is taken; rows are spread over it by 2^32 over the
-# golden ratio.
+# At most one in TABLE_SLACK places of a hash table is taken. The multiplier, 2^32 over the golden
+# ratio, spreads rows over the table.
 TABLE_SLACK, HASH_MULTIPLIER = 4, 2654435769
 
 
@@ -60,8 +60,8 @@ class PredictionOptions(NamedTuple):
     limits: PredictionLimits
 
 
-# This holds the interpreter lock: after releasing it for a microsecond, the thread would wait for
-# whichever thread takes it.
+# The interpreter's lock is kept: after releasing it for a microsecond, this thread would wait for
+# the thread that takes it.
 @nb.njit(cache=True)
 def record_pose(tracks, user, now, x, y, z, reach):
     """Store a pose [s, m] of row `user`; return whether it is a teleport.

@@ -125,11 +125,11 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
 def code_at(scene, voxel, x, y, z, square, codes):
     """Return the code of the normal at a lattice point, from `codes` or estimated.
 
-    scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], found to fit by
-    `normals.normal_reach`.  codes: (blocks * LANES,) uint16, UNASKED where not estimated yet; an
-    estimate is stored there. With length 0, nothing is stored.
-    Returns (code, nodes visited, whether it was estimated). The code is NO_NORMAL where the voxel has no
-    point there, or is not resident.
+    scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], as `squared_reach` returns
+    it (schemas/archive/normal_reach.py).  codes: (blocks * LANES,) uint16, NOT_ESTIMATED where not
+    estimated yet; an estimate is stored there. With length 0, nothing is stored.
+    Returns (code, nodes visited, whether it was estimated). The code is NO_NORMAL where the voxel
+    has no point there, or is not resident.
     """
     if scene.where[voxel, 0] < 0:
         return NO_NORMAL, 0, False

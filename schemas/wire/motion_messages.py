@@ -6,6 +6,7 @@ if the scene does not declare the effect.
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -81,6 +82,19 @@ def _check_finite(what: str, numbers: Iterable[float]) -> None:
     for number in numbers:
         if not math.isfinite(number):
             raise BadRequestError(f"{what} holds {number}: expected finite numbers")
+
+
+def motion_fields(pose: Any, velocity: Any) -> tuple[Poses, Vector | None]:
+    """Return pose and velocity of a motion command as the fields of a `Wish`.
+
+    pose: (4, 4) or (1, 4, 4), or None.  velocity: 3 numbers [m/s], or None.
+    Raise BadRequestError unless a velocity has 3 numbers.
+    """
+    poses = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
+    speed = None if velocity is None else tuple(float(part) for part in velocity)
+    if speed is not None and len(speed) != 3:
+        raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
+    return np.ascontiguousarray(poses), speed
 
 
 class Touched(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -1,4 +1,4 @@
-"""What a question is: its request, the rules of its answers' columns, and what is generic over questions.
+"""Declaration of a question: request, rules of its answers' columns, and code for all questions.
 
 question_table.py declares the questions. Everything generic reads the declarations: checks, unknown
 answers, joining, merging over archives, requests in batches, dispatch, the command line and the
@@ -37,7 +37,7 @@ class Rows(Enum):
 
 
 class Merge(Enum):
-    """How the values of several archives become one. server/archives/merge_answers.py has each."""
+    """Rule by which values of several archives become one (server/archives/merge_answers.py)."""
 
     VERDICT = auto()  # contact with any is contact; clear is what is clear of all
     ALL = auto()  # true if it is true for every archive
@@ -52,7 +52,7 @@ class Merge(Enum):
 
 
 class ColumnFrame(Enum):
-    """What the values of an archive at a pose are, and so how they are carried to the world."""
+    """Kind of a column's values, which decides how they are transformed to the world."""
 
     NONE = auto()  # the same in every frame
     POINT = auto()

@@ -29,7 +29,7 @@ from ...schemas.errors import BadRequestError, BusyError, CorruptError
 from ...schemas.wire.scene_messages import ReloadAnswer, SceneInfo
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
-from ..queries.engines import warm_engines
+from ..queries.engine_table import warm_engines
 from ..queries.raycast import make_directions
 from ..residency.arena import ArenaBuffer
 from ..residency.coarse_bounds import CoarseBounds

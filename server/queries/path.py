@@ -24,7 +24,7 @@ from ..kernels.core.voxels_in_reach import check_poses
 from ..runtime.stop_flag import NO_STOP, StopFlag, stop_at
 from .context.query_budget import ask_until_stopped, make_budget, unknown_answers
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
-from .engines import ENGINES
+from .engine_table import ENGINES
 
 # Default number of parts computed at a time.
 PATH_THREADS = 2

@@ -15,9 +15,9 @@ from collections.abc import Callable
 from typing import Self
 
 from ..runtime.threads import start_thread
-from .held_voxels import BackgroundLoad
 from .motion_prediction import User, UserTracks
 from .voxel_cache import VoxelCache
+from .voxel_states import BackgroundLoad
 
 log = logging.getLogger(__name__)
 

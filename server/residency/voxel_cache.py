@@ -23,9 +23,8 @@ from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
 from .arena import ArenaBuffer
 from .eviction import EvictionPolicy, make_policy
-from .held_voxels import BackgroundLoad, HeldVoxels, Hold
 from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
-from .voxel_states import VoxelStates
+from .voxel_states import BackgroundLoad, HeldVoxels, Hold, VoxelStates
 from .voxel_store import VoxelStore
 
 

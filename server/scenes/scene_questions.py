@@ -22,7 +22,7 @@ from ..avatars.client_avatars import Avatars
 from ..observability.request_stats import RequestStats
 from ..queries.context.query_budget import EXACT, QueryBudget, make_budget, unknown_answers
 from ..queries.context.query_context import SceneData, with_stop
-from ..queries.engines import ENGINES
+from ..queries.engine_table import ENGINES
 from ..queries.objects import SCENE_GROUP
 from ..queries.path import PATH_THREADS, largest_part, path_parts
 from ..runtime.path_threads import PathThreads

@@ -10,11 +10,9 @@ from collections.abc import Iterator, Mapping
 from time import monotonic
 from typing import Any, Self
 
-import numpy as np
-
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError
 from ...schemas.wire.key_expressions import User
-from ...schemas.wire.motion_messages import State, Wish
+from ...schemas.wire.motion_messages import State, Wish, motion_fields
 from ..scene_interface import FrameCommand, LatestState
 from .simulation import Simulation
 
@@ -73,10 +71,7 @@ class LocalSession:
         invalid command, or if the session is closed. If the frame is refused, `latest`, `wait` and
         `states` raise its error.
         """
-        array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
-        speed = None if velocity is None else tuple(float(part) for part in velocity)
-        if speed is not None and len(speed) != 3:
-            raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
+        poses, speed = motion_fields(pose, velocity)
         with self._commands:
             if not self._open:
                 raise BadRequestError(
@@ -86,8 +81,8 @@ class LocalSession:
             wish = Wish(
                 seq=self._seq + 1,
                 time=now if time is None else float(time),
-                pose=np.ascontiguousarray(array),
-                velocity=speed,  # type: ignore[arg-type]
+                pose=poses,
+                velocity=speed,
                 turn=float(turn),
                 objects=dict(objects or {}),
             )

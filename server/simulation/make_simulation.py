@@ -14,7 +14,7 @@ from .simulation import SimulatedScene, Simulation
 def make_simulation(scene: SimulatedScene, file: SceneFile) -> Simulation:
     """Return the simulation of a scene's frames, with the effects that `file` declares."""
     # Imported here, because a scene that is only queried needs neither effects nor their kernels.
-    from .effects.pipeline import make_pipeline
+    from .effects.effect_pipeline import make_pipeline
     from .world.collision_world import World
 
     world = World(scene, file)

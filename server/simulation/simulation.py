@@ -39,7 +39,7 @@ from .world.frame import Body, Pose, Vec
 from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
-    from .effects.pipeline import Pipeline
+    from .effects.effect_pipeline import Pipeline
     from .world.bodies import Bodies
 
 log = logging.getLogger(__name__)

@@ -14,7 +14,6 @@ from time import monotonic
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
 import zenoh
 
 from ...schemas.errors import (
@@ -26,7 +25,7 @@ from ...schemas.errors import (
 )
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer, encode
-from ...schemas.wire.motion_messages import State, Wish
+from ...schemas.wire.motion_messages import State, Wish, motion_fields
 from ...schemas.wire.scene_messages import ErrorReply
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
@@ -201,16 +200,13 @@ class ClientSession:
         states arrive. The last command is sent again every second, for at most 5 s, until its state
         arrives. Raise BadRequestError for an invalid command, or if the session is closed.
         """
-        array = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
-        speed = None if velocity is None else tuple(float(part) for part in velocity)
-        if speed is not None and len(speed) != 3:
-            raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
+        poses, speed = motion_fields(pose, velocity)
         with self._publishing:
             wish = Wish(
                 seq=self._numbers.next(),
                 time=monotonic() if time is None else float(time),
-                pose=np.ascontiguousarray(array),
-                velocity=speed,  # type: ignore[arg-type]
+                pose=poses,
+                velocity=speed,
                 turn=float(turn),
                 objects=objects or {},
             )

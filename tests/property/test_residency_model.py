@@ -11,8 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from solidcloud.server.residency.eviction import POLICIES, make_policy
-from solidcloud.server.residency.held_voxels import BackgroundLoad, HeldVoxels
 from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_states import BackgroundLoad, HeldVoxels
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9

@@ -16,16 +16,8 @@ import msgspec
 import numpy as np
 import synthetic_scans
 from numpy.typing import NDArray
-from solidcloud.schemas.wire.answers import (
-    CollideAnswers,
-    ContactsAnswers,
-    DistanceAnswers,
-    ObjectsAnswers,
-    RaycastAnswers,
-    SweepAnswers,
-    WithinAnswers,
-)
 from solidcloud.schemas.wire.encoding import MSGPACK, decode_answer, encode
+from solidcloud.schemas.wire.question_table import QUESTIONS
 from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
     CollideRequest,
@@ -44,15 +36,6 @@ from solidcloud.server.zenoh_server.server_config import ServerConfig
 
 SCAN = ("corner", 21, 500)
 MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")
-ANSWERS = {
-    "collide": CollideAnswers,
-    "distance": DistanceAnswers,
-    "contacts": ContactsAnswers,
-    "sweep": SweepAnswers,
-    "raycast": RaycastAnswers,
-    "within": WithinAnswers,
-    "objects": ObjectsAnswers,
-}
 # What depends on the clock and on what is resident: times and counters of the cache.
 COSTS = {
     "engine_seconds": 0.0,
@@ -74,7 +57,7 @@ def question(
     effort: dict[str, Any] = {"tolerance": 1e-3, "budget_visits": 100} if rng.random() < 0.2 else {}
     if rng.random() < 0.5:
         effort["radius_model"] = str(rng.choice(MODELS))
-    op = str(rng.choice(list(ANSWERS)))
+    op = str(rng.choice(list(QUESTIONS)))
     starts = rng.uniform(0, 2, (2, 3))
     asked: QuestionRequest
     if op == "collide":
@@ -116,9 +99,10 @@ def checksums(
             op, payload = request
             answer = service.answer(f"solidcloud/1/scene/scene/c/{op}", payload, MSGPACK)
             assert answer.ok, answer.payload
-            if op not in ANSWERS:
+            if op not in QUESTIONS:
                 return ""
-            plain = msgspec.structs.replace(decode_answer(ANSWERS[op], answer.payload, MSGPACK), **COSTS)
+            found = decode_answer(QUESTIONS[op].answers, answer.payload, MSGPACK)
+            plain = msgspec.structs.replace(found, **COSTS)
             return hashlib.sha256(encode(plain, MSGPACK)).hexdigest()[:16]
 
         reply(asked[0])

@@ -19,8 +19,8 @@ from ....schemas.wire.answers import Cost
 from ....schemas.wire.question_rules import Question
 from ....schemas.wire.requests import QuestionOptions
 from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
-from ...residency.held_voxels import HeldVoxels
 from ...residency.voxel_cache import VoxelCache
+from ...residency.voxel_states import HeldVoxels
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
 
 _A = TypeVar("_A", bound=Cost)

@@ -24,9 +24,9 @@ from ...kernels.core import voxels_in_reach as pose_checks
 from ...kernels.core.scene_arrays import SceneArrays, block_words
 from ...kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
 from ...residency.coarse_bounds import CoarseBounds
-from ...residency.held_voxels import HeldVoxels
 from ...residency.index_proof import ProvedBounds
 from ...residency.voxel_cache import VoxelCache
+from ...residency.voxel_states import HeldVoxels
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .query_budget import CostCounter, QueryBudget
 

@@ -1,8 +1,8 @@
 """Effects of a scene. Only the effects that a scene declares are imported (NUMERICS.md case 31).
 
 Each effect is one file, named as in the scene file, whose `make(effect, world)` returns a `Runner`.
-The code that effects share is in simulation/world/. pipeline.py runs the effects that a scene
-declares, in this order:
+The code that effects share is in simulation/world/. effect_pipeline.py runs the effects that a
+scene declares, in this order:
 
 1. `objects`, `crowd`: place everything else that could be met, before anyone moves.
 2. `stop`, with `sweep`: follow the motion command as far as nothing is touched.
@@ -16,5 +16,5 @@ declares, in this order:
 
 May import server.archives, server.avatars, server.queries, server.queries.context,
 server.residency, server.runtime, server.simulation.world, schemas.
-Begin with pipeline.py, then stop_effect.py.
+Begin with effect_pipeline.py, then stop_effect.py.
 """

@@ -1,4 +1,4 @@
-"""What effects share: the scene as they query it, other bodies, and the frame of one user.
+"""Code that effects share: the scene as they query it, other bodies, and the frame of one user.
 
 May import server.archives, server.avatars, server.kernels, server.queries, server.queries.context,
 server.runtime, server/scene_interface.py, schemas.

@@ -18,7 +18,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.question_table import QUESTIONS
 from solidcloud.server import client as client_module
 from solidcloud.server.cli.main import run
-from solidcloud.server.queries.engines import ENGINES
+from solidcloud.server.queries.engine_table import ENGINES
 from solidcloud.server.scene import Scene
 from split_scans import STEP, Built, exact_pose, several
 

@@ -14,7 +14,7 @@ from solidcloud.schemas.wire.question_rules import ColumnRules, Merge, Question
 from solidcloud.schemas.wire.question_table import QUESTIONS, path_questions, question_of
 from solidcloud.schemas.wire.requests import QuestionRequest, WithinRequest
 from solidcloud.server.cli.commands.query_command import query
-from solidcloud.server.queries.engines import ENGINES
+from solidcloud.server.queries.engine_table import ENGINES
 from solidcloud.server.scene_interface import QueryMethods
 
 WIRE = (files("solidcloud.schemas") / "WIRE.md").read_text(encoding="utf-8")

@@ -48,6 +48,18 @@ def same(
     return found
 
 
+def recorded_sweeps(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The arguments of each call that the fast path leaves to `sweep` from now on."""
+    calls: list[Any] = []
+
+    def recorded(*arguments: Any, **options: Any) -> Any:
+        calls.append(arguments)
+        return sweep(*arguments, **options)
+
+    monkeypatch.setattr(module, "sweep", recorded)
+    return calls
+
+
 @pytest.mark.interpreted
 @pytest.mark.parametrize("name", ["plane", "corner", "noise", "one point"])
 @pytest.mark.parametrize("far", [0.0, 2.0**18])
@@ -121,15 +133,10 @@ def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
     points = synthetic_scans.make_scan("plane", 5, 200)
     case = archive_cases.build(tmp_path, points)
     first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
-    probe, left = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
-
-    def counted(*arguments: Any, **options: Any) -> Any:
-        left.append(arguments)
-        return sweep(*arguments, **options)
-
+    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
     with judged_sweeps.opened(case) as data:
         same(probe, data, first, last)
-        monkeypatch.setattr(module, "sweep", counted)
+        left = recorded_sweeps(monkeypatch)
         used = data.residency.stats.hits
         same(probe, data, first, last)
         assert not left and data.residency.stats.hits > used
@@ -154,17 +161,12 @@ def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
     points = synthetic_scans.make_scan("plane", 5, 200)
     case = archive_cases.build(tmp_path, points)
     first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
-    probe, left = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05)), []
-
-    def counted(*arguments: Any, **options: Any) -> Any:
-        left.append(arguments)
-        return sweep(*arguments, **options)
-
+    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
     with judged_sweeps.opened(case) as data:
         looked = [each.visits for each in same(probe, data, first, last)]
         # Compiled, a kernel has taken the figure up already.
         monkeypatch.setattr(kernel, "MAX_RESIDENT_PATH_VISITS", 3)
-        monkeypatch.setattr(module, "sweep", counted)
+        left = recorded_sweeps(monkeypatch)
         same(probe, data, first, last)
         assert max(looked) > 3 and (len(left) > 0) == INTERPRETED
 

@@ -16,9 +16,9 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
 from solidcloud.server.kernels.core.scene_arrays import Arena
 from solidcloud.server.residency.eviction import POLICIES
-from solidcloud.server.residency.held_voxels import HeldVoxels
 from solidcloud.server.residency.load_turns import LOADS_WITHOUT_TURN
 from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_states import HeldVoxels
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
 

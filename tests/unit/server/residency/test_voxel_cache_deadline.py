@@ -10,8 +10,8 @@ import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
-from solidcloud.server.residency.held_voxels import HeldVoxels
 from solidcloud.server.residency.voxel_cache import VoxelCache
+from solidcloud.server.residency.voxel_states import HeldVoxels
 from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, NO_STOP, StopFlag
 from solidcloud.server.scene import Scene
 

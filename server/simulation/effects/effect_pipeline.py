@@ -1,4 +1,4 @@
-"""Pipeline of the effects that a scene declares.
+"""Effect pipeline: runs one frame through the effects that a scene declares, within its budget.
 
 No other effect is imported, called or reported (NUMERICS.md case 31). The scene file's `limits` set
 a frame's budget. Before each effect that may be skipped, the time spent in the frame and the

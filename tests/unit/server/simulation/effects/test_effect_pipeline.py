@@ -23,7 +23,7 @@ IMPORTED = """
 import sys
 from solidcloud.schemas.scene.effect_table import *
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
-from solidcloud.server.simulation.effects.pipeline import make_pipeline
+from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 import numpy as np

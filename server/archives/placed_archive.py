@@ -15,7 +15,6 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -25,14 +24,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
-from ...schemas.errors import BadRequestError, BusyError, CorruptError
+from ...schemas.errors import BadRequestError, BusyError
 from ...schemas.wire.scene_messages import ReloadAnswer, SceneInfo
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from ..queries.engine_table import warm_engines
 from ..queries.raycast import make_directions
-from ..residency.arena import ArenaBuffer
-from ..residency.coarse_bounds import CoarseBounds
+from ..residency.coarse_bounds import coarse_filler, make_coarse_bounds
 from ..residency.eviction import make_policy, prefetches
 from ..residency.index_proof import ProvedBounds
 from ..residency.motion_prediction import User, UserTracks
@@ -57,8 +55,6 @@ _FLOAT64 = np.dtype(np.float64)  # comparing dtypes is faster than comparing wit
 _NUMBER = (float, int)  # `float | int` would be constructed for each request
 # Voxels within this distance of a user are prefetched, however far its requests reach [m].
 _USER_REACH = 1.0
-# Share of the budget for coarse bounds, 6 KB a voxel.
-_COARSE_SHARE = 1 / 16
 # Number of radius models whose tables are cached. Clients may name any number of models.
 _MAX_MODELS = 64
 
@@ -100,7 +96,7 @@ class ArchiveGeneration:
         bounds, lattice = ProvedBounds(store.archive), store.archive.header.lattice
         around = UserTracks(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
         ahead = prefetches(policy)
-        coarse = _make_coarse(store, budget_bytes) if ahead else None
+        coarse = make_coarse_bounds(store, budget_bytes) if ahead else None
         if coarse is not None:
             budget_bytes -= coarse.bytes
         residency = VoxelCache(store, budget_bytes, make_policy(policy, budget_bytes, around.path_distances))
@@ -109,7 +105,7 @@ class ArchiveGeneration:
             arena, remember = residency.buffer.arena, coarse.store_from_arena
             residency.on_loaded = lambda row, where: remember(row, arena, where)
         # If coarse bounds of all voxels do not fit, only those of requested voxels are stored.
-        fill = _coarse_filling(coarse, store) if coarse is not None and coarse.has_room_for_all else None
+        fill = coarse_filler(coarse, store) if coarse is not None and coarse.has_room_for_all else None
         self.prefetcher = Prefetcher(residency, around, prefetch=ahead, idle=fill)
         figure = make_scene_data(store.archive, residency, bounds, coarse)
         data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
@@ -234,36 +230,6 @@ class ArchiveGeneration:
                 return
             with residency.hold([row]):
                 pass
-
-
-def _make_coarse(store: VoxelStore, budget_bytes: int) -> CoarseBounds | None:
-    """Return storage for coarse bounds of all voxels, or of as many as their budget share holds.
-
-    Return None if the budget holds no coarse bounds beside the largest voxel.
-    """
-    voxels, largest = len(store.sizes), int(store.sizes.max(initial=0))
-    most = min(int(budget_bytes * _COARSE_SHARE), budget_bytes - ArenaBuffer.rounded(largest))
-    coarse = CoarseBounds(voxels, most)
-    return coarse if len(coarse.arrays.count) else None
-
-
-def _coarse_filling(coarse: CoarseBounds, store: VoxelStore) -> Callable[[], bool]:
-    """Return a function that stores the coarse bounds of the next voxel without them.
-
-    It returns False when all voxels have them.
-    """
-    missing = coarse.rows_without_bounds()
-
-    def fill_one() -> bool:
-        row = next(missing, None)
-        if row is None:
-            return False
-        # An unreadable voxel gets no coarse bounds. The request that loads it reports the error.
-        with suppress(CorruptError, OSError):
-            coarse.store_from_archive(store, row)
-        return True
-
-    return fill_one
 
 
 class PlacedArchive:

@@ -6,12 +6,14 @@ defines this part and what it proves.
 """
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.voxel import top_shift
+from ...schemas.errors import CorruptError
 from ..kernels.collide.coarse_clearance import (
     SLOT_WORDS,
     CoarseArrays,
@@ -30,8 +32,11 @@ from ..kernels.core.scene_arrays import (
     lay_out,
 )
 from ..kernels.core.voxels_in_reach import VoxelsInReach
+from .arena import ArenaBuffer
 from .voxel_store import VoxelStore
 
+# Share of the budget for coarse bounds, 6 KB a voxel.
+BUDGET_SHARE = 1 / 16
 # Bytes of the rows of a slot and of its entry in `count`.
 SLOT_BYTES = 4 * SLOT_WORDS + 4
 # The class with the largest spheres under every radius model (schemas/archive/radius_model.py).
@@ -196,3 +201,33 @@ def drop_clear_pairs(
     starts, rows = np.empty_like(reach.starts), np.empty(needed, np.int64)
     removed = copy_unproved_pairs(poses, avatar, arrays, coarse, reach, starts, rows)
     return (reach._replace(starts=starts, rows=rows), removed) if removed else (reach, 0)
+
+
+def make_coarse_bounds(store: VoxelStore, budget_bytes: int) -> CoarseBounds | None:
+    """Return storage for coarse bounds of all voxels, or of as many as their budget share holds.
+
+    Return None if the budget holds no coarse bounds beside the largest voxel.
+    """
+    voxels, largest = len(store.sizes), int(store.sizes.max(initial=0))
+    most = min(int(budget_bytes * BUDGET_SHARE), budget_bytes - ArenaBuffer.rounded(largest))
+    coarse = CoarseBounds(voxels, most)
+    return coarse if len(coarse.arrays.count) else None
+
+
+def coarse_filler(coarse: CoarseBounds, store: VoxelStore) -> Callable[[], bool]:
+    """Return a function that stores the coarse bounds of the next voxel without them.
+
+    It returns False when all voxels have them.
+    """
+    missing = coarse.rows_without_bounds()
+
+    def fill_one() -> bool:
+        row = next(missing, None)
+        if row is None:
+            return False
+        # An unreadable voxel gets no coarse bounds. The request that loads it reports the error.
+        with suppress(CorruptError, OSError):
+            coarse.store_from_archive(store, row)
+        return True
+
+    return fill_one

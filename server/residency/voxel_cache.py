@@ -12,7 +12,7 @@ that each hold half of what the other needs therefore cannot deadlock.
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
@@ -118,20 +118,6 @@ class VoxelCache:
     def bytes_of(self, rows: Sequence[int]) -> int:
         """Return the bytes that these voxels take when resident."""
         return sum(self._sizes[row] for row in rows)
-
-    def parts_that_fit(self, rows: Sequence[int], budget_bytes: int) -> Iterator[list[int]]:
-        """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
-        part: list[int] = []
-        taken = 0
-        for row in rows:
-            size = self._sizes[row]
-            if part and taken + size > budget_bytes:
-                yield part
-                part, taken = [], 0
-            part.append(row)
-            taken += size
-        if part:
-            yield part
 
     def hold(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP

@@ -217,6 +217,21 @@ def check_request(
             )
 
 
+def parts_that_fit(residency: VoxelCache, rows: Sequence[int], budget_bytes: int) -> Iterator[list[int]]:
+    """Split rows, in order, into parts of at most `budget_bytes` or of one larger row."""
+    part: list[int] = []
+    taken = 0
+    for row in rows:
+        size = residency.bytes_of([row])
+        if part and taken + size > budget_bytes:
+            yield part
+            part, taken = [], 0
+        part.append(row)
+        taken += size
+    if part:
+        yield part
+
+
 def prove(data: SceneData, rows: Sequence[int], budget: QueryBudget, spent: CostCounter) -> None:
     """Load voxels of distinct rows in order, as many at a time as fit, within the budget's time.
 
@@ -224,7 +239,7 @@ def prove(data: SceneData, rows: Sequence[int], budget: QueryBudget, spent: Cost
     finds those itself.
     """
     residency = data.residency
-    for part in residency.parts_that_fit(rows, int(residency.buffer.total_bytes * budget.share)):
+    for part in parts_that_fit(residency, rows, int(residency.buffer.total_bytes * budget.share)):
         if budget.spent:
             return
         with residency.hold(part, budget.loads_until(), scan=True, stop=budget.stop) as held:
@@ -312,7 +327,7 @@ def pieces(
             held.update(dict.fromkeys(fresh))
             held_bytes += residency.bytes_of(fresh)
             continue
-        for part in residency.parts_that_fit(own, capacity):
+        for part in parts_that_fit(residency, own, capacity):
             yield np.array([pose]), part, _only(reach, pose, part)
     if which:
         yield np.array(which), list(held), reach

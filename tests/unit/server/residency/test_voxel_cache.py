@@ -279,25 +279,6 @@ def test_a_voxel_known_to_be_corrupt_is_not_waited_for() -> None:
         assert held.faults and (held.hits, held.misses, held.waited) == (1, 0, 0.0)
 
 
-def test_parts_that_fit_look_at_each_row_once() -> None:
-    looks = 0
-
-    class Counting(list[int]):
-        def __getitem__(self, row: int) -> int:  # type: ignore[override]
-            nonlocal looks
-            looks += 1
-            return super().__getitem__(row)
-
-    blocks = [1, 2, 1, 4, 9, 1, 1, 1, 1, 1] * 100
-    residency = VoxelCache(FakeStore(blocks), 9 * BLOCK)
-    residency._sizes = Counting(residency._sizes)
-    parts = list(residency.parts_that_fit(range(len(blocks)), 4 * BLOCK))
-    assert [row for part in parts for row in part] == list(range(len(blocks)))
-    assert parts[:4] == [[0, 1, 2], [3], [4], [5, 6, 7, 8]], "a row that takes more stands alone"
-    assert looks == len(blocks)
-    assert list(residency.parts_that_fit([], BLOCK)) == []
-
-
 def test_a_load_that_two_could_not_wait_for_is_owed_until_it_is_done() -> None:
     """One leaves it to the other, who leaves too: it is still to be loaded."""
     store = FakeStore([1, 1])

@@ -1,4 +1,4 @@
-"""Offline builder: laser scans in, an archive out.
+"""Offline builder: makes an archive from laser scans.
 
 Begin with pipeline.py, which runs the passes in order; config.py holds the options of a build.
 """

@@ -61,26 +61,27 @@ def _is_rule(rule: tuple[float, int] | None) -> bool:
 class BuildConfig:
     """Options of a build.
 
-    voxel: edge of a voxel [m]. 8: between a few and a few hundred voxels are in reach of a walk, of
-    a few MB each.
+    voxel: edge of a voxel [m]. With 8 m, a few to a few hundred voxels of a few MB each are in
+    reach of a walk.
     resolution: lattice step [m]; None: the sources' common step if they share one, otherwise 0.1
     mm, a twentieth of a terrestrial scanner's range noise. 1 mm saves a third of the archive and no
     time, and moves distances by up to 0.7 mm (measured with `solidcloud accuracy`, as are the next
     two).
-    degree: children per node, 2 to 16 ([Fig12] table 1 tries 4 to 16). 8: all values of 4 to 16
-    take the same time within 3 %.
+    degree: children per node, 2 to 16 ([Fig12] table 1 tries 4 to 16). All values from 4 to 16 take
+    the same time within 3 %.
     leaf: points per leaf node, up to 32, the width of the vector test. 16 takes 4 % less time, for
     12 % more archive.
-    cell_points: an octree cell with more points is split. 1024: octants separate surfaces better
-    than packing does. Compared with 4096, `collide` therefore takes 3 % less time with voxels of 32
-    m and 16 % less with voxels of 8 m, for 4 % more memory and 1 % more archive. 256 gains little
-    more, for 16 % more memory (scripts/bench_engine --only cells).
+    cell_points: an octree cell with more points is split. Octants separate surfaces better than
+    packing does: with 1024 instead of 4096, `collide` takes 3 % less time with voxels of 32 m and
+    16 % less with voxels of 8 m, for 4 % more memory and 1 % more archive. 256 gains little more,
+    for 16 % more memory (scripts/bench_engine --only cells).
     cells: "octree", or "balanced", which also merges cells until all trees have the same height
     (balance_cells.py).
     models: stored radius models: always "mean", optionally "local" and "border", which need one
-    byte per point. Default "mean" alone: `local` leaks 14 mm where "mean" leaks 16, takes a seventh
-    more time, and narrows narrow doors, whose jambs are scanned thinly. `border` pays off only on
-    thin sheets (`solidcloud accuracy`; builder/DESIGN.md).
+    byte per point. The default is "mean" alone: a ball of 5 cm enters a surface by 14 mm with
+    "local" and by 16 mm with "mean", but "local" takes a seventh more time, and makes doors with
+    thinly scanned jambs narrower. "border" pays off only on thin sheets (`solidcloud accuracy`;
+    builder/DESIGN.md).
     radius: radius used for `mean` [m]; None: half the mean closest-point distance.
     spacing: meshes are sampled at about this spacing [m]; None: their vertices are used.
     with_slab: bound each node by a sphere cut by a slab; False is the structure of the paper, for

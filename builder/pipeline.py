@@ -1,9 +1,9 @@
 """Build of an archive from scans: survey, spool, voxels, radius, verify, publish.
 
-builder/DESIGN.md lists what each pass holds. Everything is made in a hidden folder beside the
-target and renamed at the end; the target name therefore never refers to part of an archive.
-Finished work stays in the hidden folder when a build is interrupted, and the same command resumes
-from it.
+builder/DESIGN.md lists the memory of each pass. The archive is made in a hidden folder beside the
+target and renamed at the end. The target name therefore never refers to a partial archive. When a
+build is interrupted, finished work stays in the hidden folder, and the same command resumes from
+it.
 """
 
 import time
@@ -50,7 +50,7 @@ from .spool.spool import Spool
 
 # Approximate bytes per point of a file whose header does not declare their number: text.
 BYTES_A_POINT = 30
-# Points that become one by quantising are detected late, identical points at once.
+# Identical points are detected before the build, points that quantising makes equal only late.
 ONE_POINT = "a single distinct point has no closest point: give --radius"
 
 
@@ -60,10 +60,9 @@ class BuildSummary(NamedTuple):
     bytes: of index and shards.  preview_bytes: of the preview, 0 if it was deleted.
     stages: seconds of each stage.  skipped: reason -> points left out.
     lattice_step, moved_max, radius, radius_error: [m], see schemas/archive/index.py Header.
-    faults: of the scans left out.
-    already: nothing was built, because the archive existed already, with the same scans and
-    options.
-    warnings: sentences about scans that are in the archive and look wrong.
+    faults: faults of the scans that were left out.
+    already: whether the archive with the same scans and options existed, so that nothing was built.
+    warnings: sentences about scans in the archive that are probably wrong.
     """
 
     archive: Path
@@ -98,9 +97,9 @@ def build_archive(
     archive of the same scans and options is left as it is.
 
     Raise ScanError naming every unusable scan (`skip_bad` leaves these out and marks their region
-    as unknown), and BadRequestError for impossible options. If the survey of a build that this call
-    began detects the error, nothing is left behind. Raise SolidcloudError if the disk or a process
-    fails. The finished work is then kept.
+    as unknown), and BadRequestError for impossible options. If the survey of a new build raises one
+    of these, no files remain. Raise SolidcloudError if the disk or a process fails; finished work
+    is then kept.
     """
     begin = time.perf_counter()
     target = Path(target)
@@ -207,7 +206,7 @@ def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildCon
 
 
 def _check_voxels(spool: Spool, config: BuildConfig) -> None:
-    """Refuse a voxel with more points than a record can hold, before it costs hours."""
+    """Refuse a voxel with more points than a record can hold, before hours of work on it."""
     most = int(spool.counts.max())
     if most > MAX_RECORD_POINTS:
         raise SolidcloudError(
@@ -219,24 +218,24 @@ def _check_voxels(spool: Spool, config: BuildConfig) -> None:
 def _check_unchanged(
     inputs: Sequence[InputFile], what: Mapping[str, Any], build_dir: BuildDirectory, config: BuildConfig
 ) -> None:
-    """Raise ScanError and start over if a file changed since before it was read.
+    """Discard the build and raise ScanError if a file changed since before it was read.
 
-    What was read of it first, above all its hash, may not match what was read last. This is checked
-    as soon as everything is read, and again before the archive gets its name: writes through a
-    memory map, or on another host, may become visible late.
+    Data that was read first, such as its hash, may then not match data that was read last. The
+    check is made when everything is read, and again before the archive gets its name, because
+    writes through a memory map or on another host may become visible late.
     """
     if changed := changed_inputs(inputs, config, what):
         build_dir.start_over()
         raise ScanError(
-            f"{changed}: changed while it was read, expected files that stay as they are: build again"
+            f"{changed}: changed while it was read, expected files that do not change: build again"
         )
 
 
 def _read_back(folder: Path, points: int, spool: Spool, build: Transaction) -> None:
     """Read back everything that was written, to make the preview and to verify every record.
 
-    The points of the records must be those of the scans, because data on disk may change while in
-    use. Raise CorruptError if anything differs.
+    The records must contain the points of the scans: a disk may return other data than was written.
+    Raise CorruptError if anything differs.
     """
     fault = ""
     paths: tuple[Path, ...] = ()
@@ -253,7 +252,7 @@ def _read_back(folder: Path, points: int, spool: Spool, build: Transaction) -> N
         if report.faults:
             fault = report.faults[0]
             paths = (*map(Path, report.damaged), *((spool.folder,) if report.others else ()))
-    except FormatError as error:  # a damaged index does not tell its cause: everything is rebuilt
+    except FormatError as error:  # the damage of an index may be anywhere: everything is rebuilt
         fault, paths = str(error), (*sorted((folder / SHARD_FOLDER).iterdir()), spool.folder)
     if fault:
         raise CorruptError(
@@ -320,7 +319,7 @@ def _measure_radius(header: Header, shards: list[Shard], folder: Path, build: Tr
         header = replace(header, radius=build.config.radius)
         write_index(folder, header, rows, names)
         return header
-    write_index(folder, header, rows, names)  # for the workers; nothing else reads this folder
+    write_index(folder, header, rows, names)  # a preliminary index, which only the workers read
     with build.stage("radius", header.points, "points"):
         found = archive_mean(folder, RADIUS_SAMPLE, build.executor, build.progress)
     if found.sample == 0:

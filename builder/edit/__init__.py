@@ -1,4 +1,4 @@
-"""Changes of a finished archive: scans added or removed, and the transaction that publishes them.
+"""Changes of a finished archive: adding and removing scans, and the publishing of the result.
 
 May import builder/build_limits.py, builder/config.py, builder.kernels, builder.passes,
 builder.resume, builder.run, builder.sources, builder.sources.common, builder.spool, builder.voxel,

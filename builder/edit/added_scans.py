@@ -112,7 +112,8 @@ def _not_in(change: Change, scans: list[Scan], hashes: Mapping[Path, str], new_o
 def spool_added(change: Change, surveys: list[Survey]) -> tuple[float, int]:
     """Spool the new scans.
 
-    Return the largest distance that quantising moved a point [m] and the `position_hash` (run_files.py).
+    Return the largest distance that quantising moved a point [m] and the `position_hash`
+    (run_files.py).
     """
     header, dtype, folder = change.archive.header, change.dtype, change.folder / "spool"
     most, first = run_points(change.share, dtype), len(change.archive.header.sources)
@@ -142,9 +143,9 @@ def source_of(survey: Survey) -> Source:
 
 
 def no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
-    """Remove the unknown regions of scans that a build skipped and that are added now.
+    """Return the header without the unknown regions of scans that are added now.
 
-    The scans are matched by path. Return the new header.
+    A build had left these scans out. They are matched by path.
     """
     added = {(os.path.realpath(s.path), s.scan.index) for s in surveys if s.scan is not None}
     files = {path for path, _ in added}

@@ -1,8 +1,9 @@
 """Change of an archive, in a transaction: lock it, build the change in a hidden folder, publish it.
 
-New shards stand beside the old ones under new names, and a new index replaces the old one in one
-rename. At every moment there is therefore either the old archive or the new one. Shards that no
-index names any more are deleted afterwards. The next change deletes what a killed one left behind.
+New shards are written beside the old ones under new names, and a new index replaces the old one in
+one rename. At every moment the folder is therefore either the old archive or the new one. Shards
+that the index no longer names are deleted afterwards. If a change is killed, the next one deletes
+the files that it left.
 """
 
 import os
@@ -173,9 +174,9 @@ def link_kept_shards(change: Change, files: list[tuple[str, int]], new: set[str]
 
 @contextmanager
 def reading_back(change: Change, new: set[str]) -> Iterator[None]:
-    """Say in a reading error whether the damaged file is new or an unchanged shard.
+    """Add to a CorruptError of the block whether the damaged file is new or an unchanged shard.
 
-    new: names of the new shards. An index that cannot be read is new.
+    new: names of the new shards. An index that cannot be read counts as new.
     """
     try:
         yield
@@ -223,8 +224,8 @@ def _read_back(unit: _ReadUnit) -> int:
 def verify_new(change: Change, new: set[str], places: int) -> None:
     """Read back every voxel that was built. The files of all other voxels are unchanged.
 
-    places: the `position_hash` that their points must have (run_files.py). The sum detects damage to
-    runs, which have no checksums. Raise CorruptError if a record is broken, or if the
+    places: the `position_hash` that their points must have (run_files.py). The sum detects damage
+    to runs, which have no checksums. Raise CorruptError if a record is broken, or if the
     records are valid but hold other points.
     """
     with Archive(change.folder) as archive:
@@ -248,8 +249,8 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
 
     If the process is killed before the index is renamed, the archive is the old one, and the next
     run deletes the new shards. If it is killed afterwards, the archive is the new one, and the next
-    run deletes the old shards. A preview, if there is one, is still the old one for a moment; it
-    names its generation.
+    run deletes the old shards. An existing preview is replaced slightly later; until then it names
+    the old generation.
     """
     shards, preview = change.target / SHARD_FOLDER, change.folder / PREVIEW_NAME
     if (change.target / PREVIEW_NAME).exists():
@@ -262,9 +263,9 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
         os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
         change.published = True
     except BaseException:
-        # The disk tells whether the index was renamed: an interrupt is raised after the call has
-        # returned, and a call may report failure although a file server has done it. A renamed
-        # index names these shards.
+        # Look on the disk whether the index was renamed: an interrupt is raised after the call has
+        # returned, and a call may fail although a file server has executed it. A renamed index
+        # names these shards.
         change.published = not (change.folder / INDEX_NAME).exists()
         if not change.published:
             for name in new:

@@ -1,7 +1,8 @@
 """Adding and removing scans: makes a new generation of an archive.
 
-Only the affected voxels are rebuilt. added_scans.py prepares what is added, removed_scans.py what is removed.
-rebuild_voxels.py builds both, and archive_change.py publishes the result.
+Only the affected voxels are rebuilt. added_scans.py prepares the scans to add, removed_scans.py
+selects those to remove, rebuild_voxels.py rebuilds the voxels, and archive_change.py publishes the
+result.
 """
 
 from collections.abc import Sequence
@@ -60,7 +61,7 @@ def add_scans(
                 )
 
         if change.reads_all:
-            change.readers(change.points)  # refuses now: voxels that are too large do not get smaller
+            change.readers(change.points)  # refuse early: a voxel that is too large does not shrink
         surveys = survey_added(change, inputs, AddOptions(again, new_only, strict))
         try:
             moved, places = spool_added(change, surveys)
@@ -88,9 +89,9 @@ def remove_scans(
 ) -> ChangeSummary:
     """Remove scans from the archive in `target`, which must have been built with `keep` of "scan".
 
-    scans: each is the path of a source as the index has it (all scans of a file with several), or
-    PATH[INDEX], or its row. A removed source keeps its row, with no points, so that the numbers of
-    the others stay the same. Raise BadRequestError for a scan that is not in the archive and for
+    scans: each is the path of a source in the index (for all scans of the file), PATH[INDEX], or
+    the row of a source. A removed source keeps its row, without points, so that the numbers of the
+    others stay the same. Raise BadRequestError for a scan that is not in the archive and for
     removing all remaining scans, FormatError and CorruptError if the archive cannot be read. After
     an error the archive is unchanged.
     """

@@ -45,7 +45,7 @@ class ChangeSummary(NamedTuple):
     voxels: number in the archive.  built: number rebuilt.  gone: number that became empty.
     bytes: of the new shards.  dead_bytes: of replaced records that stay on disk in shards still in
     use.
-    radius: the stored radius.  radius_now: what it would be now; None if it was given [m].
+    radius: the stored radius [m].  radius_now: the radius of the points now; None if it was given.
     scans: scans added or removed, as the index names them.
     skipped: reason -> points of the added scans that were left out.
     warnings: sentences about the added scans.
@@ -74,8 +74,8 @@ class ChangeSpec(NamedTuple):
 
     boxes: key -> box (2, 3) of the points that change, lattice.  dropped: scans whose points are
     removed.
-    places: `position_hash` of the points already spooled (run_files.py).  added: key -> number of these
-    points.
+    places: `position_hash` of the points already spooled (run_files.py).  added: key -> number of
+    these points.
     """
 
     header: Header
@@ -193,8 +193,8 @@ def _dead_bytes(archive: Archive, rebuilt: NDArray[np.int64], files: list[tuple[
 class _Before(NamedTuple):
     """Stored state of the voxels to rebuild.
 
-    radius_counts: of each class.  capped: their part of `radius_capped`.  places: `position_hash` of
-    their points that stay (run_files.py).
+    radius_counts: of each class.  capped: their part of `radius_capped`.  places: `position_hash`
+    of their points that stay (run_files.py).
     """
 
     radius_counts: NDArray[np.int64]

@@ -1,8 +1,7 @@
-"""Work units that turn stored voxels back into sorted runs, and that find the voxels of a scan.
+"""Work units that convert stored voxels back to sorted runs, and that find the voxels of a scan.
 
-Voxels that an added scan does not affect stay as they are on disk. The stored points of the
-affected voxels are spooled again, beside the new ones. A voxel is then built from both as if all
-had been added together.
+Voxels that an added scan does not affect are unchanged on disk. The stored points of the affected
+voxels are spooled again, beside the new ones. A voxel is then built from both as in a single build.
 """
 
 from collections.abc import Iterator

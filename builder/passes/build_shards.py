@@ -1,6 +1,6 @@
-"""Work units of the build pass: consecutive voxels -> one shard file.
+"""Third pass: work units that build consecutive voxels and write them as one shard file.
 
-They are pure and idempotent, and run in any process.
+Units are pure and idempotent, and run in any process.
 """
 
 import base64
@@ -33,8 +33,8 @@ class ShardUnit(NamedTuple):
     """Shard to write. number, generation: of its name.  keys: of its voxels, ascending.
 
     points: total number in its voxels.  spool: source of the points.
-    max_neighbours: points around a voxel that may be held beside it, see radius_classes.py.  folder:
-    destination of the shard.
+    max_neighbours: points around a voxel that may be held beside it, see radius_classes.py.
+    folder: destination of the shard.
     """
 
     number: int
@@ -138,7 +138,7 @@ def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxe
         if "normal" in unit.config.keep:
             from ..voxel.point_normals import (
                 voxel_normals,
-            )  # most builds have no use for its kernels, and do not load them
+            )  # imported here, because most builds do not need its kernels
 
             square = squared_reach(unit.config.normal_reach, unit.lattice.step, len(points.local))
             points = points._replace(normal=voxel_normals(points.local, square))

@@ -101,9 +101,10 @@ def _good_source(survey: Survey, filtered: dict[str, int]) -> Source:
 
 
 def _unknown_rows(faulty: Sequence[Survey]) -> list[int | None]:
-    """Return, for each scan left out, the row of the box where it may have had points.
+    """Return `Source.unknown` of each scan that was left out.
 
-    -1: the box is not known; None: the scan had no points.
+    It is the row of the box where the scan may have had points; -1 if the box is not known; None if
+    the scan had no points.
     """
     boxes = count()
     return [None if s.empty else -1 if s.region is None else next(boxes) for s in faulty]

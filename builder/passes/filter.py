@@ -1,9 +1,9 @@
 """Optional filter pass between spool and shards.
 
-It leaves out points as filter_rules.py defines and counts them. A unit is a sequence of consecutive
-voxels; it writes one run. Memory per job is about 150 bytes per point of 2^19 points: a voxel with
-more is processed in cubes by Morton range, and the surroundings of a cube are read piece by piece.
-All points at a single lattice position are held at once, however many there are.
+It leaves out points by the rules of filter_rules.py and counts them. A unit is a sequence of
+consecutive voxels; it writes one run. A job takes about 150 bytes for each of at most 2^19 points:
+a voxel with more is processed in cubes by Morton range, and the surroundings of a cube are read
+piece by piece. Only the points at a single lattice position are always held at once.
 """
 
 from pathlib import Path
@@ -65,7 +65,7 @@ class Filtered(NamedTuple):
 def filtered_spool(
     spool: Spool, config: BuildConfig, folder: Path, executor: Executor, progress: Progress, journal: Journal
 ) -> tuple[Spool, Counts]:
-    """Filter the points of a spool into new runs below `folder`, as the options say.
+    """Filter the points of a spool by the options of `config` into new runs below `folder`.
 
     Return the new spool and the number of points left out of each scan, by reason.
     spool: its rows have `filter_dtype`; those of the result have `spool_dtype`. An interrupted pass
@@ -164,7 +164,7 @@ def filter_voxels(unit: FilterUnit) -> Filtered:
     if not keys:
         unit.path.unlink(
             missing_ok=True
-        )  # a second run of this unit, given up but alive, may have removed it
+        )  # another worker that was given up but still runs this unit may have removed it
         return Filtered({}, left_out, before, after)
     directory = write_directory(unit.path, np.array(keys, np.uint64), np.array(starts, np.int64))
     return Filtered({unit.path.name: [*file.sums, *directory]}, left_out, before, after)

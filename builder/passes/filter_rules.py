@@ -4,8 +4,8 @@ Three rules, each exact in integers of the lattice:
 
 - `moving (R, SCANS)`: leave out a point if fewer than SCANS other scans have a point within R of
   it, although SCANS other scans have points within 8 R. Those scans saw the place, but not the
-  point. Whatever moved while overlapping scans were made is seen by one of them only. If fewer than
-  SCANS other scans have points within 8 R, the point stays: no other scan could have seen it.
+  point, as happens to objects that move while overlapping scans are made. If fewer than SCANS other
+  scans have points within 8 R, the point stays, because too few scans could have seen it.
 - `outliers (R, COUNT)`: leave out a point if fewer than COUNT other distinct points lie within R.
 - `thin STEP`: of each cube of STEP, rounded to whole lattice steps, keep one point: the one nearest
   to the centre of the cube; among equally near ones the first in Morton order within the cube, then
@@ -54,9 +54,9 @@ class Reach(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Rules in lattice steps; None: off. seen: wider distance of `moving`.
+    """Rules in lattice steps; None if a rule is off.
 
-    thin: edge of a cube.
+    seen: SEEN times the distance of `moving`.  thin: edge of a cube.
     """
 
     moving: Reach | None

@@ -34,11 +34,12 @@ def near_verdicts(block: Block, reader: BlockReader, rules: Rules) -> NDArray[np
 def _pieces(
     block: Block, reader: BlockReader, reach: Reach, left: NDArray[np.bool_]
 ) -> Iterator[tuple[NearPoints, NDArray[np.int64], NDArray[np.int32], Grid]]:
-    """Yield the points within reach of the query points that are `left` (n,), until none is left.
+    """Yield the points within reach of undecided query points, piece by piece.
 
-    Each item: a piece of the surroundings, the indices of the remaining query points in the order
-    of their cells, their positions, and the grid. The block's own points come first: in dense
-    places they settle every query.
+    left: (n,), mask of undecided points, which the caller updates; the iteration ends when none is
+    left. Each item: a piece of the surroundings, the indices of the undecided points in the order
+    of their cells, their positions, and the grid. The block's own points come first, because in
+    dense places they decide every query.
     """
     low, high = block.bounds()
     box = low - reach.steps, high + reach.steps
@@ -120,7 +121,7 @@ def _scans_around(
 
 
 def thin_verdicts(block: Block, reader: BlockReader, edge: int) -> NDArray[np.uint8]:
-    """Return the verdicts of `thin`. Each cube keeps the best of its points, of whatever voxel."""
+    """Return the verdicts of `thin`. Each cube keeps the best of its points, over all voxels."""
     low, high = block.bounds()
     box = low // edge * edge, high // edge * edge + (edge - 1)
     grid = Grid.over(box, edge)

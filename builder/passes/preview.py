@@ -43,9 +43,9 @@ class _Chosen(NamedTuple):
 def write_preview(folder: Path, executor: Executor | None = None, progress: Progress | None = None) -> int:
     """Write the preview of the archive in `folder`: distinct points, rounded to 2^-13 m.
 
-    A hash of the lattice coordinates selects the points. An archive therefore has one preview, byte
-    for byte. The preview contains the archive_id and the generation. It gets its name when it is
-    complete. Return the number of points. Progress advances by the points of the archive. Raise
+    A hash of the lattice coordinates selects the points, so equal archives have equal previews,
+    byte for byte. The preview contains the archive_id and the generation. It gets its name when it
+    is complete. Return the number of points. Progress advances by the points of the archive. Raise
     CorruptError, OSError.
     """
     with Archive(folder) as archive:
@@ -92,11 +92,11 @@ def preview_faults(folder: Path, header: Header) -> tuple[list[str], list[str]]:
     except KeyError:
         return [f"{path}: does not name its archive and generation: delete it"], []
     if stamp != (header.archive_id, header.generation):
-        return [], [f"{path}: of another archive or generation"]
+        return [], [f"{path}: belongs to another archive or generation"]
     low, high = header.lattice.to_world(np.stack([header.low, header.high]))
     outside = (found.points < low - _ROUNDED) | (found.points > high + _ROUNDED)
     if not 0 < len(found.points) <= MAX_PREVIEW_POINTS or outside.any():
-        return [f"{path}: points that are not the archive's: delete it"], []
+        return [f"{path}: contains points that are not in the archive: delete it"], []
     return [], []
 
 

@@ -1,9 +1,8 @@
-"""Radius classes of points.
+"""Radius classes of points, for the radius models `local` and `border`.
 
-A class holds what the radius models `local` and `border` need of the neighbours of a point. A class
-is a function of the distinct points within reach of the point and of nothing else: not of voxels,
-trees, files or jobs. The classes of a voxel are therefore computed from its own points and from the
-points of the surrounding voxels that lie near enough, read from the spool.
+A class depends only on the distinct points within REACH of a point, and not on voxels, trees, files
+or jobs. The classes of a voxel are therefore computed from its own points and from the near points
+of the surrounding voxels, which are read from the spool.
 """
 
 import math
@@ -63,7 +62,8 @@ class ClassLimits(NamedTuple):
 def class_limits(step: float) -> ClassLimits:
     """Return the limits on a lattice of step `step` [m].
 
-    The step is taken as its decimal text: 10 steps of 0.1 mm are exactly 1 mm.
+    The step is taken as the decimal number that it prints as, so 10 steps of 0.1 mm are exactly 1
+    mm.
     """
     steps_a_metre = 1 / Fraction(repr(step))
     radii = [Fraction(radius, 1_000_000) for radius in LOCAL_RADII[:-1]]
@@ -82,8 +82,8 @@ def voxel_classes(
     """Compute the class of each point of a voxel; equal points have the same class.
 
     local: (n, 3) [voxel steps], n >= 1.
-    max_neighbours: most points around the queried points that may be in memory, as long as a smaller
-    query helps.
+    max_neighbours: limit of points around the queried points in memory. Larger queries are split
+    down to MIN_TOGETHER points.
     codes: for a voxel that is built in parts, the Morton codes of the queried part; `local` holds
     all points with these codes.
     """
@@ -197,8 +197,9 @@ def _points_in(key: int, box: NDArray[np.int64], spool: Spool, without: range) -
 
 
 def _classify(asked: NDArray[np.int32], near: NDArray[np.int32], limits: ClassLimits) -> NDArray[np.uint8]:
-    """Compute the classes (q,) of points, with the TOO_FEW_NEIGHBOURS bit, from each other and from points nearby.
+    """Compute the classes (q,) of points, including the TOO_FEW_NEIGHBOURS bit.
 
+    The neighbours are the points themselves and points nearby.
     asked: (q, 3).  near: (m, 3).  All points are distinct.
     """
     points = np.concatenate([asked, near])

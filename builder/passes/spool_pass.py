@@ -48,11 +48,12 @@ WRITTEN_ROWS = 1 << 18
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpoolUnit:
-    """Range of a scan to spool; 0 to None for a scan that cannot seek.
+    """Range of a scan to spool.
 
-    number: of the scan.  count: usable points according to the survey.
-    dtype: of the rows; it may include a scan_index for the filters that the archive does not keep.
-    name: of the runs.  run_points: points per run.
+    number: of the scan.  start, stop: range of points; 0 and None for a scan that cannot seek.
+    count: usable points according to the survey.
+    dtype: of the rows; it may include a scan_index that the filters need and the archive omits.
+    folder, name: of the runs.  run_points: points per run.
     """
 
     scan: Scan
@@ -73,8 +74,8 @@ class Spooled:
     """Result of the second pass for a range.
 
     runs: name of each run -> sums of what was written.
-    content: sums that identify the points, see `content_sum`.
-    places: the same for their lattice coordinates alone, see `position_hash`.
+    content: hash sums of the points, see `content_sum`.
+    places: hash sum of their lattice coordinates alone, see `position_hash`.
     moved_max: largest distance along an axis that quantising moved a point [m].
     """
 
@@ -203,7 +204,7 @@ class _RunBuffer:
             self.sums,
         )
         if lowest < -KEY_BIAS or highest >= KEY_BIAS:
-            voxel_keys(np.array([[lowest] * 3, [highest] * 3]))  # raises an error that explains the limit
+            voxel_keys(np.array([[lowest] * 3, [highest] * 3]))  # raises the error for distant voxels
         if not done:
             self._grow()
         self.size += done
@@ -323,7 +324,7 @@ def spool_scans(
 
 
 def _sweep_spool(folder: Path, vouched: set[str]) -> None:
-    """Delete uncertified runs, because a spool consists of all runs in its folder."""
+    """Delete runs that are not in `vouched`, because a spool consists of all runs in its folder."""
     stems = {Path(name).stem for name in vouched}
     for suffix in (RUN_SUFFIX, KEYS_SUFFIX):
         for path in folder.glob(f"*{suffix}"):

@@ -24,8 +24,8 @@ from ..run.transient_errors import raise_transient
 from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
 from ..sources.scan_files import InputFile
 
-# A header's bounds are trusted if no point lies farther outside than this [m]: they are rounded,
-# but not by more.
+# A header's bounds are trusted if no point lies farther outside than this [m], which allows for
+# rounded bounds.
 BOUNDS_WITHIN = 0.01
 
 
@@ -34,11 +34,11 @@ class Survey:
     """Result of the first pass for one scan.
 
     scan: its reader.  sha256: of its file.  count: usable points.
-    low, high: (3,) float64 world [m] of these; infinite if there are none.  not_finite: points left
-    out.
+    low, high: (3,) float64, bounds of these, world [m]; infinite if there are none.
+    not_finite: number of points left out because they are not finite.
     fault: why the scan cannot be used, or "".
-    region: (2, 3) world [m] that a faulty scan may have covered; None: not known.
-    empty: leaving the scan out loses no points.  parts: results of its ranges.
+    region: (2, 3), box that a faulty scan may have covered, world [m]; None: not known.
+    empty: whether the scan has no points to lose.  parts: results of its ranges.
     """
 
     scan: Scan | None
@@ -256,8 +256,8 @@ def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:
         if any(scale != step for scale in lattice.scale):
             return None
         apart = (np.array(lattice.offset) - np.array(first.offset)) / step
-        # Offsets are decimal text rounded to float64. This explains a millionth of a step; more is
-        # another lattice.
+        # Offsets are decimal text rounded to float64, which explains differences of a millionth of
+        # a step. Larger differences mean another lattice.
         if (
             not np.isfinite(apart).all()
             or (np.abs(apart - np.rint(apart)) > 1e-6 * np.maximum(1, np.abs(apart) * 1e-9)).any()

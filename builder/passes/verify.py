@@ -29,8 +29,8 @@ class VerifyReport(NamedTuple):
 
     exact_nodes: bounds verified in Python integers, out of `nodes`.
     notes: facts that are not faults: unknown files, shards that no voxel uses any more.
-    damaged: shards with faults.  others: the records are valid, but hold other points than
-    expected.
+    damaged: shards with faults.  others: whether the records are valid, but contain other points
+    than expected.
     """
 
     voxels: int
@@ -43,8 +43,8 @@ class VerifyReport(NamedTuple):
     others: bool = False
 
 
-# Cost per point relative to building it, which worker_count assumes: measured, 10, 60 and 6,000 ns
-# of 600.
+# Cost of verifying a point relative to building it, for `worker_count`: 10, 60 and 6,000 ns were
+# measured, and 600 ns for building.
 _WORK, _DEEP_WORK, _EXACT_WORK = 1 / 60, 1 / 10, 10
 
 
@@ -157,10 +157,10 @@ def verify_archive(
 
 @contextmanager
 def unchanged(folder: Path, header: Header) -> Iterator[None]:
-    """Raise SolidcloudError if the archive in `folder` no longer is that of `header` after reading.
+    """Raise SolidcloudError if the archive in `folder` is not that of `header` after the block.
 
-    What was read is then a mix of two archives, and any error on the way is a consequence.
-    Otherwise errors pass unchanged.
+    The block has then read a mix of two archives, which may have caused any other error. Otherwise
+    errors pass unchanged.
     """
     try:
         yield

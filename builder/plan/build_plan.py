@@ -234,7 +234,7 @@ def _runs(scene: SceneStats, config: BuildConfig, jobs: int) -> int:
 
 
 def _range_points(points: float) -> float:
-    """Return the number of points of a range of a scan with `points` points, as survey.py cuts it."""
+    """Return the points of a range, as survey.py cuts a scan of `points` points."""
     return min(max(points / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], points)
 
 
@@ -298,7 +298,7 @@ def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
 def _limits(
     plan: BuildPlan, scene: SceneStats, config: BuildConfig, directories: float, target: Path | None
 ) -> tuple[Limit, ...]:
-    """Return what could stop the build. Some limits grow with it although --memory is kept."""
+    """Return the limits of the build. Some grow with it although --memory is kept."""
     dense = plan.points_a_voxel * DENSEST * plan.bytes_a_point
     found = [
         Limit("voxels along an axis", (scene.extent or math.sqrt(scene.area)) / config.voxel, KEY_BIAS, "voxels",

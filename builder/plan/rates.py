@@ -41,9 +41,9 @@ class StageRate(NamedTuple):
 class Rates:
     """Measured rates of builds.
 
-    machine: its class.  cores: their number.  rests_on: what was measured.
-    stages: name -> StageRate, in the order of a build.  workers: starting the processes of more than
-    one job [s].
+    machine: type of the measured machine.  cores: their number.  rests_on: what was measured.
+    stages: name -> StageRate, in the order of a build.  workers: starting the processes of more
+    than one job [s].
     read: format -> seconds per point, reading alone, on one core.  passes: number of times a build
     reads its scans.
     archive: (pitch, bytes per point), ascending. The pitch is the square root of the surface area

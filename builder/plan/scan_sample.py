@@ -1,8 +1,8 @@
 """Quick sampling of scans for an estimate: number of points, surface area, number of voxels.
 
-Headers tell the number of points and where they are. No header tells the surface area. Some points
-of each scan are therefore read, which takes a few seconds. Scans that can seek are sampled in many
-places, others at their beginning.
+Headers state the number of points and their bounds, but not the surface area. Some points of each
+scan are therefore read, which takes a few seconds. Scans that can seek are sampled in many places,
+others at their beginning.
 """
 
 import time
@@ -24,9 +24,9 @@ from .build_plan import BuildPlan, SceneStats, estimate
 from .packed_sample import BrokenScanError, Packed, packed_sample
 from .rates import Rates, load_rates
 
-# Edges [m] of the cubes that measure surface area. The first edge is used that is far more than the
-# distance between points, which gives a cube at least POINTS_A_CUBE points; it should be far less
-# than a room.
+# Edges [m] of the cubes that measure surface area. The first edge is used with which a cube has at
+# least POINTS_A_CUBE points. It is then far larger than the distance between points, and should be
+# far smaller than a room.
 CUBES = (0.25, 0.5, 1.0, 2.0)
 POINTS_A_CUBE = 8
 # Total number of samples (looks) over all scans, and points of each; each decodes a chunk of LAZ,
@@ -38,8 +38,8 @@ SOME = 8
 # sampled.
 FIRST_POINTS = 1 << 17
 SECONDS = 10.0
-# A file whose header does not declare its points, mostly text, has one point per this many bytes,
-# or more if its beginning has.
+# A file whose header does not declare its points, mostly text, is assumed to have at least one
+# point per this many bytes.
 TEXT_BYTES = 30
 # Most scans left out that are named.
 MAX_NAMED = 5

@@ -1,6 +1,6 @@
-"""Description of a build in its journal.
+"""Description of a build in its journal: software, options and scans.
 
-A build resumes only if the description is the same. Otherwise an error names the differences.
+A build resumes only if its description is unchanged. Otherwise an error names the differences.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -113,7 +113,7 @@ def _input_differences(was: list[dict[str, Any]], now: list[dict[str, Any]]) -> 
     for key in sorted({*before, *after}):
         name = key[0] if key[1] == 0 else f"{key[0]} scan {key[1]}"
         if key not in before:
-            differ.append(f"{name} was not there")
+            differ.append(f"{name} is new")
         elif key not in after:
             differ.append(f"{name} is missing")
         elif before[key]["bytes"] != after[key]["bytes"]:
@@ -137,7 +137,7 @@ def is_up_to_date(
     config: BuildConfig,
     tick: Callable[[int], None] = lambda _: None,
 ) -> bool:
-    """Return whether `target` already is the archive of these scans, by their SHA-256, and options.
+    """Return whether `target` is already the archive of these scans (by SHA-256) and options.
 
     tick: receives the bytes of each file that is hashed. No file is hashed if a cheaper check finds
     a difference.

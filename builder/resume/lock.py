@@ -24,7 +24,7 @@ def lock_path(target: Path) -> Path:
 def _taken(target: Path) -> BadRequestError:
     """Make the error for a second builder."""
     return BadRequestError(
-        f"{target}: another build is writing it, or add or remove: wait for it (a build may be given another -o)"
+        f"{target}: another build, add or remove is writing it: wait for it, or give a build another -o"
     )
 
 

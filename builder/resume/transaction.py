@@ -24,7 +24,7 @@ from ..run.progress import Progress, Silent, Stages
 
 
 class Transaction(Stages):
-    """Archive that is being written: where, with which options and workers.
+    """Archive that is being written, with the options and workers.
 
     target: its folder.  folder: the hidden folder.  what: "build" or "change".
     executor: runs the work units, inside `workers`.
@@ -40,7 +40,7 @@ class Transaction(Stages):
 
     @property
     def outcome(self) -> str:
-        """Return the end of an error message, which says what a failure leaves."""
+        """Return the end of an error message, which states what is kept after a failure."""
         return f", then give the same command again: it resumes from the finished work in {self.folder}"
 
     @property
@@ -50,7 +50,7 @@ class Transaction(Stages):
 
     @contextmanager
     def workers(self, points: int) -> Iterator[None]:
-        """Provide the executor, with as many processes as the points are worth and the memory allows."""
+        """Provide the executor, with as many processes as points and memory justify."""
         jobs = jobs_that_fit(worker_count(self.config.jobs, points), self.config)
         with make_executor(self.config, jobs) as self.executor:
             yield
@@ -60,9 +60,9 @@ class Transaction(Stages):
         return list(self.executor.map(function, units, self.progress, lambda unit: unit.points))
 
     def check_space(self, needed: int, folder: Path | None = None) -> None:
-        """Raise SolidcloudError if files of `needed` bytes do not fit on the disk, before they are written.
+        """Raise SolidcloudError if files of `needed` bytes will not fit on the disk.
 
-        folder: existing files in it are part of the need; None: nothing is there yet.
+        folder: existing files in it are included in `needed`; None: no file exists yet.
         """
         if folder is not None:
             needed -= sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -75,7 +75,7 @@ class Transaction(Stages):
 
     @contextmanager
     def machine_errors(self) -> Iterator[None]:
-        """Turn a failure of the disk or the memory into an error that says what to do and what is kept."""
+        """Convert a failure of disk or memory to a SolidcloudError with advice and what is kept."""
         try:
             yield
         except MemoryError as error:

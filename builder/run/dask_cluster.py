@@ -3,9 +3,8 @@
 This module is the only user of distributed.
 
 dask decides which worker runs a unit, what happens when a worker dies, and how often a unit is
-retried. A unit is pure and writes under its own temporary name. A unit that is killed half-way or
-that runs twice therefore changes nothing. Results come in the order of the units, as from
-`executor.py`.
+retried. A unit is pure and writes under a unique temporary name, so a unit that is killed or runs
+twice does not change the result. Results are in the order of the units, as in `executor.py`.
 """
 
 import asyncio
@@ -51,8 +50,8 @@ Answer = TypeVar("Answer")
 
 # Time limit for a scheduler to answer and to show its first worker.
 REACH_SECONDS = 10
-# A cluster without any worker for this long is given up. A batch system may take a while to replace
-# workers; dask takes a second. A worker that is killed while it starts dask is not always
+# A build fails if its cluster has no worker for this long [s]. A batch system may take a while to
+# replace workers; dask takes a second. A worker that is killed while it starts dask is not always
 # restarted.
 LONELY_SECONDS, LONELY_LOCAL_SECONDS = 300, 60
 # How often a wait for a unit checks whether any worker exists and whether the builder is
@@ -91,7 +90,7 @@ def _run_unit(work: bytes, expected: dict[str, str], folder: str) -> Any:
     try:
         _check_worker(worker.address, software_versions(), expected, worker.state.nthreads)
     except BadRequestError as error:
-        raise SolidcloudError(str(error)) from None  # not the request: the build could begin as requested
+        raise SolidcloudError(str(error)) from None  # no BadRequestError: the request is valid
     try:
         # Relative paths must mean the same as in the builder. A worker runs one unit at a time, so
         # no other unit is affected.

@@ -29,11 +29,11 @@ Handle = TypeVar("Handle")
 # With fewer points, a second process costs more (1 to 2 s to start and to load the kernels) than it
 # saves.
 POINTS_WORTH_A_PROCESS = 4_000_000
-# Per process: most units handed out and not done, and most results that wait for earlier ones.
+# Limits per process: units handed out and not done, and results that wait for earlier ones.
 WAITING, AHEAD = 4, 64
 # Ranges of voxels per job: the last ones to finish are small compared with the whole.
 _RANGES_A_JOB = 8
-# Least points of a range: fewer are not worth opening the archive again.
+# Least points of a range, because each range opens the archive again.
 _MIN_POINTS = 1 << 20
 # How often a wait for a unit checks for an interrupt.
 ASK_SECONDS = 0.1
@@ -229,7 +229,7 @@ class ProcessExecutor:
 
 @contextmanager
 def _worker_deaths() -> Iterator[None]:
-    """Turn the death of a worker, noticed when submitting or waiting, into a helpful error."""
+    """Convert the error of a worker that died to a SolidcloudError that says what to do."""
     try:
         yield
     except BrokenProcessPool:

@@ -1,4 +1,4 @@
-"""Software that the bytes of an archive may depend on: library versions, hash of our sources."""
+"""Software that the bytes of an archive may depend on: library versions, hash of the sources."""
 
 import functools
 import hashlib

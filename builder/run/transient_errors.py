@@ -1,6 +1,6 @@
-"""Transient errors of reading a scan, which are no fault of the scan.
+"""Transient errors of reading a scan, such as those of a network, which are not faults of the scan.
 
-A scan left out because of such an error would be left out of the archive for good.
+They end the build, because the archive would otherwise lack a valid scan.
 """
 
 import errno
@@ -19,7 +19,8 @@ TRANSIENT = frozenset(
 def raise_transient(error: ScanError, path: Path) -> None:
     """Raise Interrupted or the OSError if a file could not be read for a transient reason.
 
-    Lack of memory is detected where it occurs, in every pass (sources/common/scan.py `library_errors`).
+    Lack of memory is detected where it occurs, in every pass (sources/common/scan.py
+    `library_errors`).
     """
     check_interrupt()
     cause = error.__cause__

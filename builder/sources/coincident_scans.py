@@ -58,7 +58,7 @@ def coincident_scan(scan: Scan) -> str:
 def _read_bounds(scan: Scan) -> NDArray[np.float64] | None:
     """Return the bounds (2, 3) of a scan's points, or None if it cannot be read.
 
-    A build reports that.
+    The build reports an unreadable scan later.
     """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     try:

@@ -1,8 +1,8 @@
 """Opening of scans: files, folders and scan lists, as a build or `solidcloud inspect` names them.
 
-format_table.py lists the formats, scan_list.py reads a list. Opening a file reads its headers. Points
-are read only from the text of PTX and PTS files, where the second scan can be found only by reading
-past the first, and from small scans without declared bounds (coincident_scans.py).
+format_table.py lists the formats, scan_list.py reads a list. Opening a file reads its headers.
+Points are read only from the text of PTX and PTS files, where the second scan can be found only by
+reading past the first, and from small scans without declared bounds (coincident_scans.py).
 """
 
 import importlib
@@ -120,7 +120,7 @@ def header_bounds(path: Path) -> NDArray[np.float64] | None:
     """Return the bounds that the header of an unreadable scan file declares.
 
     Returns (2, 3) world frame [m], low and high corner, or None where they are unknown. Never
-    raises, and reads no more than the header, whatever it claims.
+    raises, and reads only the header.
     """
     form = _FORMATS.get(Path(path).suffix.lower())
     if form is None or not form.bounds:
@@ -199,7 +199,8 @@ def open_input_files(paths: Sequence[Path], spacing: float | None = None) -> lis
     Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
     opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
     that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
-    that is named twice, OSError if a file cannot be opened for a transient reason (transient_errors.py).
+    that is named twice, OSError if a file cannot be opened for a transient reason
+    (transient_errors.py).
     """
     found: list[InputFile] = []
     for path in map(Path, paths):

@@ -17,9 +17,9 @@ from .formats.glb import GlbScan
 STEP_U = 0.7548776662466927
 STEP_V = 0.5698402909980532
 
-# A damaged vertex makes a surface of any size. More points than SAMPLES_ANYWAY + SAMPLES_A_BYTE per
-# byte of the file are taken as damage. This allows 800 points per triangle of a binary STL (50
-# bytes), and ten million for a hall of a dozen triangles.
+# A damaged vertex can make a surface of any size. A mesh that needs more sample points than
+# SAMPLES_ANYWAY + SAMPLES_A_BYTE per byte of its file is refused as damaged. This allows 800 points
+# per triangle of a binary STL (50 bytes), and ten million for a hall of a dozen triangles.
 SAMPLES_A_BYTE = 16
 SAMPLES_ANYWAY = 10**7
 
@@ -93,7 +93,10 @@ class SurfaceSamples(Scan):
 
 
 def _by_trimesh(path: Path) -> NDArray[np.float64]:
-    """Return the corners of all triangles of an OBJ, STL or PLY file, (n, 3, 3). Raises ScanError."""
+    """Return the corners (n, 3, 3) of all triangles of an OBJ, STL or PLY file.
+
+    Raises ScanError.
+    """
     size = path.stat().st_size
     if size > LARGEST_MESH:
         raise scan_error(

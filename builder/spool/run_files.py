@@ -146,7 +146,7 @@ def is_run_damaged(path: Path, sums: RunSums) -> bool:
 
     Reads both files.
 
-    A missing file is no difference: what was made from the run while it existed is correct.
+    A missing file does not count as damage: results that were made from the run are correct.
     """
     written = zip((path, path.with_suffix(KEYS_SUFFIX)), sums[::2], sums[1::2], strict=True)
     return any(

@@ -1,7 +1,7 @@
 """Spool: all points of a build, quantised, in sorted runs on disk (run_files.py).
 
-A `Spool` is a folder of runs. It holds no rows: each access reads the rows of a voxel, in order,
-from the few runs that have some.
+A `Spool` is a folder of runs. It keeps no rows in memory: each access reads the rows of a voxel, in
+order, from the few runs that have rows of it.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Blocks of points that fit in memory, and the points around a block, in whatever voxels they are.
+"""Blocks of points that fit in memory, and the points around a block in all voxels.
 
 The filter rules that examine the neighbourhood of a point use them (filter.py). A voxel may have
 any number of points, so neighbours are delivered in pieces. Positions are int32 lattice steps from
@@ -21,9 +21,8 @@ from .spool import Spool
 # Most points in memory at a time, of a voxel and of its surroundings. Memory depends on it; results
 # do not.
 BLOCK_POINTS = 1 << 19
-# Where only the border of a voxel is needed: a voxel with more points is read in cubes of at most
-# this many. A smaller voxel is read whole and cached while a unit proceeds, because it is a
-# neighbour of the next voxel too.
+# If only the border of a voxel is needed, a voxel with more points is read in cubes of at most this
+# many. A smaller voxel is read whole and cached, because it is a neighbour of the next voxel too.
 BORDER_POINTS = 1 << 17
 
 Box = tuple[NDArray[np.int64], NDArray[np.int64]]

@@ -9,9 +9,10 @@ A packed tree of degree m over leaf nodes of l points has height h exactly when 
 merged with the remainders of their siblings, in the cube of their parent, up to the largest
 permitted cube. A cell is still an aligned cube around its points, but cubes may nest.
 
-This is not the default. Splitting alone gives nine trees in ten the same height. Merging the
-remainders makes cells of parts that lie apart, and leaf nodes of these cells reach across the gap.
-server/report/walk/cell_comparison.py compares the three.
+This is not the default, because splitting alone gives nine in ten trees the same height. Merging
+the remainders makes cells of parts that lie apart, and leaf nodes of these cells span the space
+between them. server/report/walk/cell_comparison.py compares octree cells, larger ones and balanced
+ones.
 """
 
 import math
@@ -42,7 +43,8 @@ def balance_cells(
     permitted cube has fewer, or if fewest > most / 2 (degree 2) permits no other cut.
     """
     balance = _Balance(codes, largest_log2, fewest, most)
-    rest = balance.build_cells(0, len(codes), root_log2)  # empty if the root is above the largest cube
+    # Empty if the root cube is larger than the largest permitted cube.
+    rest = balance.build_cells(0, len(codes), root_log2)
     balance.absorb_remainder(rest, 0, root_log2)
     order = np.concatenate([points for points, _ in balance.cells])
     sizes = [len(points) for points, _ in balance.cells]

@@ -1,8 +1,7 @@
 """Construction of the cell of a heap: more points at one lattice position than fit in memory.
 
-The points of a heap form one cell and differ only in their columns. The columns are a multiset in
-canonical order. They are merged from the runs, each of which has that order, a few rows of each run
-at a time.
+The points of a heap form one cell and differ only in their columns, whose order is canonical. The
+columns are merged from the runs, each of which has that order, a few rows of each run at a time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -105,7 +104,7 @@ def merge_runs(runs: Sequence[Iterator[NDArray]]) -> Iterator[NDArray]:
 def _order_keys(rows: NDArray) -> NDArray[np.uint64]:
     """Return integers (n,) that sort as the rows of one lattice position do.
 
-    The order is that of spool.py `canonical_columns`.
+    The order is that of `canonical_columns` (run_files.py).
     """
     keys = np.zeros(len(rows), np.uint64)
     if "scan_index" in (rows.dtype.names or ()):

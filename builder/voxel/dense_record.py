@@ -41,8 +41,8 @@ from .voxel_octree import (
     leaf_runs,
 )
 
-# Most points of cells that are read together on the way into the record. Fewer than DENSE_POINTS,
-# which makes a heap a window of its own.
+# Limit of the points of cells that are read together. It is less than DENSE_POINTS, so that a heap
+# (coincident_points.py) forms a separate window.
 WINDOW_POINTS = 1 << 17
 
 
@@ -254,7 +254,7 @@ class RecordLayout:
             yield rows
 
     def _empty_voxel(self) -> VoxelData:
-        """Return the voxel without rows: its key, and empty columns that tell which it has."""
+        """Return the voxel without rows: its key, and an empty array for each of its columns."""
         nodes = np.empty(0, NODE_DTYPE)
         return VoxelData(
             self.key,

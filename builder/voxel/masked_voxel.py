@@ -1,9 +1,9 @@
-"""Voxels of an archive without some of their points, equal to what a build of the rest would store.
+"""Voxels of an archive rebuilt without some of their points, as a build of the rest stores them.
 
-A server requests them if a scene ignores contacts (server/archives/masked_archive.py). The remaining points keep
-their columns as stored: a radius class remains that of the whole scan, or the surface of the rest
-would grow. Normals, however, are computed from the remaining points, as they are when a server
-estimates them.
+A server uses them for the effect `through` (server/archives/masked_archive.py). The remaining
+points keep their stored columns. A radius class in particular remains that of the whole scan,
+because the classes of the rest alone would be larger at its border. Normals are computed from the
+remaining points, as when a server estimates them.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Codes of the normals of all points of a voxel; schemas/kernels/normal_codes.py has the definition."""
+"""Codes of the normals of all points of a voxel; schemas/kernels/normal_codes.py defines them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ def voxel_normals(local: NDArray[np.int32], square: int) -> NDArray[np.uint16]:
     """Return the codes (n,) of the normals at all points (n, 3) of a voxel [voxel steps], n >= 1.
 
     The points may be in any order. square: squared radius of the neighbourhood [steps^2], as
-    `normal_reach` limits it. Points at the same position each count.
+    `squared_reach` returns it. Each of several points at one position counts.
     """
     _, first, back, times = np.unique(
         voxel_codes(local), return_index=True, return_inverse=True, return_counts=True

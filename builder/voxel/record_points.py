@@ -1,4 +1,4 @@
-"""Points of a voxel: of an opened record block by block (all, those in a box, a sample), or all at once."""
+"""Points of a voxel's record, in blocks (all, those in a box, or a sample) or all at once."""
 
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple

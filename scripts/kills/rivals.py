@@ -27,7 +27,7 @@ def rival(reference: ReferenceBuild, tally: Tally) -> float:
     second.go()
     code = second.end()
     seconds = time.perf_counter() - begin
-    if code != 2 or "another build is writing it" not in second.said():
+    if code != 2 or "another build, add or remove is writing it" not in second.said():
         faults.append(f"the second builder exited with {code}: {second.said()[-1000:]}")
     if seconds > AT_ONCE:
         faults.append(f"the second builder was refused after {seconds:.2f} s, expected at most {AT_ONCE}")

@@ -1,9 +1,9 @@
 """Normals of all points of a voxel; boxes wholly within reach contribute their precomputed sums.
 
-The boxes are those of nearest_neighbours.py, over points in Morton order. Sums of a box are relative to its
-least corner and are translated to the query point. All arithmetic is exact in int64: a box whose
-sums are used lies in the ball of the reach, hence measures at most twice the reach, and
-`normal_reach` (schemas/archive/normal_reach.py) leaves room for it.
+The boxes are those of nearest_neighbours.py, over points in Morton order. Sums of a box are
+relative to its least corner and are translated to the query point. All arithmetic is exact in
+int64: a box whose sums are used lies in the ball of the reach, so it measures at most twice the
+reach, and `squared_reach` (schemas/archive/normal_reach.py) leaves room for it.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Closest points by descent of a bounding sphere hierarchy, and nearest boxes of a point; exact.
 
-A voxel is a box to those who search several: a tree over boxes, in their given order, finds the
-nearest.
+In a search over several voxels, each voxel is a box, and a tree over the boxes, in their given
+order, finds the nearest.
 """
 
 from typing import NamedTuple

@@ -1,9 +1,9 @@
 """Radius class of a point, from the positions of its closest distinct points; exact over integers.
 
-The local class depends on the distance of a neighbour, hence on the density around the point. The
-mean of the neighbours tells a rim of a surface. For n neighbours at random all around the point,
-the squared distance of their mean is 1 / n of the mean of their squared distances; in half a disc
-it is 0.36 of it, about a right-angled crease 0.18. The largest angle between neighbours, in the
+The local class depends on the distance of a neighbour, and thus on the density around the point.
+The mean of the neighbours indicates a rim of a surface. For n neighbours at random all around the
+point, the squared distance of their mean is 1 / n of the mean of their squared distances; in half a
+disc it is 0.36 of it, at a right-angled crease 0.18. The largest angle between neighbours, in the
 plane through them, finds the same rims but needs an eigenvector.
 """
 
@@ -55,10 +55,10 @@ def point_classes(points, boxes, starts, rows, reach2, local2, classes):
 
     points, boxes, starts: as in `closest_distinct`.
     rows: (n,) int32, the row of `classes` for each point; -1 to skip the point.
-    reach2, local2: `Limits` of builder/passes/radius_classes.py.
+    reach2, local2: `ClassLimits` of builder/passes/radius_classes.py.
     Writes classes (q,) uint8: the local class, with RIM_BIT on a rim. A point with too few
-    neighbours gets the last class with TOO_FEW_NEIGHBOURS. With steps of at least 1 micrometre all sums stay below
-    2^50.
+    neighbours gets the last class with TOO_FEW_NEIGHBOURS. With steps of at least 1 micrometre all
+    sums stay below 2^50.
     """
     closest, stack = np.empty((NEIGHBOURS, 4), np.int64), np.empty((STACK, 2), np.int64)
     for i in range(points.shape[0]):

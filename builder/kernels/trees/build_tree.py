@@ -2,13 +2,13 @@
 
 `build_cells` builds the hierarchies of a voxel's cells; an avatar is built as one cell. The top
 hierarchy over the cells is bounded in a stream: from cell summaries, then from the points once. The
-extreme points of the cells below a node give an estimate of a good centre; the cells' moment_rows give
-the slab's direction. Neither needs the points again. Radius and slab do: every cell's points pass
-once, in any order, and a node's bounds grow to hold them. The result is the same whether a voxel is
-held in memory or read block by block.
+extreme points of the cells below a node give an estimate of a good centre, and the cells' moments
+give the slab's direction, both without the points. Radius and slab need the points: those of every
+cell are read once, in any order, and a node's bounds grow to enclose them. The result is the same
+whether a voxel is held in memory or read block by block.
 
-Rows of `nodes`, a tuple of arrays as in schemas/archive/voxel.py `Nodes`: center, radius, normal, slab,
-count, axis, block_low.
+Rows of `nodes`, a tuple of arrays as in schemas/archive/voxel.py `Nodes`: center, radius, normal,
+slab, count, axis, block_low.
 """
 
 import numpy as np
@@ -165,10 +165,10 @@ def build_cells(
     starts: (c + 1,) int64, first point of each cell, and n.
     low: (c, 3) int64, the cells' corners.
     leaf, degree, with_slab, highest: see `build_tree`.
-    Writes rows of nodes, cell by cell, level by level; row_counts (c,), the number of rows of each cell;
-    xyz (3, n) uint16, the points in leaf-node order, from their cell's corner; rank (n,) int32,
-    each point's index in `points`; moment_rows (c, MOMENTS) and extremes (c, EXTREMES, 3) int32 of the
-    cells' points, from the voxel's corner.
+    Writes rows of nodes, cell by cell, level by level; row_counts (c,), the number of rows of each
+    cell; xyz (3, n) uint16, the points in leaf-node order, from their cell's corner; rank (n,)
+    int32, each point's index in `points`; moment_rows (c, MOMENTS) and extremes (c, EXTREMES, 3)
+    int32 of the cells' points, from the voxel's corner.
     """
     largest = np.int64(0)
     for cell in range(low.shape[0]):

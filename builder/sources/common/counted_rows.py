@@ -1,7 +1,7 @@
 """Text blocks of rows whose count is declared before them, as in PTX and PTS files.
 
-Such a file does not say where its second block begins. Opening it therefore reads it once, counting
-line ends in bounded memory (about 1 GB a second).
+Such a file does not state where its second block begins. Opening it therefore reads it once and
+counts line ends, in bounded memory (about 1 GB a second).
 """
 
 from collections.abc import Iterator
@@ -79,7 +79,7 @@ class CountedRows(Scan):
 
 
 def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> int:
-    """Advance the file past `count` rows; return the number of columns of the first row, 0 where count is 0.
+    """Advance the file past `count` rows; return the first row's number of columns, 0 without rows.
 
     index: number of the scan, for messages.
     first_line: number of the line at the current file position.

@@ -186,8 +186,8 @@ def open_las(path: Path) -> list[Scan]:
 def las_bounds(path: Path) -> NDArray[np.float64] | None:
     """Return the bounds that the header of a possibly truncated LAS file declares, (2, 3) [m].
 
-    May raise anything. An inconsistent header is rejected: if a skipped scan were recorded at a
-    wrong place, queries would report its real place as clear.
+    May raise any exception. An inconsistent header is rejected: if a skipped scan were recorded at
+    a wrong place, queries would report its real place as clear.
     """
     with path.open("rb") as file:
         header = _read_header(file, path)
@@ -236,7 +236,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
 
 
 def _bounds_of(start: bytes) -> NDArray[np.float64] | None:
-    """Return the bounds in the header (max x, min x, max y, ...), or None where they form no box."""
+    """Return the bounds in the header (max x, min x, max y, ...), or None if they form no box."""
     bounds = np.array(struct.unpack_from("<6d", start, 179)).reshape(3, 2).T[::-1].copy()
     return checked_bounds(bounds)
 
@@ -297,7 +297,7 @@ def _crs_text(file: BinaryIO, header_size: int, vlr_count: int, start: int, evlr
 
 
 def _projection_records(file: BinaryIO, at: int, count: int, end: int, form: str) -> dict[int, bytes]:
-    """Return the projection records among `count` from offset `at`, up to LONGEST_CRS bytes of each."""
+    """Return the projection records among `count` from offset `at`, truncated to LONGEST_CRS."""
     head = struct.Struct(form)
     found: dict[int, bytes] = {}
     file.seek(at)

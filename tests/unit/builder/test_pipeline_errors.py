@@ -157,7 +157,7 @@ def test_an_empty_target_folder_is_used(scans: list[Path], out: Path) -> None:
 def test_a_second_builder_of_the_same_target_is_refused(scans: list[Path], out: Path) -> None:
     with open(out / ".a.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(BadRequestError, match="another build is writing it"):
+        with pytest.raises(BadRequestError, match="another build, add or remove is writing it"):
             build(scans, out / "a")
         assert [p.name for p in out.iterdir()] == [".a.lock"]
         build(scans, out / "b")
@@ -180,7 +180,7 @@ def test_the_lock_of_another_process_is_seen(scans: list[Path], out: Path) -> No
     ) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"held\n"
-        with pytest.raises(BadRequestError, match="another build is writing it"):
+        with pytest.raises(BadRequestError, match="another build, add or remove is writing it"):
             build(scans, out / "a")
         holder.communicate()
     build(scans, out / "a")

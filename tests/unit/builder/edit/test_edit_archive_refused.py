@@ -222,7 +222,7 @@ def test_what_is_no_archive_is_refused(files: Files, tmp_path: Path) -> None:
 
 def test_a_second_one_is_refused_while_one_is_at_work(built: Build, files: Files, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "a")
-    with locked(target), pytest.raises(BadRequestError, match="another build is writing it"):
+    with locked(target), pytest.raises(BadRequestError, match="another build, add or remove is writing it"):
         add_scans(target, [files.b], jobs=1)
 
 

@@ -111,7 +111,7 @@ def test_verify_reads_the_preview(built: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.attrs.modify("generation", np.uint32(7))
     report = verify_archive(built)
-    assert report.faults == () and report.notes == (f"{path}: of another archive or generation",)
+    assert report.faults == () and report.notes == (f"{path}: belongs to another archive or generation",)
     with h5py.File(path, "r+") as file:
         del file.attrs["archive_id"]
     assert "does not name its archive" in verify_archive(built).faults[0]
@@ -119,6 +119,6 @@ def test_verify_reads_the_preview(built: Path) -> None:
     with h5py.File(path, "r+") as file:
         points = file["VTKHDF/Points"]
         points[0] = points[0] + 10
-    assert "points that are not the archive's" in verify_archive(built).faults[0]
+    assert "points that are not in the archive" in verify_archive(built).faults[0]
     path.unlink()
     assert verify_archive(built).faults == ()

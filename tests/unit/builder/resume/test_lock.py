@@ -16,9 +16,12 @@ def test_one_at_a_time(tmp_path: Path) -> None:
     check_free(target)
     with locked(target):
         assert lock_path(target).exists()
-        with pytest.raises(BadRequestError, match="another build is writing it"), locked(target):
+        with (
+            pytest.raises(BadRequestError, match="another build, add or remove is writing it"),
+            locked(target),
+        ):
             pytest.fail("two builders")
-        with pytest.raises(BadRequestError, match="another build is writing it"):
+        with pytest.raises(BadRequestError, match="another build, add or remove is writing it"):
             check_free(target)
     check_free(target)
     assert not list(tmp_path.iterdir())
@@ -40,7 +43,10 @@ def test_a_lock_that_is_held_is_another_build(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fcntl, "flock", lambda *_: (_ for _ in ()).throw(OSError(number, "held")))
-    with pytest.raises(BadRequestError, match="another build is writing it"), locked(tmp_path / "hall"):
+    with (
+        pytest.raises(BadRequestError, match="another build, add or remove is writing it"),
+        locked(tmp_path / "hall"),
+    ):
         pytest.fail("locked")
 
 
@@ -68,5 +74,5 @@ def test_a_second_builder_loads_no_numpy(tmp_path: Path) -> None:
             check=False,
         )
     assert done.returncode == 2, done.stderr
-    expected = "another build is writing it, or add or remove: wait for it (a build may be given another -o)"
+    expected = "another build, add or remove is writing it: wait for it, or give a build another -o"
     assert f"hall: {expected}" in done.stderr

@@ -71,7 +71,7 @@ def test_other_scans_are_refused_by_name(
     more = write_xyz(tmp_path / "c.xyz", make_scan("plane", 4, 20))
     cases: list[tuple[list[Path], str]] = [
         (scans[:1], "b.xyz is missing"),
-        ([*scans, more], "c.xyz was not there"),
+        ([*scans, more], "c.xyz is new"),
     ]
     for paths, expected in cases:
         with pytest.raises(BadRequestError, match=expected):
@@ -105,7 +105,7 @@ def test_many_differences_are_counted() -> None:
             {"path": f"{i}.las", "scan": 0, "bytes": 1, "changed_ns": 1, "pose": []} for i in range(9)
         ],
     }
-    with pytest.raises(BadRequestError, match=r"4\.las was not there; and 4 more: give the same scans"):
+    with pytest.raises(BadRequestError, match=r"4\.las is new; and 4 more: give the same scans"):
         check_same(Path("hall"), was, now)
     check_same(Path("hall"), now, json.loads(json.dumps(now)))
 

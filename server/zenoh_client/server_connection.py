@@ -90,8 +90,7 @@ class ServerConnection:
         """Return the client's present id."""
         return self._identity.id
 
-    # --- one request
-    # -----------------------------------------------------------------------------------------
+    # --- one request -----------------------------------------------------------------------------
 
     def ask(self, operation: str, request: bytes, names: Sequence[str] = ()) -> bytes | None:
         """Send a request and return the bytes of the answer; None if none arrives in time.
@@ -155,8 +154,7 @@ class ServerConnection:
         )
         return identity.queriers[operation], query
 
-    # --- requests about avatars
-    # ------------------------------------------------------------------------------
+    # --- requests about avatars ------------------------------------------------------------------
 
     def ask_about(self, operation: str, request: bytes, names: Sequence[str]) -> bytes | None:
         """Ask about avatars, as `ask` does; add them again if the server does not know them."""
@@ -242,8 +240,7 @@ class ServerConnection:
             self._identity = ClientIdentity(self.session, self._scene, self.timeout)
             before.close()
 
-    # --- missing replies
-    # -------------------------------------------------------------------------------------
+    # --- missing replies -------------------------------------------------------------------------
 
     def explain_silence(self, operation: str) -> str:
         """Return a message on why no server answered an operation, and what to do."""

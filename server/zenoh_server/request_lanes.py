@@ -182,8 +182,7 @@ class Lane:
         if self._queues.offer(ticket, always=True) is Offer.RUN:
             self._start([ticket])
 
-    # --- threads
-    # ---------------------------------------------------------------------------------------------
+    # --- threads ---------------------------------------------------------------------------------
 
     def _start_worker(self) -> None:
         self._start_thread(self._scene, self._take_all)
@@ -270,8 +269,7 @@ class Lane:
             self._supervisor.remove(job)
         return not job.left
 
-    # --- requests
-    # --------------------------------------------------------------------------------------------
+    # --- requests --------------------------------------------------------------------------------
 
     def _work(self, ticket: Ticket, takes: bool) -> bool:
         """Carry out a request, and then those that wait, until none does.
@@ -368,8 +366,7 @@ class Lane:
             self._streaming.pop(request, None)
             self._queues.release(ticket)
 
-    # --- the watchdog
-    # ----------------------------------------------------------------------------------------
+    # --- the watchdog ----------------------------------------------------------------------------
 
     def _check(self, now: float) -> bool:
         """Check all jobs and paths; return whether there are any jobs."""

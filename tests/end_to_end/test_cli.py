@@ -132,8 +132,8 @@ def test_help_loads_no_numpy(verb: str) -> None:
             "--op move needs --poses: it takes --avatar, --poses",
         ),
         ("query --scene hall --op path --along move", 2, "--along move: expected one of collide"),
-        ("replay {out}", 3, "expected a log, as serve --log writes it"),
-        ("replay {scan}", 3, "expected a log of serve --log"),
+        ("replay {out}", 3, "expected a log written by serve --log"),
+        ("replay {scan}", 3, "expected a log written by serve --log"),
         ("make facade -o {out}.obj", 2, "cannot write '.obj'"),
     ],
 )

@@ -1,10 +1,10 @@
 """Effect pipeline: runs one frame through the effects that a scene declares, within its budget.
 
-No other effect is imported, called or reported (NUMERICS.md case 31). The scene file's `limits` set
-a frame's budget. Before each effect that may be skipped, the time spent in the frame and the
-effect's estimated time are added. If the sum exceeds the budget, the effect is skipped, and the answer
-says so. Later effects in ORDER that take less may still fit. Effects that prevent contact are never
-skipped.
+Effects that the scene does not declare are not imported, called or reported (NUMERICS.md case 31).
+The scene file's `limits` set a frame's budget. An effect that may be skipped runs only if the time
+spent in the frame so far and the effect's estimated time fit in the budget. Otherwise it is skipped
+and listed in the answer. Later effects in ORDER that take less time may still fit. Effects that
+prevent contact are never skipped.
 """
 
 import importlib
@@ -26,18 +26,18 @@ from ..world.collision_world import World
 from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
 from ..world.vectors import norm
 
-# The estimated time of an effect follows its last time by this share.
+# Weight of the last run in the exponential moving average of an effect's cost.
 _SMOOTHING = 0.1
-# The estimate for a skipped effect decays by this share a frame, so that the effect is tried again.
-# Otherwise one slow run, for example because of a compiler or a disk, would make it skipped for
-# ever. An effect that is always slow gets one frame in some dozens.
+# The estimate of a skipped effect decays by this share a frame, so that the effect is tried again.
+# Otherwise it would be skipped forever after one slow run, for example because of compilation or a
+# disk. An effect that is always slow runs once in some dozens of frames.
 _DECAY = 0.02
-# Largest number of touched things that an answer names.
+# Limit of the obstacles that an answer lists.
 _MAX_TOUCHED = 16
 
 
 class CostEstimate:
-    """Estimated cost of an effect: seconds and node visits. The first frame is ignored: it compiles."""
+    """Estimated cost of an effect: seconds and node visits. The first run compiles and is ignored."""
 
     __slots__ = ("frames", "seconds", "tried", "visits")
 
@@ -50,8 +50,8 @@ class CostEstimate:
         self.frames += 1
         if self.frames == 1:
             return
-        # A decayed estimate is no longer valid: a trial counts whole; otherwise the next would
-        # follow at once.
+        # A decayed estimate is too low, so the cost of a trial replaces it. With an average, the
+        # next trial would follow at once.
         share = 1.0 if self.tried else max(_SMOOTHING, 1.0 / (self.frames - 1))
         self.tried = False
         self.seconds += share * (seconds - self.seconds)
@@ -67,16 +67,15 @@ class CostEstimate:
 class Pipeline:
     """Effects of one scene in their order. Thread-safe, except for two frames of one body.
 
-    runners: the effects.  costs: estimate for each, by name, where there is a budget.  bodies: see
-    bodies.py; None where no effect uses it.
+    runners: the effects.  costs: cost estimate of each, by name, updated only with a budget.
+    bodies: `Bodies` that all effects which need them share, and that the simulation updates; None
+    if no effect needs them.
     """
 
     def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
-        """Create a pipeline; call `make_pipeline` instead."""
+        """Create a pipeline; callers use `make_pipeline`."""
         self.file, self.world, self.runners = file, world, runners
         self.costs = {runner.name: CostEstimate() for runner in runners}
-        # Users and objects: shared by all effects that use them, updated by the simulation. None:
-        # no effect does.
         self.bodies: Any = None
         for runner in runners:
             if hasattr(runner, "bodies"):
@@ -100,10 +99,10 @@ class Pipeline:
     ) -> Moved:
         """Run one frame of a body: move it towards a commanded pose (4, 4), rigid.
 
-        seconds: duration of the frame.  skip: the effects to omit, as an earlier frame had to;
-        None: those that do not fit the frame's budget. The body is unchanged if this raises:
-        BadRequestError for a pose farther than limits.longest_move, the errors of queries about its
-        poses, and StoppedError.
+        seconds: duration of the frame.  skip: names of the effects to skip, for replays; None:
+        those that do not fit the frame's budget.
+        Raise BadRequestError for a pose farther than limits.longest_move, the errors of queries, or
+        StoppedError. The body is then unchanged.
         """
         begin = time.perf_counter()
         body.pose = np.ascontiguousarray(body.pose, np.float64)
@@ -112,7 +111,7 @@ class Pipeline:
         if not far <= self.file.limits.longest_move:
             raise BadRequestError(
                 f"the commanded pose is {far:g} m away: expected within {self.file.limits.longest_move:g} m, the "
-                "scene's longest_move: send a nearer pose, or begin there"
+                "scene's longest_move: send a nearer pose, or enter the scene there"
             )
         frame = Frame(body, target, seconds, self.world, budget, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
@@ -134,8 +133,8 @@ class Pipeline:
                     self._run_one(runner, frame, begin, since, skip)
             if not self._stops:
                 frame.verdict = self.world.collide(body.avatar, frame.pose, budget)
-            # A body that came into the avatar, for example an object, blocks nothing: only the
-            # verdict reports it.
+            # Bodies that overlap the avatar since the frame's start, such as a placed object, do
+            # not block it, but the verdict reports them.
             if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
                 frame.verdict = Verdict.CONTACT
             if budget.stop:  # results of effects from incomplete answers are discarded
@@ -150,7 +149,7 @@ class Pipeline:
     def _restored_if_stopped(self, body: Body, budget: QueryBudget) -> Iterator[None]:
         """Restore the poses of pushed objects if the frame is stopped.
 
-        A clock decides when a frame is stopped, and no pose may depend on a clock.
+        When a frame is stopped depends on a clock, and no pose may depend on a clock.
         """
         if budget.stop is NO_STOP or self.bodies is None or not self.bodies.is_present(body):
             yield
@@ -191,9 +190,9 @@ def _vector(place: Vec) -> tuple[float, float, float]:
 
 
 def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
-    """Return what stopped a frame's motions, each position once.
+    """Return the obstacles that stopped a frame's motions, each position once.
 
-    there: for a hit without a position.
+    there: (3,), position of hits without one, world [m].
     """
     found: dict[Any, Touched] = {}
     for hit in hits:

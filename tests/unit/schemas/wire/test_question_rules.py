@@ -127,7 +127,7 @@ def test_a_column_of_the_wrong_length_is_an_internal_error(kind):
 def test_starts_that_do_not_rise_are_an_internal_error():
     good = some(ContactsAnswers, 3)
     for bad in ([0, 3, 2, 5], [1, 2, 2, 5], [0, -1, 2, 5]):
-        with pytest.raises(InternalError, match="'pair_starts' does not rise"):
+        with pytest.raises(InternalError, match="'pair_starts' does not ascend"):
             check_answers(msgspec.structs.replace(good, pair_starts=np.array(bad)), 3)
 
 

@@ -72,7 +72,7 @@ def test_a_declaration_has_a_rule_for_each_column():
         {name: rule for name, rule in rules.items() if name != "distance"},
         rules | {"hit": ColumnRules(Merge.FIRST)},
     ):
-        with pytest.raises(TypeError, match="expected a rule for each array field"):
+        with pytest.raises(TypeError, match="expected one rule for each array field"):
             Question("within", WithinRequest, WithinAnswers, "points", wrong)
 
 

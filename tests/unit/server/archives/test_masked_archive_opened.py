@@ -67,7 +67,7 @@ def test_a_corrupt_record_in_a_box_says_so_and_is_unknown(tmp_path: Path) -> Non
 
 
 def test_boxes_that_hold_everything_are_refused(whole: Path) -> None:
-    with pytest.raises(BadRequestError, match="hold all of its points: leave the archive out"):
+    with pytest.raises(BadRequestError, match="contain all of its points: leave the archive out"):
         open_without(whole, ThroughBox("all", (0.0, 0.0, 0.0), (2.0, 2.0, 2.0)))
 
 

@@ -289,5 +289,5 @@ def test_an_unknown_policy_is_refused() -> None:
         BadRequestError, match="policy 'mru': expected one of lru, lru\\+prefetch, distance, s3fifo"
     ):
         make_policy("mru", BUDGET)
-    with pytest.raises(ValueError, match="how near"):
+    with pytest.raises(ValueError, match="expected path_distances"):
         make_policy("distance", BUDGET)

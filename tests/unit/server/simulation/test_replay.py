@@ -167,5 +167,5 @@ def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
 
 def test_an_avatar_that_is_not_in_the_log_is_an_error():
     records: list[Record] = [Begin("floor", "", b"", []), Entered(AL, b"?")]
-    with pytest.raises(BadRequestError, match="avatar 'al' of the log"):
+    with pytest.raises(BadRequestError, match="avatar 'al': its points are not in the log"):
         replay(simulated(), records)

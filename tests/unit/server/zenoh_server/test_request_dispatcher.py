@@ -300,7 +300,7 @@ def test_busy_says_how_many(service):
 
 
 def test_two_scenes_of_one_name_are_refused():
-    with pytest.raises(BadRequestError, match="a name of its own"):
+    with pytest.raises(BadRequestError, match="distinct names"):
         RequestDispatcher([FloorScene(), FloorScene()], ServerConfig())
 
 

@@ -16,12 +16,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from kills.calls import has_strace
+from kill_cases.system_call_stops import has_strace
 from solidcloud.schemas.archive.index import INDEX_NAME
 from solidcloud.schemas.errors import SolidcloudError
 from solidcloud.server.client import Client
 
-from . import clients, rogue_clients
+from . import checking_clients, rogue_clients
 from . import scoreboard as b
 from .fixtures import GENERATIONS, SCENE, Fixture
 from .server_restarts import ServerRuns
@@ -52,7 +52,7 @@ def _forking() -> Any:
     from multiprocessing import forkserver
 
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["chaos_cases.clients", "chaos_cases.rogue_clients"])
+    context.set_forkserver_preload(["chaos_cases.checking_clients", "chaos_cases.rogue_clients"])
     # The process that forks does not inherit sys.path, and does not report failed imports.
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
@@ -291,7 +291,7 @@ class ChaosRun:
         ids = IDS if slot >= CLIENTS - SEVERAL else 1
         seed = self.random.randrange(1 << 32)
         process = self._context.Process(
-            target=clients.main, args=(self.folder, slot, self.endpoint, seed, ids), daemon=True
+            target=checking_clients.main, args=(self.folder, slot, self.endpoint, seed, ids), daemon=True
         )
         process.start()
         self._clients[slot], self._born[slot] = process, time.monotonic()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import zenoh
-from rogues.tools import widths, zeros
+from rogue_cases.rogue_attacks import widths, zeros
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
 from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, ContactsRequest, make_poses

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zenoh
 from floor import DEADLINE, PATH, POINTS, TRUTH, eventually, heights, joined, server_process
-from rogues.tools import Impostor
+from rogue_cases.rogue_attacks import Impostor
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.answers import Verdict

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_scans
-from kills.reading import FORMATS
+from kill_cases.interrupted_reading import FORMATS
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.cli.main import run
 

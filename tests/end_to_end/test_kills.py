@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kills.calls import Call, has_strace, one_of_each
-from kills.case import NAME, Case, Tally, content, difference
+from kill_cases.stopped_build import NAME, Case, Tally, content, difference
+from kill_cases.system_call_stops import Call, has_strace, one_of_each
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
@@ -63,9 +63,9 @@ import os, sys
 from pathlib import Path
 sys.path.append(sys.argv[2])
 import solidcloud.builder.pipeline as pipeline
-from kills.at_random import ReferenceBuild, _after_kill
-from kills.case import Tally
-from kills.child import build
+from kill_cases.random_kills import ReferenceBuild, _after_kill
+from kill_cases.stopped_build import Tally
+from kill_cases.forked_command import build
 
 def bit_by_bit(folder, target, *_):
     target.mkdir()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zenoh
 from floor import DEADLINE, POINTS, eventually, heights
-from rogues.tools import Impostor
+from rogue_cases.rogue_attacks import Impostor
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import SolidcloudError

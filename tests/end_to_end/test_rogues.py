@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from fake_server import floor_simulation
 from floor import eventually
-from rogues.tools import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
+from rogue_cases.rogue_attacks import AVATAR, DEADLINE, MODES, POINTS, TOOLS, Rogue, Victim, attempt, widths
 from solidcloud.server.client import Client
 from solidcloud.server.scene_interface import EVERYBODY
 from solidcloud.server.zenoh_server.serve_loop import serving

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench import build_limits, build_picture, build_rates, build_runs, build_sizes, build_watch
-from bench.build_watch import Sample, Watched
-from bench.results import Part
+from bench_build_cases import build_limits, build_picture, build_rates, build_runs, build_sizes, build_watch
+from bench_build_cases.build_watch import Sample, Watched
+from measurement.bench_results import Part
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.plan.rates import StageRate

@@ -9,12 +9,12 @@ import archive_cases
 import numpy as np
 import pytest
 from chaos_cases import scoreboard as b
+from chaos_cases.answer_check import judge
+from chaos_cases.chaos_report import Limits, _violations
 from chaos_cases.fixtures import AVATARS, ask, judge_claims, make_pool
-from chaos_cases.judge import judge
-from chaos_cases.report import Limits, _violations
 from chaos_cases.server_restarts import QuietPoint, ServerRuns
 from msgspec.structs import replace
-from rogues.tools import zeros
+from rogue_cases.rogue_attacks import zeros
 from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,

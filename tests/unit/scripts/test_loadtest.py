@@ -10,14 +10,24 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from bench.results import MET, MISSED, Part, goal_rows
-from load import cases, check, drive, frames, pace, page, pictures, server, town
-from load.adversary import Adversary, LruModel
-from load.cases import ECHO, Case, Ran
-from load.frames import ANSWERED, NOTHING, REFUSED, Frames
-from load.server import Memory
-from load.traces import Trace
-from load.voxels import Voxels
+from loadtest_cases import (
+    frame_clock,
+    frame_outcomes,
+    load_cases,
+    load_page,
+    load_pictures,
+    load_run,
+    server_process,
+    town_archive,
+    verdict_check,
+)
+from loadtest_cases.adversary_user import Adversary, LruModel
+from loadtest_cases.archive_voxels import Voxels
+from loadtest_cases.frame_outcomes import ANSWERED, NOTHING, REFUSED, Frames
+from loadtest_cases.load_cases import ECHO, Case, Ran
+from loadtest_cases.server_process import Memory
+from loadtest_cases.user_traces import Trace
+from measurement.bench_results import MET, MISSED, Part, goal_rows
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.stats import StatsAnswer
@@ -47,7 +57,7 @@ class Clock:
         return act
 
     def run(self, due: list[float], takes: Callable[[int], float]) -> list[tuple[int, float]]:
-        pace.pace(due, self.act(takes), lambda: self.now, self.sleep)
+        frame_clock.pace(due, self.act(takes), lambda: self.now, self.sleep)
         return self.acted
 
 
@@ -72,16 +82,16 @@ def test_no_frame_is_asked_before_its_time_though_sleep_ends_early() -> None:
 def test_a_frame_stalls_when_its_answer_is_later_than_the_next_frame_or_never() -> None:
     due = np.array([1.0, 2.0, 3.0, 4.0])
     done = np.array([1.033, 2.034, np.nan, 4.0])
-    assert pace.stalled(due, done).tolist() == [False, True, True, False]
-    assert pace.stalled(due, done, 0.1).tolist() == [False, False, True, False]
+    assert frame_clock.stalled(due, done).tolist() == [False, True, True, False]
+    assert frame_clock.stalled(due, done, 0.1).tolist() == [False, False, True, False]
 
 
 def test_the_first_second_is_that_of_each_user() -> None:
     user = np.array([0, 2, 0, 2, 0])
     due = np.array([5.0, 5.5, 5.9, 6.4, 6.0])
-    assert pace.after_first(user, due).tolist() == [False, False, False, False, True]
-    assert pace.after_first(user, due, 0.9).tolist() == [False, False, True, True, True]
-    assert pace.after_first(user[:0], due[:0]).tolist() == []
+    assert frame_clock.after_first(user, due).tolist() == [False, False, False, False, True]
+    assert frame_clock.after_first(user, due, 0.9).tolist() == [False, False, True, True, True]
+    assert frame_clock.after_first(user[:0], due[:0]).tolist() == []
 
 
 # --- figures --------------------------------------------------------------------------------------------
@@ -106,54 +116,54 @@ def test_figures_leave_the_first_second_out_but_not_its_faults() -> None:
         hits=[0, 4, 3, 0, 0],
         done=[0.5, 1.015, 2.05, np.nan, np.nan],
     )
-    f = frames.figures(made)
+    f = frame_outcomes.figures(made)
     assert (f.frames, f.stalled, f.unknown, f.refused, f.unanswered) == (4, 3, 1, 1, 1)
     assert f.misses == 1 and f.hit_rate == 7 / 8 and f.without_miss == 0.5
     assert f.delays == pytest.approx([0.05] * 4)  # of 15 and 50 ms
     assert f.round_trips[-1] == pytest.approx(0.045) and f.late == pytest.approx(0.005)
-    assert frames.figures(made, warm_up=0.0).misses == 8
+    assert frame_outcomes.figures(made, warm_up=0.0).misses == 8
 
 
 def test_a_run_without_answers_has_no_rates() -> None:
-    f = frames.figures(some_frames(status=[NOTHING] * 3, done=[np.nan] * 3, sent=[np.nan] * 3))
+    f = frame_outcomes.figures(some_frames(status=[NOTHING] * 3, done=[np.nan] * 3, sent=[np.nan] * 3))
     assert (f.stalled, f.unanswered, f.misses) == (2, 3, 0)
     assert np.isnan([f.hit_rate, f.without_miss, *f.delays, f.late]).all()
 
 
 def test_percentiles_are_values_that_were_measured() -> None:
     values = np.array([4.0, 1.0, np.nan, 2.0, 3.0])
-    assert frames.percentiles(values, (50.0, 99.0, 100.0)).tolist() == [3.0, 4.0, 4.0]
-    assert np.isnan(frames.percentiles(np.array([np.nan]))).all()
+    assert frame_outcomes.percentiles(values, (50.0, 99.0, 100.0)).tolist() == [3.0, 4.0, 4.0]
+    assert np.isnan(frame_outcomes.percentiles(np.array([np.nan]))).all()
 
 
 def test_a_frame_may_wait_for_what_another_had_loaded() -> None:
     made = some_frames(
         wait=[0.5, 0.0, 8e-3, 9e-3, np.nan], misses=[0, 0, 0, 2, 0], status=[ANSWERED] * 4 + [REFUSED]
     )
-    f = frames.figures(made)
+    f = frame_outcomes.figures(made)
     assert f.waits[1:].tolist() == [9e-3] * 3 and f.waited == 2 / 3 and f.without_miss == 2 / 3
 
 
 def test_frames_of_processes_become_those_of_one_in_order(tmp_path: Path) -> None:
     first = some_frames(user=[0, 0, 0])
     second = some_frames(user=[1, 1, 1])._replace(due=np.array([0.5, 1.0, 9.0]))
-    frames.save(tmp_path / "a.npz", first, pose=np.zeros((3, 4, 4)))
-    back, more = frames.load(tmp_path / "a.npz")
+    frame_outcomes.save(tmp_path / "a.npz", first, pose=np.zeros((3, 4, 4)))
+    back, more = frame_outcomes.load(tmp_path / "a.npz")
     assert more["pose"].shape == (3, 4, 4)
-    both = frames.merged([second, back])
+    both = frame_outcomes.merged([second, back])
     assert both.due.tolist() == [0.0, 0.5, 1.0, 1.0, 2.0, 9.0] and both.user.tolist() == [0, 1, 0, 1, 0, 1]
 
 
 def test_bytes_over_time_are_the_most_of_each_piece() -> None:
     made = some_frames(resident_bytes=[5, 9, 7, 1], done=[0.0, 1.0, 3.0, 4.0])
-    at, most = frames.bytes_over_time(made, 2)
+    at, most = frame_outcomes.bytes_over_time(made, 2)
     assert at.tolist() == [1.0, 3.0] and most.tolist() == [9.0, 7.0]
-    assert len(frames.bytes_over_time(made._replace(status=np.zeros(4, int)))[0]) == 0
+    assert len(frame_outcomes.bytes_over_time(made._replace(status=np.zeros(4, int)))[0]) == 0
 
 
 def test_wrong_is_what_is_said_and_not_true() -> None:
     made = some_frames(verdict=[CLEAR, CONTACT, UNKNOWN, CLEAR, CONTACT], status=[ANSWERED] * 4 + [REFUSED])
-    assert check.wrong(made, np.array([CLEAR, CLEAR, CONTACT, CONTACT, CLEAR])).tolist() == [1, 3]
+    assert verdict_check.wrong(made, np.array([CLEAR, CLEAR, CONTACT, CONTACT, CLEAR])).tolist() == [1, 3]
 
 
 # --- adversaries ----------------------------------------------------------------------------------------
@@ -211,20 +221,24 @@ def test_an_adversary_knows_what_else_its_pose_needs() -> None:
 
 def test_an_option_is_found_by_its_whole_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        server, "serve_help", lambda: "| --cache  TEXT  Decoded [default: 512MB] | --policy-file  |"
+        server_process, "serve_help", lambda: "| --cache  TEXT  Decoded [default: 512MB] | --policy-file  |"
     )
-    assert server.takes("--cache") and not server.takes("--policy") and not server.takes("--cach")
+    assert (
+        server_process.takes("--cache")
+        and not server_process.takes("--policy")
+        and not server_process.takes("--cach")
+    )
 
 
 def test_a_policy_is_named_only_where_one_is_given() -> None:
-    command = server.serve_command(Path("a.scd"), "tcp/127.0.0.1:1", 1000, None)
+    command = server_process.serve_command(Path("a.scd"), "tcp/127.0.0.1:1", 1000, None)
     assert command[-2:] == ["--cache", "1000"] and "--policy" not in command
-    assert server.serve_command(Path("a"), "e", 1000, "lru")[-2:] == ["--policy", "lru"]
+    assert server_process.serve_command(Path("a"), "e", 1000, "lru")[-2:] == ["--policy", "lru"]
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="the system does not say")
 def test_memory_of_a_process_is_seen() -> None:
-    watcher = server.Watcher(os.getpid())
+    watcher = server_process.Watcher(os.getpid())
     watcher.look(True)
     held = np.ones(1 << 25, np.uint8)
     watcher.look(False)
@@ -234,31 +248,31 @@ def test_memory_of_a_process_is_seen() -> None:
 
 
 def test_the_most_memory_is_read_from_a_status() -> None:
-    assert server.parse_high("VmPeak:\t 9 kB\nVmHWM:\t    21 kB\nVmRSS: 1 kB\n") == 21 * 1024
-    assert server.parse_high("VmRSS: 1 kB\n") == 0
+    assert server_process.parse_high("VmPeak:\t 9 kB\nVmHWM:\t    21 kB\nVmRSS: 1 kB\n") == 21 * 1024
+    assert server_process.parse_high("VmRSS: 1 kB\n") == 0
 
 
 def test_a_process_that_ends_before_it_is_ready_says_why(tmp_path: Path) -> None:
     code = "import sys; print('no room', file=sys.stderr); sys.exit(3)"
     with (
-        pytest.raises(server.ServerError, match="no room"),
-        server.running([sys.executable, "-c", code], tmp_path / "log", "ready"),
+        pytest.raises(server_process.ServerError, match="no room"),
+        server_process.running([sys.executable, "-c", code], tmp_path / "log", "ready"),
     ):
         pass
 
 
 def test_a_truth_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=re.escape("town.truth.json")):
-        town.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)
+        town_archive.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)
     (tmp_path / "town.truth.json").write_text("{}")
-    assert town.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)[1] == tmp_path / "town.truth.json"
+    assert town_archive.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)[1] == tmp_path / "town.truth.json"
 
 
 def test_users_in_processes_ask_every_frame_of_a_trace_and_hear_of_each(tmp_path: Path) -> None:
     user = np.array([0, 1, 2] * 10)
     asked = Trace(user, np.arange(30) / 90, np.tile(np.eye(4), (30, 1, 1)))
-    setup = drive.Setup(tmp_path / "none", tmp_path, processes=2)
-    found = drive.run_echo(setup, asked, request_bytes=226, reply_bytes=180)
+    setup = load_run.Setup(tmp_path / "none", tmp_path, processes=2)
+    found = load_run.run_echo(setup, asked, request_bytes=226, reply_bytes=180)
     made = found.frames
     assert made.user.tolist() == user.tolist() and (made.status == ANSWERED).all() and not found.faults
     assert np.allclose(made.due - made.due[0], asked.time) and (made.due <= made.sent).all()
@@ -271,8 +285,8 @@ def test_users_in_processes_ask_every_frame_of_a_trace_and_hear_of_each(tmp_path
 def ran(case: Case, made: Frames, **more: object) -> Ran:
     rss = (np.array([0.0, 1.0]), np.array([1e8, 2e8]))
     plain: dict = {"budget": 50 << 20, "wrong": 0, "speed": 1.5, "empty": 100 << 20, "peak": 250 << 20}
-    plain |= {"memory": Memory(), "resident": frames.bytes_over_time(made), "rss": rss, **more}
-    return Ran(case, figures=frames.figures(made), **plain)
+    plain |= {"memory": Memory(), "resident": frame_outcomes.bytes_over_time(made), "rss": rss, **more}
+    return Ran(case, figures=frame_outcomes.figures(made), **plain)
 
 
 STEADY = Case("kinds", "stroll", 8, 0.1, None)
@@ -281,8 +295,8 @@ CALM = some_frames(user=[0] * 9)
 
 def verdicts(runs: list[Ran]) -> dict[str, str]:
     part = Part("kinds")
-    cases.add_goals(part, runs)
-    return {row["key"]: row["verdict"] for row in goal_rows([part], cases.NOTES)}
+    load_cases.add_goals(part, runs)
+    return {row["key"]: row["verdict"] for row in goal_rows([part], load_cases.NOTES)}
 
 
 def test_goals_are_met_by_a_calm_run_and_missed_by_what_breaks_them() -> None:
@@ -317,12 +331,12 @@ def test_a_report_holds_no_figure_that_is_no_number() -> None:
     nothing = CALM._replace(status=np.zeros(9, int), done=CALM.done * np.nan, wait=CALM.wait * np.nan)
     stats = StatsAnswer(scene="load", keys=[1, 2])
     part, made = Part("kinds"), ran(STEADY, nothing, speed=np.nan, stats=stats)
-    cases.add_figures(part, made)
-    cases.add_goals(part, [made])
+    load_cases.add_figures(part, made)
+    load_cases.add_goals(part, [made])
     assert all(np.isfinite(f.value) for f in part.figures)
-    text = json.dumps(cases.summary(made), allow_nan=False)
+    text = json.dumps(load_cases.summary(made), allow_nan=False)
     assert json.loads(text)["figures"]["unanswered"] == 9 and json.loads(text)["stats"]["keys"] is None
-    assert {row["verdict"] for row in goal_rows([part], cases.NOTES) if row["key"] == "misses"} == {
+    assert {row["verdict"] for row in goal_rows([part], load_cases.NOTES) if row["key"] == "misses"} == {
         "not measured"
     }
 
@@ -344,19 +358,19 @@ def test_round_trips_of_the_crowd_are_held_against_the_echo_of_as_many() -> None
 
 def test_the_knee_is_the_fewest_users_for_whom_frames_stall() -> None:
     runs = [ran(Case("users", "stroll", n, 1.1, None), CALM) for n in (8, 16)]
-    assert cases.knee(runs) == {cases.AS_SERVED: None}
+    assert load_cases.knee(runs) == {load_cases.AS_SERVED: None}
     late = CALM._replace(done=CALM.done + 1.0)
     runs += [ran(Case("users", "stroll", n, 1.1, None), late) for n in (64, 32)]
-    assert cases.knee(runs) == {cases.AS_SERVED: 32}
+    assert load_cases.knee(runs) == {load_cases.AS_SERVED: 32}
 
 
 def test_the_speed_of_users_is_over_the_floor_and_of_no_one_who_jumps() -> None:
     pose = np.tile(np.eye(4), (91, 1, 1))
     pose[:, 0, 3] = np.arange(91) * 0.1
     walked = Trace(np.zeros(91, np.int64), np.arange(91) / 30, pose)
-    assert cases.mean_speed(walked) == pytest.approx(3.0)
+    assert load_cases.mean_speed(walked) == pytest.approx(3.0)
     pose[45:, 0, 3] += 100.0
-    assert np.isnan(cases.mean_speed(walked))
+    assert np.isnan(load_cases.mean_speed(walked))
 
 
 def test_rows_are_found_by_key_and_strangers_left_out() -> None:
@@ -372,15 +386,18 @@ def test_the_page_holds_goals_figures_and_pictures_and_needs_no_other_file(tmp_p
     crowd = [ran(Case("users", "stroll", n, 1.1, side), CALM) for n in (8, 64) for side in (None, ECHO)]
     part = Part("kinds")
     for one in runs:
-        cases.add_figures(part, one)
-    cases.add_goals(part, runs)
+        load_cases.add_figures(part, one)
+    load_cases.add_goals(part, runs)
     made = [
-        ("hits", pictures.hit_rate(runs)), ("stalls", pictures.stalls(runs)), ("trips", pictures.round_trips(crowd)),
-        ("bytes", pictures.bytes_over_time(runs)), ("strip", pictures.film_strip(shown, voxels)),
-    ]  # fmt: skip
+        ("hits", load_pictures.hit_rate(runs)),
+        ("stalls", load_pictures.stalls(runs)),
+        ("trips", load_pictures.round_trips(crowd)),
+        ("bytes", load_pictures.bytes_over_time(runs)),
+        ("strip", load_pictures.film_strip(shown, voxels)),
+    ]
     assert all(picture.startswith(b"\x89PNG") for _, picture in made)
     target = tmp_path / "out" / "load.html"
-    page.write_page([part], cases.NOTES, made, "a <town>", target)
+    load_page.write_page([part], load_cases.NOTES, made, "a <town>", target)
     text = target.read_text()
     assert text.count("data:image/png;base64,") == 5 and "a &lt;town&gt;" in text
     assert "stroll, 8 users" in text and "frames stalled" in text and 'src="http' not in text
@@ -388,7 +405,7 @@ def test_the_page_holds_goals_figures_and_pictures_and_needs_no_other_file(tmp_p
 
 def test_a_run_that_is_wrong_is_said() -> None:
     part = Part("kinds")
-    cases.add_figures(part, ran(STEADY, CALM, wrong=2, faults=["busy", "busy"]))
+    load_cases.add_figures(part, ran(STEADY, CALM, wrong=2, faults=["busy", "busy"]))
     assert (
         len(part.wrong) == 1 and "2 verdicts" in part.wrong[0] and sum("busy" in r for r in part.remarks) == 1
     )

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from load import motion, places, traces
-from load.traces import KINDS, Trace
+from loadtest_cases import town_paths, user_traces, walking_motion
+from loadtest_cases.user_traces import KINDS, Trace
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.town import POINTS_PER_FACADE, town_lots
@@ -24,17 +24,17 @@ def truth() -> SceneTruth:
 
 
 def trace(truth: SceneTruth, kind: str, seed: int = 3) -> Trace:
-    return traces.traces(kind, truth, USERS, SECONDS, seed)
+    return user_traces.traces(kind, truth, USERS, SECONDS, seed)
 
 
 def one(made: Trace, user: int) -> NDArray[np.float64]:
-    return traces.of_users(made, [user]).pose
+    return user_traces.of_users(made, [user]).pose
 
 
 def speeds(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Over half a second each, so that sway and jitter hardly count [m/s]."""
     place = pose[:, :2, 3]
-    return np.linalg.norm(place[15:] - place[:-15], axis=1) * motion.RATE / 15
+    return np.linalg.norm(place[15:] - place[:-15], axis=1) * walking_motion.RATE / 15
 
 
 def turned(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,7 +69,7 @@ def test_every_user_has_thirty_poses_a_second_and_all_are_in_order_of_time(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_poses_are_upright_on_the_floor_and_within_the_town(truth: SceneTruth, kind: str) -> None:
-    made, town = trace(truth, kind), places.make_town_of(truth)
+    made, town = trace(truth, kind), town_paths.make_town_of(truth)
     pose = made.pose
     assert np.allclose(pose[:, :3, :3] @ pose[:, :3, :3].transpose(0, 2, 1), np.eye(3))
     assert np.allclose(pose[:, 2, :3], (0, 0, 1)) and np.array_equal(
@@ -97,13 +97,13 @@ def test_turns_are_as_people_make_them(truth: SceneTruth, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["stroll", "run", "crowd"])
 def test_nobody_is_faster_than_the_kind_and_straight_on_all_are_as_fast(truth: SceneTruth, kind: str) -> None:
-    made, speed = trace(truth, kind), traces.SPEEDS[kind]
+    made, speed = trace(truth, kind), user_traces.SPEEDS[kind]
     found = np.concatenate([speeds(one(made, user)) for user in range(USERS)])
     assert found.max() < 1.05 * speed and np.percentile(found, 90) > 0.97 * speed
 
 
 def test_another_speed_may_be_asked_for(truth: SceneTruth) -> None:
-    found = speeds(one(traces.traces("stroll", truth, 1, SECONDS, 3, speed=3.0), 0))
+    found = speeds(one(user_traces.traces("stroll", truth, 1, SECONDS, 3, speed=3.0), 0))
     assert 2.9 < np.percentile(found, 90) < 3.1
 
 
@@ -116,16 +116,18 @@ def test_who_turns_on_the_spot_stays_there_and_looks_all_around(truth: SceneTrut
 
 
 def test_a_tour_passes_every_facade(truth: SceneTruth) -> None:
-    made = traces.traces("tour", truth, 3, 120.0, 1)
+    made = user_traces.traces("tour", truth, 3, 120.0, 1)
     for facade in truth.facades:
         local = made.pose[:, :2, 3] - np.asarray(facade.origin[:2])
         assert (np.abs(local) < (2.5, 1.0)).all(axis=1).any(), facade.origin  # in its main door
     for user in range(3):
-        assert speeds(one(made, user)).max() < 1.05 * traces.SPEEDS["tour"]  # over the seam of the loop too
+        assert (
+            speeds(one(made, user)).max() < 1.05 * user_traces.SPEEDS["tour"]
+        )  # over the seam of the loop too
 
 
 def test_a_crowd_goes_through_one_door_and_nobody_through_its_jambs(truth: SceneTruth) -> None:
-    made, passed = traces.traces("crowd", truth, 6, 150.0, 3), []
+    made, passed = user_traces.traces("crowd", truth, 6, 150.0, 3), []
     facade = min(truth.facades, key=lambda f: np.abs(made.pose[:, :2, 3] - f.origin[:2]).sum())
     door = facade.door("main")
     for user in range(6):
@@ -148,16 +150,16 @@ def test_who_teleports_is_elsewhere_every_second_and_stands_meanwhile(truth: Sce
 def test_one_facade_alone_is_walked_around_in(truth: SceneTruth) -> None:
     alone = SceneTruth(1, 1000, 0.0, (), truth.facades[:1])
     for kind in KINDS:
-        made = traces.traces(kind, alone, 2, 60.0, 1)
-        low, high = places.make_town_of(alone).bounds()
+        made = user_traces.traces(kind, alone, 2, 60.0, 1)
+        low, high = town_paths.make_town_of(alone).bounds()
         assert ((made.pose[:, :2, 3] >= low) & (made.pose[:, :2, 3] <= high)).all()
 
 
 def test_what_cannot_be_traced_is_refused(truth: SceneTruth) -> None:
     with pytest.raises(ValueError, match="expected one of stroll, run"):
-        traces.traces("adversary", truth, 1, 1.0, 1)
+        user_traces.traces("adversary", truth, 1, 1.0, 1)
     with pytest.raises(ValueError, match="at least one"):
-        traces.traces("stroll", truth, 0, 1.0, 1)
+        user_traces.traces("stroll", truth, 0, 1.0, 1)
 
 
 # --- files, centres -------------------------------------------------------------------------------------
@@ -165,8 +167,8 @@ def test_what_cannot_be_traced_is_refused(truth: SceneTruth) -> None:
 
 def test_a_recorded_trace_is_replayed_bit_for_bit(truth: SceneTruth, tmp_path: Path) -> None:
     made = trace(truth, "stroll")
-    traces.save(tmp_path / "a" / "stroll.npz", made)
-    back = traces.load(tmp_path / "a" / "stroll.npz")
+    user_traces.save(tmp_path / "a" / "stroll.npz", made)
+    back = user_traces.load(tmp_path / "a" / "stroll.npz")
     assert all(a.dtype == b.dtype and a.tobytes() == b.tobytes() for a, b in zip(made, back, strict=True))
 
 
@@ -176,14 +178,14 @@ def test_what_is_no_trace_is_refused(tmp_path: Path) -> None:
     )
     np.savez(tmp_path / "b.npz", user=np.zeros(2, np.int64))
     with pytest.raises(ValueError, match="ascending"):
-        traces.load(tmp_path / "a.npz")
+        user_traces.load(tmp_path / "a.npz")
     with pytest.raises(ValueError, match="no trace"):
-        traces.load(tmp_path / "b.npz")
+        user_traces.load(tmp_path / "b.npz")
 
 
 def test_centers_enclose_the_avatar_in_every_pose(truth: SceneTruth) -> None:
     avatar, made = make_avatar(figure_points(200)), trace(truth, "stroll")
-    found = traces.centers(made, avatar, margin=0.25)
+    found = user_traces.centers(made, avatar, margin=0.25)
     assert found.center.shape == (len(made.user), 3) and found.reach.shape == (len(made.user),)
     for i in (0, 17, 800):
         points = avatar.points @ made.pose[i, :3, :3].T + made.pose[i, :3, 3]
@@ -194,9 +196,9 @@ def test_centers_enclose_the_avatar_in_every_pose(truth: SceneTruth) -> None:
 def test_only_poses_after_a_teleport_are_scans(truth: SceneTruth) -> None:
     avatar = make_avatar(figure_points(200))
     for kind in MOVING:
-        assert not traces.centers(trace(truth, kind), avatar).scan.any()
+        assert not user_traces.centers(trace(truth, kind), avatar).scan.any()
     made = trace(truth, "teleport")
-    found = traces.centers(made, avatar)
+    found = user_traces.centers(made, avatar)
     assert found.scan.sum() >= 0.9 * USERS * (SECONDS - 1)
     for user in range(USERS):
         assert not (np.flatnonzero(found.scan[made.user == user]) % 30).any()

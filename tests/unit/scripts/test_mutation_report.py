@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from mutation_cases import report, results, trial
+from mutation_cases import mutation_report, trial, trial_results
 from mutation_cases.plan import LOWER_GOALS, NONE, TESTS
 
 SOURCE = "return a * 2"
@@ -30,11 +30,11 @@ def outcome(kind: str) -> trial.Outcome:
 
 
 def test_what_the_compiler_would_refuse_counts_for_nothing() -> None:
-    own = results.FileResults("source", "tests", 1)
+    own = trial_results.FileResults("source", "tests", 1)
     kinds = [trial.FAILED, trial.ERROR, trial.TIME, trial.PASSED, trial.REFUSED]
     for mutant, kind in zip(MUTANTS, kinds, strict=False):
         own.add(mutant, outcome(kind))
-    assert (own.counted(), own.killed(), report.share(own)) == (4, 3, 0.75)
+    assert (own.counted(), own.killed(), mutation_report.share(own)) == (4, 3, 0.75)
     assert not own.wants(MUTANTS[0], 9, 0) and own.wants(MUTANTS[9], 9, 0)
     assert not own.wants(MUTANTS[9], 9, 5) and not own.wants(MUTANTS[9], 4, 0)
 
@@ -42,7 +42,7 @@ def test_what_the_compiler_would_refuse_counts_for_nothing() -> None:
 def test_results_hold_for_one_source_and_survivors_for_one_set_of_tests(
     tmp_path: Path,
 ) -> None:
-    kept = results.Results(tmp_path / "results.json", {})
+    kept = trial_results.Results(tmp_path / "results.json", {})
     own = kept.take("a.py", SOURCE, "tests", 1)
     own.add(MUTANTS[0], outcome(trial.FAILED))
     own.add(MUTANTS[1], outcome(trial.PASSED))
@@ -67,11 +67,11 @@ def test_results_hold_for_one_source_and_survivors_for_one_set_of_tests(
     ],
 )
 def test_a_change_is_its_tokens_and_their_neighbours(was: str, now: str, change: str) -> None:
-    assert report.describe_change(was, now) == change
+    assert mutation_report.describe_change(was, now) == change
 
 
 def test_a_reason_holds_for_a_change_in_a_function() -> None:
-    known = report.reasons(
+    known = mutation_report.reasons(
         "**Not a reason.** Text with `code` alone.\n\n**A bound that is\nrounded.**\n\n"
         "- `a.py`: `twice` `return a*2 → +`, `x → y`; `module`\n  `N=1 → 2`\n- `*`: `*` `any → all`\n\n**Other.**\n\n"
         "- `b.py`: `*` `(1) → 2`\n"
@@ -85,7 +85,7 @@ def test_a_reason_holds_for_a_change_in_a_function() -> None:
     }
 
     def found(file: str, function: str, was: str, now: str) -> str:
-        return report.reason_of(file, {"function": function, "was": was, "now": now}, known)
+        return mutation_report.reason_of(file, {"function": function, "was": was, "now": now}, known)
 
     assert found("server/a.py", "twice", "b * 2", "b + 2") == ""
     assert found("server/a.py", "twice", "return a * 2", "return a + 2") == "A bound that is rounded."
@@ -95,31 +95,33 @@ def test_a_reason_holds_for_a_change_in_a_function() -> None:
 
 
 def test_a_survivor_without_a_reason_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    kept = results.Results(tmp_path / "results.json", {})
+    kept = trial_results.Results(tmp_path / "results.json", {})
     own = kept.take("server/a.py", SOURCE, "tests", 1)
     for mutant in MUTANTS[1:]:
         own.add(mutant, outcome(trial.FAILED))
     own.add(MUTANTS[0], outcome(trial.PASSED))
     kept.save()
-    kept = results.load(kept.place)
-    change = report.describe_change(MUTANTS[0].was, MUTANTS[0].now)
+    kept = trial_results.load(kept.place)
+    change = mutation_report.describe_change(MUTANTS[0].was, MUTANTS[0].now)
     known = {("a.py", "twice", change): "It is so."}
-    assert report.verdict(kept, known, ["server/a.py"]) and not capsys.readouterr().err
-    text = report.report(kept, known)
+    assert mutation_report.verdict(kept, known, ["server/a.py"]) and not capsys.readouterr().err
+    text = mutation_report.report(kept, known)
     assert "| `server/a.py` | 12 | 11 | 0 | 0 | 1 | 92% | 0 |" in text and "**It is so.**" in text
-    assert not report.verdict(kept, {}, ["server/a.py"])
+    assert not mutation_report.verdict(kept, {}, ["server/a.py"])
     assert "survivor without a reason in MUTATION.md: server/a.py:3" in capsys.readouterr().err
-    assert not report.verdict(kept, known, ["server/b.py"]) and "not tried" in capsys.readouterr().err
+    assert (
+        not mutation_report.verdict(kept, known, ["server/b.py"]) and "not tried" in capsys.readouterr().err
+    )
 
 
 def test_every_reason_is_for_a_function_there_is() -> None:
-    known = report.reasons(report.REASONS.read_text())
+    known = mutation_report.reasons(mutation_report.REASONS.read_text())
     sources = {Path(name).name: (trial.ROOT / name).read_text() for name in TESTS}
     assert len(sources) == len(TESTS), "files are told apart by their names"
     assert len(known) > 100
     for file, function, _ in known:
-        assert file == report.ANY or file in sources, file
-        if function not in (report.ANY, report.MODULE):
+        assert file == mutation_report.ANY or file in sources, file
+        if function not in (mutation_report.ANY, mutation_report.MODULE):
             assert re.search(rf"^def {function}\(", sources[file], re.MULTILINE), (file, function)
 
 

@@ -19,7 +19,7 @@ TESTS = {
     "tests/unit/server/queries/test_collider.py": "",
     "tests/unit/server/kernels/test_spheres.py": "",
     "tests/unit/server/test_scene.py": "from solidcloud.server.queries import collide, distance",
-    "tests/unit/scripts/test_load.py": "load_script('simulate_cache')",
+    "tests/unit/scripts/test_loadtest.py": "load_script('simulate_cache')",
     "tests/end_to_end/test_wire.py": "text = Path('schemas/WIRE.md').read_text()",
 }
 PRODUCT = {
@@ -87,8 +87,8 @@ def test_a_changed_test_comes_first_and_a_helper_selects_its_users() -> None:
 
 def test_scripts_and_documents_select_the_tests_that_name_them() -> None:
     assert chosen("schemas/WIRE.md") == ["tests/test_layers.py", "tests/end_to_end/test_wire.py"]
-    assert chosen("scripts/simulate_cache") == ["tests/unit/scripts/test_load.py"]
-    assert chosen("scripts/load/traces.py") == ["tests/unit/scripts/test_load.py"]
+    assert chosen("scripts/simulate_cache") == ["tests/unit/scripts/test_loadtest.py"]
+    assert chosen("scripts/loadtest_cases/user_traces.py") == ["tests/unit/scripts/test_loadtest.py"]
     assert chosen("CHANGELOG.md") == []
 
 
@@ -98,7 +98,7 @@ def test_scripts_and_documents_select_the_tests_that_name_them() -> None:
         ("server/queries/collide.py", "solidcloud.server.queries.collide"),
         ("server/queries/__init__.py", "solidcloud.server.queries"),
         ("server/api/__init__.py", "solidcloud"),
-        ("scripts/load/traces.py", "load.traces"),
+        ("scripts/loadtest_cases/user_traces.py", "loadtest_cases.user_traces"),
         ("tests/support/clouds.py", "clouds"),
         ("scripts/setup", None),
     ],

@@ -1,0 +1,1 @@
+"""Parts of scripts/bench_effects: the cost of each effect, the sections and the picture."""

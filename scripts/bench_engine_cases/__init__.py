@@ -1,0 +1,1 @@
+"""Sections of scripts/bench_engine, one file each, and what they share."""

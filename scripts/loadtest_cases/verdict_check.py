@@ -1,0 +1,48 @@
+"""Check of a server's verdicts under load against a scene in this process with everything resident."""
+
+from pathlib import Path
+
+import numpy as np
+from solidcloud.builder.synthetic.figure import figure_points
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.report.walk.walkthrough import open_whole
+from solidcloud.server.scene import Scene
+
+from .frame_outcomes import ANSWERED, Frames
+from .user_process import AVATAR
+from .user_traces import Trace
+
+
+class Judge:
+    """Undisturbed scene, opened at the first query, closed by `close`."""
+
+    def __init__(self, archive: Path, points: int) -> None:
+        """Create the judge. points: of the avatar."""
+        self._archive, self._points = archive, points
+        self._scene: Scene | None = None
+
+    def verdicts(self, trace: Trace) -> np.ndarray:
+        """Return the true verdict of each pose (n,), in one call per user."""
+        if self._scene is None:
+            self._scene = open_whole(self._archive)
+            self._scene.add_avatar(AVATAR, figure_points(self._points))
+        found = np.full(len(trace.user), -1)
+        for user in np.unique(trace.user):
+            own = trace.user == user
+            found[own] = self._scene.collide(AVATAR, trace.pose[own]).verdict
+        return found
+
+    def close(self) -> None:
+        """Close the scene, if it is open."""
+        scene, self._scene = self._scene, None
+        if scene is not None:
+            scene.close()
+
+
+def wrong(frames: Frames, truth: np.ndarray) -> np.ndarray:
+    """Return the numbers of frames whose verdict is neither `UNKNOWN` nor the true one.
+
+    Unanswered frames are ignored.
+    """
+    said = (frames.status == ANSWERED) & (frames.verdict != Verdict.UNKNOWN)
+    return np.flatnonzero(said & (frames.verdict != truth))

@@ -1,1 +1,0 @@
-"""Rogue clients: sessions that reach a server's port and forge, eavesdrop or impersonate."""

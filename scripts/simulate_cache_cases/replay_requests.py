@@ -1,0 +1,97 @@
+"""Requests of a replay: the town's voxels, and those that each request of a trace needs."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from loadtest_cases.user_traces import Centers
+from numpy.typing import NDArray
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
+
+# User id of sweeps, which belong to no user and have no position; duration of one sweep through all
+# voxels [s].
+NOBODY, SWEEP_SECONDS = -1, 10.0
+
+
+class Town(NamedTuple):
+    """Data of an archive that a simulation needs.
+
+    index: its voxels, in lattice steps.
+    voxel_steps: edge of a voxel.
+    origin (3,), step: of the lattice [m].
+    sizes: (v,) int64, bytes of each decoded voxel.
+    radius: of its largest sphere [m].
+    """
+
+    index: SceneIndex
+    voxel_steps: int
+    origin: NDArray[np.float64]
+    step: float
+    sizes: NDArray[np.int64]
+    radius: float
+
+    def neighbourhood(self, ahead: PrefetchOptions = PREFETCH_OPTIONS) -> UserTracks:
+        """Return a new motion prediction, without any user."""
+        return UserTracks(self.index, self.voxel_steps, self.origin, self.step, ahead)
+
+
+def town_of(archive: Archive, sizes: NDArray[np.int64]) -> Town:
+    """Return the data of an archive whose decoded voxels take `sizes` (v,) bytes."""
+    lattice, voxels = archive.header.lattice, archive.voxels
+    base = archive.coordinates * lattice.voxel_steps
+    index = SceneIndex(
+        voxels["key"].astype(np.uint64), base + voxels["low"], base + voxels["high"], archive.header.low,
+        archive.header.high,
+    )  # fmt: skip
+    origin = np.array(lattice.origin)
+    return Town(index, lattice.voxel_steps, origin, lattice.step, sizes, archive.header.radius)
+
+
+class Requests(NamedTuple):
+    """n requests and the voxels each needs.
+
+    asked: user, time and position of each.
+    rows: (n,) lists.
+    flat: all of them, in order.
+    request: the number of the request of each of `flat`.
+    first: (n,) bool, in the user's first second.
+    """
+
+    asked: Centers
+    rows: list[list[int]]
+    flat: NDArray[np.int64]
+    request: NDArray[np.int64]
+    first: NDArray[np.bool_]
+
+
+def requests_of(town: Town, asked: Centers) -> Requests:
+    """Return the voxels that each request of a trace needs, by one kernel call."""
+    starts, flat = town.neighbourhood().rows_in_reach(asked.center, asked.reach)
+    every, bounds = flat.tolist(), starts.tolist()
+    rows = [every[a:b] for a, b in pairwise(bounds)]
+    users, who = np.unique(asked.user, return_inverse=True)
+    began = np.full(len(users), np.inf)
+    np.minimum.at(began, who, asked.time)
+    return Requests(
+        asked, rows, flat, np.repeat(np.arange(len(rows)), np.diff(starts)), asked.time < began[who] + 1.0
+    )  # fmt: skip
+
+
+def with_sweeps(town: Town, asked: Centers, sweeps: int) -> Centers:
+    """Add sweeps through all voxels to a trace, evenly over its time.
+
+    Sweeps are scans in row order, by the user NOBODY.
+    """
+    voxels, seconds = len(town.sizes), float(asked.time[-1] - asked.time[0])
+    middle = (town.index.low + town.index.high) / 2 * town.step + town.origin
+    begin = asked.time[0] + seconds * (np.arange(sweeps) + 1) / (sweeps + 1)
+    time = (begin[:, None] + np.arange(voxels) * SWEEP_SECONDS / voxels).ravel()
+    swept = Centers(
+        np.full(len(time), NOBODY), time, np.tile(middle, (sweeps, 1)), np.zeros(len(time)),
+        np.ones(len(time), bool),
+    )  # fmt: skip
+    both = [np.concatenate(columns) for columns in zip(asked, swept, strict=True)]
+    order = np.argsort(both[1], kind="stable")
+    return Centers(*(column[order] for column in both))

@@ -1,6 +1,5 @@
 """Test scan lists: written, read back, edited by hand, invalid; and the files that a build opens."""
 
-import json
 import os
 import struct
 from pathlib import Path
@@ -8,51 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-import synthetic_scans
-import tomli_w
-from scan_formats import glb_document, glb_vertices, ptx_scan, write_e57, write_glb
+from scan_campaign import POSE, edit_list, read_points, write_campaign
+from scan_formats import glb_document, glb_vertices, write_e57, write_glb
 from solidcloud.builder.sources import scan_files
 from solidcloud.builder.sources.common.scan import library_errors, sha256_of
 from solidcloud.builder.sources.scan_files import inspect_scans, open_input_files
 from solidcloud.builder.sources.scan_list import ScanEntry, read_scan_list, write_scan_list
-from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
-from solidcloud.server.cli.main import run
-
-POSE = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A LAS, a PTX of two scans, an E57 that is damaged, a text, all below one folder."""
-    folder = tmp_path / "campaign"
-    (folder / "deep").mkdir(parents=True)
-    raw = np.random.default_rng(1).integers(0, 1000, (50, 3))
-    synthetic_scans.write_las(folder / "a.las", raw)
-    xyz = raw[:20] * 0.01 + 1
-    (folder / "b.ptx").write_text(ptx_scan(xyz, np.ones(20), POSE) + ptx_scan(xyz[:7], np.ones(7)))
-    path = write_e57(folder / "deep" / "c.e57", [{"columns": {f"cartesian{a}": xyz[:, 0] for a in "XYZ"}}])
-    data = bytearray(path.read_bytes())
-    data[-100] ^= 1
-    path.write_bytes(data)
-    synthetic_scans.write_xyz(folder / "deep" / "d.xyz", xyz)
-    return folder
-
-
-def points(inputs_: list[scan_files.InputFile]) -> np.ndarray:
-    blocks = [block.xyz for item in inputs_ for scan in item.scans for block in scan.blocks()]
-    return np.concatenate([np.empty((0, 3)), *blocks])
-
-
-def edit(path: Path, change: dict[str, Any], number: int = 0) -> None:
-    """Set fields of one scan of a list; None removes one."""
-    import tomllib
-
-    document = tomllib.loads(path.read_text())
-    document["scan"][number].update(change)
-    for name in [name for name, value in document["scan"][number].items() if value is None]:
-        del document["scan"][number][name]
-    path.write_text(tomli_w.dumps(document))
+    return write_campaign(tmp_path / "campaign")
 
 
 def test_headers_say_what_scans_there_are(folder: Path) -> None:
@@ -96,23 +62,23 @@ def test_paths_in_a_list_move_with_it(folder: Path, tmp_path: Path) -> None:
     assert 'path = "a.las"' in (folder / "scans.toml").read_text()
     folder.rename(tmp_path / "elsewhere")
     (item,) = open_input_files([tmp_path / "elsewhere" / "scans.toml"])
-    assert item.path == tmp_path / "elsewhere" / "a.las" and len(points([item])) == 50
+    assert item.path == tmp_path / "elsewhere" / "a.las" and len(read_points([item])) == 50
 
 
 def test_what_is_edited_is_what_is_built(folder: Path) -> None:
     path = folder / "scans.toml"
     write_scan_list(path, inspect_scans([folder / "a.las", folder / "b.ptx"]))
-    before = points(open_input_files([path]))
-    assert np.array_equal(before, points(open_input_files([folder / "a.las", folder / "b.ptx"])))
-    edit(path, {"units": "mm", "up": "y", "crs": "EPSG:2056"}, 0)
-    edit(path, {"pose": np.eye(4).tolist()}, 1)
-    edit(path, {"use": False}, 2)
+    before = read_points(open_input_files([path]))
+    assert np.array_equal(before, read_points(open_input_files([folder / "a.las", folder / "b.ptx"])))
+    edit_list(path, {"units": "mm", "up": "y", "crs": "EPSG:2056"}, 0)
+    edit_list(path, {"pose": np.eye(4).tolist()}, 1)
+    edit_list(path, {"use": False}, 2)
     las, ptx = open_input_files([path])
     x, y, z = before[:50].T
-    assert np.array_equal(points([las]), np.column_stack([x, -z, y]) * 0.001)
+    assert np.array_equal(read_points([las]), np.column_stack([x, -z, y]) * 0.001)
     assert (las.scans[0].crs, las.scans[0].units, las.scans[0].up) == ("EPSG:2056", "mm", "y")
     assert len(ptx.scans) == 1
-    turned = points([ptx])
+    turned = read_points([ptx])
     assert (
         np.abs(
             before[50:70] - np.column_stack([10 - turned[:, 1], 20 + turned[:, 0], 30 + turned[:, 2]])
@@ -125,13 +91,13 @@ def test_only_the_scans_that_are_listed_are_built(folder: Path) -> None:
     path = folder / "scans.toml"
     write_scan_list(path, [e for e in inspect_scans([folder / "b.ptx"]) if e.index == 1])
     (item,) = open_input_files([path])
-    assert [scan.index for scan in item.scans] == [1] and len(points([item])) == 7
+    assert [scan.index for scan in item.scans] == [1] and len(read_points([item])) == 7
 
 
 def test_faults_are_kept_for_all_of_them_to_be_named(folder: Path) -> None:
     (folder / "e.las").write_bytes(b"LASF")
     write_scan_list(folder / "scans.toml", inspect_scans([folder]))
-    edit(folder / "scans.toml", {"index": 5}, 2)
+    edit_list(folder / "scans.toml", {"index": 5}, 2)
     for paths, bad in (([folder], 2), ([folder / "scans.toml"], 3)):
         found = open_input_files(paths)
         faults = {item.path.name: item.fault for item in found if item.fault}
@@ -147,7 +113,7 @@ def test_a_header_says_where_a_broken_scan_was_unless_the_list_puts_it_elsewhere
     write_scan_list(folder / "scans.toml", inspect_scans([las]))
     assert np.array_equal(open_input_files([folder / "scans.toml"])[0].region, bounds)
     assert np.array_equal(open_input_files([las])[0].region, bounds)
-    edit(folder / "scans.toml", {"units": "ft"})
+    edit_list(folder / "scans.toml", {"units": "ft"})
     assert open_input_files([folder / "scans.toml"])[0].region is None
 
 
@@ -282,7 +248,7 @@ def test_a_wrong_edit_is_refused_by_file_scan_and_field(
 ) -> None:
     path = folder / "scans.toml"
     write_scan_list(path, inspect_scans([folder / "a.las"]))
-    edit(path, {field: value})
+    edit_list(path, {field: value})
     with pytest.raises(BadRequestError, match=message) as caught:
         read_scan_list(path)
     assert str(caught.value).startswith(f"{path}: ")
@@ -318,41 +284,11 @@ def test_a_mesh_is_sampled_in_metres_whatever_its_units(tmp_path: Path) -> None:
     corners = np.array([0, 1, 2, 0, 2, 3], "<u2")
     write_glb(tmp_path / "a.glb", glb_document(4, 6), glb_vertices(square) + corners.tobytes())
     write_scan_list(tmp_path / "scans.toml", inspect_scans([tmp_path / "a.glb"]))
-    edit(tmp_path / "scans.toml", {"units": "mm"})
-    xyz = points(open_input_files([tmp_path / "scans.toml"], 0.1))
+    edit_list(tmp_path / "scans.toml", {"units": "mm"})
+    xyz = read_points(open_input_files([tmp_path / "scans.toml"], 0.1))
     assert abs(len(xyz) - 400) <= 1
     # glTF has y up: the square in its xy plane stands upright, and its front looks to -y.
     assert (xyz[:, 1] == -0.001).all() and xyz[:, 2].max() <= 2 and xyz[:, 2].max() > 1.9
-
-
-def test_the_command_writes_a_list_and_names_broken_files(
-    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    assert run(["inspect", "."]) == 3
-    out, err = capsys.readouterr()
-    assert "5 scans in 4 files, 1 broken: 77 points and those of 1 scans" in out
-    assert "c.e57" in err and "checksum" in err
-    assert len(read_scan_list(folder / "scans.toml")) == 5
-    edit(folder / "scans.toml", {"use": False}, 3)
-    before = (folder / "scans.toml").read_bytes()
-    assert run(["inspect", "a.las"]) == 0
-    assert (folder / "scans.toml").read_bytes() == before and "was not changed" in capsys.readouterr().err
-    assert run(["inspect", "a.las", "-o", "scans.toml"]) == 2
-    assert run(["inspect", "a.las", "-o", "scans.toml", "--overwrite"]) == 0
-    assert len(read_scan_list(folder / "scans.toml")) == 1
-    assert run(["inspect", "nowhere"]) == 3
-
-
-def test_the_command_prints_json(
-    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    assert run(["inspect", "a.las", "b.ptx", "--json", "--sha256"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [entry["count"] for entry in found] == [50, 20, 7]
-    assert found[0]["sha256"] == sha256_of(folder / "a.las") and found[1]["pose"] == POSE.tolist()
-    assert not (folder / "scans.toml").exists()
 
 
 def test_the_crs_of_a_las_and_an_e57_is_in_the_list(folder: Path) -> None:
@@ -372,34 +308,3 @@ def test_the_crs_of_a_las_and_an_e57_is_in_the_list(folder: Path) -> None:
     columns = {f"cartesian{axis}": np.arange(3.0) for axis in "XYZ"}
     write_e57(folder / "p.e57", [{"columns": columns}], crs=wkt)
     assert inspect_scans([folder / "p.e57"])[0].crs == wkt
-
-
-def test_a_build_names_every_broken_file_on_a_line_of_its_own(
-    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    (folder / "e.las").write_bytes(b"LASF")
-    (folder / "deep" / "d.xyz").write_text("1 2 3\n4 5\n")  # broken behind what its header says
-    assert run(["build", ".", "-o", "archive", "--jobs", "1"]) == 3
-    lines = [line for line in capsys.readouterr().err.splitlines() if "expected" in line]
-    named = [next(name for name in ("c.e57", "d.xyz", "e.las") if name in line) for line in lines]
-    assert sorted(named) == ["c.e57", "d.xyz", "e.las"]
-    assert lines[0].startswith("error: ") and not (folder / "archive").exists()
-    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
-
-
-def test_a_build_may_leave_broken_files_out(
-    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    assert run(["inspect", "."]) == 3
-    edit(folder / "scans.toml", {"crs": "EPSG:2056", "up": "y"}, 0)
-    assert run(["build", "scans.toml", "-o", "archive", "--jobs", "1", "--skip-bad"]) == 0
-    assert "left out" in capsys.readouterr().err
-    with Archive(folder / "archive") as archive:
-        header = archive.header
-    assert header.points == 50 + 20 + 7 + 20 and header.unknown_everywhere
-    kept = {(Path(s.path).name, s.index): s for s in header.sources}
-    las, ptx, broken = kept["a.las", 0], kept["b.ptx", 0], kept["c.e57", 0]
-    assert (las.crs, las.up, las.units) == ("EPSG:2056", "y", "m") and (ptx.crs, ptx.up) == ("", "z")
-    assert np.array_equal(ptx.pose, POSE) and "checksum" in broken.fault

@@ -3,14 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import naive_objects
 import numpy as np
 import pytest
-from moving_bodies import INTERPRETED, Stage, at, ball, box, room, staged, touch
-from numpy.typing import NDArray
+from movable_objects import AVATARS, CRATE, LEAF, MOVING, USER, free_of, item, where
+from moving_bodies import INTERPRETED, at, ball, staged, touch
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
-from solidcloud.schemas.scene.scene_file import ObjectItem
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import EXACT
@@ -19,52 +17,14 @@ from solidcloud.server.runtime.stop_flag import StoppedError
 from solidcloud.server.simulation.world.bodies import Bodies
 from solidcloud.server.simulation.world.frame import Body
 
-COARSE = INTERPRETED
-USER = ball(0.2, 12 if COARSE else 60)
-CRATE = box(0.4, 0.4, 0.4, 0.17 if COARSE else 0.05, 0.1 if COARSE else 0.03)
-# A leaf of 2 cm, its hinge at the origin.
-LEAF = make_avatar(
-    box(0.8, 0.02, 0.8, 0.08 if COARSE else 0.02, 0.01).points + np.array([0.4, 0, 0]),
-    0.05 if COARSE else 0.01,
-)
-AVATARS = {"crate": CRATE, "leaf": LEAF}
-MOVING: list[AnyEffect] = [Stop(), Sweep(), Objects()]
-
-
-def item(name: str, pose: NDArray[np.float64], *, avatar: str = "crate", pushed: bool = True) -> ObjectItem:
-    return ObjectItem(name=name, avatar=avatar, pose=pose.tolist(), kind="pushed" if pushed else "kinematic")
-
-
-def where(stage: Stage, name: str) -> NDArray[np.float64]:
-    """The pose of an object now."""
-    pose: NDArray[np.float64] = stage.bodies.poses[stage.bodies.row_of(name, user=False)].copy()
-    return pose
-
-
-def free_of(stage: Stage, name: str) -> bool:
-    """Whether an object touches neither a user, nor another object, nor the scene."""
-    bodies, world = stage.bodies, stage.world
-    row = bodies.row_of(name, user=False)
-    model, pose = bodies.shapes[row].model, bodies.poses[row]
-    if world.collide(model, pose) != Verdict.CLEAR:
-        return False
-    return not any(
-        touch(model, pose, bodies.shapes[other].model, bodies.poses[other], bodies.origin)
-        for other in range(len(bodies.names))
-        if other != row
-    )
-
-
-# --- pushed -------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.interpreted
 def test_a_pushed_crate_stops_at_the_wall_and_the_user_behind_it(tmp_path: Path) -> None:
     with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
         body = stage.enter("c/u", USER, at(0))
         stops = 0
-        for _ in range(8 if COARSE else 40):
-            before, wish = body.pose[0, 3], body.pose[0, 3] + (0.4 if COARSE else 0.05)
+        for _ in range(8 if INTERPRETED else 40):
+            before, wish = body.pose[0, 3], body.pose[0, 3] + (0.4 if INTERPRETED else 0.05)
             begun = where(stage, "crate")[0, 3]
             moved = stage.go("c/u", at(wish))
             gone = where(stage, "crate")[0, 3] - begun
@@ -204,9 +164,6 @@ def test_who_stands_on_a_crate_is_on_the_ground_and_who_walks_along_a_leaf_slide
         assert body.pose[0, 3] > 0.1, "along it"
 
 
-# --- told ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.interpreted
 def test_a_door_blocks_until_it_is_opened(tmp_path: Path) -> None:
     """The leaf lies along x, its hinge at the origin; the user goes along y."""
@@ -296,130 +253,6 @@ def test_what_a_wish_told_is_restore_where_the_wish_is_refused(tmp_path: Path) -
         moved = stage.go("c/u", body.pose.copy())
         assert moved.verdict == Verdict.CLEAR and moved.objects is not None
         assert moved.objects.poses["door"] == at(0).tolist()
-
-
-# --- what they touch ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.interpreted
-def test_what_is_reported_to_touch_does_by_brute_force(tmp_path: Path) -> None:
-    rng = np.random.default_rng(8)
-    names = ["a", "b", "c"] if COARSE else ["a", "b", "c", "d", "e"]
-    objects = tuple(item(name, at(number), pushed=False) for number, name in enumerate(names))
-    found = set()
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
-        body = stage.enter("c/u", USER, at(0, 0, 5))
-        with stage.world as seen:
-            arrays, units = seen[0].data.arrays, seen[0].data.radius_units
-        lattice = np.rint((room() - arrays.origin) / arrays.step).astype(np.int64)
-        for _ in range(2 if COARSE else 12):
-            told = rng.choice(names, 2, replace=False).tolist()
-            places = {name: rng.uniform(-0.6, 0.6, 3) for name in told}
-            stage.bodies.place_objects(
-                {name: at(1.2 + x, y, z, heading=5 * x).tolist() for name, (x, y, z) in places.items()}
-            )
-            report = stage.go("c/u", body.pose.copy()).objects
-            assert report is not None
-            poses = np.array([where(stage, name) for name in names])
-            ones = [1] * len(names)
-            pairs = naive_objects.touching_pairs(
-                [CRATE.points] * len(names), [CRATE.radius] * len(names), poses, ones, ones, arrays.origin
-            )
-            scene = naive_objects.touching_scene(
-                lattice, arrays.step, np.full(len(lattice), units), [CRATE.points] * len(names),
-                [CRATE.radius] * len(names), poses, arrays.origin,
-            )  # fmt: skip
-            judged = [("", name) for name, touches in zip(names, scene, strict=True) if touches]
-            judged += [(names[i], names[j]) for i, j in pairs]
-            assert report.touching == judged
-            found |= {bool(one) for one, _ in judged}
-    assert COARSE or found == {False, True}
-
-
-@pytest.mark.interpreted
-def test_what_has_not_moved_is_not_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    objects = tuple(item(name, at(number), pushed=False) for number, name in enumerate("abc"))
-    with staged(tmp_path, [Objects()], avatars=AVATARS, objects=objects) as stage:
-        body = stage.enter("c/u", USER, at(0, 0, 5))
-        asked = []
-        collide = stage.world.collide
-
-        def counted(avatar: Any, *rest: Any) -> Verdict:
-            asked.append(avatar)
-            return collide(avatar, *rest)
-
-        monkeypatch.setattr(stage.world, "collide", counted)
-        for told, count in (({}, 3), ({}, 0), ({"b": at(1, 1).tolist()}, 1), ({"b": at(1, 1).tolist()}, 0)):
-            stage.bodies.place_objects(told)
-            stage.go("c/u", body.pose.copy())
-            assert len([avatar for avatar in asked if avatar is not USER]) == count
-            asked.clear()
-
-
-@pytest.mark.interpreted
-def test_what_moved_is_said_once_a_frame_is_done_and_not_lost_with_one_that_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    objects = (item("door", at(0, 1), avatar="leaf", pushed=False),)
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
-        body = stage.enter("c/u", USER, at(0, -1))
-        stage.go("c/u", at(0, -1))
-        there = at(0, 1.5).tolist()
-        stage.bodies.place_objects({"door": there})
-        with monkeypatch.context() as broken, pytest.raises(OSError, match="disk"):
-            broken.setattr(stage.world, "sweep", lambda *_: (_ for _ in ()).throw(OSError("disk")))
-            stage.go("c/u", at(0.1, -1))
-        assert np.array_equal(body.pose, at(0, -1))
-        for expected in ({"door": there}, {}):
-            moved = stage.go("c/u", at(0, -1))
-            assert moved.objects is not None and moved.objects.poses == expected
-
-
-def test_where_a_sweep_proved_the_scene_clear_only_objects_are_asked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(0, 1.5)),)) as stage:
-        body = stage.enter("c/u", USER, at(0))
-        stage.go("c/u", at(0))
-        asked = []
-        collide = stage.world.collide
-        monkeypatch.setattr(stage.world, "collide", lambda *what: asked.append(what) or collide(*what))
-        for _ in range(3):
-            stage.go("c/u", at(3))
-        assert 1.6 < body.pose[0, 3] < 1.8 and not asked
-        assert collide(USER, body.pose) == Verdict.CLEAR
-
-
-def test_what_touches_the_scene_is_asked_anew_of_other_archives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with staged(tmp_path, [Objects()], avatars=AVATARS, objects=(item("a", at(0), pushed=False),)) as stage:
-        stage.enter("c/u", USER, at(0, 0, 5))
-        stage.go("c/u", at(0, 0, 5))
-        monkeypatch.setattr(stage.world, "generations", lambda: (7,))
-        monkeypatch.setattr(stage.world, "collide", lambda *_: Verdict.CONTACT)
-        report = stage.go("c/u", at(0, 0, 5)).objects
-        assert report is not None and report.touching == [("", "a")]
-
-
-@pytest.mark.interpreted
-def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None:
-    found = []
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        rng = np.random.default_rng(4)
-        objects = (item("crate", at(0.6)), item("door", at(0.4, 0.6), avatar="leaf", pushed=False))
-        poses = []
-        with staged(tmp_path / folder, [*MOVING, Crowd()], avatars=AVATARS, objects=objects) as stage:
-            for number in range(2):
-                stage.enter(f"c/{number}", USER, at(-0.5, number))
-            for _ in range(2 if COARSE else 15):
-                stage.bodies.place_objects({"door": at(0.4, 0.6, heading=rng.uniform(0, 1)).tolist()})
-                for name in stage.users:
-                    stage.go(name, at(*rng.uniform(-1, 1, 3) * [1, 1, 0.1]))
-                poses.append(stage.bodies.poses.tobytes())
-        found.append(b"".join(poses))
-    assert found[0] == found[1]
 
 
 def test_objects_that_cannot_begin_are_refused_each_time_and_not_once() -> None:

@@ -1,4 +1,4 @@
-"""What the engine's tests share: archives of a few points, poses near them, and the judge's word on both."""
+"""Archives of a few points, poses near them, and their expected verdicts, for tests of the engine."""
 
 import math
 from pathlib import Path
@@ -12,12 +12,13 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.server.scene import Scene
 
-# 2^-10 m: metres times a power of two are exact in float64, so shifts and products of lattice points are too.
+# 2^-10 m. A product of metres and a power of two is exact in float64, and so are the shifts and
+# products of lattice points.
 BINARY_STEP = 2.0**-10
 
 
 class Case(NamedTuple):
-    """An archive and the points it was built of. points: (n, 3) float64 world [m]."""
+    """An archive and the points it was built from. points: (n, 3) float64, world [m]."""
 
     archive: Path
     points: NDArray[np.float64]
@@ -25,7 +26,7 @@ class Case(NamedTuple):
     def judge(
         self, avatar: NDArray[np.float64], radius: float, poses: NDArray[np.float64], margin: float = 0.0
     ) -> NDArray[np.bool_]:
-        """Whether the avatar touches under each pose, by the definition."""
+        """Return the expected contact (k,) of the avatar under each pose, by definition."""
         with Scene.open(self.archive) as scene:
             info = scene.info()
         found = (self.points, np.array(info.origin), info.lattice_step, info.radius)
@@ -49,7 +50,7 @@ def ask(
     margin: float = 0.0,
     **options: Any,
 ) -> NDArray[np.uint8]:
-    """The verdicts (k,) of a scene opened for this one question."""
+    """Return the verdicts (k,) of a scene that is opened for this one query."""
     with Scene.open(case.archive, **options) as scene:
         scene.add_avatar("avatar", avatar, radius)
         answers = scene.collide("avatar", poses, margin)
@@ -58,7 +59,7 @@ def ask(
 
 
 def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A rotation (3, 3), uniform: of a unit quaternion with four normal components."""
+    """Return a random rotation (3, 3), uniform: that of a unit quaternion with four normal components."""
     q = rng.normal(size=4)
     w, x, y, z = q / np.linalg.norm(q)
     return np.array(
@@ -71,7 +72,7 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def pose_of(turn: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pose (4, 4) of a 3x3 matrix and a translation."""
+    """Return the pose (4, 4) of a rotation (3, 3) and a translation."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, shift
     return pose
@@ -85,7 +86,7 @@ def near_poses(
     farthest: float,
     scale: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Poses (count, 4, 4) that put some avatar point within `farthest` [m] of some scan point."""
+    """Return poses (count, 4, 4) that put an avatar point within `farthest` [m] of a scan point."""
     poses = []
     for _ in range(count):
         turn = random_rotation(rng) * scale
@@ -99,7 +100,10 @@ def near_poses(
 def least_reach(
     case: Case, avatar: NDArray[np.float64], pose: NDArray[np.float64], origin: Any, step: float
 ) -> tuple[int, bool]:
-    """The least reach, in exact units, at which a pose is contact, and whether the nearest pair is then tangent."""
+    """Return the least reach, exact units, at which a pose is in contact.
+
+    Also returns whether the nearest pair is then tangent.
+    """
     b = naive.scan_units(naive.lattice_of(case.points, origin, step), step)
     square = naive.least_square(naive.placed_units(avatar, pose, origin), b)
     root = math.isqrt(square)

@@ -1,4 +1,4 @@
-"""Archives that are changed: scans to add and remove, archives of some of them, and what is held against each other."""
+"""Scans to add and remove, archives of some of them, and comparisons, for tests of changed archives."""
 
 import shutil
 from collections.abc import Callable
@@ -21,11 +21,11 @@ EVERYTHING = frozenset({"scan", "intensity"})
 
 
 def cloud(kind: str, seed: int, count: int) -> NDArray[np.float64]:
-    """Points on the lattice, so that no build moves them, off its border."""
+    """Return points on the lattice, away from its border, so that no build moves them."""
     return np.round(0.25 + 0.75 * synthetic_scans.make_scan(kind, seed, count), 3)
 
 
-# The corner makes the origin of every lattice the same. B lies in some voxels of A, and in new ones.
+# The corner gives every lattice the same origin. B lies partly in voxels of A, partly in new ones.
 A = np.vstack([[[0.0, 0, 0]], cloud("corner", 1, 900)])
 B = np.vstack([cloud("noise", 2, 150) * [0.5, 0.5, 0.5], [[2.6, 2.6, 2.6], [-0.0, 0.0, 0.0]]]).round(3)
 C = cloud("pillar", 3, 300) + np.array([0.75, 0, 0])
@@ -41,7 +41,7 @@ class Files(NamedTuple):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    """A, B and C, with intensities."""
+    """Write A, B and C with intensities."""
     folder = tmp_path_factory.mktemp("scans")
     rng = np.random.default_rng(9)
     return Files(
@@ -59,7 +59,7 @@ Build = Callable[..., Path]
 
 @pytest.fixture(scope="module")
 def built(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """Builds archives of some scans, each once, and copies them."""
+    """Builder of archives of some scans: builds each archive once and returns copies."""
     kept: dict[Any, Path] = {}
 
     def build(target: Path, which: str, **options: Any) -> Path:
@@ -75,7 +75,10 @@ def built(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Build:
 
 
 def content(folder: Path) -> dict[int, dict[str, bytes]]:
-    """The bytes of every record's columns by key, scan_index as the paths of the scans."""
+    """Return the bytes of every record's columns by voxel key.
+
+    scan_index is replaced by the paths of the scans.
+    """
     found = {}
     with Archive(folder) as archive:
         names = [Path(source.path).name for source in archive.header.sources]
@@ -98,7 +101,7 @@ def content(folder: Path) -> dict[int, dict[str, bytes]]:
 
 
 def all_points(folder: Path) -> NDArray[np.float64]:
-    """Every point of an archive, sorted."""
+    """Return every point of an archive, sorted."""
     with Archive(folder) as archive:
         lattice = archive.header.lattice
         parts = [
@@ -110,18 +113,18 @@ def all_points(folder: Path) -> NDArray[np.float64]:
 
 
 def sort_points(*clouds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points of several scans in the order of `all_points`."""
+    """Return the points of several scans, in the order of `all_points`."""
     xyz = np.concatenate(clouds).round(3) + 0.0
     return xyz[np.lexsort(xyz.T)]
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder and what is in it."""
+    """Return the path and content of every file below a folder."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def same_scene(one: Path, other: Path) -> None:
-    """Assert that two archives hold the same: points, trees, counts, bounds, distances."""
+    """Assert that two archives hold the same points, trees, counts, bounds and distances."""
     assert content(one) == content(other)
     with Archive(one) as first, Archive(other) as second:
         a, b = first.header, second.header
@@ -143,7 +146,7 @@ MODELS = [
 
 
 def refused(target: Path, error: type[Exception], match: str, change: Callable[[], ChangeSummary]) -> None:
-    """Assert that a change is refused, and that nothing is left of it."""
+    """Assert that a change is refused and leaves nothing behind."""
     before = snapshot(target.parent)
     with pytest.raises(error, match=match):
         change()

@@ -1,6 +1,6 @@
-"""Archives with bits flipped, as a disk or a memory that is failing does: no checksum is computed anew.
+"""Archives with flipped bits, as a failing disk or memory causes them; checksums are not recomputed.
 
-An answer of a flipped archive is that of the archive as it was built, or unknown, or the archive is refused.
+A flipped archive must be refused, or give the answers of the original archive or `unknown`.
 """
 
 import shutil
@@ -15,26 +15,26 @@ from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
 from solidcloud.server.scene import Scene
 
 REACH = 0.1
-# Most flips are single; of a burst, so many at most lie within 64 bytes.
+# Most flips are single. The flips of a burst, at most this many, lie within 64 bytes.
 MOST_FLIPS = 8
 
 
 class Truth(NamedTuple):
-    """The answers of the archive as it was built."""
+    """The answers of the original archive."""
 
     verdict: NDArray[np.uint8]
     distance: DistanceAnswers
 
 
 def true_answers(template: Template) -> Truth:
-    """Ask the archive as it was built."""
+    """Query the original archive."""
     with Scene.open(template.folder, budget_bytes=32 << 20) as scene:
         scene.add_avatar("a", AVATAR, AVATAR_RADIUS)
         return Truth(scene.collide("a", template.poses).verdict, scene.distance("a", template.poses, REACH))
 
 
 def flip(template: Template, seed: int, number: int, folder: Path) -> str:
-    """Write case `number` into `folder`; returns the name of the file that was flipped."""
+    """Write case `number` into `folder`; return the name of the flipped file."""
     rng = np.random.default_rng([seed, number, 1])
     shutil.copytree(template.folder, folder)
     files = [folder / "index.h5", *sorted((folder / "shards").iterdir())]
@@ -49,7 +49,7 @@ def flip(template: Template, seed: int, number: int, folder: Path) -> str:
 
 
 def judge_flip(truth: Truth, template: Template, folder: Path, name: str) -> Outcome:
-    """Open and ask; raises what should not be raised."""
+    """Open and query a flipped archive. Raises an error if it fails in a way that it must not."""
     try:
         scene = Scene.open(folder, budget_bytes=32 << 20)
     except FormatError as refused:

@@ -1,8 +1,9 @@
-"""Archives with numbers changed by somebody who computes the checksums anew, and what becomes of each.
+"""Archives with changed numbers and recomputed checksums, and the outcome of reading each.
 
-A mutation changes one number, or two, of the index or of a record. Bounds, sums of points and counts of leaf nodes are
-made to fit in half of the cases, so that one guard does not hide the others. Each archive is opened, validated with
-`deep`, and asked about poses; brute force over the points that its records hold is the judge (naive.py).
+A mutation changes one or two numbers of the index or of a record. In half of the cases, bounds,
+sums of points and counts of leaf nodes are adjusted, so that one check does not hide the others.
+Each archive is opened, validated with `deep` and queried. The expected verdicts come from brute
+force over the points in its records (naive.py).
 """
 
 import shutil
@@ -29,14 +30,14 @@ from zstandard import ZstdError
 POSES = 200
 AVATAR = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.02], [0.0, 0.08, 0.0]])
 AVATAR_RADIUS = 0.01
-# Bounds in a record are checked by `validate --deep` alone (FORMAT.md, "What a reader cannot find").
+# Only `validate --deep` checks the bounds in a record (FORMAT.md, "What a reader cannot find").
 ENCLOSING = ("nodes.center", "nodes.radius", "nodes.normal", "nodes.slab", "points.xyz", "nodes.block_low")
 ENCLOSING_TOO = ("nodes.axis", "cells.low", "cells.log2_size")
 RADIUS = 0.02
 
 
 class Template(NamedTuple):
-    """An archive to be changed. poses: (POSES, 4, 4).  points: of each voxel, (n, 3) int64 [voxel steps]."""
+    """Archive to be changed. poses: (POSES, 4, 4).  points: of each voxel, (n, 3) int64 [voxel steps]."""
 
     folder: Path
     index: RawIndex
@@ -45,10 +46,11 @@ class Template(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a case.
+    """Outcome of a case.
 
-    name: of what was changed.  outcome: one of GOOD, or a fault. "found": by validate, and nothing wrong was served.
-    unknown: verdicts.
+    name: of what was changed.
+    outcome: one of GOOD, or a fault. "found": validate found the change, and no answer was wrong.
+    unknown: number of unknown verdicts.
     """
 
     name: str
@@ -83,7 +85,7 @@ def make_template(folder: Path, classes: bool) -> Template:
 
 
 def numeric_fields(columns: Columns) -> list[str]:
-    """The names of all numbers of an index and of a record."""
+    """Return the names of all numbers of an index and of a record."""
     names = []
     for name, column in columns.items():
         if name == "texts":
@@ -98,7 +100,7 @@ def numeric_fields(columns: Columns) -> list[str]:
 
 
 def _changed(rng: np.random.Generator, values: NDArray) -> None:
-    """Change one of some numbers, or all of them, in place."""
+    """Change one number, or all of them, in place."""
     flat = values.reshape(-1)
     at = slice(None) if rng.random() < 0.15 else int(rng.integers(len(flat)))
     how = int(rng.integers(9))
@@ -130,7 +132,7 @@ def _changed(rng: np.random.Generator, values: NDArray) -> None:
 
 
 def _make_fit(rng: np.random.Generator, columns: Columns) -> None:
-    """Make sums and bounds of the dataset those of the voxels, as a careful forger does."""
+    """Adjust the sums and bounds of the dataset to those of the voxels, as a careful forger does."""
     voxels = columns["voxels"]
     points = int(voxels["rows"][:, 2].sum(dtype=np.int64))
     columns["points"][0] = points
@@ -163,7 +165,7 @@ def _mutate(rng: np.random.Generator, folder: Path, columns: Columns, name: str)
 
 
 def mutate(template: Template, seed: int, number: int, folder: Path) -> str:
-    """Write case `number` into `folder`; returns the names of what was changed."""
+    """Write case `number` into `folder`; return the names of what was changed."""
     rng = np.random.default_rng([seed, number])
     shutil.copytree(template.folder, folder)
     index = template.index
@@ -192,7 +194,10 @@ def mutate(template: Template, seed: int, number: int, folder: Path) -> str:
 
 
 def _record_points(archive: Archive, row: int) -> NDArray[np.int64] | None:
-    """The points of a record (n, 3) [voxel steps], whatever the index says of where they are; None: not readable."""
+    """Return the points of a record (n, 3) [voxel steps]; None if it is not readable.
+
+    The position that the index gives does not matter.
+    """
     shape = archive._shape(row)._replace(bounds=None, classes=None, leaves=None)
     header = archive.header
     try:
@@ -205,7 +210,10 @@ def _record_points(archive: Archive, row: int) -> NDArray[np.int64] | None:
 
 
 def _truth(folder: Path, template: Template) -> Iterator[bool]:
-    """Whether each pose touches, by brute force over the points of the records; of unreadable ones those that were."""
+    """Return the contact of each pose, by brute force over the points of the records.
+
+    If a record is not readable, its original points are used.
+    """
     with Archive(folder) as archive:
         lattice, radius = archive.header.lattice, archive.header.radius
         parts = []
@@ -221,7 +229,7 @@ def _truth(folder: Path, template: Template) -> Iterator[bool]:
 
 
 def judge(template: Template, folder: Path, name: str) -> Outcome:
-    """Open, validate and ask; raises what should not be raised."""
+    """Open, validate and query an archive. Raises an error if it fails in a way that it must not."""
     try:
         faults = verify_archive(folder, deep=True).faults
     except FormatError as refused:

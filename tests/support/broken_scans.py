@@ -1,5 +1,8 @@
-"""Small good scans in every format, and what random damage makes of them: bytes changed, cut, repeated, numbers made
-extreme. E57 pages may get new checksums behind the damage, or none of it would be seen by what is behind them."""
+"""Small valid scans in every format, and random damage to them.
+
+Damage changes, cuts or repeats bytes, or makes numbers extreme. Damaged E57 pages may get new
+checksums, because the checksums would otherwise hide the damage from the code behind them.
+"""
 
 import re
 import struct
@@ -34,7 +37,7 @@ def _las(path: Path, xyz: np.ndarray, point_format: int) -> None:
 
 
 def _variable_laz(path: Path, xyz: np.ndarray) -> None:
-    """A LAZ whose chunks differ in size, as those of COPC do: of 1, 7 and all other points."""
+    """Return a LAZ whose chunks differ in size, as those of COPC do: 1, 7 and all other points."""
     plain = path.with_suffix(".las")
     _las(plain, xyz, 6)
     data = plain.read_bytes()
@@ -125,7 +128,8 @@ def _ptx(path: Path, xyz: np.ndarray) -> None:
     path.write_text(ptx_scan(xyz, light, POSE, 6) + ptx_scan(xyz[:9], light[:9]))
 
 
-# File name -> what writes it, of points (n, 3), n a multiple of 6, within 5 m of the origin, with three decimals.
+# Writer of each file. It gets points (n, 3), n a multiple of 6, within 5 m of the origin, with
+# three decimals.
 SEEDS: dict[str, Callable[[Path, np.ndarray], object]] = {
     "plain.las": lambda path, xyz: _las(path, xyz, 1),
     "new.las": lambda path, xyz: _las(path, xyz, 6),
@@ -153,7 +157,7 @@ SEEDS: dict[str, Callable[[Path, np.ndarray], object]] = {
 
 
 def write_seeds(folder: Path) -> dict[str, bytes]:
-    """All good files: name -> content. Written below `folder` on the way, which must exist."""
+    """Return all valid files: name -> content. They are also written below `folder`, which must exist."""
     xyz = np.random.default_rng(12).uniform(-5, 5, (COUNT, 3)).round(3)
     content = {}
     for name, write in SEEDS.items():
@@ -220,7 +224,10 @@ def _zeros(data: bytearray, rng: np.random.Generator) -> None:
 
 
 def _extreme(data: bytearray, rng: np.random.Generator) -> None:
-    """A number at the beginning, where headers are, or at the end, where LAZ and E57 have tables and XML."""
+    """Replace a number at the beginning or end of a file.
+
+    Headers are at the beginning; LAZ and E57 have tables and XML at the end.
+    """
     some = EXTREMES[int(rng.integers(len(EXTREMES)))]
     at = int(rng.integers(min(len(data), 512)))
     if rng.random() < 0.3:
@@ -229,14 +236,14 @@ def _extreme(data: bytearray, rng: np.random.Generator) -> None:
 
 
 def _text_number(data: bytearray, rng: np.random.Generator) -> None:
-    """One of the numbers written in text; of any file, for E57, PLY, PCD and GLB have headers in text."""
+    """Replace a number written as text, in any file: E57, PLY, PCD and GLB have headers in text."""
     found = list(NUMBER.finditer(bytes(data)))
     if found:
         match = found[int(rng.integers(len(found)))]
         data[match.start() : match.end()] = NUMBERS[int(rng.integers(len(NUMBERS)))]
 
 
-# Twice: what finds most.
+# Kinds listed twice find the most faults.
 DAMAGES = (
     *(_flip, _replace_bytes, _cut, _insert, _remove, _repeat, _zeros, _extreme, _text_number),
     *(_flip, _extreme, _text_number),
@@ -244,7 +251,10 @@ DAMAGES = (
 
 
 def mutate(name: str, data: bytes, rng: np.random.Generator) -> bytes:
-    """The content of a file after one to three kinds of damage; never empty. name: of the seed."""
+    """Return the content of a file after one to three kinds of damage; never empty.
+
+    name: of the valid file.
+    """
     broken = bytearray(data)
     e57 = name.endswith(".e57")
     for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
@@ -252,7 +262,8 @@ def mutate(name: str, data: bytes, rng: np.random.Generator) -> bytes:
         length = len(broken)
         damage(broken, rng)
         if e57 and damage is _text_number:
-            # What changed its length moved all behind it off its page: the next number takes up the difference.
+            # A change of length moves everything behind it off its page; the next number makes up
+            # the difference.
             del broken[length:]
             broken.extend(bytes(length - len(broken)))
         if not broken:
@@ -275,7 +286,7 @@ CRC32C = _crc_table()
 
 
 def with_checksums(data: bytes) -> bytes:
-    """An E57 file whose pages end in the checksums that fit them: CRC-32C, big-endian [ASTM E2807, 7]."""
+    """Return an E57 file whose pages end in matching checksums: CRC-32C, big-endian [ASTM E2807, 7]."""
     pages = []
     for begin in range(0, len(data) - PAGE + 1, PAGE):
         page = data[begin : begin + PAGE - 4]

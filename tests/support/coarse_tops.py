@@ -1,4 +1,4 @@
-"""Archives opened for the tests of coarse tops: what is resident, and what has a slot, is what a test says."""
+"""Archives opened for tests of coarse bounds, with chosen voxels resident and chosen slots filled."""
 
 import math
 from pathlib import Path
@@ -18,14 +18,15 @@ from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs
 from solidcloud.server.residency.voxel_store import VoxelStore
 
-# For the tops of all voxels of any scene here.
+# Large enough for the coarse bounds of all voxels of any scene here.
 ROOM = 1 << 25
 
 
 class Made(NamedTuple):
-    """An archive that is open. loaded: (v, 3) int64, where the voxels lie in the arena, all of them.
+    """An open archive. loaded: (v, 3) int64, offsets of all voxels in the arena.
 
-    arrays, broad: what kernels read; nothing is resident.  largest: radius of the largest sphere, exact units.
+    arrays, broad: arguments of kernels; no voxel is resident.
+    largest: radius of the largest sphere, exact units.
     """
 
     store: VoxelStore
@@ -38,33 +39,33 @@ class Made(NamedTuple):
 
     @property
     def voxels(self) -> int:
-        """How many there are."""
+        """Return the number of voxels."""
         return len(self.loaded)
 
     def resident(self, *rows: int) -> "Made":
-        """The same with these voxels resident, and no others."""
+        """Return the same archive with only these voxels resident."""
         where = np.full_like(self.loaded, -1)
         where[list(rows)] = self.loaded[list(rows)]
         return self._replace(arrays=self.arrays._replace(where=where))
 
     def remember(self, row: int) -> None:
-        """Keep the top of a voxel."""
+        """Store the coarse bounds of a voxel."""
         self.coarse.store_from_arena(row, self.arena, self.loaded[row])
 
     def fill(self, *but: int) -> None:
-        """Keep the tops of all voxels but these."""
+        """Store the coarse bounds of all voxels except these."""
         for row in set(range(self.voxels)) - set(but):
             self.coarse.store_from_archive(self.store, row)
 
     def top(self, row: int, coarse: CoarseBounds | None = None) -> NDArray[np.int32]:
-        """The rows (n, ROW_WORDS) of a voxel's slot, as they are."""
+        """Return the rows (n, ROW_WORDS) in a voxel's slot."""
         arrays = (coarse or self.coarse).arrays
         number = arrays.slot[row]
         assert number >= 0
         return arrays.ints.reshape(-1, MAX_SLOT_NODES, ROW_WORDS)[number, : arrays.count[number]].copy()
 
     def reach(self, avatar: AvatarModel, poses: NDArray[np.float64], margin: int = 0) -> VoxelsInReach:
-        """What the avatar could touch; margin: exact units."""
+        """Return the reach of the avatar. margin: exact units."""
         k = len(poses)
         reach = VoxelsInReach(
             np.empty(k),
@@ -82,7 +83,7 @@ class Made(NamedTuple):
     def settled(
         self, avatar: AvatarModel, poses: NDArray[np.float64], margin: int = 0
     ) -> tuple[list[list[int]], list[list[int]]]:
-        """The voxel rows in reach of each pose, and those of them that tops prove clear."""
+        """Return the voxel rows in reach of each pose, and those that coarse bounds prove clear."""
         reach = self.reach(avatar, poses, margin)
         found, count = drop_clear_pairs(self.arrays, self.coarse.arrays, avatar.arrays, poses, reach)
         before, left = rows_of(reach), rows_of(found)
@@ -93,13 +94,13 @@ class Made(NamedTuple):
 
 
 def rows_of(reach: VoxelsInReach) -> list[list[int]]:
-    """The voxel rows of each pose."""
+    """Return the voxel rows of each pose."""
     ends = zip(reach.starts[:-1], reach.starts[1:], strict=True)
     return [reach.rows[begin:end].tolist() for begin, end in ends]
 
 
 def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) -> Made:
-    """Open an archive and load all its voxels; with the spheres of a radius model."""
+    """Open an archive and load all its voxels, with the spheres of a radius model."""
     store = VoxelStore(folder)
     archive, header = store.archive, store.archive.header
     sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
@@ -135,7 +136,10 @@ def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) 
 
 
 def scattered(folder: Path) -> Made:
-    """Eight voxels with hierarchies of a few levels, some of fewer leaf nodes than a slot holds."""
+    """Return eight voxels with hierarchies of a few levels.
+
+    Some have fewer leaf nodes than a slot holds.
+    """
     points = synthetic_scans.make_scan("noise", 3, 2500) ** 2 / synthetic_scans.SIZE
     return open_made(archive_cases.build(folder, points, voxel=1.0, leaf=2, degree=3, cell_points=50).archive)
 
@@ -148,9 +152,10 @@ def least_margin(
     avatar: AvatarModel,
     pose: NDArray[np.float64],
 ) -> int:
-    """The least margin, exact units, at which an avatar is in contact with a voxel, by the definition; may be negative.
+    """Return the least margin, exact units, at which an avatar touches a voxel, by definition.
 
-    points: (p, 3) of the voxel [voxel steps]; radii: (p,) of their spheres, exact units.
+    The result may be negative.
+    points: (p, 3) of the voxel [voxel steps].  radii: (p,) of their spheres, exact units.
     """
     header = made.store.archive.header
     base = made.store.archive.coordinates[row] * header.lattice.voxel_steps

@@ -1,4 +1,4 @@
-"""What the tests of `contacts` share: archives of scans that keep their numbers, and answers against the judge."""
+"""Archives that store scan numbers, and the expected answers of `contacts`."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from solidcloud.server.residency.voxel_store import VoxelStore
 
 
 class ScanCase(NamedTuple):
-    """An archive, its points (n, 3) [m] and the number (n,) of the scan each came from, -1: not kept.
+    """An archive, its points (n, 3) [m] and the scan number (n,) of each; -1 if not stored.
 
     radii: (n,) of the points' spheres, exact units.
     """
@@ -44,7 +44,10 @@ def open_case(
     budget_bytes: int = 64 << 20,
     **options: Any,
 ) -> ScanCase:
-    """Build an archive of points spread over scans, none empty, in a new folder inside `folder`, and open it."""
+    """Spread points over scans, none empty; build and open their archive.
+
+    The archive lies in a new folder inside `folder`.
+    """
     number = sum(1 for _ in folder.iterdir())
     own = folder / str(number)
     own.mkdir()
@@ -56,7 +59,7 @@ def open_case(
     build_archive(paths, own / "archive", BuildConfig(keep=keep, **options))
     store = VoxelStore(own / "archive")
     data = make_scene_data(store.archive, VoxelCache(store, budget_bytes))
-    # The numbers that a user sees: rows of SceneInfo.sources.
+    # Scan numbers as users see them: rows of SceneInfo.sources.
     listed = [Path(source.path).name for source in describe(store, "scene").sources]
     rows = np.array([listed.index(path.name) for path in paths])
     radii = np.full(len(points), data.radius_units)
@@ -64,7 +67,10 @@ def open_case(
 
 
 def with_model(case: ScanCase, model: str | None) -> ScanCase:
-    """The case asked with a radius model; points that coincide have one class, as `classes.any_classes` gives them."""
+    """Return the case with a radius model.
+
+    Coinciding points share a class, as `classes.any_classes` assigns it.
+    """
     archive = case.store.archive
     stored, radii = radius_class_archives.stored_radii(archive.folder, model)
     of = dict(zip(map(tuple, stored.tolist()), radii.tolist(), strict=True))
@@ -74,7 +80,7 @@ def with_model(case: ScanCase, model: str | None) -> ScanCase:
 
 
 def tight(case: ScanCase, budget_bytes: int) -> ScanCase:
-    """The case with a cache of budget_bytes, empty."""
+    """Return the case with an empty cache of budget_bytes."""
     small = make_scene_data(case.store.archive, VoxelCache(case.store, budget_bytes))
     arrays = small.arrays._replace(radius_deficit=case.data.arrays.radius_deficit)
     return case._replace(data=small._replace(arrays=arrays, radius_units=case.data.radius_units))
@@ -90,7 +96,7 @@ def compare(
     cluster_distance: float | None = None,
     budget: QueryBudget = EXACT,
 ) -> ContactsAnswers:
-    """Ask, and compare every column with the judge, bit for bit. Returns the answers."""
+    """Query, and compare every column with the expected answers, bit for bit. Returns the answers."""
     model = make_avatar(avatar, radius)
     answers = contacts(case.data, model, poses, limit, margin, cluster_distance, budget)
     assert answers.exact.all() and not answers.voxels_missing.any()
@@ -107,7 +113,7 @@ def expect(
     margin: float,
     cluster_distance: float | None,
 ) -> None:
-    """Compare answers with the judge's."""
+    """Compare answers with the expected ones."""
     header = case.store.archive.header
     step, origin = header.lattice.step, np.array(header.lattice.origin)
     margin_units = round(margin * naive.UNITS)
@@ -147,10 +153,10 @@ def expect(
 
 
 def lattice_points(pairs: list[naive_contacts.Pair]) -> NDArray[np.int64]:
-    """The scan points (p, 3) of pairs, lattice."""
+    """Return the scan points (p, 3) of pairs, lattice."""
     return np.array([pair.point for pair in pairs], np.int64).reshape(-1, 3)
 
 
 def world(lattice: NDArray[np.int64], step: float, origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World positions of lattice points [m]."""
+    """Return the world positions of lattice points [m]."""
     return np.asarray(lattice * step + origin)

@@ -1,4 +1,4 @@
-"""Engine of `count_within`: every stored point of the voxels in reach is tested, in exact units."""
+"""Engine of `count_within`: tests every stored point of the voxels in reach, in exact units."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Declaration of a question that the product does not have: how many scan points lie within reach of each point."""
+"""Declaration of a query that the product does not have: scan points within reach of each point."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ class CountWithinRequest(QuestionRequest, frozen=True):
 class CountWithinAnswers(Cost, frozen=True, eq=False):
     """Answers of `count_within` for k points.
 
-    count: (k,) uint32, scan points found within reach.  exact: (k,) bool, there are no others.
+    count: (k,) uint32, number of scan points found within reach.  exact: (k,) bool, all were found.
     """
 
     verdict: NDArray[np.uint8]

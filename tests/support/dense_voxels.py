@@ -1,4 +1,4 @@
-"""One voxel spooled as runs, built in parts, and read back from its record."""
+"""A voxel spooled as runs, built in parts, and read back from its record."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ COLUMNS = {"scan_index": "<u2", "intensity": "<f4"}
 
 
 def spooled(folder: Path, rows: NDArray, steps: int, cuts: list[int]) -> Spool:
-    """A spool of one voxel in runs of the rows between the cuts."""
+    """Return a spool of one voxel, with one run of rows between each two cuts."""
     folder.mkdir()
     for number, part in enumerate(np.split(rows, cuts)):
         if len(part):
@@ -25,7 +25,7 @@ def spooled(folder: Path, rows: NDArray, steps: int, cuts: list[int]) -> Spool:
 
 
 def rows_of(points: NDArray[np.int32], *names: str) -> NDArray:
-    """Rows of the spool with some of the columns, of few values each."""
+    """Return rows of the spool with some of the columns, with few different values in each."""
     rng = np.random.default_rng(5)
     rows = np.zeros(len(points), [("local", "<i4", (3,)), *((name, COLUMNS[name]) for name in names)])
     rows["local"] = points
@@ -35,12 +35,12 @@ def rows_of(points: NDArray[np.int32], *names: str) -> NDArray:
 
 
 def hashed(local: NDArray[np.int32], _: range, times: int = 1) -> NDArray[np.uint8]:
-    """A radius class of each place."""
+    """Return a radius class for each position."""
     return (local.astype(np.int64) @ np.array([7919, 104729, 1299709]) % 32).astype(np.uint8)
 
 
 def decoded(built: BuiltVoxel, steps: int) -> VoxelData:
-    """The voxel of a record, through all checks of a reader."""
+    """Return the voxel of a record, after all checks of a reader."""
     record = built.record
     shape = RecordShape(record.cell_rows, record.node_rows, record.point_rows, voxel_point_dtype(built.voxel))
     frames = (bytes(record.cells), bytes(record.nodes), bytes(record.points))
@@ -50,7 +50,7 @@ def decoded(built: BuiltVoxel, steps: int) -> VoxelData:
 
 
 def assert_same(a: VoxelData, b: VoxelData) -> None:
-    """Two voxels, row for row."""
+    """Assert that two voxels are equal, row by row."""
     assert a.top_shift == b.top_shift
     for x, y in zip((*a.cells, *a.nodes, *a[4:]), (*b.cells, *b.nodes, *b[4:]), strict=True):
         assert (x is None) == (y is None)

@@ -1,4 +1,4 @@
-"""Frames for one effect at a time: a world of archives, a body, and the effect's report at a pose."""
+"""Frames of a single effect: a world of archives, a body, and the effect's report at a pose."""
 
 import os
 from pathlib import Path
@@ -18,7 +18,7 @@ from solidcloud.server.simulation.world.frame import Body, Frame
 
 
 class Counting:
-    """A world whose questions are counted, by name. reaches: of `distance`."""
+    """World that counts its queries by name. reaches: of `distance`."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -32,27 +32,27 @@ class Counting:
         self._world.__exit__(*what)
 
     def generations(self) -> tuple[int, ...]:
-        """As the world's."""
+        """Return the world's generations."""
         return self._world.generations()
 
     def count(self, visits: int, missing: int = 0) -> None:
-        """As the world's."""
+        """Return the world's count."""
         self._world.count(visits, missing)
 
     def distance(self, avatar: AvatarModel, pose: Any, reach: float, **how: Any) -> Any:
-        """Counted."""
+        """Count and delegate to the world."""
         self.asked["distance"] += 1
         self.reaches.append(reach)
         return self._world.distance(avatar, pose, reach, **how)
 
     def contacts(self, *what: Any, **how: Any) -> Any:
-        """Counted."""
+        """Count and delegate to the world."""
         self.asked["contacts"] += 1
         return self._world.contacts(*what, **how)
 
 
 def world_of(*scenes: Scene, poses: Any = ()) -> Counting:
-    """The world of opened archives. poses: of each, archive to world; left out: the identity."""
+    """Return the world of opened archives. poses: of each, archive to world; default: the identity."""
 
     archives = [
         placed(scene, pose) for scene, pose in zip(scenes, poses or [None] * len(scenes), strict=True)
@@ -62,7 +62,7 @@ def world_of(*scenes: Scene, poses: Any = ()) -> Counting:
 
 
 def placed(scene: Scene, pose: Any = None) -> Any:
-    """The first archive of a scene, as if it lay at a pose; None: the identity."""
+    """Return the first archive of a scene, placed at a pose; None: the identity."""
     archive, pose = scene.archives[0], archive_pose(pose)
     inverse = None if pose is None else inverse_pose(pose)
     return SimpleNamespace(take=archive.take, info=archive.info, pose=pose, inverse=inverse)
@@ -83,7 +83,7 @@ def flip_a_byte(archive: Path, voxel: tuple[int, int, int]) -> None:
 def report(
     runner: Any, world: Any, body: Body, pose: NDArray[np.float64], budget: QueryBudget = EXACT
 ) -> Any:
-    """What an effect says of a body at a pose, the world held as the pipeline holds it."""
+    """Return an effect's report of a body at a pose, with the world held as the pipeline holds it."""
     frame = Frame(body, pose, 1 / 30, world, budget, pose)
     with world:
         runner.run(frame)
@@ -93,5 +93,5 @@ def report(
 
 
 def body_of(avatar: AvatarModel) -> Body:
-    """A user that nothing is remembered of."""
+    """Return a user without history."""
     return Body("client/body", avatar, np.eye(4))

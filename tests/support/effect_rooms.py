@@ -1,4 +1,4 @@
-"""What the tests of motions by effects share: rooms of scan points, bodies in them, and frames."""
+"""Rooms of scan points, bodies in them, and frames, for tests of the effects that change motion."""
 
 import os
 from collections.abc import Iterator
@@ -19,14 +19,15 @@ from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# Spheres of the scan [m] and their spacing: closer than their size, so that walls have no holes; fewer interpreted.
+# Radius of the scan's spheres [m] and their spacing. The spacing is smaller than the spheres, so
+# that walls have no holes. Interpreted, there are fewer.
 RADIUS, APART = (0.03, 0.04) if not INTERPRETED else (0.12, 0.2)
 
 Points = NDArray[np.float64]
 
 
 def plane(low: tuple[float, float, float], high: tuple[float, float, float], apart: float = APART) -> Points:
-    """Points (n, 3) of an upright or level rectangle, both corners included."""
+    """Return points (n, 3) of an upright or level rectangle, with both corners."""
     sides = [
         np.linspace(a, b, round(abs(b - a) / apart) + 1) if a != b else np.array([a])
         for a, b in zip(low, high, strict=True)
@@ -35,7 +36,7 @@ def plane(low: tuple[float, float, float], high: tuple[float, float, float], apa
 
 
 def room(size: float, *, half: bool = False) -> Points:
-    """The six sides of a cube around the origin; half: with a thin wall across, at x = 0."""
+    """Return the six sides of a cube around the origin. half: with a thin wall across, at x = 0."""
     e = size / 2
     sides = [
         plane(tuple(low), tuple(high))
@@ -51,38 +52,38 @@ def room(size: float, *, half: bool = False) -> Points:
 
 
 def body_box(half: float = 0.15, radius: float = 0.08) -> AvatarModel:
-    """Spheres at the corners and in the middle of a cube."""
+    """Return spheres at the corners and in the middle of a cube."""
     corners = [[x, y, z] for x in (-half, half) for y in (-half, half) for z in (-half, half)]
     return make_avatar([[0.0, 0.0, 0.0], *corners], radius)
 
 
 def person(radius: float = 0.05) -> AvatarModel:
-    """A body 0.4 m wide and 1 m high, feet at the origin."""
+    """Return a body 0.4 m wide and 1 m high, with its feet at the origin."""
     heights = np.linspace(radius, 1.0 - radius, 6)
     side = np.linspace(-0.2 + radius, 0.2 - radius, 3)
     return make_avatar([[x, y, z] for z in heights for x in side for y in side], radius)
 
 
 def at(x: float, y: float, z: float, angle: float = 0.0) -> Points:
-    """A pose (4, 4) turned about z."""
+    """Return a pose (4, 4) rotated about z."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return archive_cases.pose_of(turn, np.array([x, y, z]))
 
 
 class Play(NamedTuple):
-    """A scene, and what happens in it."""
+    """A scene whose frames are simulated."""
 
     scene: Scene
     world: World
     pipeline: Pipeline
 
     def body(self, avatar: AvatarModel, pose: Points) -> Body:
-        """A body there."""
+        """Return a body at a pose."""
         return Body("client/avatar", avatar, pose.copy(), user=("client", "avatar"))
 
     def go(self, body: Body, way: Any, turn: Points | None = None, seconds: float = 1 / 30) -> Moved:
-        """A frame of a body that wishes to go by a way (3,) and to turn to a rotation (3, 3)."""
+        """Simulate a frame of a body. way: translation (3,).  turn: target orientation (3, 3)."""
         wish = body.pose.copy()
         wish[:3, 3] += np.asarray(way, np.float64)
         if turn is not None:
@@ -90,7 +91,7 @@ class Play(NamedTuple):
         return self.pipeline.run(body, wish, seconds)
 
     def touches(self, body: Body) -> bool:
-        """Whether a body touches what was scanned."""
+        """Return whether a body touches the scan."""
         with self.world:
             return int(self.world.collide(body.avatar, body.pose)) != 0
 
@@ -99,7 +100,7 @@ class Play(NamedTuple):
 def play(
     archive: Path, *effects: AnyEffect, limits: SceneLimits | None = None, **options: Any
 ) -> Iterator[Play]:
-    """An archive opened, with effects."""
+    """Open an archive with effects."""
     how = {name: options.pop(name) for name in ("up", "radius_model") if name in options}
     file = SceneFile(
         format=1,
@@ -115,7 +116,7 @@ def play(
 
 
 def build(folder: Path, points: Points, **options: Any) -> archive_cases.Case:
-    """An archive of points, spheres as large as `RADIUS`."""
+    """Build an archive of points, with spheres of radius `RADIUS`."""
     return archive_cases.build(
         folder, points, **({"voxel": 2.0, "resolution": 1e-4, "radius": RADIUS} | options)
     )

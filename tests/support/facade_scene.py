@@ -1,4 +1,4 @@
-"""The made façade as a scene with effects, served over zenoh, and a user who walks in it frame by frame."""
+"""The generated façade as a scene with effects, served over zenoh, and a user who walks in it."""
 
 import socket
 from collections.abc import Iterator
@@ -26,14 +26,17 @@ FRAME = 1 / 30
 def build_facade_archive(
     folder: Path, points: int, *, door: float = 1.6, models: tuple[str, ...] = ("mean",)
 ) -> tuple[Path, FacadeTruth]:
-    """The archive of a façade of so many points, and the truth about it."""
+    """Build the archive of a façade of this many points; return it with its ground truth."""
     made = make_facade(folder / "facade.laz", points=points, door=door)
     build_archive([folder / "facade.laz"], folder / "facade", BuildConfig(jobs=1, models=frozenset(models)))
     return folder / "facade", read_truth(made.truth).facades[0]
 
 
 def scene_text(archive: Path, effects: tuple[str, ...] = WALKING, **top: Any) -> str:
-    """A scene file with these effects, all as by default. top: other keys, as TOML has them."""
+    """Return a scene file with these effects, with default options.
+
+    top: other top-level keys, as TOML.
+    """
     lines = ["format = 1", *(f"{key} = {value}" for key, value in top.items())]
     lines += ["", "[[archives]]", f"path = '{archive}'"]
     for effect in effects:
@@ -44,7 +47,7 @@ def scene_text(archive: Path, effects: tuple[str, ...] = WALKING, **top: Any) ->
 def cylinder(
     width: float, height: float = 1.75, radius: float = 0.02, spacing: float = 0.03
 ) -> NDArray[np.float64]:
-    """Points of an upright cylinder that stands on z = 0, `width` across with its spheres [m]."""
+    """Return points of an upright cylinder on z = 0, of diameter `width` including its spheres [m]."""
     inner = width / 2 - radius
     around = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * inner / spacing)), endpoint=False)
     heights = np.linspace(radius, height - radius, round(height / spacing))
@@ -62,7 +65,7 @@ def cylinder(
 
 
 def standing(x: float, y: float, z: float, heading: float = 0.0) -> NDArray[np.float64]:
-    """The pose (4, 4) of a body that stands there, turned about z [rad]."""
+    """Return the pose (4, 4) of a standing body, rotated about z [rad]."""
     pose = np.eye(4)
     c, s = np.cos(heading), np.sin(heading)
     pose[:2, :2] = [[c, -s], [s, c]]
@@ -71,20 +74,20 @@ def standing(x: float, y: float, z: float, heading: float = 0.0) -> NDArray[np.f
 
 
 class Walker:
-    """A user whose wishes are sent one at a time, each waited for."""
+    """A user who sends one motion command at a time and waits for its result."""
 
     def __init__(self, session: Any) -> None:
         self.session, self.states = session, []
 
     def wish(self, **wish: Any) -> Moved:
-        """One frame."""
+        """Simulate one frame."""
         seq = self.session.wish(**wish)
         state = self.session.wait(seq, timeout=20.0)
         self.states.append(state)
         return state
 
     def to(self, start: NDArray[np.float64], end: NDArray[np.float64], speed: float = 1.5) -> Moved:
-        """Wish to be ever farther on the straight way between two poses of one heading, a frame at a time."""
+        """Move along the straight line between two poses of equal heading, one frame at a time."""
         way = end[:3, 3] - start[:3, 3]
         frames = max(1, int(np.ceil(np.linalg.norm(way) / (speed * FRAME))))
         for number in range(1, frames + 1):
@@ -94,37 +97,37 @@ class Walker:
         return self.states[-1]
 
     def go(self, velocity: tuple[float, float, float], seconds: float) -> Moved:
-        """Wish to go on at this velocity, for so long."""
+        """Move on at this velocity for this long."""
         for _ in range(round(seconds / FRAME)):
             self.wish(velocity=velocity, time=(len(self.states) + 1) * FRAME)
         return self.states[-1]
 
     @property
     def places(self) -> NDArray[np.float64]:
-        """Where the body was after each frame (k, 3) [m]."""
+        """Return the position of the body after each frame (k, 3) [m]."""
         return np.array([state.pose[0, :3, 3] for state in self.states])
 
 
 def _no_avatars(path: Path) -> NDArray[np.float64]:
-    """Nothing: these scenes have none of their own."""
+    """Return no avatars: these scenes have none of their own."""
     raise AssertionError(path)
 
 
 class Served(NamedTuple):
-    """A scene that is served, and a client of it."""
+    """A served scene and a client of it."""
 
     client: Client
 
     @contextmanager
     def walking(self, name: str, start: NDArray[np.float64]) -> Iterator[Walker]:
-        """A user whose body begins at `start`."""
+        """Return a user whose body begins at `start`."""
         with self.client.session(name) as session:
             walker = Walker(session)
             walker.wish(pose=start, time=0.0)
             yield walker
 
     def assert_clear(self, name: str, walker: Walker, **options: Any) -> None:
-        """No pose that was answered is in contact."""
+        """Assert that no pose among the results is in contact."""
         poses = np.concatenate([state.pose for state in walker.states])
         verdicts = self.client.collide(name, poses, **options).verdict
         assert (verdicts == Verdict.CLEAR).all(), f"frames {np.flatnonzero(verdicts).tolist()}"
@@ -132,7 +135,7 @@ class Served(NamedTuple):
 
 @contextmanager
 def serving_scene(folder: Path, text: str) -> Iterator[Served]:
-    """Serve a scene file of this text over zenoh, on loopback."""
+    """Serve a scene file with this text over zenoh on loopback."""
     (folder / "scene.toml").write_text(text)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

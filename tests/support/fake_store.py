@@ -1,4 +1,4 @@
-"""A store without files for the tests of residency: counts loads, waits and fails as it is told."""
+"""Store without files, for tests of residency: it counts loads, and waits and fails on demand."""
 
 import threading
 import time
@@ -12,14 +12,14 @@ from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 
 
 class FakeStore:
-    """Stand-in for a `VoxelStore`: what `VoxelCache` calls.
+    """Replacement for a `VoxelStore`: the methods that `VoxelCache` calls.
 
-    sizes: (v,) int64 [bytes].  loads: row -> times it was loaded.  faults: row -> how its loading fails.
+    sizes: (v,) int64 [bytes].  loads: row -> number of loads.  faults: row -> fault of its load.
     gate: loads wait until it is set.
     """
 
     def __init__(self, blocks: list[int]) -> None:
-        """Voxels of so many cache lines each."""
+        """Create voxels of these numbers of cache lines."""
         self.sizes = np.array(blocks, np.int64) * BLOCK
         self.loads: Counter[int] = Counter()
         self.faults: dict[int, str] = {}
@@ -28,7 +28,7 @@ class FakeStore:
         self.archive = self
 
     def where(self, row: int) -> str:
-        """Where a record lies, for messages."""
+        """Return the location of a record, for messages."""
         return f"file.h5: voxel {row}"
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
@@ -46,7 +46,7 @@ class FakeStore:
         return np.array([offset // 4, offset // 4, offset // 2], np.int64)
 
     def wait_for_load(self, row: int, seconds: float) -> bool:
-        """Whether a load of this row begins within so many seconds."""
+        """Return whether a load of this row begins within this many seconds."""
         deadline = time.monotonic() + seconds
         while not self.loads[row] and time.monotonic() < deadline:
             time.sleep(0.001)

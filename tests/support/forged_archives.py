@@ -1,4 +1,4 @@
-"""Archives changed by somebody who computes the checksums anew: fields of the index, rows of records, bombs."""
+"""Forged archives with correct checksums: changed fields and rows, compression bombs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ Columns = dict[str, NDArray]
 
 
 class RawIndex(NamedTuple):
-    """What an index says, unchecked."""
+    """The content of an index, unchecked."""
 
     version: int
     archive_id: bytes
@@ -24,14 +24,14 @@ class RawIndex(NamedTuple):
 
 
 def read_index(folder: Path) -> RawIndex:
-    """Read an index without any of the checks of a reader."""
+    """Read an index without the checks of a reader."""
     with h5py.File(folder / "index.h5") as file:
         columns = {name: file[name][()] for name in file}
         return RawIndex(int(file.attrs["format_version"]), file.attrs["archive_id"].tobytes(), columns)
 
 
 def write_index(folder: Path, index: RawIndex) -> None:
-    """Write an index, whatever it says, with the checksum of what it says."""
+    """Write an index of any content, with a correct checksum."""
     (folder / "index.h5").unlink(missing_ok=True)
     with h5py.File(folder / "index.h5", "w", libver=("v110", "v110")) as file:
         file.attrs["format"] = np.bytes_("solidcloud")
@@ -51,7 +51,7 @@ def forge(folder: Path, change: Callable[[Columns], None]) -> None:
 
 
 def row_types(columns: Columns) -> tuple[np.dtype, np.dtype, np.dtype]:
-    """The rows of cells, nodes and points of an archive."""
+    """Return the row types of the cells, nodes and points of an archive."""
     kept = columns["columns"].tolist()
     points = point_dtype(
         scan_index=bool(kept[0]),
@@ -63,7 +63,7 @@ def row_types(columns: Columns) -> tuple[np.dtype, np.dtype, np.dtype]:
 
 
 def read_rows(folder: Path, columns: Columns, voxel: int, i: int) -> NDArray:
-    """The rows of dataset i of a voxel."""
+    """Return the rows of dataset i of a voxel."""
     entry = columns["voxels"][voxel]
     data = (folder / "shards" / columns["shards"]["name"][entry["shard"]].decode()).read_bytes()
     begin = int(entry["frame_offset"][i])
@@ -74,7 +74,7 @@ def read_rows(folder: Path, columns: Columns, voxel: int, i: int) -> NDArray:
 
 
 def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) -> None:
-    """Put another frame behind the end of its shard, and make the index say so."""
+    """Append another frame to its shard, and let the index refer to it."""
     entry, shards = columns["voxels"][voxel], columns["shards"]
     number = int(entry["shard"])
     with open(folder / "shards" / shards["name"][number].decode(), "ab") as file:
@@ -86,12 +86,12 @@ def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) 
 
 
 def put_rows(folder: Path, columns: Columns, voxel: int, i: int, rows: NDArray) -> None:
-    """Put other rows in the place of a voxel's dataset i."""
+    """Replace the rows of dataset i of a voxel."""
     put_frame(folder, columns, voxel, i, pack(np.ascontiguousarray(rows)))
 
 
 def bomb(size: int) -> bytes:
-    """A frame with checksum that is as short as one of `size` zeros can be, 32,768 to 1."""
+    """Return a frame with a checksum that is as short as a frame of `size` zeros can be, 32,768 to 1."""
     compressor = zstandard.ZstdCompressor(level=19, write_checksum=True).compressobj(size=size)
     zeros, parts = bytes(1 << 20), []
     for begin in range(0, size, len(zeros)):

@@ -9,7 +9,8 @@ from pathlib import Path
 def freeze(pid: int, patience: float = 30.0) -> None:
     """Send SIGSTOP, and return once every thread of the process has stopped (Linux).
 
-    The signal arrives later than `os.kill` returns: on a busy machine the process answers one more query meanwhile.
+    The signal takes effect after `os.kill` returns: on a busy machine the process answers one more
+    query meanwhile.
     """
     os.kill(pid, signal.SIGSTOP)
     end = time.monotonic() + patience

@@ -1,4 +1,4 @@
-"""A small build of two scans, interrupted, and what is left of it."""
+"""A small interrupted build of two scans, and the files that it leaves."""
 
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,18 @@ def build(target: Path, scans: list[Path], **options: Any) -> BuildSummary:
 
 
 def content(archive: Path) -> dict[str, bytes]:
-    """Every file of an archive."""
+    """Return every file of an archive."""
     return {str(p.relative_to(archive)): p.read_bytes() for p in sorted(archive.rglob("*")) if p.is_file()}
 
 
 def done_folder(target: Path) -> Path:
-    """Where all is that a build has done that was interrupted."""
+    """Return the folder with the finished work of an interrupted build."""
     (folder,) = (path for path in building_folder(target).iterdir() if path.is_dir())
     return folder
 
 
 def two_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Two scans, one of which is read in three ranges; two shards are made of them."""
+    """Write two scans, one of which is read in three ranges; they become two shards."""
     monkeypatch.setattr(survey, "RANGE_POINTS", (100, 100))
     monkeypatch.setattr(build_limits, "SHARD_POINTS", 1000)
     raw = np.random.default_rng(2).integers(-1500, 1500, (250, 3))
@@ -42,7 +42,7 @@ def two_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 
 def interrupted(target: Path, scans: list[Path], monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
-    """A build that Ctrl-C stopped just before its shards."""
+    """Interrupt a build with Ctrl-C just before its shards."""
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "build_shards", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):

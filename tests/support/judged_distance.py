@@ -1,16 +1,16 @@
-"""Answers of `distance`, and of the bounded searches, held against what the judges say."""
+"""Comparison of answers of `distance`, and of the bounded searches, with expected ones."""
 
 import naive_distance
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 
-# Bounds are rounded outward, by some exact units of 2^-26 m.
+# Bounds are rounded outward by some exact units of 2^-26 m.
 ROUNDED = 2e-7
 
 
 def compare(answers: DistanceAnswers, expected: list[naive_distance.Expected | None], reach: float) -> None:
-    """Assert that answers are the judge's, to the last bit."""
+    """Assert that answers equal the expected ones, bit for bit."""
     assert answers.exact.all()
     for i, judged in enumerate(expected):
         found = (
@@ -29,7 +29,10 @@ def compare(answers: DistanceAnswers, expected: list[naive_distance.Expected | N
 def judge_distance(
     answers: DistanceAnswers, signed: NDArray[np.float64], reach: float, tolerance: float, ended: bool
 ) -> None:
-    """Assert what `distance` promises of true signed distances (k,), inf beyond reach; ended: not for its budget."""
+    """Assert the guarantees of `distance` for true signed distances (k,), inf beyond reach.
+
+    ended: the search ended for another reason than its budget.
+    """
     beyond = np.isinf(signed)
     assert (answers.lower <= np.where(beyond, reach, signed)).all() and (answers.upper >= signed).all()
     assert (answers.signed_distance >= signed).all() and (answers.signed_distance >= answers.upper).all()
@@ -47,7 +50,10 @@ def judge_distance(
 def judge_collide(
     answers: CollideAnswers, signed: NDArray[np.float64], margin: float, tolerance: float, ended: bool
 ) -> None:
-    """Assert what `collide` promises of true signed distances (k,), inf beyond reach and tolerance."""
+    """Assert the guarantees of `collide`.
+
+    Signed distances are the true ones (k,), inf beyond reach and tolerance.
+    """
     contact, verdict = signed <= margin, answers.verdict
     assert (answers.lower <= np.minimum(signed, margin)).all() and (answers.upper >= signed).all()
     assert contact[answers.exact & (verdict == Verdict.CONTACT)].all()

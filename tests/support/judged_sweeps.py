@@ -1,4 +1,4 @@
-"""What the tests of `sweep` share: a scene opened for it, and what the judge has to say about an answer."""
+"""Scenes, motions and expected answers for tests of `sweep`."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ CLOUDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point")
 
 
 def turned(rng: np.random.Generator, turn: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """A rotation turned by at most so many radians."""
+    """Return a rotation by at most this angle [rad]."""
     axis = rng.normal(size=3)
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -39,7 +39,10 @@ def motions(
     turn: float,
     scale: float = 1.0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Motions (count, 4, 4) twice that begin within `near` of some scan point, go some way and turn as they go."""
+    """Return first and last poses (count, 4, 4) of motions, most with rotation.
+
+    Each begins within `near` of some scan point.
+    """
     first = archive_cases.near_poses(rng, points, avatar, count, near, scale)
     last = first.copy()
     for pose in last:
@@ -52,7 +55,7 @@ def motions(
 def opened(
     case: archive_cases.Case, budget_bytes: int = 1 << 26, model: str | None = None
 ) -> Iterator[SceneData]:
-    """What `sweep` reads of an archive, with the radii of a model."""
+    """Return the arguments that `sweep` takes from an archive, with the radii of a model."""
     store = VoxelStore(case.archive)
     try:
         data = make_scene_data(store.archive, VoxelCache(store, budget_bytes))
@@ -70,18 +73,18 @@ def ask(
     last: NDArray[np.float64],
     **options: Any,
 ) -> SweepAnswers:
-    """The answers for motions from first to last (k, 4, 4)."""
+    """Return the answers for motions from first to last (k, 4, 4)."""
     return sweep(data, make_avatar(avatar, radius), first, last, **options)
 
 
 def moved(avatar: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """How far the avatar point that moves farthest lies apart under two poses [m]."""
+    """Return the largest displacement of an avatar point between two poses [m]."""
     apart = avatar @ (other[:3, :3] - one[:3, :3]).T + (other[:3, 3] - one[:3, 3])
     return float(np.linalg.norm(apart, axis=1).max())
 
 
 def radii_of(case: archive_cases.Case, data: SceneData, model: str | None) -> NDArray[np.float64]:
-    """The radius (n,) of each of the points a case was built of [m]: the same where they are in the same place."""
+    """Return the radius (n,) [m] of each of a case's points; equal for points at the same position."""
     stored, units = radius_class_archives.stored_radii(case.archive, model)
     found = dict(zip(map(tuple, stored.tolist()), units.tolist(), strict=True))
     lattice = naive.lattice_of(case.points, data.arrays.origin, data.arrays.step)
@@ -102,10 +105,10 @@ def judge(
     samples: int = 60,
     model: str | None = None,
 ) -> None:
-    """Assert of every answer that sampled poses, judged by brute force in integers, do not contradict it.
+    """Assert that no answer contradicts sampled poses, judged by brute force in integers.
 
-    model: of the radii that `data` was opened with. Samples lie evenly on the whole way, and closely before `lower`
-    and between the two bounds.
+    model: of the radii with which `data` was opened. Samples lie evenly on the whole motion, and
+    closely before `lower` and between the two bounds.
     """
     arrays = data.arrays
     radii = radii_of(case, data, model)

@@ -1,4 +1,4 @@
-"""What the tests of points left out share: two scans, two boxes, archives, scenes without the points in boxes."""
+"""Two scans and two boxes, and scenes without the points in the boxes, for tests of masked archives."""
 
 import hashlib
 from pathlib import Path
@@ -18,25 +18,28 @@ from solidcloud.server.simulation.effects.through_effect import store_without
 STEP = archive_cases.BINARY_STEP
 
 
-# Voxels of half a metre, points from 0 to 2 m an axis: 0.5 and 1 are borders between them.
+# Voxels of half a metre, points from 0 to 2 m on each axis: 0.5 and 1 are borders between voxels.
 OPTIONS: dict[str, Any] = {
     "voxel": 0.5, "resolution": STEP, "radius": 0.01, "jobs": 1, "leaf": 8, "degree": 3, "cell_points": 24,
     "models": frozenset({"mean", "local", "border"}), "keep": frozenset({"scan", "intensity", "normal"}),
 }  # fmt: skip
 BODY = np.array([[0.0, 0, 0], [0.11, 0, 0], [0.0, 0.21, 0], [0.05, 0.05, 0.1]])
-# The points that give every archive the same lattice and bounds, whatever is left out between them.
+# These points give every archive the same lattice and bounds, whatever is left out between them.
 ENDS = np.array([[0.0, 0, 0], [2.0, 2.0, 2.0]])
 DOOR = ThroughBox("door", (0.375, 0.25, 0.25), (0.625, 1.125, 0.875))
 ROOM = ThroughBox("room", (1.0, 1.0, 0.5), (1.5, 1.5, 1.0))
 
 
 def on_lattice(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points moved onto the lattice, so that no build moves them."""
+    """Return the points moved onto the lattice, so that no build moves them."""
     return np.rint(points / STEP) * STEP
 
 
 def two_scans() -> list[NDArray[np.float64]]:
-    """A scan of free points and one of a corner, some of them on the borders of the boxes and in both scans."""
+    """Return a scan of scattered points and a scan of a corner.
+
+    Some points lie on the borders of the boxes and in both scans.
+    """
     first = on_lattice(synthetic_scans.make_scan("noise", 5, 500))
     second = on_lattice(synthetic_scans.make_scan("corner", 6, 300))
     edges = np.array(
@@ -47,7 +50,7 @@ def two_scans() -> list[NDArray[np.float64]]:
 
 
 def in_boxes(points: NDArray[np.float64], boxes: tuple[ThroughBox, ...]) -> NDArray[np.bool_]:
-    """The rule, point by point, of an archive at the identity."""
+    """Return which points are in the boxes, point by point, for an archive at the identity."""
     return np.array(
         [
             any(all(low <= c <= high for low, c, high in zip(b.low, p, b.high, strict=True)) for b in boxes)
@@ -57,12 +60,13 @@ def in_boxes(points: NDArray[np.float64], boxes: tuple[ThroughBox, ...]) -> NDAr
 
 
 def build(folder: Path, parts: list[NDArray[np.float64]]) -> Path:
-    """An archive of scans whose points have classes by their place alone, and intensities by theirs."""
+    """Build an archive of scans whose points have classes and intensities by position alone."""
     folder.mkdir()
     files: list[Path] = []
     digests = [b""]
     for i, xyz in enumerate(parts):
-        # Scans are numbered by their files' hashes: points are turned round until these are in order.
+        # Scans are numbered by the hashes of their files: the points are rotated until the numbers
+        # are in order.
         for turn in range(64):
             points = np.roll(xyz, turn, axis=0)
             intensity = np.floor(points.sum(axis=1) * 64).astype(np.float32)
@@ -79,5 +83,5 @@ def build(folder: Path, parts: list[NDArray[np.float64]]) -> Path:
 
 
 def open_without(archive: Path, *boxes: ThroughBox, pose: Any = None, **options: Any) -> Scene:
-    """A scene without the points in the boxes."""
+    """Open a scene without the points in the boxes."""
     return Scene.open(archive, "hall", open_store=store_without(Through(list(boxes)), pose), **options)

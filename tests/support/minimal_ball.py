@@ -1,14 +1,17 @@
-"""The judge of tightness: how small a ball around a set of points can be at all. Plain numpy."""
+"""Lower bound on the radius of the smallest ball around points, in plain numpy."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 
 def radius_bound(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower bounds (b,) on the radius of the minimal ball of each block (b, n, 3), sharp to about 0.1 %.
+    """Return lower bounds (b,) on the radius of the minimal ball of blocks (b, n, 3).
 
-    Any convex weights w give one: sum(w |p|^2) - |sum(w p)|^2 <= radius^2 (the dual of the minimal ball). So
-    the judge is sure whatever the iteration (Frank and Wolfe, steps of 2 / (i + 3)) does on degenerate points.
+    They are sharp to about 0.1 %. Any convex weights w give a bound:
+    sum(w |p|^2) - |sum(w p)|^2 <= radius^2 (the dual of the minimal ball). The result is therefore
+    a
+    bound whatever the iteration (Frank and Wolfe, steps of 2
+    (i + 3)) does on degenerate points.
     """
     p = blocks - blocks.mean(axis=1, keepdims=True)
     squares = (p * p).sum(axis=2)

@@ -1,6 +1,7 @@
-"""Requests of every question, mixed, as bytes, and the replies' bytes with costs and times taken out.
+"""Mixed requests of every query as bytes, and the bytes of the replies without costs and times.
 
-python mixed_requests.py ARCHIVE COUNT prints a checksum of each reply: run in another process, they must be the same.
+python mixed_requests.py ARCHIVE COUNT prints a checksum of each reply. Another process must print
+the same.
 """
 
 import hashlib
@@ -36,7 +37,7 @@ from solidcloud.server.zenoh_server.server_config import ServerConfig
 
 SCAN = ("corner", 21, 500)
 MODELS = ("mean:1.5", "local", "border", "local+border:0.8", "fixed:0.004")
-# What depends on the clock and on what is resident: times and counters of the cache.
+# Columns that depend on the clock and on resident voxels: times and counters of the cache.
 COSTS = {
     "engine_seconds": 0.0,
     "wait_seconds": 0.0,
@@ -50,7 +51,7 @@ COSTS = {
 def question(
     rng: np.random.Generator, points: NDArray[np.float64], body: NDArray[np.float64]
 ) -> tuple[str, QuestionRequest]:
-    """Any question, exact or within a budget of visits, of the spheres of any radius model."""
+    """Return a request of any query, exact or with a budget of visits, with any radius model."""
     poses = archive_cases.near_poses(
         rng, points, body, int(rng.integers(1, 4)), 0.15, float(rng.choice([1.0, 0.5]))
     )
@@ -78,7 +79,7 @@ def question(
 
 
 def requests(count: int) -> list[tuple[str, bytes]]:
-    """Operations and payloads."""
+    """Yield operations and payloads."""
     rng = np.random.default_rng(25)
     body, points = rng.uniform(-0.15, 0.15, (12, 3)), synthetic_scans.make_scan(*SCAN)
     found = [("add_avatar", encode(AddAvatarRequest("body", body, 0.01), MSGPACK))]
@@ -91,7 +92,10 @@ def requests(count: int) -> list[tuple[str, bytes]]:
 def checksums(
     archive: Path, asked: Sequence[tuple[str, bytes]], threads: int, budget_bytes: int
 ) -> list[str]:
-    """A checksum of each reply's bytes, costs aside; the first request is answered before the others."""
+    """Return a checksum of the bytes of each reply without costs.
+
+    The first request is answered before all others.
+    """
     with Scene.open(archive, "scene", budget_bytes=budget_bytes) as scene:
         service = RequestDispatcher([scene], ServerConfig())
 

@@ -1,4 +1,4 @@
-"""What the tests of `crowd` and `objects` share: a scene of a floor and walls, frames of users, the judge of bodies."""
+"""A scene with a floor and walls, and frames of its users, for tests of `crowd` and `objects`."""
 
 import os
 from collections.abc import Iterator
@@ -24,11 +24,11 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 FLAT, HIGH = (0.1, 0.1) if not INTERPRETED else (0.2, 0.2)  # spacing of floor and walls [m]
 
 
-WALL = 0.12 if INTERPRETED else 0.06  # radius of their points: nothing slips between [m]
+WALL = 0.12 if INTERPRETED else 0.06  # radius of their points: no gaps [m]
 
 
 def room(side: float = 4.0, height: float = 1.0) -> NDArray[np.float64]:
-    """Points (n, 3) of a floor around the origin, at z = -0.5, and a wall at x = side / 2 [m]."""
+    """Return points (n, 3) of a floor around the origin, at z = -0.5, and a wall at x = side 2 [m]."""
     across = np.arange(-side / 2, side / 2 + FLAT / 2, FLAT)
     x, y = (axis.ravel() for axis in np.meshgrid(across, across))
     up, along = (axis.ravel() for axis in np.meshgrid(np.arange(0.0, height, HIGH), across))
@@ -38,7 +38,7 @@ def room(side: float = 4.0, height: float = 1.0) -> NDArray[np.float64]:
 
 
 def ball(radius: float = 0.2, count: int = 60) -> AvatarModel:
-    """Spheres of 4 cm on a sphere, `radius` to its outside [m]."""
+    """Return spheres of 4 cm on a sphere with outer radius `radius` [m]."""
     at = np.arange(count) + 0.5
     polar, around = np.arccos(1 - 2 * at / count), np.pi * (1 + 5**0.5) * at
     points = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], axis=1)
@@ -46,7 +46,7 @@ def ball(radius: float = 0.2, count: int = 60) -> AvatarModel:
 
 
 def box(x: float, y: float, z: float, spacing: float, radius: float) -> AvatarModel:
-    """The surface of a box around its origin, of so many metres a side with its spheres."""
+    """Return the surface of a box around its origin, with these side lengths including its spheres [m]."""
     sides = [
         np.linspace(-s / 2 + radius, s / 2 - radius, max(1, round((s - 2 * radius) / spacing) + 1))
         for s in (x, y, z)
@@ -59,13 +59,13 @@ def box(x: float, y: float, z: float, spacing: float, radius: float) -> AvatarMo
 
 
 def at(x: float, y: float = 0.0, z: float = 0.0, heading: float = 0.0) -> NDArray[np.float64]:
-    """The pose (4, 4) there, turned about z [rad]."""
+    """Return the pose (4, 4) at this position, rotated about z [rad]."""
     c, s = np.cos(heading), np.sin(heading)
     return archive_cases.pose_of(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), np.array([x, y, z], float))
 
 
 class Stage:
-    """Users in a scene, frame by frame, as a simulation has them."""
+    """Users in a scene, one frame at a time, as in a simulation."""
 
     def __init__(self, pipeline: Pipeline, world: World) -> None:
         self.pipeline, self.world = pipeline, world
@@ -78,20 +78,20 @@ class Stage:
         return found
 
     def enter(self, name: str, model: AvatarModel, pose: NDArray[np.float64]) -> Body:
-        """A user is there."""
+        """Add a user."""
         body = self.users[name] = Body(name, model, pose.copy())
         self.bodies[name] = body
         return body
 
     def go(self, name: str, wish: NDArray[np.float64], seconds: float = 1 / 30) -> Moved:
-        """One frame of one user."""
+        """Simulate one frame of one user."""
         body = self.users[name]
         moved = self.pipeline.run(body, wish, seconds)
         self.bodies[name] = body
         return moved
 
     def step(self, name: str, way: Any) -> Moved:
-        """One frame of a user who wishes to go some way [m]."""
+        """Simulate one frame of a user with this translation [m]."""
         wish = self.users[name].pose.copy()
         wish[:3, 3] += way
         return self.go(name, wish)
@@ -102,7 +102,7 @@ def staged(
     folder: Path, effects: list[AnyEffect], points: NDArray[np.float64] | None = None,
     avatars: dict[str, AvatarModel] | None = None, objects: tuple[ObjectItem, ...] = (),
 ) -> Iterator[Stage]:  # fmt: skip
-    """A scene with these effects, of the room where no points are given."""
+    """Open a scene with these effects; without points, it is the room."""
     case = archive_cases.build(folder, room() if points is None else points, voxel=1.0, radius=WALL)
     items = [AvatarItem(name=name, file=f"{name}.ply") for name in avatars or {}]
     file = SceneFile(
@@ -119,7 +119,7 @@ def touch(
     one: AvatarModel, pose: NDArray[np.float64], other: AvatarModel, there: NDArray[np.float64],
     origin: NDArray[np.float64], margin: float = 0.0,
 ) -> bool:  # fmt: skip
-    """Whether two bodies touch, by the definition, every pair of points."""
+    """Return whether two bodies touch, by definition: every pair of points."""
     reach = sum(int(np.rint(length * naive.UNITS)) for length in (one.radius, other.radius, margin))
     placed = [naive.placed_units(m.points, p, origin) for m, p in ((one, pose), (other, there))]
     return naive.touches(placed[0], placed[1], reach)

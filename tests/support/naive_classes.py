@@ -1,4 +1,4 @@
-"""The judge of radius classes: every point against every other, by the definition in schemas/FORMAT.md."""
+"""Radius classes by the definition in schemas/FORMAT.md: every point against every other."""
 
 from fractions import Fraction
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# The definition's figures, written out again.
+# The figures of the definition, repeated here.
 NEIGHBOURS = 24
 LOCAL_NEIGHBOUR = 12
 REACH = Fraction(362, 1000)
@@ -31,7 +31,7 @@ LADDER = [
 
 
 class Judged(NamedTuple):
-    """Of one point: its local class, whether it is on a rim, and whether it has too few neighbours for either."""
+    """Result for one point: its local class, rim or not, and whether it has too few neighbours."""
 
     local: int
     rim: bool
@@ -39,7 +39,10 @@ class Judged(NamedTuple):
 
 
 def closest_of(distinct: NDArray[np.int64], i: int, step: Fraction) -> list[tuple[int, ...]]:
-    """Offsets [steps] to the points that count for point i, nearest first, then by coordinates."""
+    """Return offsets [steps] to the points that count for point i.
+
+    They are sorted by distance, then by coordinates.
+    """
     apart = distinct - distinct[i]
     d2 = (apart**2).sum(axis=1)
     order = np.lexsort((apart[:, 2], apart[:, 1], apart[:, 0], d2))
@@ -48,12 +51,12 @@ def closest_of(distinct: NDArray[np.int64], i: int, step: Fraction) -> list[tupl
 
 
 def square(offset: tuple[int, ...]) -> int:
-    """The squared length."""
+    """Return the squared length."""
     return sum(c * c for c in offset)
 
 
 def judge_point(closest: list[tuple[int, ...]], step: Fraction) -> Judged:
-    """What these neighbours make of a point, in fractions."""
+    """Return the class of a point with these neighbours, in fractions."""
     n = len(closest)
     if n < LOCAL_NEIGHBOUR:
         return Judged(len(LADDER) - 1, False, True)
@@ -65,7 +68,7 @@ def judge_point(closest: list[tuple[int, ...]], step: Fraction) -> Judged:
 
 
 def judge(lattice: NDArray[np.int64], step: str) -> dict[tuple[int, ...], Judged]:
-    """Of each distinct point (n, 3) [steps]; step: decimal text [m]."""
+    """Return the classes of each distinct point (n, 3) [steps]. step: decimal text [m]."""
     distinct, size = np.unique(lattice, axis=0), Fraction(step)
     return {
         tuple(point): judge_point(closest_of(distinct, i, size), size)

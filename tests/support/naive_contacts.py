@@ -1,4 +1,4 @@
-"""The judge of `contacts`: every pair of points, in integers, sorted and gathered the plain way."""
+"""Contacts and clusters by brute force: every pair of points, in integers, sorted and grouped directly."""
 
 import math
 from itertools import product
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class Pair(NamedTuple):
-    """One pair in contact; in the order in which pairs are listed. Lattice point, exact units.
+    """A pair in contact, comparable in the order of the answers. Lattice point, exact units.
 
     gap: see `gap_key`.  reach: r_a + r_b + margin of this pair.
     """
@@ -25,17 +25,21 @@ class Pair(NamedTuple):
 
 
 def gap_key(square: int, reach: int) -> int:
-    """sqrt(square) - reach times 2^128, rounded down: as gaps compare, so do their keys, squares being below 2^62.
+    """Return sqrt(square) - reach times 2^128, rounded down.
 
-    Where two roots differ by a whole number other than 0 they are whole themselves, and nothing is rounded. Where they
-    do not, the difference is a root of a polynomial with whole coefficients: its conjugates, three of at most 2^33,
-    times itself are a whole number, so it is not below 2^-99.
+    Keys are ordered as the gaps, for squares below 2^62. If two roots differ by a whole number
+    other
+    than 0, both are whole and nothing is rounded. Otherwise, the difference is a root of a
+    polynomial
+    with integer coefficients: its product with its conjugates, three of at most 2^33, is an
+    integer. It
+    is therefore not below 2^-99.
     """
     return math.isqrt(square << 256) - (reach << 128)
 
 
 class Cluster(NamedTuple):
-    """One cluster: its deepest pair, its pairs, the box of its points [lattice]."""
+    """A cluster: its deepest pair, its pairs, the box of its points [lattice]."""
 
     deepest: Pair
     count: int
@@ -44,7 +48,10 @@ class Cluster(NamedTuple):
 
 
 def edge_steps(units: int, step: float) -> int:
-    """The edge of a grid cell of a cluster distance in exact units: rounded up to steps, but for its own rounding."""
+    """Return the edge of a grid cell [steps] for a cluster distance in exact units.
+
+    It is rounded up, except for its own rounding error.
+    """
     steps = units / (step * naive.UNITS)
     whole = round(steps)
     close = abs(steps - whole) <= 1e-9 * whole + 1 / (step * naive.UNITS)
@@ -60,9 +67,9 @@ def pairs_of(
     pose: NDArray[np.float64],
     reach: int | NDArray[np.int64],
 ) -> list[Pair]:
-    """All pairs within `reach` of scan points (n, 3) of scans (n,) and a placed avatar (m, 3), deepest first.
+    """Return all pairs of scan points (n, 3) and a placed avatar (m, 3) in reach, deepest first.
 
-    reach: r_a + r_b + margin, exact units, of all scan points or (n,) of each.
+    scans: (n,).  reach: r_a + r_b + margin, exact units, of all scan points or (n,) of each.
     """
     b, a = naive.scan_units(lattice, step), naive.placed_units(avatar, pose, origin)
     reaches = np.broadcast_to(np.asarray(reach, np.int64), len(b))
@@ -78,11 +85,14 @@ def pairs_of(
 
 
 def clusters_of(pairs: list[Pair], edge: int) -> tuple[list[Cluster], list[int]]:
-    """The clusters of sorted pairs, deepest first, and the number of each pair's: a search through grid cells."""
+    """Return the clusters of sorted pairs, deepest first, and each pair's cluster number.
+
+    The search goes through grid cells.
+    """
     cell_of = [tuple(c // edge for c in pair.point) for pair in pairs]
     touched, number = set(cell_of), {}
     count = 0
-    for start in cell_of:  # pairs come deepest first, and so do their clusters
+    for start in cell_of:  # pairs are sorted deepest first, and so are their clusters
         if start in number:
             continue
         number[start], queue = count, [start]
@@ -105,6 +115,9 @@ def clusters_of(pairs: list[Pair], edge: int) -> tuple[list[Cluster], list[int]]
 
 
 def signed_distance(square: int, radii: int) -> float:
-    """Of a pair, [m]: sqrt(square) - radii without cancellation, as `distance` defines it."""
+    """Return the signed distance of a pair [m], as `distance` defines it.
+
+    It is sqrt(square) - radii without cancellation.
+    """
     both = math.sqrt(float(square)) + float(radii)
     return float(square - radii * radii) / both / naive.UNITS if both else 0.0

@@ -1,4 +1,4 @@
-"""The judge of `distance`: the nearest pair by its definition, every pair of points, in Python's integers."""
+"""The nearest pair by definition: every pair of points, in Python's integers."""
 
 import math
 from decimal import Context, Decimal
@@ -8,13 +8,16 @@ import naive
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Two gaps sqrt(D) - R are equal or, their conjugates being below 2^40, differ by more than 2^-120: in 80 digits that
-# shows. Equal ones come out the same: roots that are no whole numbers differ by a whole number only where D is equal.
+# Two gaps sqrt(D) - R are equal or, because their conjugates are below 2^40, differ by more than
+# 2^-120, which 80 digits show. Equal gaps give equal numbers: roots that are not whole numbers
+# differ by a whole number only if D is equal.
 DIGITS = Context(prec=80)
 
 
 class Nearest(NamedTuple):
-    """The nearest pair of one pose. square: |a - b|^2 [exact units].  lattice: b [steps].  placed: a [exact units].
+    """The nearest pair of one pose.
+
+    square: |a - b|^2 [exact units]. lattice: b [steps]. placed: a [exact units].
 
     radius: of b's sphere [exact units].
     """
@@ -28,13 +31,18 @@ class Nearest(NamedTuple):
 def nearest(
     lattice: NDArray[np.int64], step: float, radii: NDArray[np.int64], placed: NDArray[np.int64]
 ) -> Nearest:
-    """The nearest pair of lattice points (n, 3) with radii (n,) and placed centres (m, 3), n, m > 0: that with least
-    |a - b| - radius; of those with equal ones that with the least lattice point, then the least placed centre."""
+    """Return the nearest pair of lattice points (n, 3) and placed centres (m, 3), n, m > 0.
+
+    It has the least |a - b| - radius, with radii (n,). Ties: the least lattice point, then the
+    least
+    placed centre.
+    """
     b = naive.scan_units(lattice, step)
     apart = (placed[:, None] - b).reshape(-1, 3)
     roots = np.sqrt((apart.astype(np.float64) ** 2).sum(axis=1))
     nearly = roots - np.tile(radii, len(placed))
-    # float64 is off by less than 10^-15 of a root: the least is among those within 10^-9 of the one that seems least.
+    # The error of float64 is below 10^-15 of a root: the least is among those within 10^-9 of the
+    # apparent least.
     at_least = nearly.argmin()
     found = []
     for at in np.flatnonzero(nearly <= nearly[at_least] + 1e-9 * (1.0 + roots[at_least])).tolist():
@@ -46,13 +54,16 @@ def nearest(
 
 
 def signed_distance(square: int, radii: int) -> float:
-    """The signed distance [m] of spheres whose centres are sqrt(square) apart, radii r_a + r_b, exact units."""
+    """Return the signed distance [m] of spheres.
+
+    Their centres are sqrt(square) apart, their radii r_a + r_b, exact units.
+    """
     both = math.sqrt(float(square)) + float(radii)
     return float(square - radii * radii) / both / naive.UNITS if both else 0.0
 
 
 class Expected(NamedTuple):
-    """What `distance` must answer for one pose; None instead where nothing is within reach. radii: r_a + r_b."""
+    """Expected answer of `distance` for one pose; None if nothing is within reach. radii: r_a + r_b."""
 
     signed: float
     witness_avatar: list[float]
@@ -72,7 +83,10 @@ def distance(
     poses: NDArray[np.float64],
     reach: float,
 ) -> list[Expected | None]:
-    """The nearest pair under each of the poses (k, 4, 4), to the last bit, of scan points (n, 3) [m] of one radius."""
+    """Return the exact nearest pair under each of the poses (k, 4, 4).
+
+    All scan points (n, 3) [m] have one radius.
+    """
     lattice = naive.lattice_of(points, origin, step)
     radii = np.full(len(lattice), np.rint(scan_radius * naive.UNITS)).astype(np.int64)
     return distance_by_radii(lattice, origin, step, radii, avatar, avatar_radius, poses, reach)
@@ -88,7 +102,10 @@ def distance_by_radii(
     poses: NDArray[np.float64],
     reach: float,
 ) -> list[Expected | None]:
-    """`distance` for lattice points (n, 3) that have each a radius (n,) [exact units]."""
+    """Return nearest pairs as `distance` does, for lattice points (n, 3) of several radii.
+
+    radii: (n,) [exact units].
+    """
     answers: list[Expected | None] = []
     for pose in poses:
         found = nearest(lattice, step, radii, naive.placed_units(avatar, pose, origin))

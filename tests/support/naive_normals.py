@@ -1,4 +1,4 @@
-"""Brute force for surface normals: covariance and eigenvectors with numpy, sums in Python's integers."""
+"""Surface normals by brute force: covariance and eigenvectors with numpy, sums in Python's integers."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 
 class Found(NamedTuple):
-    """Of one point. count: its neighbours, itself included.  values: (3,) eigenvalues, ascending, of trace 1.
+    """Result for one point.
 
-    normal: (3,) unit eigenvector of the least, either side.
+    count: its neighbours, including itself. values: (3,) eigenvalues, ascending, of trace 1.
+
+    normal: (3,) unit eigenvector of the least eigenvalue, of either sign.
     """
 
     count: int
@@ -18,13 +20,16 @@ class Found(NamedTuple):
 
 
 def neighbours(points: NDArray[np.int64], at: NDArray[np.int64], square: int) -> NDArray[np.int64]:
-    """Differences (n, 3) from `at` to the points within a square [steps]."""
+    """Return the differences (n, 3) from `at` to the points within a square [steps]."""
     away = points - at
     return away[(away.astype(object) ** 2).sum(axis=1) <= square]
 
 
 def find(points: NDArray[np.int64], at: NDArray[np.int64], square: int) -> Found | None:
-    """The surface through the points (n, 3) within a square [steps] of one; None: all in one place, or none."""
+    """Return the surface through the points (n, 3) within a square [steps] of a point.
+
+    Returns None if all coincide or there are none.
+    """
     away = neighbours(points, at, square)
     if not len(away) or not (away != away[0]).any():
         return None
@@ -34,5 +39,5 @@ def find(points: NDArray[np.int64], at: NDArray[np.int64], square: int) -> Found
 
 
 def angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Between two directions, either side of each [degrees]."""
+    """Return the angle between two directions, regardless of their signs [degrees]."""
     return float(np.degrees(np.arcsin(min(1.0, float(np.sqrt((np.cross(one, other) ** 2).sum()))))))

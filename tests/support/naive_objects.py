@@ -1,4 +1,4 @@
-"""The judge of objects: every pair of points of every pair of objects, in integers. Nothing but numpy and `naive`."""
+"""Contacts of objects by brute force: every pair of points of every pair of objects, in integers."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,10 @@ def touching_pairs(
     origin: ArrayLike,
     margin: float = 0.0,
 ) -> list[list[int]]:
-    """Pairs of objects in contact, lesser first, ascending. bodies: (m, 3) points of each object, avatar frame."""
+    """Return the pairs of objects in contact, lesser number first, ascending.
+
+    bodies: (m, 3) points of each object, avatar frame.
+    """
     placed = [naive.placed_units(body, pose, origin) for body, pose in zip(bodies, poses, strict=True)]
     units = [pair_radius(radius, pose) for radius, pose in zip(radii, poses, strict=True)]
     more = int(np.rint(margin * naive.UNITS))
@@ -40,23 +43,26 @@ def touching_scene(
     origin: ArrayLike,
     margin: float = 0.0,
 ) -> list[bool]:
-    """Which objects touch scan points (n, 3), lattice, each with its own radius (n,), exact units."""
+    """Return which objects touch scan points (n, 3), lattice, each with a radius (n,), exact units."""
     b, more = naive.scan_units(lattice, step), int(np.rint(margin * naive.UNITS))
     found = []
     for body, radius, pose in zip(bodies, radii, poses, strict=True):
         a, own = naive.placed_units(body, pose, origin), pair_radius(radius, pose) + more
-        # All points that have one radius at a time.
+        # All points of one radius at a time.
         found.append(any(_touch(a, b[scan_radii == r], own + int(r)) for r in np.unique(scan_radii)))
     return found
 
 
 def pair_radius(radius: float, pose: NDArray[np.float64]) -> int:
-    """A placed radius in exact units."""
+    """Return a placed radius in exact units."""
     return int(np.rint(naive.scale_of(pose) * radius * naive.UNITS))
 
 
 def _touch(a: NDArray[np.int64], b: NDArray[np.int64], reach: int) -> bool:
-    """Whether any pair is within reach; points outside the other's box and the reach are farther along one axis."""
+    """Return whether any pair is within reach.
+
+    Points outside the other's box enlarged by the reach are skipped.
+    """
     for _ in range(2):
         if not len(a) or not len(b):
             return False

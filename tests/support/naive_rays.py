@@ -1,6 +1,6 @@
-"""The judge of rays and loose points: every ray against every scan point, in plain numpy.
+"""Rays and points by brute force: every ray against every scan point, in plain numpy.
 
-Nothing of the project's own beside `naive`. Exact units, 2^-26 m, as there.
+Uses no code of the project except `naive`. Exact units of 2^-26 m, as there.
 """
 
 from fractions import Fraction
@@ -13,7 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class Hits(NamedTuple):
-    """Of k rays or points: distance (k,) [m], inf: none; row (k,) of the lattice point, -1; outside (k,)."""
+    """Results of k rays or points.
+
+    distance: (k,) [m], inf if none.  row: (k,) of the lattice point, -1 if none.  outside: (k,).
+    """
 
     distance: NDArray[np.float64]
     row: NDArray[np.int64]
@@ -21,14 +24,17 @@ class Hits(NamedTuple):
 
 
 def world_units(points: ArrayLike, origin: ArrayLike) -> NDArray[np.int64]:
-    """Exact units (n, 3) of world positions, from the dataset's origin."""
+    """Return world positions (n, 3) in exact units from the dataset's origin."""
     return np.rint((np.asarray(points, np.float64) - np.asarray(origin, np.float64)) * naive.UNITS).astype(
         np.int64
     )
 
 
 def unit_vectors(directions: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors (k, 3): by the largest component, then by the root of (x x + y y) + z z."""
+    """Return unit vectors (k, 3).
+
+    Divides by the largest component, then by the root of (x x + y y) + z z.
+    """
     array = np.asarray(directions, np.float64)
     scaled = array / np.abs(array).max(axis=1)[:, None]
     square = (scaled[:, 0] * scaled[:, 0] + scaled[:, 1] * scaled[:, 1]) + scaled[:, 2] * scaled[:, 2]
@@ -36,9 +42,9 @@ def unit_vectors(directions: ArrayLike) -> NDArray[np.float64]:
 
 
 def meetings(d: NDArray[np.int64], u: NDArray[np.float64], radii: NDArray[np.int64]) -> NDArray[np.float64]:
-    """t (n,) at which one ray (direction u (3,)) meets spheres at d (n, 3) from its start, inf where it does not.
+    """Return t (n,) at which a ray hits spheres; inf if it misses.
 
-    radii: (n,) of the spheres, exact units.
+    direction: u (3,).  spheres: at d (n, 3) from the start.  radii: (n,), exact units.
     """
     radius = radii.astype(np.float64)
     x, y, z = d.astype(np.float64).T
@@ -55,7 +61,7 @@ def meetings(d: NDArray[np.int64], u: NDArray[np.float64], radii: NDArray[np.int
 
 
 def _least(keys: NDArray[np.float64] | NDArray[np.int64], b: NDArray[np.int64]) -> int:
-    """Row of the least key; of equal ones that of the least point."""
+    """Return the row of the least key; on ties, that of the least point."""
     rows = np.flatnonzero(keys == keys.min())
     return int(rows[np.lexsort(b[rows].T[::-1])[0]])
 
@@ -69,7 +75,10 @@ def raycast(
     directions: ArrayLike,
     reach: float,
 ) -> Hits:
-    """The first sphere each ray meets. points: (n, 3) world, n at least 1.  radius: [m], of all or (n,) of each."""
+    """Return the first sphere that each ray hits.
+
+    points: (n, 3) world, n at least 1. radius: [m], of all or (n,) of each.
+    """
     b = naive.scan_units(naive.lattice_of(points, origin, step), step)
     o, u = world_units(origins, origin), unit_vectors(directions)
     reach_units = int(np.rint(reach * naive.UNITS))
@@ -85,14 +94,14 @@ def raycast(
 
 
 def within(points: ArrayLike, origin: ArrayLike, step: float, loose: ArrayLike, reach: float) -> Hits:
-    """The scan point nearest to each loose point. points: (n, 3) world, n at least 1."""
+    """Return the scan point nearest to each given point. points: (n, 3) world, n at least 1."""
     b = naive.scan_units(naive.lattice_of(points, origin, step), step)
     q = world_units(loose, origin)
     reach_units = int(np.rint(reach * naive.UNITS))
     distance, row = np.full(len(q), np.inf), np.full(len(q), -1)
     for i in range(len(q)):
         d = b - q[i]
-        near = np.flatnonzero((np.abs(d) <= reach_units).all(axis=1))  # their squares fit 63 bits
+        near = np.flatnonzero((np.abs(d) <= reach_units).all(axis=1))  # their squares fit into 63 bits
         square = (d[near] ** 2).sum(axis=1)
         if len(near) and square.min() <= reach_units**2:
             row[i] = near[_least(square, b[near])]
@@ -102,7 +111,10 @@ def within(points: ArrayLike, origin: ArrayLike, step: float, loose: ArrayLike, 
 
 
 def ideal_miss(d: list[int], direction: list[float]) -> tuple[Fraction, Fraction]:
-    """|d x u|^2 and (d . u)^2 of a point at d from the start of a ray, exact, for the direction as given."""
+    """Return |d x u|^2 and (d .
+
+    u)^2 of a point at d from the start of a ray, exactly, for the given direction.
+    """
     w = [Fraction(c) for c in direction]
     length = sum(c * c for c in w)
     dot = sum(a * c for a, c in zip(d, w, strict=True))
@@ -111,6 +123,6 @@ def ideal_miss(d: list[int], direction: list[float]) -> tuple[Fraction, Fraction
 
 
 def root(value: Fraction, bits: int = 80) -> Fraction:
-    """The root of a fraction, rounded down to 2^-bits."""
+    """Return the root of a fraction, rounded down to 2^-bits."""
     scaled = value.numerator * (1 << (2 * bits)) // value.denominator
     return Fraction(isqrt(scaled), 1 << bits)

@@ -1,8 +1,8 @@
-"""The judge of motions: the pose at a fraction of the way by its formula, and what it should be by its meaning.
+"""Poses and contacts along a motion: by the documented formula, and by definition with high precision.
 
-Plain Python and numpy, nothing of the project's own but the judge of poses. `pose_at` is the documented float64 formula
-(server/kernels/motion/screw_motion.py), operation by operation; `ideal_pose` is exp(t log(M1
-M0^-1)) M0 in 60 decimal digits.
+Plain Python and numpy, without code of the project except `naive`. `pose_at` is the documented
+float64 formula (server/kernels/motion/screw_motion.py), operation by operation. `ideal_pose` is
+exp(t log(M1 M0^-1)) M0 in 60 decimal digits.
 """
 
 import math
@@ -40,7 +40,7 @@ def _turn_back(u: Any, s: Any, c: Any, v: Any) -> list[Any]:
 
 
 def _quaternion(turn: list[list[Any]]) -> tuple[Any, Any, Any, Any]:
-    """w, x, y, z of a turn, not of unit length, by the largest of the four."""
+    """Return w, x, y, z of a rotation, not normalised, by the largest of the four."""
     a, b, c = turn[0][0], turn[1][1], turn[2][2]
     x, y, z = turn[2][1] - turn[1][2], turn[0][2] - turn[2][0], turn[1][0] - turn[0][1]
     xy, zx, yz = turn[0][1] + turn[1][0], turn[2][0] + turn[0][2], turn[1][2] + turn[2][1]
@@ -54,7 +54,7 @@ def _quaternion(turn: list[list[Any]]) -> tuple[Any, Any, Any, Any]:
 
 
 def pose_at(first: NDArray[np.float64], last: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-    """M(t) (4, 4), bit for bit."""
+    """Return M(t) (4, 4), bit for bit."""
     if t <= 0:
         return first.copy()
     if t >= 1:
@@ -111,9 +111,10 @@ def _exact_sine_cosine(x: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def ideal_pose(first: NDArray[np.float64], last: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-    """exp(t log(M1 M0^-1)) M0 (4, 4), rounded once, for poses that are rigid, or of one scale, to rounding.
+    """Return exp(t log(M1 M0^-1)) M0 (4, 4), rounded once.
 
-    The turn is that nearest to the two as given, by its quaternion, and what they differ by beyond it goes with t.
+    The poses are rigid, or of one scale, up to rounding. The rotation is the one nearest to the two
+    given, by its quaternion. What they differ by beyond it is proportional to t.
     """
     with localcontext() as context:
         context.prec = DIGITS + 10
@@ -161,10 +162,11 @@ def touching(
     fractions: ArrayLike,
     margin: float = 0.0,
 ) -> NDArray[np.bool_]:
-    """Whether the avatar touches at each of the fractions of a motion (first, last), by the definition.
+    """Return whether the avatar touches at each of the fractions of a motion (first, last).
 
-    scan_radius: of all scan points, or (n,) of each [m]. The poses on the way are those of the dataset's frame: the
-    origin is subtracted from the ends.
+    Contact is by definition. scan_radius: of all scan points, or (n,) of each [m]. The poses on the
+    way
+    are in the dataset's frame: the origin is subtracted from the end poses.
     """
     first, last = (pose.copy() for pose in motion)
     for end in (first, last):
@@ -176,7 +178,8 @@ def touching(
         pose = pose_at(first, last, float(t))
         reach = naive.reach_units(pose, avatar_radius, 0.0, margin) + radii
         apart = np.abs(naive.placed_units(avatar, pose, np.zeros(3))[:, None] - b)
-        # A pair farther than its reach along one axis does not touch; the others' squares fit 63 bits.
+        # A pair farther apart than its reach on one axis does not touch; the squares of all others
+        # fit into 63 bits.
         near = (apart <= reach[:, None]).all(axis=2)
         apart[~near] = 0
         found.append(bool((near & ((apart * apart).sum(axis=2) <= reach * reach)).any()))

@@ -1,4 +1,4 @@
-"""Records opened as an archive's are, without an archive: of made scans, for kernels that read their bytes."""
+"""Records of synthetic scans, opened like those of an archive, for kernels that read their bytes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,13 @@ KEY = 0x1234567
 
 
 def shape_of(voxel: VoxelData) -> RecordShape:
-    """What an index would say of this voxel's record."""
+    """Return the entry of this voxel's record in an index."""
     counts = len(voxel.cells.nodes), len(voxel.nodes.count), len(voxel.points)
     return RecordShape(*counts, voxel_point_dtype(voxel))
 
 
 def decode(record: Record, voxel: VoxelData, steps: int, **other: object) -> tuple[VoxelData, Links]:
-    """`decode_voxel` of a record as it should be, but for what `other` says."""
+    """Decode a record with correct arguments, except for those in `other`."""
     arguments = {
         "cells": record.cells,
         "nodes": record.nodes,
@@ -44,7 +44,7 @@ def decode(record: Record, voxel: VoxelData, steps: int, **other: object) -> tup
 
 
 def assert_same_bits(found: VoxelData, expected: VoxelData) -> None:
-    """Every column of the same type, shape and bytes."""
+    """Assert that every column has the same type, shape and bytes."""
     assert found.key == expected.key
     assert found.top_shift == expected.top_shift
     columns = [
@@ -59,7 +59,7 @@ def assert_same_bits(found: VoxelData, expected: VoxelData) -> None:
 
 
 def kept(n: int, seed: int) -> dict[str, np.ndarray]:
-    """Optional columns of any bits, NaN among them."""
+    """Return optional columns with any bits, including NaN."""
     rng = np.random.default_rng(seed)
     bits = rng.integers(0, 2**32, n, np.uint32)
     return {
@@ -70,7 +70,7 @@ def kept(n: int, seed: int) -> dict[str, np.ndarray]:
 
 
 def open_points(points: VoxelPoints, steps: int, **options: object) -> DecompressedRecord:
-    """The record of some points, in small cells and leaf nodes unless the options say otherwise."""
+    """Return the record of some points, by default in small cells and leaf nodes."""
     config = BuildConfig(**{"cell_points": 40, "leaf": 8, "degree": 3, **options})
     voxel = build_voxel(KEY, points, steps, config)
     record = encode_voxel(voxel, ARCHIVE_ID)
@@ -78,17 +78,20 @@ def open_points(points: VoxelPoints, steps: int, **options: object) -> Decompres
 
 
 def open_scan(kind: str, seed: int, count: int, steps: int, **options: object) -> DecompressedRecord:
-    """The record of a made scan."""
+    """Return the record of a synthetic scan."""
     return open_points(VoxelPoints(make_steps(kind, seed, count, steps)), steps, **options)
 
 
 def points_of(record: DecompressedRecord) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All points of a record (p, 3) int64 [voxel steps] in stored order, and the leaf node of each (p,)."""
+    """Return all points of a record (p, 3) int64 [voxel steps], and the leaf node of each (p,).
+
+    Points are in stored order.
+    """
     return points_below(*record.decode())
 
 
 def points_below(voxel: VoxelData, links: Links) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The same of a decoded voxel."""
+    """Return the points and leaf nodes of a decoded voxel, as `points_of` does."""
     points, nodes = np.empty((len(voxel.points), 3), np.int64), np.empty(len(voxel.points), np.int64)
     for node in np.flatnonzero(links.is_leaf).tolist():
         run = slice(int(links.first[node]), int(links.first[node]) + int(voxel.nodes.count[node]))

@@ -1,4 +1,4 @@
-"""Scans of five kinds, made small or large, to hold an estimate of bytes against what a build takes."""
+"""Scans of five kinds, generated small or large, to compare estimates of archive sizes with builds."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,12 +18,15 @@ def _write(path: Path, xyz: NDArray[np.float64], step: float) -> None:
 
 
 def made(folder: Path, points: int) -> None:
-    """A façade, scanned by casting rays: a LAZ file."""
+    """Generate a façade, scanned by casting rays: a LAZ file."""
     make_facade(folder / "facade.laz", points=points, seed=3)
 
 
 def als(folder: Path, points: int) -> None:
-    """Rolling ground and some roofs from above, 10 points a square metre, 1 cm, in strips of flight."""
+    """Generate an airborne scan of rolling ground and some roofs, in flight strips.
+
+    10 points per square metre, 1 cm.
+    """
     rng = np.random.default_rng(1)
     side = np.sqrt(points / 10)
     xy = rng.random((points, 2)) * side
@@ -38,7 +41,7 @@ def als(folder: Path, points: int) -> None:
 def _room(
     rng: np.random.Generator, points: int, size: NDArray[np.float64], noise: float
 ) -> NDArray[np.float64]:
-    """Points on the six sides of a box, evenly."""
+    """Return points on the six sides of a box, evenly distributed."""
     at = rng.random((points, 3)) * size
     areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
     axis = rng.choice(3, points, p=areas / areas.sum())
@@ -49,7 +52,10 @@ def _room(
 def _seen_from(
     rng: np.random.Generator, xyz: NDArray[np.float64], station: NDArray[np.float64], count: int
 ) -> NDArray:
-    """Points of a surface as dense as a scanner at a station sees it, in the order of its turning."""
+    """Return points of a surface with the density that a scanner at a station gives.
+
+    The points are in the order of the scanner's rotation.
+    """
     away = xyz - station
     near = 1 / np.maximum(1.0, (away**2).sum(axis=1))
     taken = xyz[rng.choice(len(xyz), count, replace=False, p=near / near.sum())]
@@ -58,7 +64,7 @@ def _seen_from(
 
 
 def office(folder: Path, points: int) -> None:
-    """Rooms with flat walls and 2 mm of noise, each seen from several stations, a file each."""
+    """Generate rooms with flat walls and 2 mm of noise, from several stations, one file each."""
     rng = np.random.default_rng(2)
     stations, size = 6, np.array([18.0, 9.0, 2.8])
     each = points // stations
@@ -69,7 +75,7 @@ def office(folder: Path, points: int) -> None:
 
 
 def church(folder: Path, points: int) -> None:
-    """Large halls, few stations: some walls a hundred times as dense as others."""
+    """Generate large halls with few stations: some walls are a hundred times as dense as others."""
     rng = np.random.default_rng(3)
     each = points // 3
     for number, x in enumerate((6.0, 20.0, 55.0)):
@@ -79,7 +85,7 @@ def church(folder: Path, points: int) -> None:
 
 
 def jittered(folder: Path, points: int) -> None:
-    """Eight copies of one scan, each with 1 mm of noise of its own."""
+    """Generate eight copies of one scan, each with its own noise of 1 mm."""
     rng = np.random.default_rng(4)
     first = _room(rng, points // 8, np.array([12.0, 8.0, 4.0]), 0.001)
     first = first[np.argsort(np.floor(first[:, 0] * 20), kind="stable")]

@@ -1,4 +1,4 @@
-"""Clouds of points that make trees of all shapes, and the options that shape trees, for property tests."""
+"""Point clouds that give trees of all shapes, and options that shape trees, for property tests."""
 
 from itertools import permutations, product
 
@@ -16,8 +16,9 @@ TREES = st.fixed_dictionaries(
         "with_slab": st.booleans(),
     }
 )
-# What tests against naive answers vary: points of a scan; the step of its lattice [m]; the edge of a voxel [steps]; how
-# far from the origin it lies [m]; the scale of an avatar, and how far from its own origin that lies [m].
+# Parameters of tests against naive answers: points of a scan; the step of its lattice [m]; the edge
+# of a voxel [steps]; the distance of the scan from the origin [m]; the scale of an avatar, and its
+# distance from its own origin [m].
 COUNTS = st.sampled_from([1, 2, 33, 300])
 STEPS = st.sampled_from([1e-6, archive_cases.BINARY_STEP, 1e-4, 1e-2, 0.3])
 VOXEL_STEPS = st.sampled_from([1, 7, 1000, 70_000, 1 << 21])
@@ -27,7 +28,7 @@ OFF = st.sampled_from([0.0, 0.0, 1e3, 1e5])
 
 
 def cloud(rng: np.random.Generator, kind: str, count: int) -> NDArray[np.float64]:
-    """Points (n, 3) in [-1, 1]^3."""
+    """Return points (n, 3) in [-1, 1]^3."""
     if kind == "one point":
         count = 1
     points = rng.uniform(-1, 1, (count, 3))
@@ -50,7 +51,7 @@ def cloud(rng: np.random.Generator, kind: str, count: int) -> NDArray[np.float64
 
 
 def signed_permutations() -> list[NDArray[np.float64]]:
-    """The 24 rotations that map the axes onto themselves."""
+    """Return the 24 rotations that map the axes onto themselves."""
     found = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.zeros((3, 3))

@@ -1,4 +1,4 @@
-"""The project's scripts as modules, for tests of what they compute.
+"""Import of the project's scripts as modules, for tests of their functions.
 
 conftest.py makes their packages importable.
 """
@@ -12,7 +12,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
 def load_script(name: str) -> ModuleType:
-    """Return a script of scripts/ as a module; what it does when it is started is not done."""
+    """Return a script of scripts/ as a module, without running its `main`."""
     loader = SourceFileLoader(f"{name}_script", str(SCRIPTS / name))
     spec = spec_from_loader(loader.name, loader)
     assert spec is not None

@@ -1,4 +1,4 @@
-"""Archives whose points have radius classes of all kinds, and what the judges need to know of them."""
+"""Archives whose points have radius classes of all kinds, with the radii that the tests expect."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,12 +14,15 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, class_radii
 
 STORED = frozenset({"mean", "local", "border"})
-# Of archives of a few metres and some hundred points, so that some poses touch and some do not.
+# For archives of a few metres and some hundred points: some poses touch and some do not.
 MODELS = ("local:0.2", "border:3", "local+border:0.3", "mean:2", "fixed:0.004", None)
 
 
 def hashed_classes(local: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """A class (n,) for points (n, 3), the same for equal ones; in about half of all places the same for neighbours."""
+    """Return a class (n,) for points (n, 3), equal for equal points.
+
+    In about half of all places it is equal for neighbours, too.
+    """
     near = (local >> 9).sum(axis=1) % 2 == 0
     mixed = np.where(near[:, None], local >> 7, local).astype(np.int64) @ np.array([7919, 104729, 1299709])
     return (mixed % RADIUS_CLASSES).astype(np.uint8)
@@ -29,7 +32,7 @@ def hashed_classes(local: NDArray[np.int32]) -> NDArray[np.uint8]:
 def any_classes(
     classes_of: Callable[[NDArray[np.int32]], NDArray[np.uint8]] = hashed_classes,
 ) -> Iterator[None]:
-    """Inside, what is built with one job has classes by `classes_of`, and not by its points' neighbours.
+    """Let builds with one job take the classes from `classes_of` instead of from neighbours.
 
     classes_of: local lattice points (n, 3) of a voxel -> (n,).
     """
@@ -44,7 +47,7 @@ def any_classes(
 
 
 def stored_radii(folder: Path, model: str | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All points (n, 3) of an archive [lattice steps], and the radius (n,) of each [exact units]."""
+    """Return all points (n, 3) of an archive [lattice steps] and the radius (n,) of each [exact units]."""
     points, radii = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     with Archive(folder) as archive:
         header = archive.header

@@ -1,5 +1,4 @@
-"""What the tests of rays and loose points share: an archive's scene with a radius model, rays of every kind, answers
-against the judge."""
+"""Scenes, rays of every kind, and expected answers, for tests of `raycast` and `within`."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ KINDS = ("cluster", "plane", "line", "grid", "duplicates", "noise", "one point")
 
 @contextmanager
 def opened(case: archive_cases.Case, budget: int = 64 << 20, model: str | None = None) -> Iterator[SceneData]:
-    """What the questions read of an archive, with a radius model."""
+    """Return the arguments that the queries take from an archive, with a radius model."""
     store = VoxelStore(case.archive)
     try:
         yield with_radius_model(
@@ -31,7 +30,7 @@ def opened(case: archive_cases.Case, budget: int = 64 << 20, model: str | None =
 def some_rays(
     rng: np.random.Generator, points: NDArray[np.float64], extent: float, radii: ArrayLike, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rays of every kind: free, along an axis, from point to point, grazing, from within, from far away.
+    """Return rays: free, along an axis, from point to point, grazing, from inside, from far away.
 
     radii: of all spheres or of each of the points (n, 3) [m].
     """
@@ -50,10 +49,10 @@ def some_rays(
             direction = np.zeros(3)
             direction[rng.integers(3)] = rng.choice([-1.0, 1.0])
             origin = at - direction * rng.uniform(0, 3) * extent
-        elif kind == 2:  # from one point to another: along scan lines
+        elif kind == 2:  # from one point to another, along scan lines
             direction = points[rng.integers(len(points))] - at
             origin = at - direction * rng.integers(0, 2)
-        elif kind == 3:  # tangent, as near as float64 can make it
+        elif kind == 3:  # tangent, as closely as float64 allows
             across = np.cross(at - origin, free)
             across /= max(np.linalg.norm(across), 1e-300)
             direction = at + across * radius - origin
@@ -72,7 +71,10 @@ def some_rays(
 
 
 def same_rays(answers: RaycastAnswers, expected: naive_rays.Hits, lattice: NDArray[np.float64]) -> None:
-    """The answers are those of the judge, bit for bit. lattice: (n, 3) scan points, world, as stored."""
+    """Assert that the answers equal the expected ones, bit for bit.
+
+    lattice: (n, 3) scan points, world, as stored.
+    """
     hit = expected.row >= 0
     assert answers.distance.tolist() == expected.distance.tolist()
     assert answers.upper.tolist() == expected.distance.tolist()
@@ -84,7 +86,7 @@ def same_rays(answers: RaycastAnswers, expected: naive_rays.Hits, lattice: NDArr
 
 
 def same_points(answers: WithinAnswers, expected: naive_rays.Hits, lattice: NDArray[np.float64]) -> None:
-    """The answers are those of the judge, bit for bit."""
+    """Assert that the answers equal the expected ones, bit for bit."""
     near = expected.row >= 0
     assert answers.distance.tolist() == expected.distance.tolist()
     assert answers.verdict.tolist() == near.astype(int).tolist()

@@ -1,4 +1,4 @@
-"""Answers to some fixed questions about an archive, as text: run in another process, they must be the same.
+"""Answers to fixed queries of an archive, as text. Another process must print the same.
 
 python same_answers.py ARCHIVE
 """
@@ -17,7 +17,7 @@ SCAN = ("corner", 21, 150)
 
 
 def answers(archive: Path) -> str:
-    """Verdicts and costs of 60 poses, and the placed integers of all their avatar points."""
+    """Return the verdicts and costs of 60 poses, and the placed integers of all their avatar points."""
     rng = np.random.default_rng(12)
     avatar = rng.uniform(-0.2, 0.2, (40, 3))
     poses = np.concatenate(

@@ -1,4 +1,4 @@
-"""The same points written in formats of scans that no library here writes: PTX, PTS, PCD, GLB, E57 of every field."""
+"""Points written in formats that no library here writes: PTX, PTS, PCD, GLB, E57 with every field."""
 
 import json
 import struct
@@ -13,19 +13,22 @@ Rows = NDArray[np.float64]
 
 
 def text_rows(*columns: NDArray) -> str:
-    """Rows of numbers, every float64 to its last bit."""
+    """Return rows of numbers as text, every float64 exactly."""
     table = np.column_stack([np.asarray(column, np.float64) for column in columns])
     return "".join(" ".join(map(repr, row)) + "\n" for row in table.tolist())
 
 
 def write_pts(path: Path, blocks: Sequence[tuple[Rows, NDArray]]) -> Path:
-    """PTS of several blocks of (xyz, intensity)."""
+    """Write a PTS of several blocks of (xyz, intensity)."""
     path.write_text("".join(f"{len(xyz)}\n{text_rows(xyz, light)}" for xyz, light in blocks))
     return path
 
 
 def ptx_scan(xyz: Rows, light: NDArray, pose: Rows | None = None, columns: int = 1) -> str:
-    """One scan of a PTX file: a head, and a row for each of a multiple of `columns` points."""
+    """Return one scan of a PTX file: a header, and one row per point.
+
+    The number of points is a multiple of `columns`.
+    """
     pose = np.eye(4) if pose is None else pose
     head = [f"{columns}", f"{len(xyz) // columns}"]
     for row in (pose[:3, 3], *pose[:3, :3].T, *pose.T):
@@ -34,7 +37,7 @@ def ptx_scan(xyz: Rows, light: NDArray, pose: Rows | None = None, columns: int =
 
 
 def lzf(data: bytes) -> bytes:
-    """LZF by a greedy search for the last place of the next three bytes; the shortest code that says it right."""
+    """Compress as LZF, by a greedy search for the last occurrence of the next three bytes."""
     out, literals, at, last = bytearray(), bytearray(), 0, {}
 
     def flush() -> None:
@@ -76,7 +79,10 @@ def write_pcd(
     real: str = "<f8",
     header: str = "",
 ) -> Path:
-    """PCD with a field of three values, a padding, and intensity behind; kind: as its DATA line says."""
+    """Write a PCD with a field of three values, padding, and then intensity.
+
+    kind: as in its DATA line.
+    """
     size = np.dtype(real).itemsize
     record = np.zeros(
         len(xyz),
@@ -102,7 +108,7 @@ def write_pcd(
 
 
 def write_glb(path: Path, document: dict, binary: bytes) -> Path:
-    """GLB of a document, as JSON, and its binary part."""
+    """Write a GLB of a document, as JSON, and its binary part."""
     words = json.dumps(document).encode()
     words += b" " * (-len(words) % 4)
     binary += b"\0" * (-len(binary) % 4)
@@ -113,7 +119,10 @@ def write_glb(path: Path, document: dict, binary: bytes) -> Path:
 
 
 def glb_document(vertices: int, corners: int = 0) -> dict:
-    """A document with one mesh at one node: float32 vertices 16 bytes apart, then uint16 corners of triangles."""
+    """Return a document with one mesh at one node.
+
+    Its float32 vertices lie 16 bytes apart; uint16 corners of triangles follow.
+    """
     attributes = {"POSITION": 0}
     primitive = {"attributes": attributes, "indices": 1} if corners else {"attributes": attributes, "mode": 0}
     size = 16 * vertices
@@ -136,22 +145,27 @@ def glb_document(vertices: int, corners: int = 0) -> dict:
 
 
 def glb_vertices(xyz: Rows) -> bytes:
-    """Vertices as glb_document() says they lie."""
+    """Return vertices in the layout of glb_document()."""
     rows = np.zeros((len(xyz), 4), "<f4")
     rows[:, :3] = xyz
     return rows.tobytes()
 
 
 def cartesian(xyz: NDArray, real: type = np.float64) -> dict[str, NDArray]:
-    """The columns x, y, z of an E57 scan."""
+    """Return the columns x, y, z of an E57 scan."""
     return {f"cartesian{axis}": xyz[:, k].astype(real) for k, axis in enumerate("XYZ")}
 
 
 def write_e57(path: Path, scans: list[dict], crs: str = "") -> Path:
-    """E57 of scans with the keys columns (name -> array), and perhaps rotation, translation, bounds (2, 3), scaled.
+    """Write an E57 of scans.
 
-    scaled: name -> (scale, offset) of columns written as scaled integers; the array holds what they mean.
-    By libE57Format itself: pye57 cannot write spherical coordinates, and writes bounds against the standard.
+    scans: dicts with the keys columns (name -> array), and optionally rotation, translation, bounds
+    (2, 3), scaled.
+    scaled: name -> (scale, offset) of columns written as scaled integers; the array holds the
+    decoded
+    values.
+    libE57Format is called directly: pye57 cannot write spherical coordinates, and its bounds do not
+    follow the standard.
     """
     image = libe57.ImageFile(str(path), "w")
     image.extensionsAdd("", libe57.E57_V1_0_URI)

@@ -1,4 +1,4 @@
-"""An archive of six small scans, in several voxels of several cells, to be read and broken."""
+"""An archive of six small scans, in several voxels with several cells each."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,13 +10,16 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.archive_writer import write_index
 from synthetic_scans import WITH_POINTS, make_scan, write_xyz
 
-# Of version 3, with dead voxels in its shards.
+# Archive of format version 3, with unused voxels in its shards.
 LATER = Path(__file__).resolve().parents[1] / "golden" / "archive-3"
 ORIGIN = np.array([512345.678901, 5612345.123456, -7.25])
 
 
 def dataset() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Six scans, georeferenced: points (n, 3) [m], negative heights among them, and intensities (n,)."""
+    """Return six georeferenced scans: points (n, 3) [m] and intensities (n,).
+
+    Some heights are negative.
+    """
     scans = []
     for seed, kind in enumerate(WITH_POINTS):
         xyz = make_scan(kind, seed, 200) + ORIGIN
@@ -25,7 +28,7 @@ def dataset() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def build_six(folder: Path) -> Path:
-    """Build the archive of `dataset` below `folder`, with both optional columns; its folder."""
+    """Build the archive of `dataset` below `folder`, with both optional columns; return its folder."""
     files = [write_xyz(folder / f"{i}.xyz", *scan) for i, scan in enumerate(dataset())]
     config = BuildConfig(
         voxel=0.9, cell_points=60, leaf=16, degree=4, keep=frozenset({"scan", "intensity"}), jobs=1
@@ -35,13 +38,13 @@ def build_six(folder: Path) -> Path:
 
 
 def rows_of(xyz: np.ndarray, *columns: np.ndarray) -> np.ndarray:
-    """Rows (n, 3 + c) float64 in an order of their own."""
+    """Return rows (n, 3 + c) float64 in a sorted order."""
     rows = np.column_stack([xyz, *columns])
     return rows[np.lexsort(rows.T)]
 
 
 def rewrite_index(folder: Path, change: Callable[[np.ndarray], None]) -> None:
-    """Write an index with a valid checksum over changed rows."""
+    """Write an index of changed rows, with a valid checksum."""
     with Archive(folder) as archive:
         header, voxels = archive.header, archive.voxels.copy()
         shards = [(p.name, p.stat().st_size) for p in map(archive.shard_path, range(archive.shard_count()))]

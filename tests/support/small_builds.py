@@ -10,18 +10,18 @@ from synthetic_scans import WITH_POINTS, make_scan, write_xyz
 
 
 def build(paths: Sequence[Path], target: Path, **options: object) -> BuildSummary:
-    """Build in this process, small voxels and cells unless the options say otherwise."""
+    """Build in this process, by default with small voxels and cells."""
     config = BuildConfig(**{"voxel": 0.9, "cell_points": 60, "leaf": 16, "degree": 4, "jobs": 1, **options})
     return build_archive(paths, target, config)
 
 
 def content(archive: Path) -> dict[str, bytes]:
-    """Every file of an archive."""
+    """Return every file of an archive."""
     return {str(p.relative_to(archive)): p.read_bytes() for p in sorted(archive.rglob("*")) if p.is_file()}
 
 
 def six_files(tmp_path: Path) -> list[Path]:
-    """Six scans as text."""
+    """Write six scans as text."""
     folder = tmp_path / "scans"
     folder.mkdir()
     return [

@@ -1,4 +1,4 @@
-"""What the tests of several archives share: the archives of two halves of a scan and of the whole, scenes of some."""
+"""Archives of two halves of a scan and of the whole, for tests of several archives."""
 
 import os
 from pathlib import Path
@@ -25,7 +25,10 @@ COUNT = 12 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else 60
 
 
 def halves() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two scans on one lattice with points of each beside those of the other, and no point in both."""
+    """Return two scans on one lattice.
+
+    Points of each lie beside those of the other; no point is in both.
+    """
     points = np.rint(
         np.vstack([synthetic_scans.make_scan("corner", 8, 300), synthetic_scans.make_scan("noise", 9, 300)])
         / STEP
@@ -39,7 +42,7 @@ def halves() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class Built:
-    """Archives of the halves, and of both; each its own scan."""
+    """Archives of each half, and of both as two scans."""
 
     def __init__(self, folder: Path) -> None:
         self.points = halves()
@@ -50,7 +53,7 @@ class Built:
 
 
 def several(*archives: tuple[Path, Any], **options: Any) -> Scene:
-    """A scene of archives at poses, with an avatar."""
+    """Open a scene of archives at poses, with an avatar."""
     metrics, how = RequestStats(), {"budget_bytes": DEFAULT_BUDGET, **options}
     opened = [
         PlacedArchive.open(path, "hall", pose=pose, took=metrics.loaded, **how) for path, pose in archives
@@ -61,14 +64,17 @@ def several(*archives: tuple[Path, Any], **options: Any) -> Scene:
 
 
 def near(rng: np.random.Generator, points: NDArray[np.float64], count: int = COUNT) -> NDArray[np.float64]:
-    """Poses of any turn, translations on a lattice, some of which touch."""
+    """Return poses of any rotation, with translations on a lattice; some touch."""
     poses = archive_cases.near_poses(rng, points, BODY, count, 0.09)
     poses[:, :3, 3] = np.rint(poses[:, :3, 3] / STEP) * STEP
     return poses
 
 
 def exact_pose(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A pose that float64 inverts exactly: a turn by right angles, a shift by lattice steps."""
+    """Return a pose that float64 inverts exactly.
+
+    It rotates by right angles and translates by lattice steps.
+    """
     turns = signed_permutations()
     return archive_cases.pose_of(
         turns[rng.integers(len(turns))], np.rint(rng.uniform(-9, 9, 3) / STEP) * STEP

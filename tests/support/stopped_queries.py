@@ -1,4 +1,4 @@
-"""What the tests of stops share: each question as a call, and whether an answer cut short says nothing wrong."""
+"""Each query as a call, and checks that an answer that was cut short is not wrong, for tests of stops."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,12 +20,12 @@ from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within
 
 CLEAR, CONTACT, UNKNOWN = Verdict
-# A budget of visits that is not spent: what is bounded has kernels of its own.
+# Budget of visits that is never spent: bounded searches have kernels of their own.
 PLENTY = 1 << 50
 
 
 class Asked(NamedTuple):
-    """What a question is asked of. poses: (k, 4, 4).  margin, reach: [m]."""
+    """Arguments of the queries. poses: (k, 4, 4).  margin, reach: [m]."""
 
     data: SceneData
     avatar: AvatarModel
@@ -83,12 +83,12 @@ QUESTIONS: dict[str, Callable[[Asked, QueryBudget], Any]] = {
 
 
 def gaps(a: Asked, budget: QueryBudget) -> Any:
-    """`separation_per_scan` of the first pose."""
+    """Return `separation_per_scan` of the first pose."""
     return separation_per_scan(with_stop(a.data, budget.stop), a.avatar, a.poses[0], a.reach, 2, budget)
 
 
 def assert_not_wrong(found: Any, truth: Any) -> None:
-    """Assert that an answer cut short says nothing that the whole one does not."""
+    """Assert that an answer that was cut short does not contradict the complete one."""
     assert type(found) is type(truth) and len(found) == len(truth)
     known = found.verdict != UNKNOWN
     assert (found.verdict[known] == truth.verdict[known]).all()

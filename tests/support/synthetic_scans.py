@@ -1,4 +1,4 @@
-"""Synthetic scans by seed, as arrays and as small files: plane, corner, pillar, noise, duplicates, one point, none."""
+"""Synthetic scans by seed, as arrays and small files: plane, corner, pillar, noise and others."""
 
 from pathlib import Path
 
@@ -10,16 +10,19 @@ from numpy.typing import NDArray
 KINDS = ("plane", "corner", "pillar", "noise", "duplicates", "one point", "none")
 WITH_POINTS = KINDS[:-1]
 
-# Everything lies in [0, SIZE) metres an axis.
+# All points lie in [0, SIZE) metres on each axis.
 SIZE = 2.0
 
 
 def make_scan(kind: str, seed: int, count: int = 400) -> NDArray[np.float64]:
-    """Points (n, 3) [m] of one of KINDS, the same for the same seed; n is `count` or what the kind says."""
+    """Return points (n, 3) [m] of one of KINDS, equal for equal seeds.
+
+    n is `count`, or given by the kind.
+    """
     rng = np.random.default_rng(seed)
     free = rng.uniform(0, SIZE, (count, 3))
     noise = rng.normal(0, 0.001, count)
-    if kind == "plane":  # tilted, so that neither its sphere nor its slab follows an axis
+    if kind == "plane":  # tilted, so that neither its sphere nor its slab is parallel to an axis
         free[:, 2] = 0.5 + 0.25 * free[:, 0] + 0.125 * free[:, 1] + noise
     elif kind == "corner":
         free[np.arange(count), rng.integers(0, 3, count)] = 0.25 + noise
@@ -39,12 +42,12 @@ def make_scan(kind: str, seed: int, count: int = 400) -> NDArray[np.float64]:
 
 
 def make_steps(kind: str, seed: int, count: int, steps: int) -> NDArray[np.int32]:
-    """The same scan as lattice integers (n, 3), each in [0, steps)."""
+    """Return the same scan as lattice integers (n, 3), each in [0, steps)."""
     return np.floor(make_scan(kind, seed, count) / SIZE * steps).astype(np.int32)
 
 
 def write_xyz(path: Path, xyz: NDArray[np.float64], intensity: NDArray[np.float32] | None = None) -> Path:
-    """Write text of three or four named columns, every float64 to its last bit. Returns the path."""
+    """Write three or four named columns as text, every float64 exactly. Returns the path."""
     columns = [xyz] if intensity is None else [xyz, np.asarray(intensity, np.float64)[:, None]]
     names = "x y z\n" if intensity is None else "x y z intensity\n"
     path.write_text(names + "".join(" ".join(map(repr, row)) + "\n" for row in np.hstack(columns).tolist()))
@@ -72,7 +75,7 @@ def write_las(
     intensity: NDArray[np.uint16] | None = None,
     point_format: int = 6,
 ) -> NDArray[np.float64]:
-    """Write a LAS, or LAZ, of raw integers (n, 3). Returns the world points (n, 3) [m] that it stands for."""
+    """Write a LAS, or LAZ, of raw integers (n, 3). Returns their world points (n, 3) [m]."""
     header = laspy.LasHeader(version="1.4" if point_format > 5 else "1.2", point_format=point_format)
     header.scales, header.offsets = [scale] * 3, list(offset)
     las = laspy.LasData(header)

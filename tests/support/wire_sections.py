@@ -1,4 +1,4 @@
-"""What WIRE.md, or one of its sections, says of a question's messages, against the declaration."""
+"""Comparison of the sections of WIRE.md with the declaration of a query's messages."""
 
 import re
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ def _rows(section: str) -> Iterator[tuple[str, str]]:
 
 
 def _array_type(question: Question[Any], kind: type, name: str) -> str:
-    """Return the type of an array as WIRE.md writes it; "" for a field that is none."""
+    """Return the type of an array as WIRE.md writes it; "" for any other field."""
     of = array_fields(kind).get(name)
     if of is None:
         return ""

@@ -1,8 +1,9 @@
-"""Questions about small fixed scenes: what is answered, and the work done for it, as numbers that can be kept.
+"""Queries about small fixed scenes: their answers, and the work done for them, as numbers to compare.
 
-The work is what bounds and orders of visits decide and no answer shows: node visits, pairs of points tested, and the
-calls of every function of server/kernels, all of it interpreted. Scenes, avatars and poses come of whole numbers,
-square roots and sums in a fixed order, so that they are the same bits on any machine.
+The work shows what no answer shows, such as bounds and the order of visits: node visits, pairs of
+points tested, and the calls of every function of server/kernels, all interpreted. Scenes, avatars
+and poses are computed from integers, square roots and sums in a fixed order. They are therefore
+the same bits on any machine.
 """
 
 import hashlib
@@ -28,7 +29,7 @@ from solidcloud.server.scene import Scene
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "work.json"
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# Functions of server/kernels that look at the stop flag or copy rows between two looks.
+# Functions of server/kernels that check the stop flag, or copy rows between two checks.
 CHECKS = ("_stopped_interpreted", "should_end", "copy_rows")
 COSTS = ("node_visits", "point_tests", "steps")
 
@@ -40,7 +41,10 @@ Options = dict[str, Any]
 
 
 def wall(count: int) -> NDArray[np.float64]:
-    """Points (count, 3) [m] of a floor, a wall and a bump, on a lattice of 1/1024 m, by integer arithmetic."""
+    """Return points (count, 3) [m] of a floor, a wall and a bump.
+
+    They lie on a lattice of 1/1024 m and are computed in integers.
+    """
     i = np.arange(1, count + 1, dtype=np.int64)
     u, v = i * 7919 % 2039, i * 104729 % 2029
     steps = np.stack([u, v, i * i % 13], axis=1)
@@ -50,7 +54,7 @@ def wall(count: int) -> NDArray[np.float64]:
 
 
 def shell(count: int, radius: float) -> NDArray[np.float64]:
-    """Points (count, 3) [m] about a sphere, longer along z, none at equal distance."""
+    """Return points (count, 3) [m] on a sphere elongated along z, no two at equal distance."""
     i = np.arange(1, count + 1, dtype=np.int64)
     whole = np.stack([i * 7919 % 2003 - 1001, i * 104729 % 1999 - 999, i * 1299709 % 1997 - 998], axis=1)
     own = whole.astype(np.float64)
@@ -59,7 +63,7 @@ def shell(count: int, radius: float) -> NDArray[np.float64]:
 
 
 def turned(w: int, x: int, y: int, z: int, scale: float = 1.0) -> NDArray[np.float64]:
-    """The rotation (3, 3) of a quaternion of whole numbers."""
+    """Return the rotation (3, 3) of a quaternion of integers."""
     n = float(w * w + x * x + y * y + z * z)
     rows = [
         [w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -70,7 +74,7 @@ def turned(w: int, x: int, y: int, z: int, scale: float = 1.0) -> NDArray[np.flo
 
 
 def poses() -> NDArray[np.float64]:
-    """Poses (k, 4, 4) in, on, near and far from the scene of `wall`, some scaled, one beside it."""
+    """Return poses (k, 4, 4) in, on, near and far from the scene of `wall`, some scaled, one beside it."""
     places = [
         (3, 1, 0, 0, (0.5, 0.5, 0.3), 1.0), (5, 1, -2, 1, (1.25, 0.75, 0.3), 1.0), (1, 0, 0, 0, (1.0, 0.75, 0.55), 1.0),
         (2, 3, 1, -1, (0.22, 1.5, 0.9), 1.0), (7, 0, 2, 3, (1.7, 1.6, 0.345), 1.0), (4, -1, 1, 2, (1.0, 1.0, 0.9), 2.5),
@@ -81,7 +85,10 @@ def poses() -> NDArray[np.float64]:
 
 
 def motions() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """First and last poses (k, 4, 4): onto the floor, along it, through the wall, past it, standing still, turning."""
+    """Return first and last poses (k, 4, 4) of motions.
+
+    They lead onto the floor, along it, through the wall and past it; some rest or rotate.
+    """
     pairs = [
         ((1, 0, 0, 0, (1.5, 1.5, 1.5)), (3, 1, 0, 0, (1.4, 1.5, 0.1))),
         ((1, 0, 0, 0, (1.75, 0.3, 0.46)), (1, 0, 0, 1, (1.7, 1.8, 0.45))),
@@ -98,10 +105,14 @@ def motions() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def rays() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Origins and directions (k, 3): at, along and past surfaces, from inside a sphere, along an axis."""
+    """Return origins and directions (k, 3): at, along and past surfaces, and along an axis.
+
+    One begins inside a sphere.
+    """
     i = np.arange(30)
     origins = np.stack([1.0 + (i * 37 % 23) / 32, 0.25 + (i * 17 % 29) / 16, 0.25 + (i * 7 % 11) / 8], axis=1)
-    # Two of three at a point, or past its sphere of 10 mm by little; the others along an axis and askew.
+    # Of three rays, two point at a point or just past its sphere of 10 mm; the others run along an
+    # axis and askew.
     directions = wall(300)[i * 9] + np.stack([i % 5, i * 3 % 5, i * 7 % 4], axis=1) / 512.0 - origins
     directions[2::3] = np.stack([i * 5 % 7 - 4, i * 3 % 5 - 2.0, -(i % 4) - 1.0], axis=1)[2::3]
     directions[8] = [0, 0, -1]
@@ -111,7 +122,7 @@ def rays() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def loose() -> NDArray[np.float64]:
-    """Points (k, 3) near and far from the scene."""
+    """Return points (k, 3) near and far from the scene."""
     i = np.arange(24)
     found = np.stack([(i * 37 % 23) / 10, (i * 17 % 29) / 12, (i * 7 % 11) / 9 - 0.1], axis=1)
     found[4] = wall(300)[40]
@@ -122,12 +133,12 @@ def loose() -> NDArray[np.float64]:
 
 
 def scene_points(kind: str) -> NDArray[np.float64]:
-    """The points of a scene."""
+    """Return the points of a scene."""
     return wall(300 if kind in ("fine", "broken") else 500)
 
 
 def build(folder: Path, kind: str) -> Path:
-    """The archive of a kind, in an empty folder."""
+    """Build the archive of a kind, in an empty folder."""
     archive = archive_cases.build(
         folder, scene_points(kind), resolution=2.0**-10, radius=0.01, **KINDS[kind]
     ).archive
@@ -142,8 +153,8 @@ def build(folder: Path, kind: str) -> Path:
     return archive
 
 
-# Small cells and nodes in many voxels; few large nodes in one voxel; spheres of several sizes; every third voxel is
-# not what it was written as, and so is missing.
+# Small cells and nodes in many voxels; a few large nodes in one voxel; spheres of several sizes; an
+# archive in which every third record is damaged, so that its voxel is missing.
 KINDS: dict[str, dict[str, Any]] = {
     "fine": {"voxel": 0.5, "leaf": 4, "degree": 3, "cell_points": 24},
     "flat": {"voxel": 4.0},
@@ -157,13 +168,13 @@ KINDS: dict[str, dict[str, Any]] = {
     "broken": {"voxel": 0.5},
 }
 OPTIONS: dict[str, Options] = {kind: {} for kind in KINDS} | {"classed": {"radius_model": "local+border"}}
-# Points, radius: one leaf node, and a tree.
+# Points and radius of two avatars: one is a single leaf node, the other a tree.
 AVATARS = {"small": (shell(20, 0.25), 0.02), "large": (shell(200, 0.25), 0.01)}
 DEEP = (shell(300, 0.3), 0.01)
 
 
 def about_objects(scene: Scene, options: Options) -> list[Any]:
-    """Objects against one another and the scene."""
+    """Return the queries of objects against each other and the scene."""
     places, names = poses()[:7], ["small", "large", "small", "small", "large", "small", "large"]
     places[3:6, :3, 3] = [[0.9, 0.75, 0.35], [1.3, 0.9, 0.9], [1.3, 1.35, 0.9]]
     places[5, :3, :3] /= 2.5
@@ -173,7 +184,7 @@ def about_objects(scene: Scene, options: Options) -> list[Any]:
     return [scene.objects(rows, 0.05, **options)]
 
 
-# Without any time, nothing is loaded, and bounds are those of the index.
+# Without any time, no voxel is loaded, and the bounds are those of the index.
 BUDGETS = ((0.01, 20), (0.0, 2), (0.0, 7), (0.05, None))  # tolerance [m], visits
 QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
     "collide": lambda s, o: [s.collide(a, poses(), m, **o) for a in AVATARS for m in (0.0, 0.04)],
@@ -227,14 +238,14 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
 
 
 def told(answers: Any) -> tuple[Answers, Answers]:
-    """What an answer says, a digest a field, bit for bit; and its costs."""
+    """Return the content of an answer as one digest per field, bit for bit, and its costs."""
     says, costs = {}, {}
     for name in array_fields(type(answers)):
         column = np.asarray(getattr(answers, name))
         if name in COSTS:
             costs[name] = column.tolist()
         else:
-            # NaN is NaN, whichever of them.
+            # All NaNs count as equal.
             column = np.where(np.isnan(column), np.nan, column) if column.dtype.kind == "f" else column
             says[name] = hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest()[:12]
     return says, costs
@@ -242,9 +253,10 @@ def told(answers: Any) -> tuple[Answers, Answers]:
 
 @contextmanager
 def counted_calls() -> Iterator[Counter[str]]:
-    """Count the calls of functions of server/kernels, as "file.function", while it is entered.
+    """Count the calls of functions of server/kernels within the block, as "file.function".
 
-    Looks at the stop flag are not counted: they are no work, and there is one at nearly every node.
+    Checks of the stop flag are not counted: they are no work, and there is one at nearly every
+    node.
     """
     calls: Counter[str] = Counter()
     names: dict[Any, str] = {}
@@ -268,14 +280,15 @@ def counted_calls() -> Iterator[Counter[str]]:
 
 @contextmanager
 def opened(archive: Path) -> Iterator[Scene]:
-    """A scene just opened, with the avatars."""
+    """Open a scene and add the avatars."""
     with Scene.open(archive) as scene:
-        # Loads that a question did not wait for would go on beside the next, and their calls be counted or not.
+        # Loads that a query did not wait for would run beside the next query, and their calls might
+        # be counted.
         scene.residency.on_owed = None
         for name, (points, radius) in AVATARS.items():
             scene.add_avatar(name, points, radius)
-        # As avatars of 8,000 points and more, whose leaf nodes are too many for a front: inner nodes are their front,
-        # one level above the leaf nodes, and two.
+        # Like avatars of 8,000 points and more, whose leaf nodes are too many for a front: their
+        # front consists of inner nodes, one level above the leaf nodes, and two.
         for name, most in (("deep", 3), ("deepest", 1)):
             with mock.patch.object(avatar, "MAX_FRONT", most):
                 scene.add_avatar(name, *DEEP)
@@ -283,8 +296,8 @@ def opened(archive: Path) -> Iterator[Scene]:
 
 
 def measure(archive: Path, question: str, kind: str) -> Answers:
-    """What a question is answered and costs when a scene has just been opened; calls only where interpreted."""
-    # Interpreted, what is left to be said after a budget of no time takes longer than its grace.
+    """Return the answer and cost of a query of a newly opened scene; calls only when interpreted."""
+    # Interpreted, finishing after a budget of no time takes longer than its grace period.
     with mock.patch.object(budget, "GRACE", 3600.0), opened(archive) as scene, counted_calls() as calls:
         answers = QUESTIONS[question](scene, OPTIONS[kind])
     says, costs = zip(*map(told, answers), strict=True)
@@ -297,7 +310,7 @@ def measure(archive: Path, question: str, kind: str) -> Answers:
 
 
 def dumped(golden: Answers) -> str:
-    """JSON with a line for each field and function, so that a comparison of two shows which of them changed."""
+    """Return JSON with one line per field and function, so that a comparison shows each change."""
     lines = ["{"]
     for question, kinds in golden.items():
         for kind, kept in kinds.items():

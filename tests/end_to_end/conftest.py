@@ -1,4 +1,4 @@
-"""The made floor of fake_server.py, and a server and a client of it, where a test has no scene of its own."""
+"""Fixtures for tests without a scene of their own: the floor of fake_server.py, its server, a client."""
 
 import socket
 
@@ -18,7 +18,7 @@ def _free_endpoint():
 
 @pytest.fixture(scope="session")
 def free_endpoint():
-    """Make endpoints on loopback that nobody listens on."""
+    """Return a function that makes endpoints on free loopback ports."""
     return _free_endpoint
 
 

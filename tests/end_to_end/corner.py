@@ -1,4 +1,4 @@
-"""A scanned corner, what is asked of it, and its scene, server and clients."""
+"""A scanned corner with every query about it, as a scene, a server and clients."""
 
 from contextlib import contextmanager
 from functools import partial
@@ -44,7 +44,8 @@ TOWARDS = np.where(np.arange(30)[:, None] % 2, POINTS[:30] - RAYS, RNG.normal(si
 OBJECTS = [("al", POSES[0]), ("bo", POSES[0], 2), ("al", POSES[1], 4, 1), ("bo", POSES[2], 1, 0xFFFFFFFE)]
 ITEMS, PLACES = make_objects(OBJECTS)
 
-# What is asked of a scene and a client, the same as a request, the type of the answer, and how many.
+# For each query: the call on a scene or client, the same as a request, the type of its answers, and
+# their number.
 QUESTIONS = {
     "collide": (
         lambda scene: scene.collide("al", POSES, 0.02),
@@ -91,7 +92,7 @@ QUESTIONS = {
     ),
 }
 
-# The same with spheres of several sizes.
+# The same queries with spheres of several sizes.
 MODELS = {
     "collide": "border:2",
     "distance": "local:0.1",
@@ -111,7 +112,7 @@ QUESTIONS |= {
 
 
 class _WithModel:
-    """A scene or client all of whose questions are asked with one radius model."""
+    """Scene or client whose queries all use one radius model."""
 
     def __init__(self, scene, model):
         self._scene, self._model = scene, model
@@ -121,13 +122,13 @@ class _WithModel:
 
 
 def add_avatars(scene, **client):
-    """Two avatars, "al" and "bo", of a scene or client. client: whose they are."""
+    """Add two avatars, "al" and "bo", to a scene or client. client: their owner."""
     scene.add_avatar("al", BODY, 0.01, **client)
     scene.add_avatar("bo", BODY[:2] + 0.01, 0.02, **client)
 
 
 def same(one, other):
-    """Whether two answers are one, what they cost in time and loads apart."""
+    """Assert that two answers are equal, except for costs in time and loads."""
     assert type(one) is type(other)
     for name in array_fields(type(one)):
         a, b = getattr(one, name), getattr(other, name)
@@ -137,7 +138,10 @@ def same(one, other):
 
 @contextmanager
 def opened(folder):
-    """The corner as a scene, built below `folder`, with avatars of its own and of the client "plain"."""
+    """Open the corner as a scene, built below `folder`.
+
+    It has its own avatars and those of the client "plain".
+    """
     with radius_class_archives.any_classes():
         case = archive_cases.build(folder, POINTS, models=radius_class_archives.STORED)
     with Scene.open(case.archive, "hall") as scene:
@@ -148,7 +152,7 @@ def opened(folder):
 
 @contextmanager
 def served(scene):
-    """A server of the scene; its endpoint."""
+    """Serve the scene; yield the endpoint."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with serving([scene], ServerConfig(listen=endpoint, avatar_seconds=600.0)):
         yield endpoint
@@ -156,7 +160,7 @@ def served(scene):
 
 @contextmanager
 def client_of(endpoint):
-    """A client of the corner, with its avatars."""
+    """Connect a client to the corner and add its avatars."""
     with Client(endpoint, scene="hall", timeout=30.0) as client:
         add_avatars(client)
         yield client

@@ -1,6 +1,6 @@
-"""A scene that needs no archive: a floor at z = 0, and knobs for what goes wrong. Run: serves it.
+"""A scene without an archive, a floor at z = 0, which can be made to fail. As a program: serve it.
 
-The floor is touched where the lowest avatar point's z minus the radius is at most the margin.
+The floor is touched where the z of the lowest avatar point, less the radius, is at most the margin.
 """
 
 import argparse
@@ -46,15 +46,17 @@ PART = 10  # poses in a part of a path
 
 
 def floor_verdicts(points, radius, poses, margin=0.0):
-    """The judge: which poses touch the floor."""
+    """Return the verdict of each pose, by the definition of the floor."""
     heights = np.einsum("kj,nj->kn", poses[:, 2, :3], points) + poses[:, 2, 3:4]
     touched = heights.min(axis=1) - radius <= margin
     return np.where(touched, Verdict.CONTACT, Verdict.CLEAR).astype(np.uint8)
 
 
 class FloorPipeline:
-    """Stands in for effects: an avatar gets as low as the floor lets it. One named "crash" raises, of one named "large"
-    the states are."""
+    """Replacement for the effects: an avatar sinks as low as the floor permits.
+
+    An avatar named "crash" raises an error; the states of one named "large" are large.
+    """
 
     def __init__(self):
         self.frames = 0
@@ -78,7 +80,7 @@ class FloorPipeline:
 
 
 def floor_simulation(name="floor", users=64, **fields):
-    """A simulation of the floor, with a stand-in for its effects; its `scene` has it as its own."""
+    """Return a simulation of the floor with the replacement effects; its `scene` uses it."""
     scene = FloorScene(name)
     scene.file = SceneFile(
         format=1, archives=scene_of(name).archives, limits=SceneLimits(users=users), **fields
@@ -88,7 +90,10 @@ def floor_simulation(name="floor", users=64, **fields):
 
 
 class FloorScene:
-    """What a service asks of a scene. Avatars named "crash" raise, those named "wait" wait for `gate`."""
+    """The scene methods that a service calls.
+
+    Avatars named "crash" raise, those named "wait" wait for `gate`.
+    """
 
     def __init__(self, name="floor", delay=0.0):
         self.name, self.delay = name, delay
@@ -96,7 +101,7 @@ class FloorScene:
         self.avatars = {}
         self.gone, self.asked, self.unused = [], [], []
         self.at_work = self.warmed = self.parts = self.reloaded = 0
-        self.refuses = None  # what a reload raises
+        self.refuses = None  # error that a reload raises
         self.lock = threading.Lock()
         self.simulation = self.file = None
         self.archives = []
@@ -189,7 +194,7 @@ class FloorScene:
             verdict, outside, ones * 0, ones, ones * 2, engine_seconds=0.25, hits=1, resident=1
         )
 
-    # The other questions say nothing, but what they were asked is kept.
+    # All other queries have empty answers, but record their arguments.
     def distance(self, name, poses, reach, *, client="", **effort):
         self.check(name, poses, client)
         return self.keep(DistanceAnswers, len(poses), "distance", (name, reach), effort)
@@ -219,7 +224,10 @@ class FloorScene:
         return self.keep(ObjectsAnswers, len(objects), "objects", (asked, margin), effort)
 
     def path(self, name, poses, op, *, client="", **parameters):
-        """Parts of PART poses; an avatar named "wait" waits after the first, "crash" raises there."""
+        """Yield parts of PART poses.
+
+        After the first, it waits with an avatar named "wait", and raises with one named "crash".
+        """
         self.check(name, poses, client)
         self.asked.append(("path", (name, op), parameters))
 

@@ -1,4 +1,4 @@
-"""The made floor of fake_server.py as tests ask of it: an avatar, poses, a path over it, a server of its own."""
+"""Avatar, poses, a path and servers for tests on the floor of fake_server.py."""
 
 import subprocess
 import sys
@@ -16,7 +16,10 @@ DEADLINE = 20.0
 
 @contextmanager
 def server_process(endpoint, *arguments):
-    """A server in a process of its own, ready. Ended with SIGKILL if it still runs."""
+    """Run a server in a separate process until the block ends; yield when it is ready.
+
+    The server is killed if it still runs at the end.
+    """
     command = [sys.executable, str(Path(__file__).parent / "fake_server.py"), endpoint, *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -35,7 +38,7 @@ def eventually(condition):
 
 
 def heights(values):
-    """Poses at these heights, not turned."""
+    """Return poses at these heights, without rotation."""
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, 2, 3] = values
     return poses
@@ -46,7 +49,7 @@ TRUTH = floor_verdicts(POINTS, 0.125, PATH)
 
 
 def joined(parts):
-    """The verdicts of a path's parts, which are all of it and in order."""
+    """Assert that the parts are a whole path in order; return its verdicts."""
     stops = np.cumsum([len(part) for part in parts]).tolist()
     assert [part.first for part in parts] == [0, *stops[:-1]]
     assert {part.total for part in parts} == {stops[-1]}
@@ -54,5 +57,5 @@ def joined(parts):
 
 
 def sending():
-    """The threads that send parts."""
+    """Return the threads that send parts."""
     return [thread for thread in threading.enumerate() if thread.name == "solidcloud-floor-parts"]

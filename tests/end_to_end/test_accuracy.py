@@ -1,4 +1,4 @@
-"""`solidcloud accuracy` from end to end, on a small façade, a few settings and few poses."""
+"""Test `solidcloud accuracy` with a small façade, a few settings and few poses."""
 
 import csv
 import json
@@ -21,7 +21,7 @@ SMALL = MeasurementPlan(
 
 
 def report_of(folder: Path, *arguments: str) -> dict:
-    """Run the command; returns what its JSON holds, once the other files are found to agree."""
+    """Run the command, check that its files agree, and return the content of its JSON."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measurement_plan, "BRIEF", SMALL)
         assert cli.run(["accuracy", *arguments, "-o", str(folder)]) == 0
@@ -30,7 +30,8 @@ def report_of(folder: Path, *arguments: str) -> dict:
         rows = list(csv.DictReader(file))
     assert [row["setting"] for row in rows] == [row["setting"] for row in report["rows"]]
     page = (folder / "accuracy.html").read_text()
-    # Without the pictures: among so many letters "http" would stand by chance, in one page of fifty.
+    # Remove the pictures: by chance, the letters "http" would appear in the pictures of one page in
+    # fifty.
     words, pictures = re.subn(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", page)
     assert "http" not in words and pictures == len(list(folder.glob("*.png")))
     return report
@@ -107,7 +108,7 @@ def test_border_opens_the_door_of_a_thin_sheet(made: dict) -> None:
 def test_an_archive_that_is_given_is_walked_over_and_has_no_doors(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     floor = np.column_stack([rng.uniform(0, 8, 9000), rng.uniform(0, 3, 9000), rng.normal(0, 0.002, 9000)])
-    # The walk goes through the middle of all points, y = 2.33 m: the wall is a shoulder's width beside it.
+    # The walk goes through the middle of all points, y = 2.33 m. The wall is 0.4 m beside it.
     wall = np.column_stack([rng.uniform(0, 8, 5000), np.full(5000, 2.73), rng.uniform(0, 2, 5000)])
     scan = synthetic_scans.write_ply(tmp_path / "hall.ply", np.concatenate([floor, wall]))
     build_archive(

@@ -1,4 +1,4 @@
-"""`solidcloud.connect`, used in a process of its own."""
+"""Test `solidcloud.connect` in a separate process."""
 
 import subprocess
 import sys

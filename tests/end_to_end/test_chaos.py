@@ -1,4 +1,4 @@
-"""Twenty seconds of scripts/chaos, with its judge; what depends on how fast a machine is has generous limits here."""
+"""Test twenty seconds of scripts/chaos. Limits that depend on the machine's speed are generous."""
 
 import json
 import subprocess

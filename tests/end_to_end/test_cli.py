@@ -1,4 +1,4 @@
-"""The command: its verbs on a small scan, its exit codes, and one line for every error."""
+"""Test the command `solidcloud`: its verbs on a small scan, its exit codes, and one-line errors."""
 
 import json
 import re

@@ -22,7 +22,7 @@ def test_query_agrees_with_the_floor(
     archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     heights = [0.3, 0.0999, 0.1001, 0.02, 5.0]
-    # One point over a scanned one; both radii are 0.05 m.
+    # The avatar is one point above a scan point; both radii are 0.05 m.
     (tmp_path / "ball.xyz").write_text("0 0 0\n")
     rows = "".join(f"{t},0,0,{z},1,0,0,0\n" for t, z in enumerate(heights))
     (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
@@ -41,7 +41,10 @@ def test_query_agrees_with_the_floor(
 
 
 def ask_all(folder: Path) -> dict[str, list[str]]:
-    """What is asked of the floor, by a ball of 0.05 m; every point of it too is a ball of 0.05 m."""
+    """Return the options of every query on the floor, with a ball of 0.05 m as avatar.
+
+    Every point of the floor also has a radius of 0.05 m.
+    """
     (folder / "ball.xyz").write_text("0 0 0\n")
     heights = [0.3, 0.09, 5.0]
     rows = "".join(f"{t},0,0,{z},1,0,0,0\n" for t, z in enumerate(heights))
@@ -69,7 +72,8 @@ def ask_all(folder: Path) -> dict[str, list[str]]:
     }
 
 
-# A line each of what is said: verdict and figure. One pair in contact at 0.09 m: the point below, 0.01 m deep.
+# Expected lines of output: verdict and result. At 0.09 m one pair is in contact: the point below,
+# 0.01 m deep.
 LINES = {
     "distance": [
         r"0\.000 s  clear +0\.200000 m from .*",
@@ -130,7 +134,8 @@ def test_every_question_from_the_command_line(
             check_json(op, told)
 
 
-# What each question is asked about, and which of these lie outside the floor: 4 m wide, at a height of 0.
+# For each query: the noun for its items, and whether each lies outside the floor, which is 4 m wide
+# at height 0.
 OUTSIDE = {
     "collide": ("poses", [False, True]),
     "distance": ("poses", [False, True]),
@@ -145,7 +150,10 @@ OUTSIDE = {
 
 
 def outside_files(folder: Path, first: float) -> dict[str, list[str]]:
-    """What is asked of the floor, 0.3 m above its plane, at two places: x = first, and x = 9 m, which is beside it."""
+    """Return the options of every query at two places, 0.3 m above the floor's plane.
+
+    One place is at x = first, the other at x = 9 m, beside the floor.
+    """
     here, there = f"{first},0,0.3", "9,0.5,0.3"
     (folder / "ball.xyz").write_text("0 0 0\n")
     (folder / "poses.csv").write_text(f"t,x,y,z,qw,qx,qy,qz\n0,{here},1,0,0,0\n1,{there},1,0,0,0\n")
@@ -214,7 +222,7 @@ def test_poses_in_millimetres_are_called_so(
 
 
 def check_json(op: str, told: dict[str, Any]) -> None:
-    """Figures of the JSON that the text does not have."""
+    """Check values of the JSON that the text does not contain."""
     answers = told["answers"]
     if op in ("distance", "path"):
         assert [answer["t"] for answer in answers] == [0.0, 1.0, 2.0]

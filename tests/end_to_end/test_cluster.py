@@ -1,4 +1,4 @@
-"""A build on a cluster of two workers, one killed in mid-build: the archive is a single process's, to the byte."""
+"""Test builds on two dask workers, one killed in the middle: the bytes are those of one process."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ VOXEL = 0.5
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scans of a floor and a wall, 20,000 points in some 90 voxels."""
+    """Write two scans of a floor and a wall, 20,000 points in about 90 voxels."""
     folder = tmp_path_factory.mktemp("scans")
     rng = np.random.default_rng(7)
     for name, axis in (("floor", 2), ("wall", 1)):
@@ -40,13 +40,13 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_units(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some 40 shards of a few voxels, so that there is a middle of the build."""
+    """Make the build write about 40 shards of a few voxels, so that it has a middle."""
     monkeypatch.setattr(build_limits, "SHARD_POINTS", 2000)
 
 
 @pytest.fixture(scope="module")
 def alone(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, bytes]]:
-    """What a single process makes of the scans."""
+    """Return the archive that a single process builds from the scans."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build_limits, "SHARD_POINTS", 2000)
         target = tmp_path_factory.mktemp("alone") / "hall"
@@ -61,7 +61,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 class Killer(threading.Thread):
-    """Kills one worker of the cluster as soon as the first shard is there."""
+    """Thread that kills one worker of the cluster as soon as the first shard exists."""
 
     def __init__(self, target: Path) -> None:
         super().__init__(daemon=True)
@@ -70,7 +70,7 @@ class Killer(threading.Thread):
         self.killed, self.shards = 0, 0
 
     def run(self) -> None:
-        """Wait, and kill."""
+        """Wait for the shard and kill the worker."""
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             self.shards = len([*self.work.glob("**/0-*.h5")])
@@ -134,7 +134,7 @@ def test_no_more_workers_read_records_back_than_may_hold_them(
 def test_a_scheduler_that_runs_elsewhere_makes_the_same_archive(
     scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Workers started by hand, in another folder than the builder's, whose paths are relative."""
+    """Test workers that were started by hand in another folder than the builder's, with relative paths."""
     code = (
         "from distributed import LocalCluster; import sys\n"
         "if __name__ == '__main__':\n"
@@ -157,7 +157,7 @@ def test_a_scheduler_that_runs_elsewhere_makes_the_same_archive(
         archive = os.path.relpath(tmp_path / "hall")
         config = BuildConfig(voxel=VOXEL, scheduler=address)
         build_archive([Path(".")], Path(archive), config)
-        # The index names the scans as they were given: all else is the same.
+        # The index contains the paths of the scans as given; everything else is the same.
         found = content(tmp_path / "hall")
         assert found.keys() == alone.keys()
         assert {name for name in found if found[name] != alone[name]} <= {"index.h5"}

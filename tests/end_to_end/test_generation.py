@@ -1,4 +1,4 @@
-"""The commands `add`, `remove` and `reload`: an archive that grows while a server serves it."""
+"""Test `add`, `remove` and `reload` while a server serves the archive."""
 
 import json
 import subprocess
@@ -28,7 +28,7 @@ CHAIR = synthetic_scans.make_scan("pillar", 2, 200).round(3)
 
 @pytest.fixture
 def hall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
-    """An archive of one scan, beside it another scan."""
+    """Build an archive of one scan, and write another scan beside it."""
     synthetic_scans.write_ply(tmp_path / "hall.ply", HALL)
     synthetic_scans.write_ply(tmp_path / "chair.ply", CHAIR)
     options = ["--voxel", "0.5", "--resolution", "0.001", "--keep", "scan", "--jobs", "1", "--radius", "0.02"]
@@ -38,7 +38,7 @@ def hall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 
 
 def told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict:
-    """What a command says as JSON."""
+    """Return the JSON output of a command."""
     capsys.readouterr()
     assert run([*arguments, "--json"]) == 0
     return json.loads(capsys.readouterr().out)
@@ -81,7 +81,7 @@ def test_points_that_are_left_out_are_said_or_refused(hall: Path, capsys: pytest
 
 
 def start_adding(hall: Path) -> subprocess.Popen[str]:
-    """`solidcloud add` with workers, in a process of its own that has begun."""
+    """Start `solidcloud add` with workers in a separate process, and wait until it has begun."""
     command = ["add", str(hall), str(hall.parent / "chair.ply"), "--jobs", "2"]
     process = subprocess.Popen(
         [sys.executable, "-m", "solidcloud.server.cli.main", *command], stderr=subprocess.PIPE, text=True
@@ -126,7 +126,7 @@ def test_a_change_that_was_killed_keeps_nobody_off(
     else:
         assert told(["remove", str(hall), "1"], capsys)["points"] == len(HALL)
     assert run(["validate", str(hall), "--deep"]) == 0
-    if following != "build":  # which leaves that alone: the next change removes it
+    if following != "build":  # which leaves the folder as it is: the next change removes it
         assert not (hall.parent / ".hall.changing").exists()
     assert told(["add", str(hall), chair, "--again"], capsys)["generation"] >= 1
     assert not list(hall.parent.glob(".hall*"))
@@ -153,7 +153,7 @@ def test_the_stored_figure_stays_and_info_says_how_far_it_is_off(
 
 
 def test_an_archive_grows_and_shrinks_while_it_is_served(hall: Path, endpoint: str) -> None:
-    """Nothing is lost meanwhile, and what is answered is true of a generation that was there."""
+    """Test that no request is lost and that each answer is true of some generation of the archive."""
     rng = np.random.default_rng(6)
     poses = archive_cases.near_poses(rng, np.vstack([HALL, CHAIR]), BODY, 150, 0.1)
     place = (np.zeros(3), 0.001, 0.02)

@@ -1,4 +1,4 @@
-"""A program at the endpoint of a server that is dead: without the server's key nobody believes it."""
+"""Test an impostor at the endpoint of a dead server: clients reject replies without the server's key."""
 
 import os
 import struct
@@ -31,19 +31,19 @@ COUNT = 5
 
 
 def seals_seen(seals):
-    """What replays a seal that the true server once gave."""
+    """Return a seal function that replays a seal of the true server."""
     return lambda query, payload: seals[0]
 
 
 def garbage(query, payload):
-    """A seal of the right length under another key."""
+    """Return a seal of the right length, made with another key."""
     return Sealer(
         os.urandom(32), query.attachment.to_bytes(), str(query.key_expr), hash_of(query.payload.to_bytes())
     ).seal(0, True, MSGPACK, payload)
 
 
 def asked_of(client, impostor):
-    """Ask the impostor all kinds of questions; verdicts that are not unknown, and states."""
+    """Send all kinds of queries to the impostor; return all verdicts that are not unknown."""
     found = []
     for _ in range(COUNT):
         eventually(lambda: client.collide("al", POSES) is not None and "collide" in impostor.asked)
@@ -67,7 +67,8 @@ def test_a_rogue_at_a_dead_servers_port_is_never_believed(endpoint, seal, caplog
             make = {"none": None, "garbage": garbage, "replayed": seals_seen(seals)}[seal]
             with Impostor(endpoint, make) as impostor:
                 assert asked_of(client, impostor) == []
-                # A query for states that was lost on the way is asked again once a wish brings none.
+                # A query for states may have been lost; the client repeats it after a motion
+                # command without a state.
                 eventually(lambda: session.wish(pose_at(0.0, 2.0)) and "state" in impostor.asked)
                 for _ in range(COUNT):
                     with pytest.raises(BusyError, match="no state"):
@@ -80,14 +81,14 @@ def test_a_rogue_at_a_dead_servers_port_is_never_believed(endpoint, seal, caplog
                     scenes_at(endpoint, timeout=1.0)
         said = [record.getMessage() for record in caplog.records if "not sealed" in record.getMessage()]
         assert len(said) == 3, "once for each client"
-        # A new server has another key, in the file.
+        # A new server has another key, which is in the file.
         with server_process(endpoint, "--walked"):
             eventually(lambda: client.collide("al", POSES).verdict.tolist() == CONTACTS)
             assert np.array_equal(joined(list(client.path("al", PATH))), TRUTH)
 
 
 def seal_of_the_server(client):
-    """A seal as the server gives it, for another question."""
+    """Return a seal that the server gave for another query."""
     replies = client._connection.session.get(
         key_expressions.query_key("floor", client._connection.client_id, "info"),
         attachment=bytes(16),
@@ -105,7 +106,7 @@ def test_without_a_key_replies_are_taken_as_they_come_and_that_is_said_once(
         client.add_avatar("al", POINTS, 0.125)
         assert Verdict.CLEAR in asked_of(client, impostor), "the impostor is one"
         with client.session("al") as session:
-            # It keeps no state for a query that comes after the wish.
+            # It stores no state for a query that comes after the motion command.
             eventually(lambda: session.wish(pose_at(0.0, 1.0)) and session.latest() is not None)
             assert session.latest().state.pose[0, 2, 3] == 9.0
     said = [record.getMessage() for record in caplog.records if "no key of the server" in record.getMessage()]
@@ -146,7 +147,7 @@ def test_a_key_may_be_handed_out(scene, endpoint, tmp_path, monkeypatch):
 
 
 def error_of(client):
-    """An error reply is sealed too."""
+    """Provoke an error reply, which is sealed, too, and raise its error."""
     try:
         client._connection.ask("collide", b"\xc1")
     except BadRequestError as error:
@@ -154,18 +155,21 @@ def error_of(client):
 
 
 def settled(queries):
-    """Whether some came, and none for a while: one that ends as servers come and go is asked again."""
+    """Return whether some queries for states came, and then none for a while.
+
+    A query that ends because a server starts or stops is repeated.
+    """
     count = len(queries)
     time.sleep(0.5)
     return 0 < count == len(queries)
 
 
 def test_a_state_that_was_heard_before_is_ignored(endpoint, tmp_path):
-    """Whoever can repeat what the server said cannot have it heard twice, nor out of order."""
+    """Test that replayed states of the server are received neither twice nor out of order."""
     key = b"\xab" * 32
     (tmp_path / "key").write_text(key.hex())
     (tmp_path / "key").chmod(0o600)
-    config = ServerConfig(listen=endpoint)  # for its check alone
+    config = ServerConfig(listen=endpoint)  # only for its check
     open_queries = []
     with zenoh.open(session_config(listen=config.listen)) as session:
         session.declare_queryable("solidcloud/1/state/floor/*/*", open_queries.append, complete=True)
@@ -235,7 +239,7 @@ def test_errors_do_not_have_states_asked_for_faster(endpoint):
         with Client(endpoint, scene="floor", timeout=0.5) as client, client.session("al"):
             eventually(lambda: len(asked) >= 1)
             time.sleep(2.0)
-    # At most each 0.2 s after the first few; without a pause that grows, each 0.02 s.
+    # At most one every 0.2 s after the first few; without a growing pause, one every 0.02 s.
     assert 2 <= len(asked) <= 30
 
 

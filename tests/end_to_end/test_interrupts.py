@@ -1,4 +1,4 @@
-"""Commands interrupted while they read scans: an interrupt is never a fault of a file, whatever library reads it."""
+"""Test commands interrupted while they read scans: no reader reports a fault of the file."""
 
 import io
 import json
@@ -28,7 +28,7 @@ def usual_handler() -> Iterator[None]:
 
 
 class Interrupting(io.BufferedReader):
-    """A file whose reader is interrupted at the `left`-th read or seek from now on, of all such files."""
+    """File that interrupts its reader at the `left`-th read or seek, counted over all such files."""
 
     left = 0
 
@@ -53,7 +53,7 @@ class Interrupting(io.BufferedReader):
 
 @pytest.fixture(scope="module")
 def laz(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of a LAZ file of several chunks, and of a small scan that can always be read."""
+    """Return a folder with a LAZ file of several chunks and a small scan that is always readable."""
     folder = tmp_path_factory.mktemp("laz")
     rng = np.random.default_rng(3)
     synthetic_scans.write_las(folder / "hall.laz", rng.integers(0, 8000, (120_000, 3)))
@@ -91,7 +91,7 @@ def test_an_interrupt_in_a_callback_of_lazrs_loses_no_scan(
 
 
 def interrupt_readers(folder: Path, *arguments: str) -> dict[str, Any]:
-    """Run the script; its figures."""
+    """Run the script; return its figures."""
     done = subprocess.run(
         [sys.executable, SCRIPTS / "interrupt_readers", *arguments, "--scratch", folder],
         capture_output=True,

@@ -1,6 +1,7 @@
-"""Builds stopped at any moment: nothing bad is visible, and the same command makes the undisturbed archive.
+"""Test builds stopped at any moment: nothing invalid is visible, and a repeat gives the same archive.
 
-scripts/kill_builds does it, in a process without other threads, which may fork; here it does a part of what it can.
+scripts/kill_builds does this in a process without other threads, which may fork. These tests run a
+part of its cases.
 """
 
 import json
@@ -17,7 +18,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
 def kill_builds(folder: Path, *arguments: str) -> dict[str, Any]:
-    """Run the script; its figures."""
+    """Run the script; return its figures."""
     done = subprocess.run(
         [sys.executable, SCRIPTS / "kill_builds", *arguments, "--scratch", folder],
         capture_output=True,
@@ -34,7 +35,7 @@ def test_forty_builds_killed_at_random_end_as_one_that_was_not(tmp_path: Path) -
     found = kill_builds(tmp_path, "--forked", "40", "--rivals")
     assert found["forked"]["counts"]["killed"] == 40
     assert found["forked"]["counts"]["finished after kills"] >= 10
-    # They were killed all over the build, not all at its beginning.
+    # The kills were spread over the whole build, not only over its beginning.
     assert len(found["forked"]["stages"]) >= 3
     assert (
         found["rivals"]["counts"]["two builders"]
@@ -55,8 +56,6 @@ def test_a_build_stopped_at_a_call_of_each_kind_goes_on(tmp_path: Path) -> None:
         == sum(found[fault] for fault in ("KILL", "INT", "EIO", "ENOSPC"))
     )
 
-
-# --- the judge --------------------------------------------------------------------------------------------
 
 SABOTAGED = """
 import os, sys
@@ -95,7 +94,7 @@ def test_a_builder_that_publishes_bit_by_bit_is_found_out(tmp_path: Path) -> Non
 
 @pytest.fixture
 def case(tmp_path: Path) -> Case:
-    """A target to be, and what it must become."""
+    """Return a small build: its target, and the archive that it must become."""
     for name, text in (("new", "new"), ("old", "old")):
         (tmp_path / name / "shards").mkdir(parents=True)
         (tmp_path / name / "index.h5").write_text(text)

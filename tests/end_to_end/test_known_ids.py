@@ -1,4 +1,4 @@
-"""A program that knows a client's id adds avatars in its name to a server that has just started, in vain."""
+"""Test that a rogue who knows a client's id cannot replace its avatars on a restarted server."""
 
 import json
 import time
@@ -27,7 +27,7 @@ from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])
 CONTACTS = [Verdict.CONTACT] * 2
-# Lies that "al" is told to be: nothing at all, another radius, and all of it high above the floor.
+# False avatars "al": without points, with another radius, and shifted high above the floor.
 LIES = {
     "nothing": (np.empty((0, 3)), 0.125),
     "radius": (POINTS, 1e-6),
@@ -37,7 +37,7 @@ LIES = {
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A floor of 4 by 4 m at z = 0."""
+    """Build a floor of 4 by 4 m at z = 0."""
     folder = tmp_path_factory.mktemp("floor")
     x, y = np.meshgrid(np.arange(-2, 2, 0.05), np.arange(-2, 2, 0.05))
     np.savetxt(folder / "floor.xyz", np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), fmt="%.4f")
@@ -56,7 +56,10 @@ def served(archive, endpoint):
 
 @contextmanager
 def known_by_a_rogue(archive, endpoint, radius=0.125):
-    """A client that was right, and whose id an impostor at its dead server's endpoint has heard."""
+    """Yield a client with right answers, and its id.
+
+    An impostor at its dead server's endpoint has heard the id.
+    """
     with Client(endpoint, scene="floor", timeout=2.0) as client:
         client.add_avatar("al", POINTS, radius)
         with served(archive, endpoint):
@@ -77,7 +80,7 @@ def rogue_session(endpoint):
 
 
 def add(session, client, points, radius, name="al"):
-    """Add an avatar in the name of a client."""
+    """Add an avatar on behalf of a client."""
     key = key_expressions.query_key("floor", client, "add_avatar")
     payload = encode(AddAvatarRequest(name, points, radius))
     replies = list(session.get(key, payload=payload, encoding=MSGPACK, timeout=DEADLINE))
@@ -85,7 +88,7 @@ def add(session, client, points, radius, name="al"):
 
 
 def verdicts_of(client, kind):
-    """The verdicts of one kind of question."""
+    """Return the verdicts of one kind of query."""
     if kind == "objects":
         found = client.objects([("al", POSES[0]), ("al", POSES[1])])
         return found.verdict.tolist()
@@ -95,7 +98,7 @@ def verdicts_of(client, kind):
 
 
 def verdicts_until_right(client, kind):
-    """All verdicts that are heard until the client is connected again and its answers are right."""
+    """Repeat a query until the client is connected again and right; return all verdicts meanwhile."""
     heard = []
 
     def are_right():
@@ -131,7 +134,7 @@ def test_a_radius_that_the_server_makes_is_known_by_what_it_said(archive, endpoi
 
 
 def test_an_avatar_that_somebody_else_added_first_does_not_keep_the_own_one_out(archive, endpoint):
-    """Between `unknown_avatar` and the client's adding it again."""
+    """Test a false avatar added between `unknown_avatar` and the client's own `add_avatar`."""
     with (
         known_by_a_rogue(archive, endpoint) as (client, known),
         served(archive, endpoint),
@@ -149,7 +152,7 @@ def test_an_avatar_that_somebody_else_added_first_does_not_keep_the_own_one_out(
 
 
 def states_after(session, count, height):
-    """The heights that a session's states say, after wishes for one, and errors."""
+    """Return the heights in a session's states after motion commands to a height, and names of errors."""
     found = []
     for _ in range(count):
         try:
@@ -176,7 +179,7 @@ def test_a_session_does_not_walk_as_an_avatar_that_somebody_else_added(archive, 
                 session.__enter__()
             with session:
                 eventually(lambda: states_after(session, 1, 2.0) == [2.0])
-                # Its own avatar does not get into the floor; the lie would.
+                # The client's own avatar does not enter the floor; the false one would.
                 for height in (1.0, -1.0):
                     found = states_after(session, 20, height)
                     assert not [each for each in found if not isinstance(each, str) and each < -0.2], found
@@ -191,7 +194,7 @@ def test_a_session_goes_on_when_a_question_found_out(archive, endpoint):
         client.session("al") as session,
     ):
         eventually(lambda: states_after(session, 1, 2.0) == [2.0])
-        # The avatar is taken from the client and replaced: as by a token that ends.
+        # Take the avatar from the client, as the end of a token does, and replace it.
         token = rogue.liveliness().declare_token(key_expressions.client_token_key("floor", known))
         token.undeclare()
         eventually(lambda: list(rogue.get("solidcloud/1/scenes", timeout=DEADLINE)))

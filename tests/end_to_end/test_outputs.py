@@ -1,4 +1,7 @@
-"""Outputs that cannot be written: one line that says where, what and what to do; and SIGTERM leaves nothing behind."""
+"""Test outputs that cannot be written: one line of error; and SIGTERM: nothing left behind.
+
+The line says where, what and what to do.
+"""
 
 import os
 import shutil
@@ -26,7 +29,7 @@ def floor(z: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def place() -> Iterator[Path]:
-    """A folder that everybody may enter, with scans, an archive and a walk's truth."""
+    """Return a folder that every user may enter, with scans, an archive and a walk's ground truth."""
     folder = Path(tempfile.mkdtemp(prefix="solidcloud-outputs-"))
     folder.chmod(0o755)
     try:
@@ -43,7 +46,7 @@ def place() -> Iterator[Path]:
 
 
 def verbs(place: Path, out: Path) -> dict[str, list[str]]:
-    """Each verb that writes, asked to write into the folder `out`."""
+    """Return the arguments of each verb that writes, with `out` as its folder."""
     floor_scan, hall, truth = (str(place / name) for name in ("floor.xyz", "hall", "facade.truth.json"))
     return {
         "build": ["build", floor_scan, "-o", str(out / "new"), "--jobs", "1"],
@@ -65,13 +68,12 @@ VERBS = list(verbs(Path(), Path()))
 
 
 def check_line(capsys: pytest.CaptureFixture[str], path: Path) -> str:
-    """The one line of the error, which names what was to be written, or the folder in the way."""
+    """Check the one line of an error: it names the output, or the folder in the way."""
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert "Errno" not in line and ".tmp" not in line and ".lock" not in line, line
     assert line.startswith(f"error: {path}"), line
-    assert len(line.removeprefix(f"error: {path}").split(": ")) >= 3, (
-        line
-    )  # where, what was found, what to do
+    # Location, what was found, what to do.
+    assert len(line.removeprefix(f"error: {path}").split(": ")) >= 3, line
     return line
 
 
@@ -87,7 +89,7 @@ def test_below_a_file_nothing_can_be_written(
 
 @contextmanager
 def not_root() -> Iterator[None]:
-    """Without the rights of root, to whom permissions mean nothing."""
+    """Drop the rights of root, to which permissions do not apply."""
     if os.geteuid() != 0:
         yield
         return

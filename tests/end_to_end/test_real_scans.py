@@ -1,6 +1,6 @@
-"""Real scans at the defaults: against the definition near their surfaces, and against what is known of a building.
+"""Test real scans with default options, against the definition and against known sizes in a building.
 
-They lie in the folder that SOLIDCLOUD_SCANS names and are skipped where it is unset.
+The scans lie in the folder that SOLIDCLOUD_SCANS names; without it, the tests are skipped.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from solidcloud.server.scene import Scene
 
 
 def source_points(path: Path) -> NDArray[np.float64]:
-    """All points of a scan or a folder of them, world [m], as the readers give them."""
+    """Return all points of a scan or a folder of scans, world [m], as the readers give them."""
     scans = [scan for file in find_scan_files([path]) for scan in open_scans(file)]
     points = np.concatenate([block.xyz for scan in scans for block in scan.blocks()])
     return points[np.isfinite(points).all(axis=1)]
@@ -48,19 +48,17 @@ def test_poses_near_surfaces_by_the_definition(
     assert 6 <= expected.sum() <= 54, "the poses should be a mixture"
 
 
-# --- the atrium: a question as a user asks it -------------------------------------------------------------
-
 FLOOR = -1.32  # y of the floor [m]; y is up
-LOW, HIGH = 0.2, 1.8  # the cylinder, above the floor [m]
+LOW, HIGH = 0.2, 1.8  # height range of the cylinder above the floor [m]
 CORRIDOR = [(-14.04, 1.5), (-12.8, 1.85), (-11.1, 2.05), (-9.9, 2.75), (-8.5, 3.25), (-6.7, 3.35), (-3, 3.5)]
 PASSAGE = [(-3, 3.5), (-3.84, 3.15), (-2.74, 2.6), (-1.94, 1.75), (-0.69, 1.35), (0.21, 2.1), (1.31, 2.65),
            (1.01, 3.8), (0.26, 4.7)]  # fmt: skip
-# From z up, as avatars are made, to y up.
+# Rotation from z up, as avatars are made, to y up.
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def route(corners: list[tuple[float, float]]) -> NDArray[np.float64]:
-    """Places (k, 2), x and z [m], every 5 cm along a route."""
+    """Return places (k, 2), x and z [m], every 5 cm along a route."""
     legs = []
     for a, b in zip(np.array(corners[:-1]), np.array(corners[1:]), strict=True):
         count = int(np.ceil(np.linalg.norm(b - a) / 0.05))
@@ -69,12 +67,15 @@ def route(corners: list[tuple[float, float]]) -> NDArray[np.float64]:
 
 
 def upright(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses (k, 4, 4) of an avatar that stands on the floor at places (k, 2)."""
+    """Return poses (k, 4, 4) of an avatar that stands on the floor at places (k, 2)."""
     return np.array([archive_cases.pose_of(UPRIGHT, np.array([x, FLOOR, z])) for x, z in places])
 
 
 def grid(radius: float, low: float, high: float, gap: float) -> NDArray[np.float64]:
-    """Points (n, 3) of a cylinder about the z axis, at most `gap` [m] apart along each axis, its edge included."""
+    """Return points (n, 3) of a cylinder about the z axis, including its edge.
+
+    They are at most `gap` [m] apart on each axis.
+    """
     across = np.linspace(-radius, radius, int(np.ceil(2 * radius / gap)) + 1)
     up = np.linspace(low, high, int(np.ceil((high - low) / gap)) + 1)
     x, y, z = (c.ravel() for c in np.meshgrid(across, across, up, indexing="ij"))
@@ -82,23 +83,23 @@ def grid(radius: float, low: float, high: float, gap: float) -> NDArray[np.float
 
 
 def inner(radius: float) -> tuple[NDArray[np.float64], float]:
-    """Spheres that lie inside the cylinder: when they touch a point, the point is in the cylinder."""
+    """Return spheres that lie inside the cylinder: if they touch a point, the point is in the cylinder."""
     size = 0.04
     points = grid(radius - size, LOW + size, HIGH - size, 0.04)
     return points[np.hypot(points[:, 0], points[:, 1]) <= radius - size], size
 
 
 def outer(radius: float, gap: float) -> tuple[NDArray[np.float64], float]:
-    """Spheres that together hold the cylinder: when they touch nothing, no point is in the cylinder.
+    """Return spheres that cover the cylinder: if they touch nothing, no point is in the cylinder.
 
-    No place in it is farther than half a cell's diagonal from one of the grid's points.
+    No place in it is farther than half a cell's diagonal from a point of the grid.
     """
     return grid(radius, LOW, HIGH, gap), gap * np.sqrt(3) / 2
 
 
 @pytest.fixture(scope="module")
 def atrium(real_scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """The atrium. Points as points: with no radius of their own a cylinder is only as wide as it says."""
+    """Open the atrium with points of radius zero, so that the cylinder has exactly its nominal width."""
     target = tmp_path_factory.mktemp("atrium") / "archive"
     build_archive([real_scans / "indoor_atrium.laz"], target, BuildConfig(jobs=1, radius=0.0))
     return Scene.open(target)
@@ -106,12 +107,12 @@ def atrium(real_scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture(scope="module")
 def atrium_points(real_scans: Path) -> NDArray[np.float64]:
-    """Its points, world [m]."""
+    """Return the atrium's points, world [m]."""
     return source_points(real_scans / "indoor_atrium.laz")
 
 
 def ask(scene: Scene, spheres: tuple[NDArray[np.float64], float], places: NDArray[np.float64]) -> list[int]:
-    """The verdicts of an avatar of these spheres at these places."""
+    """Return the verdicts of an avatar of these spheres at these places."""
     points, radius = spheres
     name = f"{len(points)}-{radius}"
     scene.add_avatar(name, points, radius)
@@ -119,7 +120,7 @@ def ask(scene: Scene, spheres: tuple[NDArray[np.float64], float], places: NDArra
 
 
 def within(points: NDArray[np.float64], places: NDArray[np.float64], radius: float, rim: float = 1e-9) -> int:
-    """How many points of the scan lie in the cylinder at some of the places, grown by `rim` [m]."""
+    """Return the number of scan points in the cylinder, enlarged by `rim` [m], at some of the places."""
     up = points[:, 1] - FLOOR
     standing = points[(up >= LOW - rim) & (up <= HIGH + rim)][:, [0, 2]]
     found = np.zeros(len(standing), bool)
@@ -152,6 +153,7 @@ def test_who_stands_in_the_wall_is_in_contact(
     atrium: Scene, atrium_points: NDArray[np.float64], place: tuple[float, float], count: int
 ) -> None:
     places = np.array([place])
-    # The scan lies on a grid of 1 cm, and so do the cylinder's ends and rim: float64 counts a point there or not.
+    # The scan lies on a grid of 1 cm, and so do the ends and the rim of the cylinder. Rounding in
+    # float64 decides which of these points count.
     assert within(atrium_points, places, 0.3, -1e-9) <= count <= within(atrium_points, places, 0.3)
     assert ask(atrium, inner(0.3), places) == [Verdict.CONTACT]

@@ -1,4 +1,4 @@
-"""A server that is reloaded while it is asked, over zenoh: nothing is lost, and an answer is of one generation."""
+"""Test a reload during queries over zenoh: no query is lost, and each answer is of one generation."""
 
 import os
 import shutil
@@ -37,7 +37,10 @@ DEADLINE = 60.0
 
 
 class Generations(NamedTuple):
-    """Two archives of one folder name. poses: (k, 4, 4); verdicts: (2, k), what is true of each, by brute force."""
+    """Two archives of one folder name.
+
+    poses: (k, 4, 4). verdicts: (2, k), true for each, by brute force.
+    """
 
     archives: tuple[Path, Path]
     poses: NDArray[np.float64]
@@ -46,10 +49,10 @@ class Generations(NamedTuple):
 
 @pytest.fixture(scope="module")
 def generations(tmp_path_factory: pytest.TempPathFactory) -> Generations:
-    """Two archives that touch at different poses."""
+    """Build two archives that touch at different poses."""
     folder = tmp_path_factory.mktemp("generations")
     rng = np.random.default_rng(5)
-    # The corners of all make the lattice the same for both.
+    # Both contain the same corners, which makes their lattice the same.
     shared = np.vstack([synthetic_scans.make_scan("plane", 1, 500), [[0, 0, 0], [2, 2, 2]]])
     built = [
         archive_cases.build(folder, np.vstack([shared, synthetic_scans.make_scan("noise", n, 500)]))
@@ -63,25 +66,28 @@ def generations(tmp_path_factory: pytest.TempPathFactory) -> Generations:
 
 @pytest.fixture
 def endpoint() -> str:
-    """A free port on loopback."""
+    """Return a free port on loopback."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
 def put(archive: Path, place: Path) -> None:
-    """What `build --overwrite` does to a folder, in its effect on who reads it."""
+    """Replace a folder as `build --overwrite` does."""
     shutil.rmtree(place, ignore_errors=True)
     shutil.copytree(archive, place)
 
 
 def which(generations: Generations, verdicts: NDArray[np.uint8]) -> set[int]:
-    """The generations of which verdicts of all poses are right."""
+    """Return the generations for which the verdicts of all poses are right."""
     return {n for n in (0, 1) if np.array_equal(verdicts, generations.verdicts[n])}
 
 
 class Asking:
-    """Threads, a client each, that ask without pause. found: when it was asked, when answered, of which it is right."""
+    """Threads, one client each, that query without pause.
+
+    found: time of the query, time of the answer, generations for which it is right.
+    """
 
     def __init__(self, generations: Generations, endpoint: str) -> None:
         self._generations, self._endpoint = generations, endpoint
@@ -117,7 +123,7 @@ class Asking:
             self.faults.append(repr(error))
 
     def wait_for_more(self, count: int) -> None:
-        """Wait until so many more answers came."""
+        """Wait until this many more answers came."""
         goal, deadline = len(self.found) + count, time.monotonic() + DEADLINE
         while len(self.found) < goal and not self.faults:
             assert time.monotonic() < deadline, "no answers"
@@ -129,7 +135,8 @@ def test_no_question_is_lost_and_each_is_answered_of_one_generation(
 ) -> None:
     place = tmp_path / "hall"
     put(generations.archives[0], place)
-    swaps: list[tuple[float, float, int]] = []  # a reload was asked, was answered, what is served since
+    # Times of request and answer of each reload, and the generation served since then.
+    swaps: list[tuple[float, float, int]] = []
     with (
         Scene.open(place) as scene,
         serving([scene], ServerConfig(listen=endpoint)),
@@ -208,7 +215,7 @@ def test_a_reload_that_nobody_answers_says_so(endpoint: str, capsys: pytest.Capt
 
 @pytest.fixture
 def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """`solidcloud serve` in a process of its own, of the first generation."""
+    """Run `solidcloud serve` of the first generation in a separate process."""
     put(generations.archives[0], tmp_path / "hall")
     command = [
         sys.executable,
@@ -246,7 +253,8 @@ def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
     with Client(endpoint, scene="hall") as client:
         client.reload()
         freeze(server.pid)
-        killer = threading.Timer(0.3, server.kill)  # while it is asked, and before: it is gone all the same
+        # The server dies during the queries or before them.
+        killer = threading.Timer(0.3, server.kill)
         killer.start()
         with pytest.raises(BusyError) as told:
             client.reload()
@@ -286,7 +294,7 @@ def test_the_command_and_the_signal_reload(
         deadline = time.monotonic() + DEADLINE
         while now() != {0}:
             assert time.monotonic() < deadline, "the signal did nothing"
-        # One that cannot be opened ends nothing, and a signal to stop is heard after.
+        # A reload that fails ends nothing, and the server still obeys a signal to stop.
         shutil.rmtree(place)
         os.kill(server.pid, signal.SIGHUP)
         assert now() == {0}

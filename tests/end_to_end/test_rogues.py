@@ -1,4 +1,4 @@
-"""Rogues at the server's port: whatever they declare, put and ask for, others hear no lie and lose nothing."""
+"""Test rogue sessions at the server's port: others receive no false answer and lose nothing."""
 
 import json
 import subprocess
@@ -25,7 +25,7 @@ def endpoint(free_endpoint):
 
 @pytest.fixture(scope="module")
 def victim(endpoint):
-    """A client with an avatar and a session, of a server that rogues reach too."""
+    """Return a client with an avatar and a session, of a server that rogues can reach."""
     with (
         serving([floor_simulation().scene], ServerConfig(listen=endpoint)),
         Client(endpoint, scene="floor", timeout=DEADLINE) as client,
@@ -57,7 +57,7 @@ def test_a_rogue_is_not_gossiped_to_clients(rogue, victim):
 
 
 def test_a_token_of_everybody_leaves_the_scenes_own_avatars(free_endpoint):
-    """The scene's own avatars are kept under the client "*", which is no client's name."""
+    """Test a token of the client "*", which owns the scene's avatars and is no valid client name."""
     endpoint, floor = free_endpoint(), floor_simulation()
     floor.scene.add_avatar("own", POINTS, 0.125, client=EVERYBODY)
     with serving([floor.scene], ServerConfig(listen=endpoint)), Rogue(endpoint, "client") as rogue:
@@ -65,12 +65,12 @@ def test_a_token_of_everybody_leaves_the_scenes_own_avatars(free_endpoint):
         for key in ("solidcloud/1/client/floor/*", "solidcloud/1/client/floor/last"):
             rogue.session.liveliness().declare_token(key).undeclare()
             rogue.settle()
-        eventually(lambda: "last" in floor.scene.gone)  # behind the others on one channel
+        eventually(lambda: "last" in floor.scene.gone)  # after the others on one channel
         assert floor.scene.gone[gone:] == ["last"] and floor.scene.avatar("own", "anybody")
 
 
 def test_few_attacks_by_the_script_have_no_success():
-    """scripts/attack_wire, in a process of its own."""
+    """Test a few attacks by scripts/attack_wire in a separate process."""
     done = subprocess.run(
         [sys.executable, SCRIPTS / "attack_wire", "--attempts", "36"],
         capture_output=True,

@@ -1,6 +1,7 @@
-"""The paper's scenarios ([Fig12] section 3) on the made façade, over zenoh: a user wishes, the scene says where it got.
+"""Test the paper's scenarios ([Fig12] section 3) on the generated façade, over zenoh.
 
-Nobody is ever in contact: every pose that was answered is asked about again, exactly.
+A user sends motion commands and receives poses. No pose may be in contact, which an exact query
+checks afterwards.
 """
 
 from collections.abc import Iterator
@@ -18,21 +19,23 @@ from solidcloud.builder.synthetic.truth import FacadeTruth
 from solidcloud.schemas.wire.answers import Verdict
 
 POINTS = 300_000
-# Feet are held so far above the ground (schemas/scene/effect_table.py, `Ground.clearance`).
+# Height at which feet are held above the ground (schemas/scene/effect_table.py,
+# `Ground.clearance`).
 FEET = 0.03
-# The scan's noise and half its spacing, with the spheres of both sides: how far from a true surface a body may stop.
+# Distance from a true surface at which a body may stop: the scan's noise and half its spacing, with
+# the spheres of both.
 NEAR = 0.08
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FacadeTruth]:
-    """The façade's archive, and the truth."""
+    """Build the façade's archive; return it with its ground truth."""
     return facade_scene.build_facade_archive(tmp_path_factory.mktemp("facade"), POINTS)
 
 
 @pytest.fixture(scope="module")
 def served(made: tuple[Path, FacadeTruth], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """The façade with everything that walking calls for, and the figure as `body`."""
+    """Serve the façade with all effects for walking, and the figure as `body`."""
     text = facade_scene.scene_text(made[0])
     with facade_scene.serving_scene(tmp_path_factory.mktemp("scene"), text) as served:
         served.client.add_avatar("body", figure_points())
@@ -40,7 +43,7 @@ def served(made: tuple[Path, FacadeTruth], tmp_path_factory: pytest.TempPathFact
 
 
 def test_through_the_open_door_without_contact(served: Served, made: tuple[Path, FacadeTruth]) -> None:
-    """From the landing through the middle of the door into the nave."""
+    """Walk from the landing through the middle of the door into the nave."""
     door = made[1].door("main")
     start, end = standing(0.0, -1.2, door.sill + FEET), standing(0.0, 2.6, door.sill + FEET)
     with served.walking("body", start) as walker:
@@ -51,7 +54,7 @@ def test_through_the_open_door_without_contact(served: Served, made: tuple[Path,
 
 
 def test_alongside_the_wall_sliding_and_never_into_it(served: Served, made: tuple[Path, FacadeTruth]) -> None:
-    """Wishing into the cloister's wall at 20 degrees: the wall is slid along for six metres."""
+    """Walk into the cloister's wall at 20 degrees: the body slides six metres along it."""
     wall = made[1].wall("cloister")
     angle = np.radians(20.0)
     half = np.ptp(figure_points()[:, 0]) / 2
@@ -67,7 +70,7 @@ def test_alongside_the_wall_sliding_and_never_into_it(served: Served, made: tupl
 
 
 def test_stopped_at_the_wall_head_on(served: Served, made: tuple[Path, FacadeTruth]) -> None:
-    """Straight at the wall for three seconds: it gets there, and does not move from there."""
+    """Walk straight at the wall for three seconds: the body reaches it and stays there."""
     wall = made[1].wall("cloister")
     with served.walking("body", standing(wall.offset + 1.5, -10.0, FEET, np.pi / 2)) as walker:
         walker.go((-1.5, 0.0, 0.0), 3.0)
@@ -81,7 +84,7 @@ def test_stopped_at_the_wall_head_on(served: Served, made: tuple[Path, FacadeTru
 
 
 def test_up_the_steps_of_the_portal_and_down_again(served: Served, made: tuple[Path, FacadeTruth]) -> None:
-    """Three risers of 15 cm up to the sill and back, at walking pace."""
+    """Walk up three risers of 15 cm to the sill and back at walking pace."""
     sill = made[1].door("main").sill
     foot, top = standing(0.0, -4.0, FEET), standing(0.0, -0.7, sill + FEET)
     with served.walking("body", foot) as walker:
@@ -92,13 +95,13 @@ def test_up_the_steps_of_the_portal_and_down_again(served: Served, made: tuple[P
         down = walker.to(top, foot)
     assert abs(down.pose[0, 2, 3] - FEET) < 0.03
     assert down.pose[0, 1, 3] < -3.95
-    # Descended, not fallen: the ground was kept all the way.
+    # The body descended without falling: it was on the ground all the way.
     assert [number for number, state in enumerate(walker.states) if not state.ground.on_ground] == []
     served.assert_clear("body", walker)
 
 
 def test_around_a_column(served: Served, made: tuple[Path, FacadeTruth]) -> None:
-    """Straight at the forecourt's column, beside its middle: round it, on that side."""
+    """Walk straight at the forecourt's column, beside its middle: the body passes on that side."""
     column = made[1].column("forecourt left")
     half = np.ptp(figure_points()[:, 0]) / 2
     start = standing(column.x + 0.4, column.y - column.radius - 1.2, FEET)
@@ -115,9 +118,9 @@ def test_around_a_column(served: Served, made: tuple[Path, FacadeTruth]) -> None
 def test_tight_door_is_passed_with_border_radii_and_reported_with_mean(
     model: str, passes: bool, tmp_path: Path
 ) -> None:
-    """A door of 60 cm in a thin wall, a body of 55 cm: what the spheres of the rim leave of it decides.
+    """Walk through a 60 cm door in a thin wall with a body of 55 cm: the spheres of the rim decide.
 
-    Of a thin wall, for in a deep one the jambs are planes, and no radius model makes their spheres smaller.
+    In a thick wall the jambs are planes, and no radius model makes their spheres smaller.
     """
     sheet = make_sheet(tmp_path / "sheet.ply", spacing=0.05, door=0.60)
     build_archive([sheet.path], tmp_path / "sheet", BuildConfig(jobs=1, models=frozenset({"mean", "border"})))
@@ -131,7 +134,7 @@ def test_tight_door_is_passed_with_border_radii_and_reported_with_mean(
     if passes:
         assert last.pose[0, 1, 3] == 1.0 and not any(state.touched for state in walker.states)
     else:
-        # A round body gets in as far as it is narrower than what is left of the door.
+        # A round body enters as far as it is narrower than the remaining width of the door.
         assert -0.2 < last.pose[0, 1, 3] < 0.0
         place = np.array(last.touched[0].place)
         assert abs(abs(place[0]) - 0.30) < 0.06 and abs(place[1]) < 0.01

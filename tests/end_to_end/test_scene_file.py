@@ -1,4 +1,4 @@
-"""A server started from a scene file serves what it says: over zenoh, to clients that add nothing."""
+"""Test a server of a scene file, over zenoh, with clients that add nothing."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from solidcloud.server.report.walk.server_process import served
 
 BALL, SCAN = 0.05, 0.03
 HOLE = np.array([[-0.45, -0.45, -1.0], [0.45, 0.45, 1.0]])
-# The second archive: turned by a quarter about z, then shifted.
+# Pose of the second archive: rotated by a quarter turn about z, then translated.
 TURN = np.array([[0.0, -1.0, 0.0, 6.0], [1.0, 0.0, 0.0, 0.5], [0.0, 0.0, 1.0, 1.25], [0.0, 0.0, 0.0, 1.0]])
 
 SCENE = f"""
@@ -50,13 +50,13 @@ effect = "proximity"
 
 
 def floor(width: float, depth: float) -> np.ndarray:
-    """A level floor at z = 0, points 0.1 m apart."""
+    """Return a level floor at z = 0, points 0.1 m apart."""
     x, y = np.meshgrid(np.arange(-width, width + 0.05, 0.1), np.arange(-depth, depth + 0.05, 0.1))
     return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).round(4)
 
 
 def truth() -> np.ndarray:
-    """The points (n, 3) of the scene."""
+    """Return the points (n, 3) of the scene."""
     lower, upper = floor(1.0, 1.0), floor(1.0, 0.5) @ TURN[:3, :3].T + TURN[:3, 3]
     return np.concatenate([lower[~((lower >= HOLE[0]) & (lower <= HOLE[1])).all(axis=1)], upper])
 
@@ -87,7 +87,7 @@ def test_a_server_of_a_scene_file_serves_what_it_says(folder: Path) -> None:
     places = np.concatenate([rng.uniform([-1.2, -1.2, -0.1], [1.2, 1.2, 0.2], (150, 3)),
                              rng.uniform([5.3, -0.7, 1.1], [6.7, 1.7, 1.4], (150, 3))])  # fmt: skip
     nearest = np.linalg.norm(places[:, None] - truth(), axis=2).min(axis=1)
-    # The lattice moves points by some of its 0.1 mm.
+    # The lattice moves points by up to its step of 0.1 mm.
     sure = np.abs(nearest - BALL - SCAN) > 1e-3
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, 3] = places
@@ -122,7 +122,7 @@ def test_a_server_of_a_scene_file_serves_what_it_says(folder: Path) -> None:
 def test_a_new_scene_file_is_checked_served_and_asked(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a user does it, in folders with spaces in their names."""
+    """Use the commands as a user does, in folders with spaces in their names."""
     home = tmp_path / "my scenes"
     home.mkdir()
     shutil.copytree(folder / "lower", tmp_path / "my scans/ground floor")
@@ -144,7 +144,7 @@ def test_a_new_scene_file_is_checked_served_and_asked(
         ask += ["--poses", str(home / "poses of a walk.csv"), "--json"]
         capsys.readouterr()
         assert run(ask) == 0
-        # Of points 0.1 m apart both radii are 0.05.
+        # Points 0.1 m apart have a radius of 0.05; so does the avatar.
         assert [a["verdict"] for a in json.loads(capsys.readouterr().out)["answers"]] == ["clear", "contact"]
         assert run([*ask, "--op", "move"]) == 0
         (moved,) = json.loads(capsys.readouterr().out)

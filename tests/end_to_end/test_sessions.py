@@ -1,4 +1,4 @@
-"""Sessions over zenoh: wishes go out, states come in, whatever becomes of other clients and of servers."""
+"""Test sessions over zenoh: motion commands, states, and faults of clients and servers."""
 
 import threading
 
@@ -39,7 +39,7 @@ def served(floor, endpoint):
 
 
 def walk(client, name, count, found):
-    """A viewer of 60 frames a second: wish, and take what comes."""
+    """Send motion commands 60 times a second, as a viewer does; store the states received."""
     rng = np.random.default_rng(len(found))
     client.add_avatar(name, POINTS, 0.125)
     with client.session(name) as session:
@@ -69,7 +69,7 @@ def test_eight_users_at_sixty_frames_a_second(served, endpoint):
         frames = [state.frame for state in states]
         assert frames == sorted(set(frames))
         assert np.array_equal(last.pose[0], outcome(pose))
-        # What a link has no room for is dropped, and nobody can count that.
+        # States for which a link has no room are dropped without being counted.
         assert 10 < len(states) <= seq - last.late
     eventually(lambda: not served.users)
 
@@ -85,7 +85,8 @@ def test_what_is_not_simulated_in_time_is_dropped_and_counted(served, endpoint):
             session.wait(seq, 0.0)
         assert session.latest() is None
         gate.set()
-        # What a link has no room for is dropped, the last as well: who wants to be there wishes on.
+        # If a link has no room for a state, it is dropped, even the last. The client therefore
+        # repeats its motion command.
         for _ in range(100):
             try:
                 last = session.wait(seq, DEADLINE / 100)
@@ -120,7 +121,10 @@ def test_a_velocity_that_took_the_place_of_the_first_pose_is_no_error(served, en
 
 
 def holding(simulation):
-    """Have its frames wait: an event that lets them go on, and one that is set when the first waits."""
+    """Make frames wait.
+
+    Returns an event that lets them continue, and one that is set when the first waits.
+    """
     gate, entered = threading.Event(), threading.Event()
     run = simulation._pipeline.run
 
@@ -167,7 +171,8 @@ def test_the_avatar_is_added_to_a_server_that_does_not_know_it(served, endpoint)
         session.wait(session.wish(pose_at(0.5, 1.0)), DEADLINE)
         (user,) = served.users
         served.drop_client(user.client)
-        # Refused, added again, and wished again, although nobody wishes after it.
+        # The command is refused, the avatar is added, and the session repeats the command by
+        # itself.
         state = session.wait(session.wish(velocity=(0.0, 0.0, 0.0)), DEADLINE)
         assert state.pose[0, 0, 3] == 0.5, "from where it was"
         assert served.users == [user]
@@ -191,7 +196,7 @@ def test_what_is_refused_is_raised_where_it_is_waited_for(served, endpoint):
 
 
 def eventually_raises(ask, kind):
-    """Ask until it raises an error of a kind."""
+    """Call until it raises an error of this kind."""
 
     def raised():
         try:
@@ -249,7 +254,7 @@ def test_a_full_scene_says_so(endpoint):
 
 
 def reached(session):
-    """Whether a wish has a state now."""
+    """Return whether a motion command gets a state now."""
     try:
         session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
     except BusyError:
@@ -286,7 +291,7 @@ def test_plain_zenoh_is_enough_to_walk(served, endpoint, encoding):
         session.put(key, encode(wish), encoding="text/plain")
         eventually(lambda: len(heard) == 6)
         assert decode_answer(ErrorReply, heard[-1].err.payload.to_bytes(), MSGPACK).code == "bad_request"
-        session.put("solidcloud/1/wish/floor/me/*", b"")  # of nobody: no answer, and nothing breaks
+        session.put("solidcloud/1/wish/floor/me/*", b"")  # without an owner: no answer, and nothing fails
         assert served.users == [user]
         session.delete(key)
         eventually(lambda: not served.users)
@@ -314,7 +319,10 @@ def test_a_state_that_comes_before_its_query_is_kept_for_it(served, endpoint):
 
 
 def test_a_large_number_locks_nobody_out(served, endpoint):
-    """A wish of a foreign program of the same client; the number is forgotten when states are asked for again."""
+    """Test a large command number from a foreign program in the name of the same client.
+
+    The number is forgotten when states are queried again.
+    """
     with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
         client.add_avatar("al", POINTS, 0.125)
         with client.session("al") as session:
@@ -323,7 +331,7 @@ def test_a_large_number_locks_nobody_out(served, endpoint):
             far = Wish(seq=10**9, time=1.0, pose=pose_at(0.0, 5.0)[None])
             client._connection.session.put(key_expressions.command_key("floor", user), encode(far))
             session.wait(10**9, DEADLINE)
-            # The session counts on above what it heard.
+            # The session continues counting above the number that it received.
             seq = session.wish(pose_at(0.0, 2.0))
             assert seq > 10**9 and session.wait(seq, DEADLINE).pose[0, 2, 3] == 2.0
             client._connection.session.put(
@@ -355,7 +363,7 @@ def test_a_state_that_was_dropped_is_sent_once_more(served, endpoint, monkeypatc
 
 def test_a_wish_that_was_dropped_is_sent_once_more(served, endpoint):
     class Dropping:
-        """A publisher whose first sample is lost."""
+        """Publisher whose first sample is lost."""
 
         def __init__(self, publisher):
             self.publisher, self.lost = publisher, []
@@ -388,7 +396,7 @@ def test_a_user_who_comes_again_hears_nothing_of_before(served, endpoint):
 
 
 def test_others_are_told_of_by_another_name_than_their_id(served, endpoint):
-    """The id of a client is a secret: whoever knows it may ask and wish in its name."""
+    """Test that states hide the ids of other clients: an id permits queries and commands in its name."""
     with walking(endpoint) as session:
         session.wait(session.wish(pose_at(0.0, 1.0)), DEADLINE)
         ((user, present),) = served._present.items()

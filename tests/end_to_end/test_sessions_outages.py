@@ -1,4 +1,4 @@
-"""Sessions over zenoh while clients freeze and die, and servers go and come back."""
+"""Test sessions over zenoh while clients freeze or die, and servers stop and restart."""
 
 import os
 import signal
@@ -51,7 +51,7 @@ with Client(sys.argv[1], scene="floor") as client:
 
 @contextmanager
 def other_client(endpoint):
-    """A client in a process of its own that walks; its states are large."""
+    """Run a client with a session in a separate process; its states are large."""
     command = [sys.executable, "-P", "-c", CLIENT, endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -62,7 +62,10 @@ def other_client(endpoint):
 
 
 def test_a_frozen_client_stops_nobody(served, endpoint):
-    """It is sent 20 MB of states, more than sockets and queues hold. Its query asks for replies that wait for room."""
+    """Send 20 MB of states to a frozen client, more than sockets and queues hold.
+
+    Its query asks for replies that wait for room.
+    """
     with other_client(endpoint) as other, walking(endpoint) as session:
         (frozen,) = [user for user in served.users if user.avatar == "large"]
         key, stranger = key_expressions.command_key("floor", frozen), session._session
@@ -83,7 +86,7 @@ def test_a_killed_client_leaves_the_scene(served, endpoint):
         assert [user.avatar for user in served.users] == ["large"]
         other.kill()
         eventually(lambda: not served.users)
-    _, client = served.scene.gone  # the first is who warmed it
+    _, client = served.scene.gone  # the first is the client that warmed the scene
     assert client != "*warm" and not served.scene.avatars
 
 
@@ -94,16 +97,16 @@ def test_a_session_goes_on_with_a_server_that_was_restarted(endpoint):
             for restart in range(3):
                 with server_process(endpoint, "--walked") as process:
                     last = keep_wishing(session, lambda: session.wish(velocity=(0.0, 1.0, 0.0)), restart == 0)
-                    # A state more, of the server that is there now.
+                    # One more state, from the new server.
                     assert last.pose[0, 1, 3] > 0.001 * restart
                     process.kill()
-                # What is on its way may still come, and nothing after it.
+                # Messages under way may still arrive, but nothing after them.
                 eventually(lambda: session.latest().age > 0.5)
     assert last.pose[0, 0, 3] == 0.25, "from where the first server had left it"
 
 
 def keep_wishing(session, wish, first):
-    """Wish until a server says something, as a viewer does; the first wish of all says where it begins."""
+    """Send motion commands until the server replies, as a viewer does; the very first gives a pose."""
     before = session.latest().state.seq if session.latest() else 0
     found = []
 

@@ -1,4 +1,4 @@
-"""Whatever some clients ask for, the others are answered: a light client's answers are the judge."""
+"""Test that heavy requests of some clients do not starve others: a light client keeps right answers."""
 
 import hashlib
 import threading
@@ -26,7 +26,7 @@ TRUTH = [int(Verdict.CONTACT), int(Verdict.CLEAR)]
 
 
 class Light:
-    """A client that asks for little."""
+    """A client with small requests."""
 
     def __init__(self, endpoint):
         self.client = Client(endpoint, scene="floor", timeout=DEADLINE)
@@ -40,13 +40,16 @@ class Light:
         self.client.__exit__(*error)
 
     def is_answered(self):
-        """Ask again and again; an answer that is not the truth is a failure, and so are `busy` and silence."""
+        """Repeat a query; fail if an answer is wrong, `busy` or missing."""
         for _ in range(ASKED):
             assert self.client.collide("al", heights([-1.0, 1.0])).verdict.tolist() == TRUTH
 
 
 class StoppableService(RequestDispatcher):
-    """Answers `info` when the request is stopped, or the gate is opened. began: how often; reasons: of each stop."""
+    """Service whose `info` replies when the request is stopped or the gate is opened.
+
+    began: number of requests that began.  reasons: of each stop.
+    """
 
     def __init__(self, scene, config):
         super().__init__([scene], config)
@@ -58,14 +61,14 @@ class StoppableService(RequestDispatcher):
             self.began += 1
             deadline = time.monotonic() + DEADLINE
             while not (stop or self.gate.is_set()) and time.monotonic() < deadline:
-                hashlib.sha256(_WORK)  # computes, and others may have the interpreter
+                hashlib.sha256(_WORK)  # simulates computing while other threads get the interpreter
             self.reasons.append(stop.reason)
         return super().answer(key, payload, encoding, stop)
 
 
 @contextmanager
 def stoppable(scene, config):
-    """A server of such a service."""
+    """Serve a StoppableService."""
     service = StoppableService(scene, config)
     with Transport(["floor"], service, config) as transport:
         service.in_flight = lambda: len(transport._lanes[0]._queues)
@@ -74,7 +77,7 @@ def stoppable(scene, config):
 
 @contextmanager
 def blocked(stack, endpoint, number, name="wait"):
-    """Clients that ask for what is not answered yet; ended by the gate."""
+    """Start clients whose requests are not answered until the gate opens."""
     threads, answers = [], []
     for _ in range(number):
         client = stack.enter_context(Client(endpoint, scene="floor", timeout=DEADLINE))
@@ -93,7 +96,7 @@ def blocked(stack, endpoint, number, name="wait"):
 
 
 def test_slow_requests_of_several_clients_hold_nobody_up(scene, endpoint):
-    """As many as may be slow at a time, more than there are workers."""
+    """Test the maximum number of slow requests at a time, which is larger than the number of workers."""
     config = ServerConfig(listen=endpoint, workers=2, max_slow=4, max_request_seconds=DEADLINE)
     with serving([scene], config), ExitStack() as stack:
         light = stack.enter_context(Light(endpoint))
@@ -155,7 +158,7 @@ def test_a_flood_of_one_client_is_busy_for_that_client_alone(scene, endpoint):
 
 
 def test_clients_without_a_token_share_a_turn(scene, endpoint):
-    """However many client ids somebody invents, all of them together count as one client."""
+    """Test many invented client ids: together they count as one client."""
     with (
         serving([scene], ServerConfig(listen=endpoint)),
         zenoh.open(session_config(connect=endpoint)) as session,
@@ -210,7 +213,7 @@ def test_requests_of_a_client_that_is_gone_are_stopped_and_dropped(scene, endpoi
 
 
 def test_more_slow_requests_than_places_wait_without_a_worker(scene, endpoint):
-    """They are stopped, wait for a place, and begin anew."""
+    """Test slow requests beyond the limit: they are stopped, wait for a place and start again."""
     config = ServerConfig(listen=endpoint, workers=2, max_slow=1, max_request_seconds=2 * DEADLINE)
     with stoppable(scene, config) as service, ExitStack() as stack:
         light = stack.enter_context(Light(endpoint))

@@ -1,4 +1,4 @@
-"""`stats` over zenoh, as Prometheus' text and in `solidcloud top`: what a server says is what was asked of it."""
+"""Test `stats` over zenoh, as Prometheus text and in `solidcloud top`, against the queries made."""
 
 import json
 import os
@@ -45,14 +45,14 @@ KEY = query_key("floor", "c", "stats")
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of several voxels."""
+    """Build an archive of several voxels."""
     points = np.vstack([synthetic_scans.make_scan("plane", 1, 500), [[0, 0, 0], [9, 9, 9]]])
     return archive_cases.build(tmp_path_factory.mktemp("stats"), points).archive
 
 
 @pytest.fixture
 def endpoint() -> str:
-    """A free port on loopback."""
+    """Return a free port on loopback."""
     return f"tcp/127.0.0.1:{free_port()}"
 
 
@@ -152,7 +152,7 @@ def test_users_go_with_their_client_and_still_count_in_all(archive: Path, endpoi
 
 @contextmanager
 def server(archive: Path, endpoint: str, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """`solidcloud serve` in a process of its own, ready; killed if it still runs."""
+    """Run `solidcloud serve` in a separate process until the block ends; yield when it is ready."""
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(archive)]
     options = ("--name", "hall", "--listen", endpoint, *options)
     with subprocess.Popen(
@@ -168,7 +168,7 @@ def server(archive: Path, endpoint: str, *options: str) -> Iterator[subprocess.P
 
 @contextmanager
 def taken_port() -> Iterator[int]:
-    """A port that somebody listens on."""
+    """Return a port on which a process listens."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -176,7 +176,7 @@ def taken_port() -> Iterator[int]:
 
 
 def wait_for(stream: IO[str], pattern: str) -> str:
-    """The first line that matches."""
+    """Return the first line that matches."""
     for line in stream:
         if re.search(pattern, line):
             return line
@@ -203,7 +203,7 @@ def test_the_command_serves_metrics_and_top_shows_them(
             f'client="{public_id(client._connection.client_id)}"' in text
             and client._connection.client_id not in text
         )
-        # All that are served, one by name, and as JSON.
+        # All scenes served, one by name, and as JSON.
         for more in ([], ["--scene", "hall"]):
             assert run(["top", "--connect", endpoint, "--once", *more]) == 0
             shown = capsys.readouterr().out
@@ -224,7 +224,7 @@ def test_the_command_serves_metrics_and_top_shows_them(
 
 
 def top(endpoint: str) -> "subprocess.Popen[str]":
-    """`solidcloud top` in a process of its own, its first table printed."""
+    """Run `solidcloud top` in a separate process; return when it has printed its first table."""
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "top", "--connect", endpoint]
     process = subprocess.Popen(
         [*command, "--interval", "0.2"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -235,7 +235,7 @@ def top(endpoint: str) -> "subprocess.Popen[str]":
 
 
 def watch_until_interrupted(endpoint: str) -> None:
-    """Ctrl-C is how it ends."""
+    """Check that Ctrl-C ends it."""
     process = top(endpoint)
     os.kill(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=DEADLINE)
@@ -243,7 +243,7 @@ def watch_until_interrupted(endpoint: str) -> None:
 
 
 def watch_until_the_server_goes(endpoint: str, serving: "subprocess.Popen[str]") -> None:
-    """A server that is gone is one line."""
+    """Check that it reports a stopped server in one line."""
     process = top(endpoint)
     os.kill(serving.pid, signal.SIGTERM)
     _, errors = process.communicate(timeout=DEADLINE)

@@ -1,4 +1,4 @@
-"""The command line where answers do not come: exit code 1, one line that says where, what and what to do."""
+"""Test commands without answers: exit code 1, and one line that says where, what and what to do."""
 
 import json
 import subprocess
@@ -36,7 +36,10 @@ OPS = [
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Any]:
-    """What each question takes: six poses from low to high, so five motions; two rays, points and objects."""
+    """Write the input files of each query.
+
+    They hold six poses from low to high, which are five motions, and two rays, points and objects.
+    """
     (tmp_path / "ball.xyz").write_text("0 0 0\n")
     rows = "".join(f"{t},0,0,{t - 1},1,0,0,0\n" for t in range(6))
     (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
@@ -54,7 +57,7 @@ def files(tmp_path: Path) -> dict[str, Any]:
 
 
 def query(endpoint: str, op: str, options: list[str]) -> list[str]:
-    """The arguments of a question; `op` as in OPS."""
+    """Return the arguments of a query; `op` as in OPS."""
     name, _, along = op.partition(" ")
     arguments = ["query", "--connect", endpoint, "--scene", "floor", "--op", name, *options]
     return [*arguments, "--along", along] if along else arguments
@@ -112,7 +115,7 @@ def test_the_command_itself_exits_with_1(endpoint: str, files: dict[str, Any], v
 
 
 class Stalls(FloorScene):
-    """Answers two poses, and the rest once it may."""
+    """Scene that answers two poses at once, and the others when the gate opens."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,7 +157,7 @@ def test_where_some_answers_do_not_come_the_others_are_printed(
 
 
 class Doubts(FloorScene):
-    """Cannot tell of the first two poses, nor where frames end."""
+    """Scene that returns unknown for the first two poses and for the end of frames."""
 
     def __init__(self, fault: str) -> None:
         super().__init__()
@@ -203,14 +206,14 @@ def test_what_the_server_itself_does_not_know_is_said(
 def test_a_path_that_stops_after_its_first_part(
     endpoint: str, tmp_path: Path, files: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The parts that came are printed, the rest is unknown and counted."""
+    """Test a path cut short: the parts that arrived are printed, the others are unknown and counted."""
     count = 45
     rows = "".join(f"{t},0,0,1,1,0,0,0\n" for t in range(count))
     (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
 
     class Waits(FloorScene):
         def path(self, name: str, *what: Any, client: str = "", **parameters: Any) -> Any:
-            # By another name: the floor waits after the first part of a path of "wait".
+            # Another avatar name: the floor waits after the first part of a path of "wait".
             self.avatars[client, "wait"] = self.avatars[client, name]
             return super().path("wait", *what, client=client, **parameters)
 
@@ -228,7 +231,7 @@ def test_a_path_that_stops_after_its_first_part(
 
 
 def test_frames_that_are_answered(endpoint: str, files: dict[str, Any], capsys: Any) -> None:
-    """All of them: a simulation that answers is not taken for one that does not, whatever its verdicts."""
+    """Test answered frames with any verdict: they are not taken for unanswered ones."""
     with serving([floor_simulation().scene], ServerConfig(listen=endpoint)):
         assert run(query(endpoint, "move", files["move"])) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5

@@ -1,4 +1,4 @@
-"""The demonstration on a small scan: what it writes adds up, and its server is gone afterwards."""
+"""Test the demonstration on a small scan: its figures are consistent, and its server stops afterwards."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from solidcloud.server.report.walk.server_process import served
 
 @pytest.fixture
 def corridor(tmp_path: Path) -> Path:
-    """A floor of 6 by 2 m with a wall across its middle."""
+    """Return a floor of 6 by 2 m with a wall across its middle."""
     x, y = np.meshgrid(np.arange(0, 6, 0.04), np.arange(0, 2, 0.04))
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     y, z = np.meshgrid(np.arange(0, 2, 0.04), np.arange(0.1, 2, 0.04))
@@ -30,7 +30,7 @@ def test_walk_through_a_wall_touches_it_there_and_nowhere_else(corridor: Path, t
     assert summary["contact"] == verdicts.count("contact") and summary["unknown"] == 0
     assert summary["contact"] + summary["clear"] == 1200
     touched = np.flatnonzero([verdict == "contact" for verdict in verdicts])
-    # 6 m in 1,200 frames; the figure reaches under half a metre before and behind itself.
+    # 6 m in 1,200 frames; the figure extends less than half a metre to the front and back.
     assert len(touched) > 60 and np.diff(touched).max() == 1
     assert abs(touched.mean() - 600) < 40 and np.ptp(touched) < 1.3 / 6 * 1200
     assert sum(frame["hits"] for frame in frames) == summary["hits"] > 0

@@ -1,4 +1,4 @@
-"""Users who walk a scene with its effects, over zenoh: what they meet, what is remembered, and the replay of it all."""
+"""Test users who walk in a scene with effects, over zenoh: obstacles, memory, and replay of the log."""
 
 import struct
 import sys
@@ -27,14 +27,14 @@ from solidcloud.server.simulation.replay_log import MAGIC, FrameRecord, read_log
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
-# A body of a metre and a half, of three spheres.
+# A body 1.5 m high, of three spheres.
 BODY = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.8], [0.0, 0.0, 1.3]])
 RADIUS = 0.25
 STEP = 1 / 60
 
 
 def room() -> np.ndarray:
-    """A floor at z = 0, four metres square, with a wall at x = 1.5 (n, 3) [m]."""
+    """Return a floor at z = 0, four metres square, with a wall at x = 1.5 (n, 3) [m]."""
     x, y = np.meshgrid(np.arange(-2, 2, 0.05), np.arange(-2, 2, 0.05))
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     y, z = np.meshgrid(np.arange(-2, 2, 0.05), np.arange(0.05, 2, 0.05))
@@ -43,7 +43,7 @@ def room() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The room's archive."""
+    """Build the room's archive."""
     return archive_cases.build(tmp_path_factory.mktemp("room"), room(), voxel=2.0).archive
 
 
@@ -60,7 +60,7 @@ def pose_at(x: float, y: float = 0.0, z: float = 0.05) -> np.ndarray:
 
 
 def walk(session: Any, x: float, y: float = 0.0, frames: int = 40) -> np.ndarray:
-    """Wish to be at a place, frame after frame; where the avatar got to."""
+    """Send a motion command to a place in each frame; return where the avatar arrived."""
     for _ in range(frames):
         state = session.wait(session.wish(pose_at(x, y)), DEADLINE)
     place: np.ndarray = state.pose[0, :3, 3]
@@ -117,7 +117,7 @@ def test_users_block_one_another_until_one_of_them_leaves(
 
 
 def compiled() -> dict[str, int]:
-    """How many versions of each kernel there are; none where nothing is compiled."""
+    """Return the number of compiled versions of each kernel; empty if interpreted."""
     return {
         f"{name}.{key}": len(kernel.signatures)
         for name, module in sorted(sys.modules.items())
@@ -164,7 +164,7 @@ limits = {{ users = 4, frame_visits = 3000 }}
 
 @pytest.fixture(scope="module")
 def logged(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A scene file, and the log of two users who walked it."""
+    """Return a scene file and the log of two users who walked in it."""
     folder = tmp_path_factory.mktemp("logged")
     (folder / "room.toml").write_text(SCENE.format(archive=archive))
     log = folder / "frames.log"
@@ -214,7 +214,7 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
     np.savetxt(tmp_path / "box.xyz", [[0, 0, 0.3], [0, 0.3, 0.3], [0, 0, 0.8]], fmt="%.3f")
     path, log = tmp_path / "things.toml", tmp_path / "frames.log"
     rng = np.random.default_rng(12)
-    users = [User("a", "box"), User("b", "box")]  # as the scene's own avatar
+    users = [User("a", "box"), User("b", "box")]  # as an avatar of the scene
     moved = {}
     with Scene.open(path, read_points=np.loadtxt) as scene, recorded(scene, path, log):
         scene.simulation.warm()
@@ -229,12 +229,12 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
             for outcome in scene.simulation.step(turns):
                 moved.update(outcome.state.objects.poses)
     assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"
-    with Scene.open(path, read_points=np.loadtxt) as scene:  # not warmed: that leaves nothing behind
+    with Scene.open(path, read_points=np.loadtxt) as scene:  # not warmed: warming leaves no trace
         assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None)
 
 
 def records_of(whole: bytes) -> Iterator[tuple[int, int]]:
-    """Where each record's body begins, and its length."""
+    """Return the offset of each record's body, and its length."""
     at = len(MAGIC)
     while at < len(whole):
         (length,) = struct.unpack_from("<I", whole, at)
@@ -255,7 +255,7 @@ def test_a_log_with_one_bit_changed_is_not_believed(
     (tmp_path / "changed.log").write_bytes(whole)
     assert run(["replay", str(tmp_path / "changed.log")]) == 3
     assert f"at byte {at - 12}: its bytes have checksum" in capsys.readouterr().err
-    # Made to fit, it is found by what it says.
+    # With a corrected checksum, the replay finds the change in the poses.
     struct.pack_into("<I", whole, at - 4, zlib.crc32(bytes(whole[at : at + length])))
     (tmp_path / "fitting.log").write_bytes(whole)
     assert run(["replay", str(tmp_path / "fitting.log")]) == 1

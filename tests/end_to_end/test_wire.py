@@ -1,4 +1,4 @@
-"""A client and a server over zenoh on loopback: what is answered, and what is refused."""
+"""Test a client and a server over zenoh on loopback: answers and refusals."""
 
 import threading
 
@@ -195,7 +195,7 @@ def test_an_avatar_over_the_cap_is_an_error_and_poses_over_it_are_asked_in_halve
     client.add_avatar("al", POINTS, 0.1)
     with pytest.raises(TooLargeError):
         client.add_avatar("huge", np.zeros((1_000_001, 3)))
-    # The server refuses so many at once (test_service.py); the client asks for them in halves.
+    # The server refuses a request of this size; the client splits it in halves.
     monkeypatch.setattr(client_module, "BATCH_POSES", 10**6)
     verdict = client.collide("al", np.tile(np.eye(4), (100_001, 1, 1))).verdict
     assert len(verdict) == 100_001 and len(set(verdict.tolist())) == 1

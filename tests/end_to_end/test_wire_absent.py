@@ -1,4 +1,4 @@
-"""A server that is not there, not yet, no longer, or frozen: what it does not answer is unknown."""
+"""Test a server that is absent, late, stopped or frozen: what it does not answer is unknown."""
 
 import signal
 import time

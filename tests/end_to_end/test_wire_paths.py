@@ -1,4 +1,4 @@
-"""A path comes over zenoh in parts and in order, and what of it is not answered is unknown."""
+"""Test paths over zenoh: the parts arrive in order, and missing parts are unknown."""
 
 import signal
 from contextlib import ExitStack
@@ -162,7 +162,7 @@ def test_a_client_whose_token_goes_is_sent_no_more_parts(scene, endpoint):
         token = session.liveliness().declare_token("solidcloud/1/client/floor/c")
         scene.avatars["c", "wait"] = (POINTS, 0.125)
         request = encode(PathRequest("wait", PATH))
-        # By default zenoh keeps of several replies the last.
+        # By default zenoh keeps only the last of several replies.
         every = {"consolidation": zenoh.ConsolidationMode.NONE, "timeout": DEADLINE}
         replies = session.get("solidcloud/1/scene/floor/c/path", payload=request, **every)
         assert replies.recv().ok

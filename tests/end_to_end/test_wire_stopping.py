@@ -1,4 +1,4 @@
-"""A server that stops, by itself or by a signal, answers what it accepted, within its time."""
+"""Test a server that stops, by itself or by a signal: it answers accepted requests within its time."""
 
 import signal
 import threading
@@ -31,9 +31,9 @@ def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):
 
 
 def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
-    """A path without end in sight, and a queue behind a slow answer: cut short, and no thread is left at work."""
+    """Test an endless path and a queue behind a slow answer: both are cut short, and no thread remains."""
     scene = FloorScene(delay=0.05)
-    before = set(threading.enumerate())  # of scenes that other tests share
+    before = set(threading.enumerate())  # excludes threads of scenes that other tests share
     with Client(endpoint, scene="floor", timeout=DEADLINE) as client, ExitStack() as stack:
         with serving([scene], ServerConfig(listen=endpoint, stop_seconds=0.1)):
             client.add_avatar("al", POINTS, 0.125)
@@ -54,7 +54,7 @@ def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
 
 @pytest.mark.parametrize("delay, count", [(0.005, 60), (0.015, 50)])
 def test_terminated_server_answers_what_it_accepted_and_exits_0(endpoint, delay, count):
-    """Requests that take longer than 10 ms are each handed to a thread of their own."""
+    """Test requests of more than 10 ms, each of which is handed to a separate thread."""
     with server_process(endpoint, "--delay", str(delay)) as process:
         with (
             Client(endpoint, scene="floor") as client,
@@ -64,7 +64,8 @@ def test_terminated_server_answers_what_it_accepted_and_exits_0(endpoint, delay,
             payload = encode(CollideRequest("al", heights([-1.0])))
             key = f"solidcloud/1/scene/floor/{client._connection.client_id}/collide"
             asked = [session.get(key, payload=payload, timeout=DEADLINE) for _ in range(count)]
-            # Answered by the other worker, and asked after the others on the same link: all have arrived.
+            # The other worker answered this query, which was sent after the others on the same
+            # link: all have arrived.
             assert next(iter(session.get("solidcloud/1/scene/floor/other/info"))).ok
             process.send_signal(signal.SIGTERM)
             replies = [reply for handler in asked for reply in handler]

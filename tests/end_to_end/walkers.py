@@ -1,4 +1,4 @@
-"""Avatars that walk the made floor of fake_server.py over zenoh, and where it lets them get to."""
+"""Avatars that walk on the floor of fake_server.py over zenoh, and their expected positions."""
 
 from contextlib import contextmanager
 
@@ -6,7 +6,7 @@ import numpy as np
 from floor import DEADLINE, POINTS
 from solidcloud.server.client import Client
 
-REST = np.nextafter(-0.375, 1.0)  # where POINTS with a radius of 0.125 come to rest on the floor
+REST = np.nextafter(-0.375, 1.0)  # height at which POINTS with a radius of 0.125 rest on the floor
 
 
 def pose_at(x, z, y=0.0):
@@ -16,7 +16,7 @@ def pose_at(x, z, y=0.0):
 
 
 def outcome(pose):
-    """The judge: where the floor lets an avatar get to."""
+    """Return the expected pose: where the floor stops an avatar."""
     there = pose.copy()
     there[2, 3] = max(pose[2, 3], REST)
     return there
@@ -24,7 +24,7 @@ def outcome(pose):
 
 @contextmanager
 def walking(endpoint, name="al", **fields):
-    """A client with one avatar, and its session."""
+    """Connect a client with one avatar; yield its session."""
     with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
         client.add_avatar(name, POINTS, 0.125)
         with client.session(name) as session:

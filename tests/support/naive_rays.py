@@ -44,7 +44,7 @@ def unit_vectors(directions: ArrayLike) -> NDArray[np.float64]:
 def meetings(d: NDArray[np.int64], u: NDArray[np.float64], radii: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return t (n,) at which a ray hits spheres; inf if it misses.
 
-    direction: u (3,).  spheres: at d (n, 3) from the start.  radii: (n,), exact units.
+    d: (n, 3), the spheres from the start.  u: (3,), direction.  radii: (n,).  All in exact units.
     """
     radius = radii.astype(np.float64)
     x, y, z = d.astype(np.float64).T

@@ -1,4 +1,4 @@
-"""The scene of corner.py, opened and served once for all tests of a file."""
+"""Fixtures: the scene of corner.py, opened and served once for all tests of a file."""
 
 import pytest
 from corner import client_of, opened, served

@@ -1,4 +1,4 @@
-"""A question that the product does not have, from its declaration and its engine: asked in every way."""
+"""Test a query that the product does not have, from declaration and engine to every way to call it."""
 
 import json
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
 
 @pytest.fixture(autouse=True)
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The declaration and the engine are known."""
+    """Declare the query and register its engine."""
     monkeypatch.setitem(QUESTIONS, COUNT_WITHIN.name, COUNT_WITHIN)
     monkeypatch.setitem(ENGINES, COUNT_WITHIN.name, count_within)
 
@@ -45,7 +45,7 @@ def scene(built: Built) -> Iterator[Scene]:
 
 
 def places(built: Built) -> Floats:
-    """Points near scan points, and one where there are none."""
+    """Return points near scan points, and one without scan points around it."""
     rng = np.random.default_rng(5)
     points = np.vstack(built.points)
     near = rng.choice(points, 40) + rng.normal(0, 0.2, (40, 3))
@@ -53,7 +53,7 @@ def places(built: Built) -> Floats:
 
 
 def judged(scan: Floats, points: Floats) -> list[int]:
-    """The number of scan points within reach of each point, every one tested."""
+    """Return the number of scan points within reach of each point, by testing every pair."""
     stored = naive.scan_units(naive.lattice_of(scan, [0.0, 0, 0], STEP), STEP)
     apart = stored[None] - naive_rays.world_units(points, [0.0, 0, 0])[:, None]
     square = (apart.astype(object) ** 2).sum(axis=2)

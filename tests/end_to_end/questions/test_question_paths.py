@@ -1,4 +1,4 @@
-"""Every question along a path: its parts are the answers to it, bit for bit, here and over zenoh."""
+"""Test every query along a path: the parts equal the plain answers, bit for bit, here and over zenoh."""
 
 import numpy as np
 import pytest
@@ -132,7 +132,7 @@ def test_nothing_is_asked_once_the_time_is_up(scene, monkeypatch):
 
 
 def clear_at_once(parts):
-    """Which poses were clear without a visit: out of reach of every voxel."""
+    """Return which poses were clear without a visit: out of reach of every voxel."""
     visits = np.concatenate([part.node_visits for part in parts])
     bounds = np.concatenate([part.lower for part in parts])
     return (visits == 0) & (bounds > 0)

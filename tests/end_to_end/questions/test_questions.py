@@ -1,4 +1,4 @@
-"""Every question over zenoh: what comes back is what the scene in this process says, bit for bit."""
+"""Test every query over zenoh: the answers equal those of the scene in this process, bit for bit."""
 
 import importlib
 import pkgutil
@@ -64,7 +64,7 @@ def test_what_is_split_is_what_was_asked_at_once(scene, client, question, monkey
 
 
 def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monkeypatch):
-    """Clusters are not bounded by `limit`: here there are many of them, and messages are small."""
+    """Test many clusters with small messages: `limit` does not bound clusters."""
     from solidcloud.server.zenoh_server import request_dispatcher as dispatcher_module
 
     parameters = {"limit": 0, "margin": 0.5, "cluster_distance": 0.0}
@@ -82,7 +82,7 @@ def test_contacts_that_no_message_holds_come_in_smaller_ones(scene, client, monk
 
 
 def compiled():
-    """How many versions of each kernel there are; none where nothing is compiled."""
+    """Return the number of compiled versions of each kernel; empty if interpreted."""
     found = {}
     for found_module in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
         module = importlib.import_module(found_module.name)

@@ -1,4 +1,4 @@
-"""The wheel holds every module and data file, and nothing bare; the pins cover every extra."""
+"""Test that the wheel holds every module and data file, and that the pins cover every extra."""
 
 import json
 import re
@@ -23,7 +23,7 @@ wheel = pytest.mark.skipif(not is_wheel(), reason="an editable install, not a wh
 
 
 def sources() -> set[str]:
-    """What should be installed, as paths inside the package; server/api is the package itself."""
+    """Return the files to be installed, as paths inside the package; server/api is the package itself."""
     return {
         path.relative_to(ROOT).as_posix().removeprefix("server/api/")
         for package in ("schemas", "builder", "server")
@@ -60,7 +60,7 @@ def test_tests_import_what_is_installed() -> None:
 
 
 def pins() -> dict[str, str]:
-    """Name (normalised) -> version of scripts/requirements.txt."""
+    """Return name (normalised) -> version of scripts/requirements.txt."""
     lines = (ROOT / "scripts/requirements.txt").read_text().splitlines()
     pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
     return {normalised(name): version for name, version in pairs}

@@ -1,4 +1,4 @@
-"""The same questions have the same replies, byte for byte, on any number of threads and for any processor."""
+"""Test that equal requests have equal reply bytes, on any number of threads and any processor."""
 
 import json
 import os
@@ -20,7 +20,7 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of many voxels and small trees, its points of several radii."""
+    """Build an archive of many voxels and small trees, with points of several radii."""
     points = synthetic_scans.make_scan(*mixed_requests.SCAN)
     models = frozenset({"mean", "local", "border"})
     folder = tmp_path_factory.mktemp("mixed")
@@ -32,7 +32,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "10,000 mixed requests on 1, 2 and 4 threads, with loads and evictions: the same reply bytes, except for costs",
 )
 @pytest.mark.interpreted
-@pytest.mark.timeout(900)  # it may be the first to compile everything
+@pytest.mark.timeout(900)  # the first run may have to compile everything
 def test_threads_change_no_byte(archive: Path) -> None:
     count = 60 if INTERPRETED else 10_000
     asked = mixed_requests.requests(count)
@@ -56,7 +56,7 @@ def test_threads_change_no_byte(archive: Path) -> None:
 @pytest.mark.timeout(1000)
 @pytest.mark.skipif(INTERPRETED, reason="it compiles twice")
 def test_the_processor_changes_no_byte(archive: Path) -> None:
-    """Everything is compiled once more: a minute or two."""
+    """Compile everything once more, which takes a minute or two."""
     here = mixed_requests.checksums(archive, mixed_requests.requests(10_000), 1, 1 << 26)
     path = os.pathsep.join([str(Path(mixed_requests.__file__).parent), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(

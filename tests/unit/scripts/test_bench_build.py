@@ -1,4 +1,4 @@
-"""The helpers of scripts/bench_build: what its report says of memory, stages and limits. Nothing is timed."""
+"""Test the parts of scripts/bench_build: memory, stages, limits and sizes. Nothing is timed."""
 
 import dataclasses
 import hashlib
@@ -29,9 +29,6 @@ def built(points: int, seconds: float, stages: dict[str, float], samples: list[S
     return build_runs.Built(
         points, summary, Watched(seconds, 2 * seconds, 0.0, samples), 1e-4, 3 * points, points
     )
-
-
-# --- watching -------------------------------------------------------------------------------------------
 
 
 def test_memory_of_a_process_is_its_share_of_pages_and_what_is_anonymous() -> None:
@@ -67,9 +64,6 @@ def test_json_is_found_behind_other_lines(before: str) -> None:
     assert build_watch.last_json(before + '{\n "a": 1\n}\n') == {"a": 1}
 
 
-# --- builds ---------------------------------------------------------------------------------------------
-
-
 def test_stages_and_the_rest_are_the_whole_time() -> None:
     run = built(10, 8.0, {"survey": 1.0, "build": 4.0}, [])
     assert run.stages == {"survey": 1.0, "build": 4.0, build_runs.REST: 3.0}
@@ -97,9 +91,6 @@ def test_a_failed_build_says_why(tmp_path: Path) -> None:
         build_runs.build(tmp_path / "no.las", tmp_path / "archive", memory="1GB", jobs=1)
 
 
-# --- rates ----------------------------------------------------------------------------------------------
-
-
 def test_a_stage_is_found_again_in_the_times_it_would_take() -> None:
     stage = StageRate(0.3, 5e-7, 1e-8, 2e-7)
     found = build_rates.fit_stage({(n, jobs): stage.seconds(n, jobs) for n, jobs in build_rates.SIZES})
@@ -107,7 +98,10 @@ def test_a_stage_is_found_again_in_the_times_it_would_take() -> None:
 
 
 def rate_builds(others: float, slower: float) -> dict[tuple[int, int], list[build_runs.Built]]:
-    """Builds of one stage: 1 s and 1 µs a point, shared among jobs; processor time as if nothing else ran."""
+    """Return builds of one stage: 1 s and 1 µs a point, shared among jobs.
+
+    Processor times are those without other load.
+    """
     found = {}
     for n, jobs in build_rates.SIZES:
         alone = 1.0 + 1e-6 * n / jobs
@@ -126,9 +120,6 @@ def test_other_work_does_not_make_rates_slow(others: float, slower: float) -> No
     assert set(stages) == {"build", "start, end"}
     assert build_rates.fit_memory(builds) == pytest.approx((120 << 20, 10 << 20, 0.0))
     assert build_rates.fit_workers(builds, stages) == (0.0 if others < 1 else build_rates.USUAL_WORKERS)
-
-
-# --- limits and sizes -----------------------------------------------------------------------------------
 
 
 def test_limits_do_all_of_the_work_and_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The helpers of scripts/bench_engine: poses, classes, goals and turns are what its report says. Nothing is timed."""
+"""Test the parts of scripts/bench_engine: poses, classes, targets and turns. Nothing is timed."""
 
 import csv
 import json
@@ -22,12 +22,9 @@ BODY = np.array([[0.0, 0, 0.1], [0.1, 0, 0.1], [0, 0, 1.0]])
 
 
 def least(points: np.ndarray, avatar: np.ndarray, pose: np.ndarray) -> float:
-    """Least distance of centres, all pairs."""
+    """Return the least distance of centres, over all pairs."""
     placed = avatar @ pose[:3, :3].T + pose[:3, 3]
     return float(np.sqrt(((placed[:, None] - points) ** 2).sum(axis=2).min()))
-
-
-# --- poses ----------------------------------------------------------------------------------------------
 
 
 def test_jitter_moves_every_pose_by_at_most_its_size_and_keeps_the_given_ones(
@@ -141,9 +138,6 @@ def test_inside_columns(rng: np.random.Generator) -> None:
         assert any((x, y) == (c.x, c.y) and c.z_low <= z <= c.z_high for c in truth.columns)
 
 
-# --- goals and figures ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("measured", "limit", "at_least", "word"),
     [
@@ -198,7 +192,7 @@ def test_numbers_have_three_digits_that_count(value: float | None, text: str) ->
 
 
 def a_report() -> list[bench_results.Part]:
-    """Two sections: one with a met, a missed and an unmeasured goal, one that failed."""
+    """Return two sections: one with a met, a missed and an unmeasured target, and one that failed."""
     part = bench_results.Part("collide", missing=["peers"], others=0.1)
     part.add("façade, walk", "ours, voxel 32 m", "collide", [9.0, 10.0], "µs", 1200)
     part.add("façade, walk", compared_sides.TABLE, "collide", 39.0, "µs", 1200)
@@ -245,9 +239,6 @@ def test_the_report_is_written_and_drawn(tmp_path: Path) -> None:
     for number, parts in enumerate((a_report(), [bench_results.Part("memory")])):
         engine_picture.draw(parts, {}, "a machine", tmp_path / f"{number}.png")
         assert (tmp_path / f"{number}.png").read_bytes().startswith(b"\x89PNG")
-
-
-# --- turns ----------------------------------------------------------------------------------------------
 
 
 def test_sides_take_turns_and_no_pose_comes_twice(rng: np.random.Generator) -> None:

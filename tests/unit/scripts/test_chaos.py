@@ -1,4 +1,4 @@
-"""The judge of scripts/chaos: what is unknown is never wrong, and every kind of wrong answer is found out."""
+"""Test the checks of scripts/chaos: unknown is never wrong, and every kind of wrong answer is found."""
 
 import json
 import time
@@ -30,7 +30,7 @@ from solidcloud.schemas.wire.requests import CollideRequest, WithinRequest
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory):
-    """A floor, opened in this process."""
+    """Open a floor in this process."""
     from solidcloud.server.scene import Scene
 
     x, y = np.meshgrid(np.arange(-2, 2, 0.1), np.arange(-2, 2, 0.1))
@@ -168,8 +168,8 @@ def test_a_client_is_still_once_all_its_ids_are(tmp_path: Path) -> None:
 
 
 def violations(threads: list[dict[str, int]], files: list[dict[str, int]]) -> list[str]:
-    """What of a run is broken whose last life has held this at quiet points."""
-    quiet = [QuietPoint(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0, False)]  # of a life before
+    """Return the violations of a run whose last server process had these figures at quiet points."""
+    quiet = [QuietPoint(1, 0.0, {"odd": 7}, {"odd": 7}, 0, 0, False)]  # of an earlier process
     quiet += [QuietPoint(2, 0.0, *held, 0, 0, False) for held in zip(threads, files, strict=True)]
     report = dict.fromkeys(
         ("wrong", "of them in contact", "clear_away", "errors", "tracebacks in the server's log",
@@ -179,7 +179,7 @@ def violations(threads: list[dict[str, int]], files: list[dict[str, int]]) -> li
 
 
 def pools(*counts: int) -> list[dict[str, int]]:
-    """Threads at quiet points with so many of zenoh's pool, and some of ours."""
+    """Return threads at quiet points: this many of zenoh's pool, and some of ours."""
     return [{"worker-0": 1, "chaos-parts": 2, "app-0": 1, f"rx-{i}": n - 1} for i, n in enumerate(counts)]
 
 
@@ -214,7 +214,7 @@ def test_a_generation_that_was_served_while_a_question_was_under_way_is_remember
     client = b.Scoreboard(tmp_path / "board")
     driver.serve(1)
     asked = time.monotonic()
-    for generations in (3, 2, 3, 1):  # to the other and back, while a client is frozen
+    for generations in (3, 2, 3, 1):  # to the other generation and back while a client is frozen
         driver.serve(generations)
     assert client.served_since(asked) == 3
     assert client.served_since(time.monotonic()) == 1

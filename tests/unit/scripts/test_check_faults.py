@@ -1,4 +1,4 @@
-"""scripts/check_faults: the addresses at which a process listens."""
+"""Test scripts/check_faults: the addresses on which a process listens."""
 
 import os
 import socket

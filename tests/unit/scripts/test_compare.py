@@ -1,4 +1,4 @@
-"""scripts/compare: intervals of ratios, and what they say of a limit."""
+"""Test scripts/compare: confidence intervals of ratios, and their comparison with a limit."""
 
 import numpy as np
 import pytest

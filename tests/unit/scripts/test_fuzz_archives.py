@@ -1,4 +1,4 @@
-"""scripts/fuzz_archives: some hundred forged archives now, and a fault is found where there is one."""
+"""Test scripts/fuzz_archives with some hundred forged archives, and that it finds a fault."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ SCRIPT = Path(__file__).parents[3] / "scripts" / "fuzz_archives"
 
 
 def test_flipped_archives_are_refused_or_answered_right() -> None:
-    """A share of what `scripts/fuzz_archives --flips` does."""
+    """Test a share of the cases of `scripts/fuzz_archives --flips`."""
     command = [sys.executable, str(SCRIPT), "--flips", "--cases", "150", "--seed", "3", "--jobs", "1"]
     done = subprocess.run([*command, "--seconds", "10"], capture_output=True, text=True, check=False)
     assert done.stdout, done.stderr
@@ -20,13 +20,13 @@ def test_flipped_archives_are_refused_or_answered_right() -> None:
 
 
 def test_forged_archives_are_refused_or_answered_right() -> None:
-    """A share of the 100,000 of scripts/fuzz_archives, which is where to look for more."""
+    """Test a share of the 100,000 cases of scripts/fuzz_archives."""
     command = [sys.executable, str(SCRIPT), "--cases", "160", "--seed", "3", "--jobs", "1", "--seconds", "10"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout, done.stderr
     found = json.loads(done.stdout)
     assert found["faults"] == [] and done.returncode == 0
-    # Neither is all of it stopped at the first check, nor is the damage too slight to be seen.
+    # The damage is neither always found by the first check nor too slight to be noticed.
     assert found["outcomes"]["refused"] > 60 and found["outcomes"]["found"] > 20
     assert found["outcomes"]["right"] > 20 and found["with_unknown"] > 10
     assert len(found["by_field"]) > 35

@@ -1,4 +1,4 @@
-"""scripts/fuzz_readers: some hundred mutants now, and each kind of fault is found where there is one."""
+"""Test scripts/fuzz_readers with some hundred mutants, and that it finds each kind of fault."""
 
 import json
 import subprocess
@@ -14,17 +14,17 @@ SCRIPT = Path(__file__).parents[3] / "scripts" / "fuzz_readers"
 
 
 def test_damaged_scans_are_read_or_refused_by_name() -> None:
-    """A share of the 10,000 of scripts/fuzz_readers, which is where to look for more."""
+    """Test a share of the 10,000 cases of scripts/fuzz_readers."""
     command = [sys.executable, str(SCRIPT), "--mutants", "308", "--seed", "5", "--jobs", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = json.loads(done.stdout)
     assert found["faults"] == [] and done.returncode == 0
     assert found["mutants"] == 308 and set(found["by_seed"]) == set(SEEDS)
-    # Neither is all of it stopped at the first check, nor is the damage too slight to be seen.
+    # The damage is neither always found by the first check nor too slight to be noticed.
     assert found["outcomes"]["read"] > 30 and found["outcomes"]["refused"] > 100
 
 
-# What is done in place of reading a scan, and what is to be found then.
+# Outcome to be found -> code that runs instead of reading a scan.
 FAULTS = {
     "crash by signal 9": "os.kill(os.getpid(), signal.SIGKILL)",
     "crash by exit 7": "os._exit(7)",
@@ -38,9 +38,9 @@ FAULTS = {
 
 
 def reading(outcome: str, fault: str, path: Path) -> dict[str, Any]:
-    """What is found of a scan and, under other limits, where reading it does `fault`.
+    """Return the outcome of a scan and, with other limits, of a scan whose reading runs `fault`.
 
-    In a process that holds no more than the script's own: what it forks is measured with all that it holds.
+    Runs in a separate process with only the script: the memory of its forks is measured.
     """
     program = f"""
 import importlib.machinery, importlib.util, json, os, resource, signal, sys, time

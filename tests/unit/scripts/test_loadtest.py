@@ -51,7 +51,7 @@ def test_each_frame_is_asked_when_it_is_due() -> None:
 
 def test_a_late_frame_delays_no_other_but_those_due_meanwhile() -> None:
     due = [0.0, 1.0, 2.0, 3.0, 4.0]
-    # The second takes until 3.5: two follow at once, the last is on time again.
+    # The second frame takes until 3.5: two follow at once, the last is on time again.
     acted = Clock().run(due, lambda number: 2.5 if number == 1 else 0.0)
     assert acted == [(0, 0.0), (1, 1.0), (2, 3.5), (3, 3.5), (4, 4.0)]
 
@@ -103,7 +103,7 @@ def row_of_boxes(count: int) -> NDArray[np.float64]:
     [(True, [0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 2]), (False, [0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4])],
 )
 def test_an_adversary_asks_for_what_was_evicted(recent: bool, asked: list[int]) -> None:
-    # The cache holds three: all six are asked for once, until three were evicted; from then on each is missed.
+    # The cache holds three voxels: all six are requested once; after that, each request misses.
     model = LruModel(np.full(7, 10), 30)
     found = Adversary(row_of_boxes(7), model, np.array([0.0, 0.0, 0.9]), 1.0)
     for number, row in enumerate(asked):

@@ -1,4 +1,4 @@
-"""Traces of scripts/load: speeds, floors, bounds, smooth turns, and the same bits for the same arguments."""
+"""Test the traces of scripts/loadtest: speeds, floors, bounds, smooth turns, reproducible bits."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ SECONDS, USERS = 40.0, 4
 
 @pytest.fixture(scope="module")
 def truth() -> SceneTruth:
-    """Seven façades: two whole rows of three, and a third of one."""
+    """Return the ground truth of seven façades: two whole rows of three, and a third row of one."""
     lots = town_lots(7 * POINTS_PER_FACADE, 5)
     return SceneTruth(5, 7 * POINTS_PER_FACADE, 0.0, (), tuple(lot.truth for lot in lots))
 
@@ -32,18 +32,15 @@ def one(made: Trace, user: int) -> NDArray[np.float64]:
 
 
 def speeds(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Over half a second each, so that sway and jitter hardly count [m/s]."""
+    """Return speeds over half a second each, in which sway and jitter hardly count [m/s]."""
     place = pose[:, :2, 3]
     return np.linalg.norm(place[15:] - place[:-15], axis=1) * walking_motion.RATE / 15
 
 
 def turned(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From each pose to the next [degrees]."""
+    """Return the rotation from each pose to the next [degrees]."""
     yaw = np.unwrap(np.arctan2(-pose[:, 0, 1], pose[:, 0, 0]))
     return np.degrees(np.diff(yaw))
-
-
-# --- every kind -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -63,7 +60,7 @@ def test_every_user_has_thirty_poses_a_second_and_all_are_in_order_of_time(
     for user in range(USERS):
         time = made.time[made.user == user]
         assert np.allclose(np.diff(time), 1 / 30) and 0 <= time[0] < 1 / 30
-    # Not all at once: the frames of users are spread.
+    # The frames of different users are not due at the same time.
     assert len(np.unique(made.time[:USERS])) == USERS
 
 
@@ -77,7 +74,7 @@ def test_poses_are_upright_on_the_floor_and_within_the_town(truth: SceneTruth, k
     )
     low, high = town.bounds()
     assert ((pose[:, :2, 3] >= low) & (pose[:, :2, 3] <= high)).all()
-    # Nobody's sole is in the floor; up to a stride before a step it is raised already.
+    # No sole is in the floor; up to a stride before a step it is already raised.
     height = pose[:, 2, 3] - town.floor(pose[:, :2, 3])
     assert height.min() > 0.0 and height.max() < 0.5
     assert np.median(height) == pytest.approx(0.03)
@@ -89,10 +86,7 @@ def test_turns_are_as_people_make_them(truth: SceneTruth, kind: str) -> None:
     for user in range(USERS):
         turns = turned(one(made, user))
         assert np.abs(turns).max() < 300 / 30  # 300 degrees a second
-        assert np.abs(np.diff(turns)).max() < 2500 / 900  # and as much faster or slower in a tenth of one
-
-
-# --- each kind ------------------------------------------------------------------------------------------
+        assert np.abs(np.diff(turns)).max() < 2500 / 900  # 2,500 degrees per second squared
 
 
 @pytest.mark.parametrize("kind", ["stroll", "run", "crowd"])
@@ -160,9 +154,6 @@ def test_what_cannot_be_traced_is_refused(truth: SceneTruth) -> None:
         user_traces.traces("adversary", truth, 1, 1.0, 1)
     with pytest.raises(ValueError, match="at least one"):
         user_traces.traces("stroll", truth, 0, 1.0, 1)
-
-
-# --- files, centres -------------------------------------------------------------------------------------
 
 
 def test_a_recorded_trace_is_replayed_bit_for_bit(truth: SceneTruth, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The parts of scripts/mutation that need cosmic-ray: what is drawn, and how a trial ends."""
+"""Test the parts of scripts/mutation that need cosmic-ray: the mutants drawn, and the end of a trial."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ def twice(a: int | float, b):
 
 
 def drawn(seed: int = 1) -> list[Mutant]:
-    """All mutants of SOURCE."""
+    """Return all mutants of SOURCE."""
     return [mutant for mutant, _ in draw(Path("a.py"), SOURCE, seed)]
 
 
@@ -76,7 +76,7 @@ def test_every_place_comes_once_before_any_comes_twice() -> None:
     ],
 )
 def test_a_trial_ends_as_its_tests_do(tmp_path: Path, change: tuple[str, str], kind: str) -> None:
-    """In a process of its own, which has not imported what is changed, as scripts/mutation has not."""
+    """Test in a separate process that has not imported the changed module, as in scripts/mutation."""
     program = f"""
 import os, sys
 os.environ["NUMBA_DISABLE_JIT"] = "1"

@@ -1,4 +1,4 @@
-"""Results, reasons and plan of scripts/mutation."""
+"""Test the results, reasons and plan of scripts/mutation."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ SOURCE = "return a * 2"
 
 
 class Mutant(NamedTuple):
-    """A mutant, as mutation_cases.mutants.Mutant, which needs cosmic-ray."""
+    """A mutant as mutation_cases.mutants.Mutant, which requires cosmic-ray."""
 
     key: str
     line: int = 3

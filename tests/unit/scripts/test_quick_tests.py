@@ -1,4 +1,4 @@
-"""`scripts/test --quick`: the selection of tests, and its time limit."""
+"""Test `scripts/test --quick`: the selection of tests, and its time limit."""
 
 import os
 import subprocess

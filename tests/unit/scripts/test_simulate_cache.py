@@ -1,4 +1,4 @@
-"""scripts/simulate_cache: what it counts, against replays that are obviously right; and one run from the outside."""
+"""Test scripts/simulate_cache: its counts against simple replays, and one run of the script."""
 
 import argparse
 import csv
@@ -35,7 +35,7 @@ QUICK = Loading(per_load=0.001, per_byte=0.0)
 
 
 def floor(columns: int = 60, rows: int = 4, seed: int = 1) -> Town:
-    """A floor of 2 m voxels, each full of points, of different sizes."""
+    """Return a floor of 2 m voxels, each full of points, of different sizes."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     coordinates = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size, np.int64)])
     coordinates = coordinates[np.argsort(voxel_keys(coordinates))]
@@ -50,7 +50,7 @@ TOWN = floor()
 
 
 def walks(ways: list[NDArray[np.float64]], rate: float = 30.0) -> Centers:
-    """Users on ways (k, 2), all `rate` poses a second, a little after one another."""
+    """Return users on paths (k, 2), with `rate` poses a second each, slightly after one another."""
     user = np.concatenate([np.full(len(way), number) for number, way in enumerate(ways)])
     time = np.concatenate([np.arange(len(way)) / rate + number * 1e-4 for number, way in enumerate(ways)])
     center = np.concatenate([np.column_stack([way, np.ones(len(way))]) for way in ways])
@@ -61,18 +61,18 @@ def walks(ways: list[NDArray[np.float64]], rate: float = 30.0) -> Centers:
 
 
 def along(speed: float, seconds: float, y: float = 1.0) -> NDArray[np.float64]:
-    """Straight along x."""
+    """Return a straight path along x."""
     x = 1.0 + speed * np.arange(round(seconds * 30)) / 30
     return np.column_stack([x, np.full(len(x), y)])
 
 
 def strays(rng: np.random.Generator, users: int, poses: int) -> list[NDArray[np.float64]]:
-    """Users who jump about a small part of the floor."""
+    """Return users who jump within a small part of the floor."""
     return [rng.uniform([0, 0], [24, 8], (poses, 2)) for _ in range(users)]
 
 
 def replay(name: str, asked: Centers, budget: int = 1 << 30, **options: object) -> tuple[Replay, Outcome]:
-    """One run; at every load what is resident is within the budget."""
+    """Replay once; check at every load that the resident bytes are within the budget."""
     given = {"prefetch": name != "lru", "loading": QUICK} | options
     run = Replay(TOWN, budget, name, **given)  # type: ignore[arg-type]
     load = run.load
@@ -101,7 +101,7 @@ def test_what_a_request_needs_is_what_its_ball_touches() -> None:
 
 
 def naive_lru(requests: Requests, budget: int) -> tuple[int, int, int, list[float]]:
-    """Misses, frames missed, evictions, waits; in lists, oldest first, one load after another."""
+    """Return misses, frames missed, evictions and waits of LRU: lists, oldest first, loads one by one."""
     order: list[int] = []
     ready: dict[int, float] = {}
     misses = evictions = 0
@@ -137,7 +137,7 @@ def test_lru_counts_as_lists_do(seed: int) -> None:
 
 
 def test_one_loader_serves_one_after_another() -> None:
-    """Two users at the same place: the second waits for the first one's load, a third elsewhere for both."""
+    """Test three users: the second waits for the load of the first, the third, elsewhere, for both."""
     asked = walks([along(0.0, 0.1), along(0.0, 0.1), along(0.0, 0.1, y=5.0)])
     _, found = replay("lru", asked, loading=Loading(0.1, 0.0))
     assert found.misses == 2 and found.frames_missed == 9, (
@@ -187,7 +187,7 @@ def test_a_ring_that_nobody_goes_to_is_in_vain() -> None:
 
 
 def test_what_comes_too_late_is_a_miss_once_and_waits_the_less() -> None:
-    """Running, with loads of half a second: begun ahead of time, and not there yet when they are needed."""
+    """Test a running user with loads of half a second: prefetches begin in time, but end too late."""
     asked = walks([along(5.0, 10.0)])
     slow = Loading(0.35, 0.0)
     _, without = replay("lru", asked, loading=slow)
@@ -200,7 +200,7 @@ def test_what_comes_too_late_is_a_miss_once_and_waits_the_less() -> None:
 
 
 def test_loading_ahead_takes_nothing_that_somebody_stands_in() -> None:
-    """One user stands, one runs; there is room for little more than they touch."""
+    """Test a standing and a running user, with room for little more than they touch."""
     asked = walks([along(0.0, 8.0, y=5.0), along(5.0, 8.0)])
     _, found = replay("lru+prefetch", asked, budget=700)
     stands = asked.user == 0
@@ -224,7 +224,7 @@ def test_sweeps_come_evenly_and_ask_for_every_voxel() -> None:
 
 @pytest.mark.parametrize("name", ["lru", "lru+prefetch"])
 def test_sweeps_that_are_told_hurt_less_and_are_counted_apart(name: str) -> None:
-    """Users who go to and fro, with room for little more than where they go."""
+    """Test users who walk to and fro, with room for little more than their path."""
     x = 6.0 + 5.0 * np.sin(np.arange(1800) / 30)
     asked = walks([np.column_stack([x, np.full(1800, y)]) for y in (1.0, 5.0)])
     swept = with_sweeps(TOWN, asked, 4)
@@ -254,12 +254,9 @@ def test_a_budget_below_one_request_is_refused() -> None:
         replay("lru", walks([along(1.0, 1.0)]), budget=60)
 
 
-# --- the script -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    """scripts/simulate_cache as a module."""
+    """Return scripts/simulate_cache as a module."""
     return load_script("simulate_cache")
 
 

@@ -1,4 +1,4 @@
-"""Belady's optimum, against every order of eviction there is."""
+"""Test Belady's optimum against every possible order of eviction."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from simulate_cache_cases.belady_optimum import next_uses, optimum
 
 
 def fewest(rows: list[int], capacity: int) -> int:
-    """Brute force: all that could be resident after each reference, and the fewest misses that lead there."""
+    """Return the fewest misses, by brute force over all sets that could be resident."""
     states: dict[frozenset[int], int] = {frozenset(): 0}
     for row in rows:
         after: dict[frozenset[int], int] = {}
@@ -24,7 +24,7 @@ def fewest(rows: list[int], capacity: int) -> int:
 
 
 def of_lru(rows: list[int], capacity: int) -> int:
-    """Misses of the least recently used."""
+    """Return the misses of LRU."""
     order: list[int] = []
     misses = 0
     for row in rows:

@@ -1,4 +1,4 @@
-"""`solidcloud build` as it is typed: its options arrive, it says how to go on, and what it would take."""
+"""Test `solidcloud build` from its command line: options, how to resume, and the estimated cost."""
 
 import json
 import os
@@ -15,14 +15,14 @@ from solidcloud.server.cli.main import run
 
 @pytest.fixture
 def scan(tmp_path: Path) -> Path:
-    """A small scan."""
+    """Write a small scan."""
     path = tmp_path / "floor.xyz"
     np.savetxt(path, np.random.default_rng(1).random((300, 3)), fmt="%.4f")
     return path
 
 
 def caught_config(arguments: str, scan: Path, monkeypatch: pytest.MonkeyPatch) -> BuildConfig:
-    """The options that a command line comes to."""
+    """Return the configuration that a command line produces."""
     caught: list[BuildConfig] = []
 
     def instead(paths: Any, target: Path, config: BuildConfig, progress: Any) -> Any:

@@ -1,4 +1,4 @@
-"""`add` and `remove` interrupted: nothing is left behind, and what the archive is now is said."""
+"""Test interrupted `add` and `remove`: nothing is left behind, and the archive's state is printed."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""A trial of compiled kernels where the last start did not come to its end."""
+"""Test the trial of compiled kernels after a start that did not complete."""
 
 import os
 import pickle
@@ -31,7 +31,7 @@ compiled = pytest.mark.skipif(
 
 
 class Crash:
-    """What crashes as it is unpickled: written as it is, its digest is right."""
+    """Object that crashes when it is unpickled. Its digest is right, because it is stored as written."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return exec, (f"import os; os.kill(os.getpid(), {int(signal.SIGSEGV)})",)
@@ -41,7 +41,7 @@ class Crash:
 def test_kernels_that_crash_are_wiped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    morton_decode(np.zeros(1, np.uint64))  # compiled, or loaded: it is kept now
+    morton_decode(np.zeros(1, np.uint64))  # compiled or loaded: stored now
     files = KernelFiles(tmp_path / "solidcloud-kernels")
     for path in kernel_files().folder.glob("*.morton_decode-*"):
         files.write(path.name, pickle.dumps(Crash()))
@@ -75,7 +75,7 @@ def test_kernels_that_are_right_are_kept(
     before = set(os.listdir(files.folder))
     rehearse(ARCHIVE, files)
     assert caplog.records == []
-    assert before <= set(os.listdir(files.folder))  # a rehearsal simulates frames too
+    assert before <= set(os.listdir(files.folder))  # the trial simulates frames, too
 
 
 @compiled
@@ -84,13 +84,13 @@ def test_a_fault_of_a_record_that_a_wrong_kernel_finds_is_the_kernels_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     with Archive(ARCHIVE) as archive:
-        archive.open_tree(0)  # compiled, or loaded: it is kept now
+        archive.open_tree(0)  # compiled or loaded: stored now
     stored = kernel_files()
     shutil.copytree(stored.folder, tmp_path / "solidcloud-kernels")
     files = KernelFiles(tmp_path / "solidcloud-kernels")
     for path in stored.folder.glob("*.link_rows-*"):
         files.write(path.name, no_tree(stored.read(path.name) or b""))
-    # The kernels that a child compiles anew are those of this process, to save the time.
+    # The kernels that a child compiles are replaced by those of this process, to save time.
     monkeypatch.setattr(
         tempfile, "TemporaryDirectory", partial(nullcontext, str(stored.folder.resolve().parent))
     )

@@ -1,4 +1,4 @@
-"""`solidcloud plan` as it is typed: what it prints, and what it refuses."""
+"""Test `solidcloud plan` from its command line: its output and its errors."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def test_a_number_of_points_is_planned_for(capsys: pytest.CaptureFixture[str]) -
 
 def test_what_binds_is_said_with_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["plan", "--points", "1_000_000_000_000", "--memory", "1GB", "--density", "330"]) == 0
-    # Lines are folded where the terminal ends.
+    # Lines are wrapped at the width of the terminal.
     out = " ".join(capsys.readouterr().out.split())
     assert "1,000,000,000,000 of 714,286 scans, 330 per square metre" in out
     assert "BINDS index, held by build and server" in out and "give a larger --voxel" in out

@@ -1,4 +1,4 @@
-"""`solidcloud scene new`, `scene check`: the file that is written, the table, one line for every error, exit codes."""
+"""Test `solidcloud scene new` and `scene check`: file, table, one-line errors, exit codes."""
 
 import json
 import re
@@ -21,7 +21,7 @@ STOP = '[[effects]]\neffect = "stop"\n'
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with an archive and an avatar; the working directory is another."""
+    """Return a folder with an archive and an avatar; the working directory is another."""
     shutil.copytree(GOLDEN / "archive-3", tmp_path / "scans/hall")
     (tmp_path / "visitor.xyz").write_text("0 0 0\n0.1 0 0\n0 0.1 0.5\n")
     (tmp_path / "elsewhere").mkdir()
@@ -292,7 +292,7 @@ def test_a_scan_given_as_a_scene_file_is_not_read_whole(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with open(folder / "scan.toml", "wb") as file:
-        file.truncate(1 << 40)  # a hole: that much memory nobody has
+        file.truncate(1 << 40)  # a sparse file: no machine has that much memory
     assert run(["scene", "check", str(folder / "scan.toml")]) == 2
     assert "scan.toml: more than 4,194,304 bytes" in one_error(capsys)
 

@@ -1,4 +1,4 @@
-"""Pose files: what is written reads back, quaternions are checked, a wrong line is named."""
+"""Test pose files: written values read back, quaternions are checked, an invalid line is named."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def test_written_poses_read_back(tmp_path: Path, rng: np.random.Generator) -> None:
     times, poses = np.arange(500) / 30, random_poses(rng, 500)
-    # Half turns and none, where a component of the quaternion is zero.
+    # Half turns and the identity, where a component of the quaternion is zero.
     poses[:4, :3, :3] = [np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
     write_poses(tmp_path / "walk.csv", times, poses)
     found_times, found = read_poses(tmp_path / "walk.csv")
@@ -39,7 +39,7 @@ def test_quaternions_turn_as_scipy_says(tmp_path: Path, rng: np.random.Generator
 
 
 def test_quaternion_near_unit_length_is_normalised(tmp_path: Path) -> None:
-    """NUMERICS.md, case 4."""
+    """Test NUMERICS.md, case 4."""
     (tmp_path / "a.csv").write_text(HEADER + "0,0,0,0,1.0000009,0,0,0\n")
     assert np.array_equal(read_poses(tmp_path / "a.csv")[1][0], np.eye(4))
 

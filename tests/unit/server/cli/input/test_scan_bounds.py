@@ -1,4 +1,4 @@
-"""Which places lie outside a scan, and in which units they would not."""
+"""Test which places lie outside a scan, and in which units they would lie inside."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ LOW, HIGH = np.array([-1.0, -2.0, 0.0]), np.array([4.0, 3.0, 5.0])
 
 
 class Info:
-    """What is read of a SceneInfo."""
+    """The fields of a SceneInfo that are read."""
 
     def __init__(self, radius=0.0):
         self.bounds = [LOW.tolist(), HIGH.tolist()]
@@ -30,14 +30,14 @@ def poses_at(places, scale=1.0):
 
 
 def bodies(places, *, half=0.5, radius=0.1, reach=0.0, scale=1.0, to=None):
-    """Cubes at places, or on their way to others."""
+    """Return cubes at places, or in motion to other places."""
     box = np.array([[[-half] * 3, [half] * 3]])
     poses = poses_at(places, scale)
     return BodyPlaces(box, np.array([radius]), reach, poses, poses if to is None else poses_at(to, scale))
 
 
 def lies(places, radius=0.0):
-    """Whether the one place lies outside."""
+    """Return whether the only place lies outside."""
     info = Info(radius)
     leaves, verdicts = np.array([True]), np.array([0], np.uint8)
     return bool(lying_outside(places, leaves, verdicts, info)[0])
@@ -46,13 +46,13 @@ def lies(places, radius=0.0):
 @pytest.mark.parametrize(
     ("x", "reach", "scale", "radius", "outside"),
     [
-        (4.59, 0.0, 1.0, 0.0, False),  # half a metre of body, a tenth of radius
+        (4.59, 0.0, 1.0, 0.0, False),  # half a metre of body and a tenth of radius
         (4.61, 0.0, 1.0, 0.0, True),
-        (4.61, 0.02, 1.0, 0.0, False),  # what is asked reaches in
-        (4.61, 0.0, 1.0, 0.02, False),  # the spheres of the scan reach out
+        (4.61, 0.02, 1.0, 0.0, False),  # the reach intersects the bounds
+        (4.61, 0.0, 1.0, 0.02, False),  # the spheres of the scan extend beyond its points
         (5.19, 0.0, 2.0, 0.0, False),
         (5.21, 0.0, 2.0, 0.0, True),
-        (3.9, 0.0, 1.0, 0.0, False),  # pokes out
+        (3.9, 0.0, 1.0, 0.0, False),  # part of it lies outside
     ],
 )
 def test_a_body_lies_outside_where_nothing_of_the_scan_is_in_reach(x, reach, scale, radius, outside):
@@ -78,12 +78,13 @@ def test_contact_and_what_stays_within_the_bounds_never_lie_outside():
 
 def test_a_motion_through_the_scan_does_not_lie_outside():
     assert not lies(bodies([[-9.0, 0, 1]], to=[[9.0, 0, 1]]))
-    assert lies(bodies([[9.0, 0, 1]], to=[[99.0, 0, 1]])) is False  # an arc of that length could reach in
+    # An arc of that length could intersect the bounds.
+    assert lies(bodies([[9.0, 0, 1]], to=[[99.0, 0, 1]])) is False
     assert lies(bodies([[90.0, 0, 1]], to=[[99.0, 0, 1]]))
 
 
 def test_no_point_of_a_turning_motion_leaves_the_box_that_is_judged(rng):
-    """A screw of up to half a turn: its points, sampled, stay within the bulge of the ends' box."""
+    """Sample screws of up to half a turn: all points stay in the box of the ends plus the bulge."""
     for _ in range(50):
         angle, radius = rng.uniform(0, np.pi), rng.uniform(0.1, 5)
         axis_at = rng.uniform(-3, 3, 2)

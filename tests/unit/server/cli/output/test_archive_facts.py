@@ -1,4 +1,4 @@
-"""`info` says where scanners stood, what systems and units scans are in, which voxel is densest; `validate` notes."""
+"""Test `info` about scanners, coordinate systems, units and the densest voxel; notes of `validate`."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ WKT = 'PROJCS["UTM",\n  UNIT["metre",1]]'
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Path:
-    """An archive of three scans: one posed and in a system, one in feet, one plain."""
+    """Build an archive of three scans: one with a pose and a coordinate system, one in feet, one plain."""
     for i in range(3):
         write_xyz(tmp_path / f"{i}.xyz", make_scan("noise", i, 100 + 200 * i) + np.array([3.0 * i, 0, 0]))
     build_archive([tmp_path / f"{i}.xyz" for i in range(3)], tmp_path / "a", BuildConfig(voxel=3.0, jobs=1))

@@ -1,4 +1,4 @@
-"""What long work says of itself: rates and times left from a clock set by hand, bars on a terminal that is none."""
+"""Test the progress display: rates and remaining times by a manual clock, bars on a terminal."""
 
 import io
 import json
@@ -22,7 +22,7 @@ from solidcloud.server.cli.output.progress_display import (
 
 
 class Clock:
-    """A clock that stands still until it is set."""
+    """Clock that changes only when it is set."""
 
     now = 100.0
 
@@ -42,7 +42,7 @@ def test_a_rate_is_of_late_and_the_time_left_runs_down(clock: Clock) -> None:
         clock.now += 1
         pace.advance(10)
     assert pace.rate == 10 and pace.left == 90
-    clock.now += 4  # nothing new is known; the clock runs
+    clock.now += 4  # no new progress, but time passes
     assert pace.rate == 10 and pace.left == 86
     clock.now += 1000
     assert pace.left == 0
@@ -60,7 +60,7 @@ def test_a_rate_is_of_late_and_the_time_left_runs_down(clock: Clock) -> None:
 
 def test_what_an_interrupted_build_had_done_is_no_rate(clock: Clock) -> None:
     pace = StageProgress("build", 1_000_000, "points", clock)
-    pace.advance(900_000)  # vouched for by the journal
+    pace.advance(900_000)  # listed in the journal
     assert (pace.done, pace.rate, pace.left) == (900_000, None, None)
     clock.now += 10
     pace.advance(10_000)
@@ -79,7 +79,7 @@ def test_many_small_steps_are_few_samples(clock: Clock) -> None:
 
 
 def work(listener: Listener, clock: Clock, stages: tuple[tuple[str, int, str, int], ...]) -> None:
-    """Stages of ten steps, each of 3 s."""
+    """Run stages of ten steps, each of 3 s."""
     for stage, total, unit, step in stages:
         listener.start(stage, total, unit)
         for _ in range(10):
@@ -185,11 +185,11 @@ def test_a_stage_that_fails_is_not_said_to_be_done(clock: Clock) -> None:
         assert "done," not in stream.getvalue() and '"end"' not in stream.getvalue()
 
 
-# --- a terminal -------------------------------------------------------------------------------------------
-
-
 def drawn(width: int, clock: Clock) -> str:
-    """All that is sent to a terminal of so many columns while the stages run, drawn after every step."""
+    """Return everything sent to a terminal of this many columns while the stages run.
+
+    The display is redrawn after every step.
+    """
     terminal = Console(
         file=io.StringIO(), force_terminal=True, width=width, color_system=None, legacy_windows=False
     )
@@ -206,7 +206,7 @@ def drawn(width: int, clock: Clock) -> str:
 
 
 def frames(sent: str) -> list[str]:
-    """The lines drawn, without what moves the cursor."""
+    """Return the drawn lines without the control sequences that move the cursor."""
     return [
         line
         for part in re.split(r"[\r\n]", sent)
@@ -227,13 +227,13 @@ def test_a_bar_shows_how_much_how_fast_and_how_long(clock: Clock) -> None:
 
 def test_bars_of_several_stages_do_not_flicker(clock: Clock) -> None:
     sent = drawn(100, clock)
-    # One line is drawn over and over; the cursor never goes up to draw those that are over again.
+    # Only one line is redrawn; the cursor never moves up to the lines of completed stages.
     assert not re.search(r"\x1b\[\d*A", sent)
     assert sent.count("\x1b[?25l") == sent.count("\x1b[?25h") == 1
     for stage, *_ in STAGES:
         finished = [line for line in frames(sent) if line.startswith(stage) and " in 0:30" in line]
         assert len(finished) == 1
-    # Columns stand where they stand, whatever the figures.
+    # The columns have fixed positions, whatever the figures.
     seen = frames(sent)
     assert {len(line) for line in seen} == {79}
     assert {line[8] + line[29] + line[56] + line[66] for line in seen} == {"    "}

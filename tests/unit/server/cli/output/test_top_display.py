@@ -1,4 +1,4 @@
-"""The tables of `top`: rates between two looks, a bar for bytes, names that somebody else chose."""
+"""Test the tables of `top`: rates between two samples, the bar of bytes, names from clients."""
 
 import io
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from solidcloud.server.cli.output.top_display import (
 
 
 class Told:
-    """A scene that says one thing after the other, then that nobody is there."""
+    """Scene that returns one sample after another, and then fails as without a server."""
 
     def __init__(self, *said: StatsAnswer) -> None:
         self.said = list(said)
@@ -34,7 +34,7 @@ class Told:
 
 
 class Clock:
-    """A clock that moves when somebody sleeps."""
+    """Clock that advances during a sleep."""
 
     now = 50.0
 
@@ -51,7 +51,7 @@ def hall(**fields: Any) -> StatsAnswer:
 
 
 def shown(said: Sequence[StatsAnswer], width: int = 80, terminal: bool = False, **more: Any) -> str:
-    """What is printed of these, until nobody answers."""
+    """Return what is printed for these samples, until no server answers."""
     out, clock = io.StringIO(), Clock()
     console = Console(file=out, width=width, height=60, force_terminal=terminal)
     watching: dict[str, Any] = {"console": console, "clock": clock, "sleep": clock.sleep, **more}
@@ -64,7 +64,7 @@ def shown(said: Sequence[StatsAnswer], width: int = 80, terminal: bool = False, 
 
 
 def line(text: str, name: str, which: int = -1) -> list[str]:
-    """The words after a name in a line that begins with it and a number; of several, one of them."""
+    """Return the words after a name in a line that begins with it and a number, or in one of several."""
     found = [each.removeprefix(name).split() for each in text.splitlines() if each.startswith(name)]
     return [words for words in found if words[0][0].isdigit()][which]
 

@@ -1,4 +1,4 @@
-"""The accuracy report's page and charts: self-contained, every setting named, labels that cover nothing."""
+"""Test the accuracy report's page and charts: self-contained, every setting named, labels apart."""
 
 import base64
 import math
@@ -40,7 +40,7 @@ FACTS = {
 
 
 def all_rows() -> list[Row]:
-    """A row for each setting of a brief run, with figures drawn at random, but for the defaults."""
+    """Return a row for each setting of a brief run, with random results except for the defaults."""
     rng = np.random.default_rng(5)
     settings = [*engine_settings(BRIEF, PLAIN_BUILD, 0.0124), *radius_settings(BRIEF, PLAIN_BUILD, 0.0124)]
     rows = [s.row for s in settings]
@@ -65,7 +65,7 @@ def all_rows() -> list[Row]:
 
 
 class Outside(HTMLParser):
-    """Collects whatever a page would fetch, and its text."""
+    """Parser that collects everything that a page would fetch, and its text."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -144,7 +144,7 @@ def test_points_that_coincide_share_a_label_and_what_stops_a_ball_early_is_drawn
             row.mean_us, row.doorway_mm, row.leak_p99_mm = 20.0, 30.0, -64.0 if "5 cm" in row.setting else 7.0
     error_charts.draw_scatter(rows, ("doorway", "leak"), "made façade", tmp_path / "chart.png")
     doors, walls, trade = said
-    assert "search within 1 mm to 5 cm" in doors  # three of one place
+    assert "search within 1 mm to 5 cm" in doors  # three at one place
     assert "search within 1 mm, 2 mm" in walls and "search within 5 cm: -64 mm" in walls
     assert any(label.startswith("default") for label in walls) and any("mean, default" in t for t in trade)
     for model in ("mean:0.5", "local", "border:2", "local+border", "fixed:0.025"):

@@ -1,4 +1,4 @@
-"""The accuracy report's judge, poses and guards, on a small hall."""
+"""Test the accuracy report's reference answers, poses and checks, on a small hall."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,14 +37,14 @@ CONFIG = BuildConfig(resolution=1e-3, radius=0.01, jobs=1)
 
 
 class Judged:
-    """A hall with a wall along its middle, and what the judge says of it."""
+    """A hall with a wall along its middle, and the reference answers for it."""
 
     def __init__(self, folder: Path) -> None:
         rng = np.random.default_rng(9)
         floor = np.column_stack(
             [rng.uniform(0, 6, 4000), rng.uniform(0, 2, 4000), rng.normal(0, 0.002, 4000)]
         )
-        # The walk goes through the middle of all points, y = 1.25 m: the wall is a shoulder's width beside it.
+        # The walk goes through the middle of all points, y = 1.25 m. The wall is 0.4 m beside it.
         wall = np.column_stack([rng.uniform(0, 6, 1000), np.full(1000, 1.65), rng.uniform(0, 2, 1000)])
         scan = synthetic_scans.write_ply(folder / "hall.ply", np.concatenate([floor, wall]))
         build_archive([scan], folder / "hall", BuildConfig(voxel=1.0, resolution=1e-3, jobs=1))

@@ -1,4 +1,4 @@
-"""The accuracy report's figures: what counts as wrong, what is on the front, how times are taken."""
+"""Test the accuracy report's figures: wrong answers, Pareto fronts, and how times are taken."""
 
 import json
 import math
@@ -112,7 +112,7 @@ def test_rows_are_written_as_json_and_csv_that_hold_every_field(tmp_path: Path) 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
-    """A clock that stands still but for what is added to it."""
+    """Return a clock that advances only by what is added to it."""
     now = [0.0]
     monkeypatch.setattr(interleaved_timing.time, "perf_counter", lambda: now[0])
     yield now
@@ -132,7 +132,7 @@ def test_settings_are_timed_in_turn_and_a_busy_moment_is_left_out(clock: list[fl
     subjects = [answer("slow", 3.0), answer("fast", 1.0)]
     ticks = []
     take_times(subjects, np.zeros((8, 4, 4)), 3, 4, lambda: ticks.append(1))
-    # All poses once, untimed; then two runs of four.
+    # All poses once, untimed; then two runs of four poses.
     assert asked == [("slow", 8), ("slow", 4), ("slow", 4), ("fast", 8), ("fast", 4), ("fast", 4)] * 3
     assert len(ticks) == 6
     assert [s.mean for s in subjects] == [3.0, 1.0]

@@ -1,4 +1,4 @@
-"""Where a surface ends at a door: spheres half as large on its rim halve the doorway's error, and it leaks no more."""
+"""Test `border` at a door: half-size spheres on the rim halve the doorway error at the same leak."""
 
 from collections.abc import Iterator
 
@@ -15,7 +15,7 @@ from solidcloud.server.scene import Scene
 def made(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Sheet, Scene]]:
-    """A sheet, and its scene."""
+    """Generate a sheet and open its scene."""
     folder = tmp_path_factory.mktemp("sheet")
     sheet = make_sheet(folder / "sheet.ply", seed=request.param)
     config = BuildConfig(jobs=1, models=frozenset({"mean", "border"}))
@@ -25,8 +25,13 @@ def made(
 
 
 def test_border_halves_the_doorway_error_at_equal_leak(made: tuple[Sheet, Scene]) -> None:
-    """At three times the mean radius: smaller ones, and the last points, half a spacing inside the rim, make up for one
-    another. Over the seeds 0 to 5, mean 33.4 mm and border 7.0 mm, at a leak (p99) of -21.0 mm both."""
+    """Test at three times the mean radius.
+
+    At smaller radii, the spheres and the last points, half a spacing inside the rim, compensate
+    each
+    other. Over the seeds 0 to 5: mean 33.4 mm and border 7.0 mm, at a leak (p99) of -21.0 mm for
+    both.
+    """
     sheet, scene = made
     mean, border = (
         doorway_error(scene, "figure", sheet.truth, radius_model=model).error

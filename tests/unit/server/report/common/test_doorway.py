@@ -1,4 +1,4 @@
-"""The doorway's error, on made jambs: against brute force over every pair, and figures that follow from the making."""
+"""Test the doorway error on generated jambs, against brute force and against their known geometry."""
 
 import math
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ from solidcloud.server.scene import Scene
 
 ORIGIN = (400_000.0, -20.0, 7.0)
 RADIUS = 0.012
-# A door 0.8 m wide in a wall 0.3 m thick, its middle at x = 0.1.
+# A door 0.8 m wide in a wall 0.3 m thick, with its middle at x = 0.1.
 DOOR = DoorTruth("main", -0.3, 0.5, 0.0, 0.3, 0.2, 2.5, 2.9)
 TRUTH = FacadeTruth(1, ORIGIN, 0.2, (DOOR,), (), (), ())
 FIGURE = figure_points()
 
 
 def jambs(rng: np.random.Generator, spacing: float, noise: float) -> NDArray[np.float64]:
-    """Points of both jambs, the façade's frame: a jittered grid, and noise across."""
+    """Return the points of both jambs in the façade's frame: a jittered grid, with noise across."""
     sides = []
     for x in (DOOR.x_left, DOOR.x_right):
         y, z = np.meshgrid(
@@ -38,7 +38,7 @@ def jambs(rng: np.random.Generator, spacing: float, noise: float) -> NDArray[np.
 
 
 def narrowest(points: NDArray[np.float64], radius: float, figure_radius: float) -> float:
-    """The narrowest door by brute force: the figure is drawn through along y without a step."""
+    """Return the narrowest door by brute force: the figure moves along y, without steps."""
     reach = radius + figure_radius
     middle = (DOOR.x_left + DOOR.x_right) / 2
     play = 0.0
@@ -58,7 +58,10 @@ def narrowest(points: NDArray[np.float64], radius: float, figure_radius: float) 
 
 @pytest.fixture(scope="module")
 def dense(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Scene, NDArray[np.float64]]]:
-    """Jambs of points 2 cm apart, noise of 2 mm, at map coordinates, and those points in the façade's frame."""
+    """Return jambs with points 2 cm apart and noise of 2 mm.
+
+    They are returned at map coordinates and in the façade's frame.
+    """
     points = jambs(np.random.default_rng(2012), 0.02, 0.002)
     archive = archive_cases.build(
         tmp_path_factory.mktemp("dense"), points + ORIGIN, voxel=8.0, radius=RADIUS
@@ -75,7 +78,8 @@ def test_narrowest_door_is_that_of_brute_force(
     found = doorway_error(scene, "figure", TRUTH, radius_model=model)
     own = scene.add_avatar("figure", FIGURE).radius
     judged = narrowest(points, radius, own)
-    # Bisection says a door too wide, by a quarter of a millimetre a side; steps of 5 mm one too narrow, by as little.
+    # Bisection gives a door that is too wide by a quarter of a millimetre a side; steps of 5 mm
+    # give one that is too narrow by as little.
     missed = 2 * doorway.POSE_SPACING**2 / 8 / (radius + own)
     assert judged - missed - 1e-4 <= found.narrowest <= judged + 2 * doorway.FINEST
     assert found.width == pytest.approx(np.ptp(FIGURE[:, 0]) + 2 * own, abs=1e-12)
@@ -83,7 +87,7 @@ def test_narrowest_door_is_that_of_brute_force(
 
 
 def test_jambs_without_noise_cost_their_spheres_and_no_more(tmp_path: Path) -> None:
-    """Points so dense that each side of the figure meets one squarely: the error is two radii."""
+    """Test points so dense that each side of the figure hits one squarely: the error is two radii."""
     points = jambs(np.random.default_rng(7), 0.008, 0.0)
     archive = archive_cases.build(tmp_path, points + ORIGIN, voxel=8.0, radius=RADIUS).archive
     with Scene.open(archive) as scene:
@@ -93,7 +97,7 @@ def test_jambs_without_noise_cost_their_spheres_and_no_more(tmp_path: Path) -> N
 def test_tolerance_makes_the_door_narrower_by_at_most_itself_a_side(
     dense: tuple[Scene, NDArray[np.float64]],
 ) -> None:
-    """In the search that a budget asks for, here one that is never spent; a tolerance alone is answered exactly."""
+    """Test the search of a budget, here one that is never spent; a tolerance alone is answered exactly."""
     scene, _ = dense
     exact = doorway_error(scene, "figure", TRUTH).error
     loose = doorway_error(scene, "figure", TRUTH, tolerance=0.02, budget_visits=1 << 40).error

@@ -1,4 +1,4 @@
-"""A walk through a scan of which nothing is known keeps to the floor."""
+"""Test that a walk through an unknown scan stays on the floor."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,10 @@ from solidcloud.server.report.common.floor_walk import LAYER, SOLE, floor_walk
 
 
 def hall(rng: np.random.Generator, turned: bool = False) -> np.ndarray:
-    """A hall of 20 by 8 m: a floor rising from 1 to 2 m, a ceiling 4 m above, outliers below and beside."""
+    """Return a hall of 20 by 8 m with a floor rising from 1 to 2 m and a ceiling 4 m above.
+
+    Outliers lie below and beside it.
+    """
     x, y = rng.uniform(0, 20, 60_000), rng.uniform(0, 8, 60_000)
     floor = np.column_stack([x, y, 1 + x / 20])
     ceiling = np.column_stack([x, y, 5 + x / 20])[:20_000]

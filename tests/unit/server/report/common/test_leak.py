@@ -1,4 +1,4 @@
-"""How far walls leak, on made walls of known spacing: against brute force, and figures that follow from the making."""
+"""Test the leak of generated walls of known spacing, against brute force and their known geometry."""
 
 import math
 from pathlib import Path
@@ -18,23 +18,29 @@ RADIUS = 0.012
 
 
 def wall(spacing: float, half: int) -> NDArray[np.float64]:
-    """A square grid (n, 3) on the plane y = 0, facing -y: 2 half + 1 points a side, one at the origin."""
+    """Return a square grid (n, 3) on the plane y = 0, facing -y.
+
+    It has 2 half + 1 points a side, one at the origin.
+    """
     x, z = np.meshgrid(np.arange(-half, half + 1) * spacing, np.arange(-half, half + 1) * spacing)
     return np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()])
 
 
 def places(points: NDArray[np.float64]) -> WallPlaces:
-    """Places on the plane y = 0, facing -y."""
+    """Return places on the plane y = 0, facing -y."""
     return WallPlaces(points, np.tile([0.0, -1.0, 0.0], (len(points), 1)), np.ones(len(points)))
 
 
 def depth(hole: float, radius: float) -> float:
-    """How far in the probe's foremost point is when a sphere at distance `hole` from its way stops it."""
+    """Return the depth of the probe's foremost point.
+
+    A sphere at distance `hole` from its path stops it.
+    """
     return PROBE - math.sqrt((PROBE + radius) ** 2 - hole**2)
 
 
 def opened(folder: Path, points: NDArray[np.float64]) -> Scene:
-    """The scene of these points."""
+    """Open the scene of these points."""
     return Scene.open(archive_cases.build(folder, points, voxel=8.0, radius=RADIUS).archive)
 
 
@@ -48,7 +54,7 @@ def test_on_a_point_the_probe_is_stopped_a_radius_early_and_in_a_hole_late(tmp_p
 
 
 def test_hole_wider_than_the_probe_lets_it_through(tmp_path: Path) -> None:
-    """At a spacing of 10 cm the middle of four points is 71 mm off: too far for 50 + 12 mm, near enough for 50 + 24."""
+    """Test points 10 cm apart: the middle of four is 71 mm away, beyond 50 + 12 mm, but within 50 + 24."""
     with opened(tmp_path, wall(0.10, 5)) as scene:
         spots = places(np.array([[0.05, 0.0, 0.05], [0.0, 0.0, 0.0]]))
         through, stopped = leak(scene, spots), leak(scene, spots, radius_model="mean:2")
@@ -58,7 +64,7 @@ def test_hole_wider_than_the_probe_lets_it_through(tmp_path: Path) -> None:
 
 
 def test_percentiles_are_those_of_the_places(tmp_path: Path) -> None:
-    """Of 200 places 194 are on points, 4 between two, 2 in the middle of four."""
+    """Test 200 places: 194 on points, 4 between two, 2 in the middle of four."""
     spots = np.zeros((200, 3))
     spots[:4, 0] = 0.03
     spots[4:6] = 0.03, 0.0, 0.03
@@ -66,14 +72,17 @@ def test_percentiles_are_those_of_the_places(tmp_path: Path) -> None:
         found = leak(scene, places(spots))
     assert found.p50 == pytest.approx(-1000 * RADIUS, abs=0.002)
     assert found.worst == pytest.approx(1000 * depth(0.03 * 2**0.5, RADIUS), abs=0.002)
-    # The 99th percentile of 200 lies between the third and the second from above.
+    # The 99th percentile of 200 lies between the third and the second largest.
     low, high = 1000 * depth(0.03, RADIUS), found.worst
     assert found.p99 == pytest.approx(low + 0.01 * (high - low), abs=0.01)
 
 
 @pytest.mark.parametrize("model", ["mean:0.5", "mean", "mean:3", "local", "local+border:2"])
 def test_depths_of_a_random_wall_are_those_of_brute_force(tmp_path: Path, model: str) -> None:
-    """A wall of noisy points, random in density too, far from the origin; a second sheet far behind changes nothing."""
+    """Test a noisy wall of random density far from the origin.
+
+    A second sheet far behind changes nothing.
+    """
     rng = np.random.default_rng(2012)
     flat = np.column_stack([rng.uniform(-1, 1, 900), rng.normal(0, 0.002, 900), rng.uniform(-1, 1, 900)])
     flat = np.rint(np.concatenate([flat, flat + np.array([0, 0.4, 0])]) * 1e4) / 1e4
@@ -91,14 +100,14 @@ def test_depths_of_a_random_wall_are_those_of_brute_force(tmp_path: Path, model:
     for spot, at in zip(spots, found, strict=True):
         under = reach**2 - (points[:, 0] - spot[0]) ** 2 - (points[:, 2] - spot[2]) ** 2
         near = (under >= 0) & (points[:, 1] < 0.1)
-        # The centre comes from -y: it is stopped by the sphere it meets first, if before its way's end.
+        # The centre moves from -y; the first sphere that it touches on its path stops it.
         first = (points[near, 1] - np.sqrt(under[near])).min() if near.any() else np.inf
         expected = min(first + PROBE, 2 * PROBE)
         assert at == pytest.approx(expected, abs=3e-6)
 
 
 def test_what_cannot_be_proved_clear_stops_the_probe(tmp_path: Path) -> None:
-    """With hardly any visits nothing is proved: the probe is said to stop early, never late."""
+    """Test with hardly any visits: nothing is proved, and the probe stops early, never late."""
     with opened(tmp_path, wall(0.06, 8)) as scene:
         spots = places(np.array([[0.03, 0.0, 0.03]] * 3))
         exact, few = leak_depths(scene, spots), leak_depths(scene, spots, budget_visits=1)
@@ -106,7 +115,7 @@ def test_what_cannot_be_proved_clear_stops_the_probe(tmp_path: Path) -> None:
 
 
 def test_probe_starts_before_what_may_stop_it(tmp_path: Path) -> None:
-    """Spheres of 20 cm stop it 20 cm before the surface, and it was not in contact from the beginning."""
+    """Test spheres of 20 cm: they stop the probe 20 cm before the surface, and it starts clear of them."""
     with opened(tmp_path, wall(0.06, 8)) as scene:
         found = leak_depths(scene, places(np.zeros((1, 3))), radius_model="fixed:0.2")
     assert found == pytest.approx([-0.2], abs=2e-6)

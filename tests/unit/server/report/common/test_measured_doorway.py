@@ -1,4 +1,4 @@
-"""The narrowest made door: the bisection over made façades, and who passes one of them."""
+"""Test the narrowest generated door: the bisection, and which doors the figure passes."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ from solidcloud.server.scene import Scene
 
 
 class Facades:
-    """Stands in for making: notes which widths were made, and lets pass what its model's door is wide enough for."""
+    """Replacement for the generator: records the widths, and passes doors wide enough for the model."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, narrowest: dict[str, float]) -> None:
         self.widths: list[float] = []
@@ -32,7 +32,7 @@ class Facades:
         monkeypatch.setattr(measured_doorway, "passes", lambda door, model: door.truth >= narrowest[model])
 
     def make(self, folder: Path, config: BuildConfig, width: float, points: int, seed: int) -> Any:
-        """A façade whose truth is its door's width."""
+        """Return a façade whose ground truth is its door's width."""
         self.widths.append(width)
         scene = SimpleNamespace(
             close=self.close, add_avatar=lambda name, points: SimpleNamespace(radius=0.01)
@@ -40,7 +40,7 @@ class Facades:
         return GeneratedDoor(scene, width)  # type: ignore[arg-type]
 
     def close(self) -> None:
-        """Count a scene that is closed."""
+        """Count a closed scene."""
         self.closed += 1
 
 
@@ -58,13 +58,16 @@ def test_narrowest_is_found_to_half_a_millimetre_and_facades_are_made_once(
     assert found["mean"].width == pytest.approx(own, abs=1e-12)
     assert found["mean"].error == pytest.approx(1000 * (found["mean"].narrowest - own), abs=1e-9)
     assert len(facades.widths) == len(set(facades.widths)) == len(ticks) == facades.closed
-    # Twelve for the first model; the second's way parts from it within the last three.
+    # Twelve façades for the first model; the second model differs within the last three.
     assert len(facades.widths) <= 12 + 3
     assert facades.widths[0] == WIDEST
 
 
 def test_figure_passes_what_is_clear_at_half_of_the_heights(tmp_path: Path) -> None:
-    """Two jambs 0.7 m apart; then a bolt across, at the height of the head of the tallest half alone, and of all."""
+    """Test two jambs 0.7 m apart, with a bolt across at the height of the head.
+
+    The bolt stops the figure at half of the sole heights, then at all.
+    """
     frame = DoorTruth("main", -0.35, 0.35, 0.0, 0.1, 0.0, 2.6, 2.9)
     truth = FacadeTruth(1, (0.0, 0.0, 0.0), 0.0, (frame,), (), (), ())
     y, z = np.meshgrid(np.arange(0.0, 0.1, 0.02), np.arange(0.0, 2.6, 0.02), indexing="ij")
@@ -72,7 +75,7 @@ def test_figure_passes_what_is_clear_at_half_of_the_heights(tmp_path: Path) -> N
     along = np.arange(-0.34, 0.35, 0.01)
 
     def bolted(height: float | None) -> bool:
-        """Whether the figure passes with a bolt at this height, or none."""
+        """Return whether the figure passes with a bolt at this height; None: without a bolt."""
         bolt = [] if height is None else [np.column_stack([along, 0 * along + 0.05, 0 * along + height])]
         archive = archive_cases.build(tmp_path, np.concatenate(jambs + bolt), voxel=8.0).archive
         with Scene.open(archive) as scene:

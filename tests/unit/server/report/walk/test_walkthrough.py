@@ -1,4 +1,4 @@
-"""The paper's experiment: equal verdicts or an error, figures that follow from the times, spheres that enclose."""
+"""Test the paper's experiment: equal verdicts or an error, figures by the times, enclosing spheres."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ STEP = 1e-3
 
 
 def wall() -> np.ndarray:
-    """A wall of 6,000 points on the lattice, 4 m by 2 m, at y = 0."""
+    """Return a wall of 6,000 points on the lattice, 4 m by 2 m, at y = 0."""
     rng = np.random.default_rng(SEED)
     return (
         np.column_stack([rng.integers(0, 4000, 6000), rng.integers(0, 20, 6000), rng.integers(0, 2000, 6000)])
@@ -40,7 +40,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def case(scan: Path) -> Case:
-    """A box of 60 points that is carried into the wall and out again in 12 poses."""
+    """Return a box of 60 points that moves into the wall and out again in 12 poses."""
     rng = np.random.default_rng(SEED)
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, :3, 3] = np.column_stack(
@@ -59,7 +59,7 @@ def archive(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def structure(kind: str = SLAB, degree: int = 8, verdict: tuple[int, ...] = (0, 1)) -> Structure:
-    """A structure as measured: two frames in three loops, one of them disturbed."""
+    """Return measurements of a structure: two frames in three loops, one of them disturbed."""
     frames = np.array([[0.001, 0.1], [0.001, 0.1], [0.9, 0.1]])
     found = Structure(
         kind, degree, Path("nowhere"), frames, np.array([0.004, 0.002, 0.006]), np.array(verdict, np.uint8)
@@ -154,7 +154,7 @@ def test_level_zero_is_refused(archive: Path) -> None:
 
 
 def test_nearer_sphere_hides_the_one_behind() -> None:
-    centers = np.array([[0.0, 0.0, 0.0], [0.0, -5.0, 1.5]])  # the second stands before the first
+    centers = np.array([[0.0, 0.0, 0.0], [0.0, -5.0, 1.5]])  # the second is in front of the first
     pair = LevelSpheres(centers, np.array([1.0, 1.0]), np.array([0, 1]), np.zeros(2, bool))
     image = render_spheres(pair, 120)
     swapped = render_spheres(LevelSpheres(*(column[::-1] for column in pair)), 120)

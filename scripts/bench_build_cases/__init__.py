@@ -1,1 +1,1 @@
-"""Parts of scripts/bench_build: observed builds, limits of the machine, rates, sizes, notes and picture."""
+"""Parts of scripts/bench_build: observed builds, limits of the machine, rates, sizes, picture."""

@@ -43,7 +43,7 @@ def fit_stage(times: Mapping[tuple[int, int], float]) -> StageRate:
 
 
 def calm_times(name: str, builds: Builds) -> dict[tuple[int, int], float]:
-    """Return the least seconds of a stage at each of SIZES; what slows it down is not the builder.
+    """Return the least seconds of a stage at each of SIZES, which other work disturbs least.
 
     On a busy machine a build by one job is assumed to take its processor time, and two jobs half of
     that. On an idle machine this holds within a tenth, except for the start and the end.
@@ -60,7 +60,7 @@ def calm_times(name: str, builds: Builds) -> dict[tuple[int, int], float]:
 
 
 def is_busy(builds: Builds) -> bool:
-    """Return whether other work used more of the machine than leaves the times unaffected."""
+    """Return whether other work on the machine affected the times."""
     return max(run.watched.others or 0.0 for runs in builds.values() for run in runs) > BUSY
 
 

@@ -1,1 +1,1 @@
-"""What scripts/chaos does to a server, and who judges its answers."""
+"""Parts of scripts/chaos: faults, clients, rogue clients, the check of answers and the report."""

@@ -12,7 +12,8 @@ from .server_restarts import ServerRuns
 
 STOP_SECONDS = 2.0
 SLOPE = 1.0  # [MB a minute]
-# zenoh's own threads block on behalf of tasks: they come and go with the load. The end may have this many more.
+# zenoh's own threads block on behalf of tasks; their number follows the load. At the end there may
+# be this many more.
 ZENOH_THREAD, POOL_GROWTH = re.compile(r"(app|acc|net|rx|tx)-\d+"), 2
 # Shards are opened at the first read of one of their records, once.
 SHARD = re.compile(r"\d+-\d{6}\.h5")

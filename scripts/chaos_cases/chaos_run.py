@@ -203,7 +203,7 @@ class ChaosRun:
     # Generations
 
     def _serve(self, generation: int) -> None:
-        """Tell that this generation, and no other, is served."""
+        """Record that this generation, and no other, is served."""
         self.generation = generation
         self.scoreboard.serve(1 << generation)
 
@@ -219,7 +219,7 @@ class ChaosRun:
         self._reload(hang_up=hang_up)
 
     def _reload(self, *, hang_up: bool = False) -> bool:
-        """Have the server serve what is in the folder; False where it does not say that it does."""
+        """Make the server serve the content of the folder; return False if it does not confirm that."""
         deadline = time.monotonic() + READY_SECONDS
         if hang_up:
             self.server_runs.hang_up()

@@ -113,7 +113,7 @@ class QueryingClient:
 
     @staticmethod
     def _silent(got: Any) -> bool:
-        """Return whether the client made the answer itself, because no server gave one."""
+        """Return whether the client made the answer itself, because no server answered."""
         if hasattr(got, "engine_seconds"):
             return len(got) > 0 and got.engine_seconds == 0.0
         return not got.simulated

@@ -1,1 +1,1 @@
-"""Cases that scripts/compare times in two versions, using the public interface of both."""
+"""Parts of scripts/compare and scripts/compare_answers, which run the same cases in two versions."""

@@ -1,10 +1,14 @@
-"""One version of the product: what it answers, encodes and logs, written down for a comparison.
+"""Record of the answers, messages and logs of one version, for scripts/compare_answers.
 
 Runs in the environment of that version, from any checkout:
 
-    python recorded_version.py answers ARCHIVE   answers of a scene in this process, as digests by case and field
-    python recorded_version.py messages          requests in both encodings, in hex
-    python recorded_version.py walk ENDPOINT     a session over zenoh with the server at ENDPOINT
+    python recorded_version.py answers ARCHIVE
+    python recorded_version.py messages
+    python recorded_version.py walk ENDPOINT
+
+`answers` prints digests of the answers of a scene in this process, by case and field. `messages`
+prints requests in both encodings, in hex. `walk` runs a session over zenoh with the server at
+ENDPOINT.
 """
 
 import hashlib
@@ -44,7 +48,7 @@ def content() -> dict[str, Any]:
 
 
 def answers(archive: str) -> dict[str, dict[str, str]]:
-    """Ask a scene in this process; return the digest of each field of each answer."""
+    """Query a scene in this process; return the digest of each field of each answer."""
     from solidcloud.server.scene import Scene
 
     given = content()
@@ -58,7 +62,8 @@ def answers(archive: str) -> dict[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     with Scene.open(Path(archive), budget_bytes=1 << 30) as scene:
         scene.add_avatar("al", given["figure"])
-        # Loads happen here, and the hits and misses of the cases do not depend on their order.
+        # Load everything first, so that the hits and misses of a case do not depend on the order of
+        # the cases.
         scene.distance("al", poses, 8.0)
         things = [("al", pose) for pose in poses[::4]]
         for more in options:
@@ -123,7 +128,9 @@ def messages() -> dict[str, dict[str, str]]:
 
 
 def walk(endpoint: str) -> int:
-    """Send motion commands of a session, one after another's state; return how many."""
+    """Send the motion commands of a session, each after the state of the previous one; return their
+    number.
+    """
     given = content()
     client_of = find("Client", "server.client")
     with client_of(endpoint, scene="walk") as client:

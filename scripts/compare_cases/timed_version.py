@@ -1,4 +1,4 @@
-"""Process of one version for scripts/compare: runs the cases it is told to and prints their durations.
+"""Process of one version for scripts/compare: runs cases on command and prints their durations.
 
     python timed_version.py ARCHIVE CASE,CASE,...
 
@@ -83,7 +83,7 @@ def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
     path = scene_file(archive)
     try:
         open_scene = find("open_scene", "server.scenes.open_scene", "server.scene_file")
-    except ImportError:  # since Scene.open takes scene files, too
+    except ImportError:  # exists since Scene.open takes scene files, too
         return stack.enter_context(find("Scene", "server.scene").open(path, budget_bytes=1 << 30))
     rooms = ("server.avatars.avatar_file", "server.cli.input.point_file", "server.report.points")
     read_avatar = find("read_avatar", *rooms)

@@ -1,4 +1,4 @@
-"""What a comparison of two versions shares: cases, names in either version, a checkout of a commit."""
+"""Shared code of comparisons of two versions: cases, names in either version, a checkout of a commit."""
 
 import importlib
 import subprocess
@@ -13,7 +13,7 @@ DEFAULT_CASES = (
     "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
 )  # fmt: skip
 CASES = (*DEFAULT_CASES, "build")
-# Fields of answers that are not compared: durations, and how much memory the cache holds.
+# Fields of answers that are not compared: durations, and the memory that the cache holds.
 VOLATILE = frozenset({"engine_seconds", "wait_seconds", "resident", "resident_bytes"})
 EFFECTS = ("stop", "sweep", "slide", "step", "ground")
 

@@ -1,1 +1,1 @@
-"""Parts of scripts/loadtest: traces of users in a generated town, the processes, the figures and the page."""
+"""Parts of scripts/loadtest: traces of users, their processes, the figures and the page."""

@@ -1,8 +1,9 @@
 """Paths of people in a generated town, from its truth: forecourts, doors, naves, streets and lanes.
 
 Frame: the world's, metres, z up. A visit of a façade and the connections between visits are corners
-of a path, without turns much above a right angle: rounding them leaves no cusp (motion.py). The
-path through the main door is straight from before the portal until behind the wall.
+of a path, without turns much above a right angle: rounding them leaves no cusp
+(walking_motion.py). The path through the main door is straight from before the portal until behind
+the wall.
 """
 
 from typing import NamedTuple

@@ -77,7 +77,7 @@ class SceneUser(Client):
 
 
 class EchoUser:
-    """User of a bare echo (echo.py), as in zenoh's examples."""
+    """User of a bare echo (echo_process.py), as in zenoh's examples."""
 
     def __init__(self, endpoint: str, user: int) -> None:
         config = zenoh.Config()
@@ -101,7 +101,7 @@ class EchoUser:
 
 
 class Run:
-    """Frames in flight: what is sent, and what came back."""
+    """Frames in flight: requests sent and replies received."""
 
     def __init__(self, job: Job, trace: user_traces.Trace, start: float) -> None:
         self.job, self.trace = job, trace

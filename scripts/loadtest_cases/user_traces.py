@@ -3,7 +3,7 @@
 The same arguments give the same bits. Kinds: stroll and run from façade to façade, some through the
 door; turn on the spot; tour, one long path through every façade, along which users are spread;
 crowd, all through one door; teleport, another place every second. An adversary's requests depend on
-evictions: its trace exists only after a run, which records it (adversary.py).
+evictions: its trace exists only after a run, which records it (adversary_user.py).
 """
 
 from collections.abc import Callable

@@ -1,1 +1,1 @@
-"""Code that several benchmark scripts and check_exact share: machine, archives, poses, definition, results."""
+"""Code that several benchmark scripts share: machine, archives, poses, definition, results."""

@@ -46,7 +46,7 @@ class Figure:
 class Goal:
     """Target and its figure.
 
-    key: of its note in notes.py.
+    key: of its note in engine_notes.py or build_notes.py.
     measured, limit: None where not measured.
     at_least: True for a lower limit, else the limit is an upper one.
     """
@@ -61,7 +61,7 @@ class Goal:
 
     @property
     def met(self) -> bool | None:
-        """Return whether it is met; None: not measured. A NaN meets nothing."""
+        """Return whether the target is met; None: not measured. A NaN meets no target."""
         if self.measured is None or self.limit is None:
             return None
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit

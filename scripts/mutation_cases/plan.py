@@ -240,7 +240,8 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("contacts"),
     ),
 }
-# Goals of files of which fewer than report.GOAL are killed: server/MUTATION.md says why.
+# Targets of files of which fewer than mutation_report.GOAL are killed; server/MUTATION.md gives the
+# reason.
 LOWER_GOALS = {
     "server/kernels/nearest/nearest_by_scan.py": 0.75,
     "server/kernels/nearest/nearest_resident.py": 0.65,

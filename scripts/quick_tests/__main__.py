@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def run_all(selected: list[Selected], began: float, limit: float) -> bool:
-    """Run tests in both modes, and print what was run and what not; return whether one failed."""
+    """Run tests in both modes, and print which ran and which did not; return whether one failed."""
     with tempfile.TemporaryDirectory(prefix="solidcloud-quick-") as folder:
         runs = [Run(mode, Path(folder), selected, began + limit) for mode in MODES]
         for run in runs:

@@ -153,7 +153,7 @@ def _mirrors(test: str, path: str) -> bool:
     if source.parts[0] not in (*PRODUCT, "scripts") or not _is_test(test):
         return False
     folder, stem = source.parent, source.stem
-    if source.parts[0] == "scripts":  # a package of scripts is tested as the script that it serves
+    if source.parts[0] == "scripts":  # a folder X_cases of scripts is tested as the script X
         folder, stem = PurePosixPath("scripts"), PurePosixPath(source.parts[1]).stem.removesuffix("_cases")
     return str(PurePosixPath(test).parent) == f"tests/unit/{folder}" and bool(
         re.fullmatch(rf"test_{re.escape(stem)}(_\w+)?\.py", PurePosixPath(test).name)

@@ -1,2 +1,4 @@
-"""Attacks of rogue clients, for scripts/attack_wire, scripts/chaos and the tests: sessions that reach a
-server's port and forge, eavesdrop or impersonate."""
+"""Attacks of rogue clients, for scripts/attack_wire, scripts/chaos and the tests.
+
+A rogue session reaches a server's port and forges, eavesdrops or impersonates.
+"""

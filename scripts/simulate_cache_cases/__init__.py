@@ -1,1 +1,1 @@
-"""Parts of scripts/simulate_cache: the requests of a trace, their replay with a policy, and Belady's optimum."""
+"""Parts of scripts/simulate_cache: requests of a trace, replay with a policy, Belady's optimum."""

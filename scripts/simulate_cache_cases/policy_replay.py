@@ -117,8 +117,8 @@ class Replay:
     ) -> None:
         """Prepare an empty cache. name: of the policy."""
         self.budget_bytes, self.prefetch, self.loading = budget_bytes, prefetch, loading
-        self.neighbourhood = town.neighbourhood(ahead)
-        self.policy: EvictionPolicy = make_policy(name, budget_bytes, self.neighbourhood.path_distances)
+        self.tracks = town.user_tracks(ahead)
+        self.policy: EvictionPolicy = make_policy(name, budget_bytes, self.tracks.path_distances)
         self.sizes = town.sizes.tolist()
         self.costs = (loading.per_load + town.sizes * loading.per_byte).tolist()
         self.usual = float(np.quantile(self.costs, USUAL)) if self.costs else 0.0
@@ -178,7 +178,7 @@ class Replay:
                 self.plan(now)
             upto = int(np.searchsorted(somebody, end, side="right"))
             some = slice(seen, upto)
-            scans[somebody[some]] |= self.neighbourhood.record_poses(
+            scans[somebody[some]] |= self.tracks.record_poses(
                 users[some], times[some], centers[some], reaches[some]
             )
             seen = upto
@@ -293,9 +293,9 @@ class Replay:
     def plan(self, now: float) -> None:
         """Update the prefetch queue and the users' positions."""
         self.planned = now
-        self.neighbourhood.expire(now)
-        wanted = self.neighbourhood.plan(now, self.usual)
-        self.kept = frozenset(self.neighbourhood.kept(now).tolist())
+        self.tracks.expire(now)
+        wanted = self.tracks.plan(now, self.usual)
+        self.kept = frozenset(self.tracks.kept(now).tolist())
         if self.prefetch:
             self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
             resident = self.resident

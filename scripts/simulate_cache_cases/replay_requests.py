@@ -32,7 +32,7 @@ class Town(NamedTuple):
     sizes: NDArray[np.int64]
     radius: float
 
-    def neighbourhood(self, ahead: PrefetchOptions = PREFETCH_OPTIONS) -> UserTracks:
+    def user_tracks(self, ahead: PrefetchOptions = PREFETCH_OPTIONS) -> UserTracks:
         """Return a new motion prediction, without any user."""
         return UserTracks(self.index, self.voxel_steps, self.origin, self.step, ahead)
 
@@ -68,7 +68,7 @@ class Requests(NamedTuple):
 
 def requests_of(town: Town, asked: Centers) -> Requests:
     """Return the voxels that each request of a trace needs, by one kernel call."""
-    starts, flat = town.neighbourhood().rows_in_reach(asked.center, asked.reach)
+    starts, flat = town.user_tracks().rows_in_reach(asked.center, asked.reach)
     every, bounds = flat.tolist(), starts.tolist()
     rows = [every[a:b] for a, b in pairwise(bounds)]
     users, who = np.unique(asked.user, return_inverse=True)

@@ -128,9 +128,7 @@ def messages() -> dict[str, dict[str, str]]:
 
 
 def walk(endpoint: str) -> int:
-    """Send the motion commands of a session, each after the state of the previous one; return their
-    number.
-    """
+    """Send motion commands of a session, one after another's state; return their number."""
     given = content()
     client_of = find("Client", "server.client")
     with client_of(endpoint, scene="walk") as client:

@@ -75,11 +75,14 @@ ALLOWED = {
     ),
     "server/report/common": "cli/input avatars scene.py",
     "server/cli/scene_files": "residency archives scenes",
-    "server/report/accuracy": "avatars residency scene.py report/common",
+    "server/report/accuracy/measurement": "avatars residency scene.py report/common",
+    "server/report/accuracy/page": "report/common report/accuracy/measurement",
+    "server/report/accuracy": "report/common report/accuracy/measurement report/accuracy/page",
     "server/report/walk": "client.py residency cli/output scene.py report/common",
     "server/cli/commands": (
         "cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency cli/output "
-        "archives simulation scene.py cli/scene_files report/accuracy"
+        "archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
+        "report/accuracy"
     ),
     "server/cli": "cli/commands",
     "server/api": "client.py scene.py",

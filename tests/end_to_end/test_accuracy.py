@@ -11,8 +11,8 @@ import synthetic_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.server.cli import main as cli
-from solidcloud.server.report.accuracy import measurement_plan
-from solidcloud.server.report.accuracy.measurement_plan import MeasurementPlan
+from solidcloud.server.report.accuracy.measurement import measurement_plan
+from solidcloud.server.report.accuracy.measurement.measurement_plan import MeasurementPlan
 
 SMALL = MeasurementPlan(
     points=20_000, frames=48, near_tangent=12, brute=12, loops=1, tolerances=(0.0, 0.05),

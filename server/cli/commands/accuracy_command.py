@@ -28,8 +28,8 @@ def accuracy(
 
     with needs_extra("made"):
         from ...report.accuracy.accuracy_report import run as measure
-    from ...report.accuracy.measurement_plan import BRIEF, FULL
-    from ...report.accuracy.page_texts import findings
+    from ...report.accuracy.measurement.measurement_plan import BRIEF, FULL
+    from ...report.accuracy.page.page_texts import findings
     from ..output.progress_display import progress_listener
 
     with (

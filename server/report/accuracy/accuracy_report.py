@@ -16,7 +16,7 @@ from ....builder.run.progress import Progress
 from ....schemas.archive.archive import Archive
 from ....schemas.process.os_errors import check_writable
 from ..common.sphere_pictures import load_pyplot
-from .engine_settings import (
+from .measurement.engine_settings import (
     Archives,
     Setting,
     compare_engine,
@@ -25,12 +25,12 @@ from .engine_settings import (
     radius_settings,
     time_engine,
 )
-from .measured_scene import MeasuredScene, archive_scene, generated_scene
-from .measurement_plan import MeasurementPlan
-from .reference_answers import ReferenceAnswers, check_reference, find_reference
-from .setting_results import COLUMNS, SHOWN, Report, Row, mark_pareto_fronts
-from .thin_sheet import count_sheet, measure_sheet
-from .user_errors import FACADES, USER_ERROR_KNOBS, measure_generated_doors, measure_user_errors
+from .measurement.measured_scene import MeasuredScene, archive_scene, generated_scene
+from .measurement.measurement_plan import MeasurementPlan
+from .measurement.reference_answers import ReferenceAnswers, check_reference, find_reference
+from .measurement.setting_results import COLUMNS, SHOWN, Report, Row, mark_pareto_fronts
+from .measurement.thin_sheet import count_sheet, measure_sheet
+from .measurement.user_errors import FACADES, USER_ERROR_KNOBS, measure_generated_doors, measure_user_errors
 
 
 def run(
@@ -48,8 +48,8 @@ def run(
     avatar: a file of points; None: the generated figure.
     Raises SolidcloudError if matplotlib is missing.
     """
-    from .error_charts import draw_charts
-    from .html_page import write_page
+    from .page.error_charts import draw_charts
+    from .page.html_page import write_page
 
     load_pyplot()  # fails now if matplotlib is missing, not after minutes of measuring
     if archive is not None:

@@ -9,14 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.report.accuracy import error_charts
-from solidcloud.server.report.accuracy.chart_labels import place_labels
-from solidcloud.server.report.accuracy.engine_settings import engine_settings, radius_settings
-from solidcloud.server.report.accuracy.error_charts import draw_charts, points_of
-from solidcloud.server.report.accuracy.html_page import table, write_page
-from solidcloud.server.report.accuracy.measurement_plan import BRIEF
-from solidcloud.server.report.accuracy.page_texts import KNOBS, findings, leak_at
-from solidcloud.server.report.accuracy.setting_results import (
+from solidcloud.server.report.accuracy.measurement.engine_settings import engine_settings, radius_settings
+from solidcloud.server.report.accuracy.measurement.measurement_plan import BRIEF
+from solidcloud.server.report.accuracy.measurement.setting_results import (
     RADIUS,
     SHEET,
     STEP,
@@ -25,6 +20,11 @@ from solidcloud.server.report.accuracy.setting_results import (
     Row,
     mark_pareto_fronts,
 )
+from solidcloud.server.report.accuracy.page import error_charts
+from solidcloud.server.report.accuracy.page.chart_labels import place_labels
+from solidcloud.server.report.accuracy.page.error_charts import draw_charts, points_of
+from solidcloud.server.report.accuracy.page.html_page import table, write_page
+from solidcloud.server.report.accuracy.page.page_texts import KNOBS, findings, leak_at
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 PLAIN_BUILD = BuildConfig(resolution=1e-4)

@@ -8,9 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from .interleaved_timing import NOISY
+from ..measurement.interleaved_timing import NOISY
+from ..measurement.setting_results import Report, Row, knobs
 from .page_texts import CHARTS, KNOBS, TERMS, findings
-from .setting_results import Report, Row, knobs
 
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#2f2a26;background:#fbfaf7;max-width:75rem}

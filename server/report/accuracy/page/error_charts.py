@@ -5,10 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..common.sphere_pictures import load_pyplot
-from .bar_charts import MODEL_COLOURS, draw_knob, draw_sheet, save_picture
-from .chart_labels import place_labels
-from .setting_results import (
+from ...common.sphere_pictures import load_pyplot
+from ..measurement.setting_results import (
     ALONE,
     BUDGET,
     ERRORS,
@@ -23,6 +21,8 @@ from .setting_results import (
     knobs,
     pareto_front,
 )
+from .bar_charts import MODEL_COLOURS, draw_knob, draw_sheet, save_picture
+from .chart_labels import place_labels
 
 INK, FRONT = "#2f2a26", "#1b7f3b"
 COLOURS = {

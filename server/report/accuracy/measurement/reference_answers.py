@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.voxel.record_points import voxel_points
-from ....schemas.archive.archive import Archive
-from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.errors import BadDataError, InternalError
-from ....schemas.wire.answers import Verdict
-from ...avatars.avatar_model import make_avatar
-from ...scene import Scene
+from .....builder.voxel.record_points import voxel_points
+from .....schemas.archive.archive import Archive
+from .....schemas.archive.units import UNITS_PER_METRE
+from .....schemas.errors import BadDataError, InternalError
+from .....schemas.wire.answers import Verdict
+from ....avatars.avatar_model import make_avatar
+from ....scene import Scene
 from .measured_scene import AVATAR, REACH, SEED, MeasuredScene
 from .measurement_plan import MeasurementPlan
 

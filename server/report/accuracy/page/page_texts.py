@@ -4,8 +4,19 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from .interleaved_timing import NOISY
-from .setting_results import ALONE, BUDGET, DEGREE, LEAF, NODES, RADIUS, SHEET, STEP, TOLERANCE, Row
+from ..measurement.interleaved_timing import NOISY
+from ..measurement.setting_results import (
+    ALONE,
+    BUDGET,
+    DEGREE,
+    LEAF,
+    NODES,
+    RADIUS,
+    SHEET,
+    STEP,
+    TOLERANCE,
+    Row,
+)
 
 # Times that differ by less than this factor are called the same: times of one archive built twice
 # differed by 6 %.

@@ -6,12 +6,12 @@ The figure can only touch the rim of this sheet.
 from collections.abc import Callable
 from pathlib import Path
 
-from ....builder.config import BuildConfig
-from ....builder.pipeline import build_archive
-from ....builder.synthetic.sheet import make_sheet
-from ...scene import Scene
-from ..common.doorway import doorway_error
-from ..common.leak import leak
+from .....builder.config import BuildConfig
+from .....builder.pipeline import build_archive
+from .....builder.synthetic.sheet import make_sheet
+from ....scene import Scene
+from ...common.doorway import doorway_error
+from ...common.leak import leak
 from .measured_scene import AVATAR
 from .setting_results import SHEET, Row
 

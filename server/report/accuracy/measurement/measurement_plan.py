@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..common.paper_case import PAPER_POINTS
+from ...common.paper_case import PAPER_POINTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,23 +14,28 @@ from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import InternalError
 from solidcloud.server.report.accuracy.accuracy_report import warnings_of
-from solidcloud.server.report.accuracy.engine_settings import UNSPENT, Archives, Setting, compare_engine
-from solidcloud.server.report.accuracy.measured_scene import (
+from solidcloud.server.report.accuracy.measurement.engine_settings import (
+    UNSPENT,
+    Archives,
+    Setting,
+    compare_engine,
+)
+from solidcloud.server.report.accuracy.measurement.measured_scene import (
     REACH,
     MeasuredScene,
     archive_scene,
     config_of,
     unknown_regions,
 )
-from solidcloud.server.report.accuracy.measurement_plan import MeasurementPlan
-from solidcloud.server.report.accuracy.reference_answers import (
+from solidcloud.server.report.accuracy.measurement.measurement_plan import MeasurementPlan
+from solidcloud.server.report.accuracy.measurement.reference_answers import (
     MAX_OFFSET,
     MIN_OFFSET,
     ReferenceAnswers,
     check_reference,
     find_reference,
 )
-from solidcloud.server.report.accuracy.setting_results import BUDGET, DEGREE, TOLERANCE, Row
+from solidcloud.server.report.accuracy.measurement.setting_results import BUDGET, DEGREE, TOLERANCE, Row
 
 PLAN = MeasurementPlan(frames=40, near_tangent=20, loops=1)
 CONFIG = BuildConfig(resolution=1e-3, radius=0.01, jobs=1)

@@ -4,9 +4,9 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from ..common.doorway import doorway_error
-from ..common.leak import leak, leak_places
-from ..common.measured_doorway import measure_doorways
+from ...common.doorway import doorway_error
+from ...common.leak import leak, leak_places
+from ...common.measured_doorway import measure_doorways
 from .engine_settings import Archives, Setting
 from .measured_scene import AVATAR, SEED, MeasuredScene
 from .measurement_plan import MeasurementPlan

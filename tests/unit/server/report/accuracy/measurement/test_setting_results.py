@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.server.report.accuracy import interleaved_timing, user_errors
 from solidcloud.server.report.accuracy.accuracy_report import write_rows
-from solidcloud.server.report.accuracy.engine_settings import engine_settings, length_name, radius_settings
-from solidcloud.server.report.accuracy.interleaved_timing import TimedSetting, take_times
-from solidcloud.server.report.accuracy.measurement_plan import BRIEF, FULL, MeasurementPlan
-from solidcloud.server.report.accuracy.setting_results import (
+from solidcloud.server.report.accuracy.measurement import interleaved_timing, user_errors
+from solidcloud.server.report.accuracy.measurement.engine_settings import (
+    engine_settings,
+    length_name,
+    radius_settings,
+)
+from solidcloud.server.report.accuracy.measurement.interleaved_timing import TimedSetting, take_times
+from solidcloud.server.report.accuracy.measurement.measurement_plan import BRIEF, FULL, MeasurementPlan
+from solidcloud.server.report.accuracy.measurement.setting_results import (
     BUDGET,
     COLUMNS,
     DEGREE,
@@ -31,7 +35,10 @@ from solidcloud.server.report.accuracy.setting_results import (
     error_of,
     mark_pareto_fronts,
 )
-from solidcloud.server.report.accuracy.user_errors import measure_generated_doors, measure_user_errors
+from solidcloud.server.report.accuracy.measurement.user_errors import (
+    measure_generated_doors,
+    measure_user_errors,
+)
 from solidcloud.server.report.common.doorway import Doorway
 from solidcloud.server.report.common.leak import Leak
 

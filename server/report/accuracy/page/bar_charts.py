@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..common.sphere_pictures import load_pyplot
-from .setting_results import RADIUS, Row
+from ...common.sphere_pictures import load_pyplot
+from ..measurement.setting_results import RADIUS, Row
 
 # Colours of the pictures' palette: halves the file size without losing a colour.
 PALETTE = 256

@@ -6,18 +6,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.config import DEFAULT_STEP, BuildConfig
-from ....builder.synthetic.facade import build_facade
-from ....builder.synthetic.figure import figure_points
-from ....builder.synthetic.scenes import make_facade
-from ....builder.synthetic.truth import SceneTruth, read_truth
-from ....builder.synthetic.walk import walk_poses
-from ....builder.voxel.record_points import voxel_points
-from ....schemas.archive.archive import Archive
-from ....schemas.archive.index import Header
-from ...avatars.avatar_file import read_avatar
-from ...avatars.avatar_model import make_avatar
-from ..common.floor_walk import floor_walk
+from .....builder.config import DEFAULT_STEP, BuildConfig
+from .....builder.synthetic.facade import build_facade
+from .....builder.synthetic.figure import figure_points
+from .....builder.synthetic.scenes import make_facade
+from .....builder.synthetic.truth import SceneTruth, read_truth
+from .....builder.synthetic.walk import walk_poses
+from .....builder.voxel.record_points import voxel_points
+from .....schemas.archive.archive import Archive
+from .....schemas.archive.index import Header
+from ....avatars.avatar_file import read_avatar
+from ....avatars.avatar_model import make_avatar
+from ...common.floor_walk import floor_walk
 from .measurement_plan import MeasurementPlan
 
 Floats = NDArray[np.float64]

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....builder.config import DEFAULT_STEP, BuildConfig
-from ....builder.pipeline import build_archive
-from ....schemas.errors import InternalError
-from ....schemas.wire.answers import Verdict
-from ...residency.arena import ArenaBuffer
-from ...residency.voxel_store import VoxelStore
-from ...scene import Scene
+from .....builder.config import DEFAULT_STEP, BuildConfig
+from .....builder.pipeline import build_archive
+from .....schemas.errors import InternalError
+from .....schemas.wire.answers import Verdict
+from ....residency.arena import ArenaBuffer
+from ....residency.voxel_store import VoxelStore
+from ....scene import Scene
 from .interleaved_timing import TimedSetting, take_times
 from .measured_scene import AVATAR, REACH, MeasuredScene
 from .measurement_plan import MeasurementPlan

@@ -47,7 +47,7 @@ LEAST = {"wrong": 1e-3, "distance": 1e-2}
 
 TITLES = {
     "doorway": "Door: extra width that the figure needs",
-    "leak": "Wall: depth that a ball of 5 cm radius gets into it",
+    "leak": "Wall: depth to which a ball of 5 cm radius enters it",
     "wrong": "Verdicts that differ from the exact ones",
     "distance": "Distances that differ from the exact ones",
 }

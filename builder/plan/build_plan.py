@@ -114,7 +114,7 @@ def hypothetical_scene(
 
 
 class Limit(NamedTuple):
-    """Limit of a build. found: need of the build.  most: what is available.
+    """Limit of a build. found: amount that the build needs.  most: amount that is available.
 
     advice: what to do if the limit binds.
     """

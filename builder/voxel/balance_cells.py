@@ -11,8 +11,8 @@ permitted cube. A cell is still an aligned cube around its points, but cubes may
 
 This is not the default, because splitting alone gives nine in ten trees the same height. Merging
 the remainders makes cells of parts that lie apart, and leaf nodes of these cells span the space
-between them. server/report/walk/cell_comparison.py compares octree cells, larger ones and balanced
-ones.
+between them. server/report/walk/cell_comparison.py compares octrees of
+several limits with balanced cells.
 """
 
 import math

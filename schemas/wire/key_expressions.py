@@ -34,7 +34,7 @@ class User(NamedTuple):
 def check_name(name: str, what: str) -> str:
     """Return the name if it is valid in a key; raise BadRequestError otherwise.
 
-    what: what the name denotes, for the error message.
+    what: noun for the name in the error message, such as "scene".
     """
     if not _NAME.fullmatch(name):
         raise BadRequestError(f"{what} {name!r}: expected 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'")

@@ -50,7 +50,7 @@ class CoarseBounds:
     without a slot has to be loaded. Overwriting slots would require a lock, and kernels read slots
     without a lock.
 
-    arrays: what kernels read.  bytes: size of the arrays, constant and at most the budget.
+    arrays: arrays that kernels read.  bytes: size of the arrays, constant and at most the budget.
     """
 
     def __init__(self, voxels: int, budget_bytes: int) -> None:

@@ -32,7 +32,7 @@ class ProvedBounds:
     index of a proved one. A box only shrinks, one number at a time; a reader without the lock may
     see some of its numbers before the change and some after it.
     index_boxes: the boxes in the index, proved or not.
-    proved: (v,) bool, voxels whose record contains no point outside its box in the index.
+    proved: (v,) bool, voxels whose record matches its box in the index.
     unproved: the number of voxels not proved. Read it before `index`, and pass it to `unsettled`
     afterwards.
     """

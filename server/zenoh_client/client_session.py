@@ -324,9 +324,9 @@ class ClientSession:
     def _begin_again(self, unknown: UnknownAvatarError) -> None:
         """Add the avatar and send its pose again to a server that does not know them.
 
-        unknown: the server's error; raised after too many attempts. The server was restarted, has
-        dropped this client's avatars or has another avatar of the name. Or a velocity replaced the
-        first motion command, which had the pose.
+        unknown: the server's error; stored for the caller if there is no pose to send, or after too
+        many attempts. The server was restarted, has dropped this client's avatars or has another
+        avatar of the name. Or a velocity replaced the first motion command, which had the pose.
         """
         self._refusals += 1
         try:

@@ -238,8 +238,8 @@ class Lane:
     def _empty(self, following: Ticket | None) -> tuple[Ticket | None, bool]:
         """Queue the queries that wait in the channel.
 
-        following: what this thread carries out next, None if nothing yet. Return that, and whether
-        this thread is still a worker.
+        following: ticket that this thread carries out next, None if there is none yet. Return the
+        next ticket, and whether this thread is still a worker.
         """
         takes, number = True, 0
         while takes and number < _MAX_TAKEN and (query := take_waiting(self._queries)) is not None:

@@ -121,8 +121,8 @@ def sweep_resident(
 def pose_between(pose_from, pose_to, fraction, box, origin, pose):
     """Write the pose at a fraction of a motion to pose (4, 4), world.
 
-    The motion is given as for `sweep_resident`. Returns whether it is that pose bit for bit once
-    the origin is subtracted again; what was proved of the motion then holds for it.
+    The motion is given as for `sweep_resident`. Returns whether subtracting the origin again gives
+    the sweep's pose bit for bit, so that a proof of the sweep holds for this pose.
     """
     poses = np.empty((2, 4, 4))
     poses[0], poses[1] = pose_from, pose_to

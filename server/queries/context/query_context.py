@@ -67,7 +67,7 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 class SceneData(NamedTuple):
     """Data of one scene that every query reads; made once, by `make_scene_data`.
 
-    arrays: what the kernels read.  bounds: boxes around the points of each voxel.
+    arrays: arrays that the kernels read.  bounds: boxes around the points of each voxel.
     broad: the index of `bounds`, which the broad phase reads.
     radius_units: of the largest sphere of a scan point, exact units.
     unknown: (u, 2, 3) int64, lattice boxes of scans that the build left out.

@@ -4,15 +4,15 @@ Each effect is one file, named as in the scene file, whose `make(effect, world)`
 The code that effects share is in simulation/world/. effect_pipeline.py runs the effects that a
 scene declares, in this order:
 
-1. `objects`, `crowd`: place everything else that could be met, before anyone moves.
-2. `stop`, with `sweep`: follow the motion command as far as nothing is touched.
-3. `slide`: continue the remaining motion along what was touched.
-4. `step`: carry the motion that is left after that over low obstacles.
-5. `ground`: as the last motion, let the feet settle or fall where the avatar arrived.
+1. `objects`, `crowd`: add objects and other users as obstacles, before the avatar moves.
+2. `stop`, with `sweep`: follow the motion command until the first contact.
+3. `slide`: continue the remaining motion along the touched surfaces.
+4. `step`: try to climb low obstacles with the motion that still remains.
+5. `ground`: as the last motion, lower the avatar to the ground, or let it fall.
 6. `proximity`, `contacts`, `uncertainty`: report about the final pose. The most expensive comes
-   last, because the last is skipped first.
+   last, because a small budget skips the last effects first.
 
-`through` has no part in a frame: it changes the scene once, when it is opened.
+`through` does nothing in a frame: it changes the scene once, when it is opened.
 
 May import server.archives, server.avatars, server.queries, server.queries.context,
 server.residency, server.runtime, server.simulation.world, schemas.

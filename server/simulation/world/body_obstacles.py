@@ -25,7 +25,7 @@ from .bodies import USER, Bodies, Shape
 from .frame import Body, Frame, Hit, Pose, Vec
 from .vectors import dot, horizontal, norm, rotate
 
-# Tolerance for a translation across what is overlapped: rounding does not count as going deeper.
+# Tolerance for a translation across an overlapped body, so that rounding does not count as deeper.
 _ACROSS = 1e-9
 
 

@@ -151,6 +151,8 @@ def sweep(
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
     asked: set[int] = set()  # rows loaded to prove the index
+    # A round plans the next segment of each unfinished motion, loads the voxels that only the index
+    # excludes, and advances the motions through the segment's voxels, piece by piece.
     while len(which):
         begun = progress.at.copy()
         unproved = bounds.unproved

@@ -181,6 +181,7 @@ class VoxelCache:
             return HeldVoxels(len(rows), 0, ())  # all are resident and pinned
         try:
             wanted = mine
+            # Each further round does loads that other requests abandoned at their deadlines.
             while True:
                 self._load(wanted, deadline, stop)
                 with self._changed:

@@ -92,6 +92,11 @@ def _advance(sweep, start, stop, rows, size, tolerance):
     Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
     was found. lower is `stop` when nothing touches in [start, stop]. A graze fixes lower; the part
     after it is still searched for contacts.
+
+    Each round searches [t, after]. `since` is the first fraction at which something may touch,
+    `sure` one at which the integers confirm contact. If nothing may touch, t moves to `after` and
+    the next interval is longer. Otherwise t moves to `since` and the next interval is shorter;
+    `refused` counts these rounds. `lower` is -1 until it is fixed.
     """
     motion, moving = sweep.motion, sweep.moving
     t, lower, upper, refused, steps = start, -1.0, INFINITE, 0, 0

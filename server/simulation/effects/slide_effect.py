@@ -94,6 +94,8 @@ class SlideRunner:
         """
         assert frame.advance is not None
         start, most = frame.pose[:3, 3] - (command - rest), norm(command)
+        # Distinct planes touched so far. A plane that is touched again, or that the motion did not
+        # lead into, is taken for a bump.
         planes: list[Vec] = []
         ended: Hit | None = hit
         for _ in range(_MOTIONS_PER_SURFACE * self.surfaces):

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import ScanError, SolidcloudError
 from ....schemas.process.interrupts import check_interrupt
 
@@ -33,10 +34,7 @@ BLOCK_BYTES = 64 << 20
 # Bytes of a file hashed per read.
 HASHED_BYTES = 1 << 20
 
-# Largest valid distance of a coordinate from the origin [m] (NUMERICS.md, case 16).
-FARTHEST = 1e9
-
-# Drop reason of points that are not finite or lie beyond FARTHEST.
+# Drop reason of points that are not finite or lie beyond MAX_COORDINATE.
 NOT_FINITE = "not finite"
 
 # Drop reason of directions in which the scanner measured nothing.
@@ -271,7 +269,7 @@ def checked_bounds(bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
     Writers that do not know the bounds leave zeros, infinities or the largest float64 (some with
     high below low).
     """
-    believable = np.isfinite(bounds).all() and (np.abs(bounds) <= FARTHEST).all()
+    believable = np.isfinite(bounds).all() and (np.abs(bounds) <= MAX_COORDINATE).all()
     if believable and (bounds[0] <= bounds[1]).all() and (bounds[0] < bounds[1]).any():
         return bounds
     return None

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
-from ..common.scan import FARTHEST, Scan, library_errors, scan_error
+from ..common.scan import Scan, library_errors, scan_error
 from ..common.text_rows import LONGEST_LINE, is_number
 
 # Numbers in each header line after the two lines of the grid's size.
@@ -83,7 +84,7 @@ def _pose(file: BufferedReader, path: Path, line: int) -> NDArray[np.float64]:
     pose = np.array(found[4:]).T
     if (
         not np.isfinite(pose).all()
-        or np.abs(pose).max() > FARTHEST
+        or np.abs(pose).max() > MAX_COORDINATE
         or pose[3].tolist() != [0, 0, 0, 1]
         or np.linalg.matrix_rank(pose) < 4
     ):

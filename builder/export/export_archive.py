@@ -8,7 +8,6 @@ the last bit in PLY and VTKHDF, and as a LAS reader computes them (las_export.py
 name once it is complete.
 """
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -22,7 +21,7 @@ from ...schemas.archive.index import Header
 from ...schemas.archive.voxel_grid import MAX_COORDINATE, Lattice
 from ...schemas.archive.vtkhdf import vtk_file
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import sync_folder
+from ...schemas.process.new_file import new_path
 from ..run.progress import Progress, Silent
 from ..voxel.record_points import PointBlock, iter_points, read_columns, record_columns, stored_columns
 from .export_contents import Contents
@@ -94,18 +93,11 @@ def export_archive(
         contents = _survey_points(archive, rows, base, limits, progress)
         progress.finish()
         notes = [] if contents.points else ["no point is in the box"]
-        temporary = output.with_name(f".{output.name}.{os.getpid()}.tmp")
-        try:
+        with new_path(output) as temporary:
             progress.start("export", contents.points, "points")
             with _writer(form, temporary, archive.header, contents, notes) as writer:
                 _write_points(archive, rows, base, limits, contents, writer, progress)
             progress.finish()
-            with open(temporary, "rb") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, output)
-            sync_folder(output.parent)
-        finally:
-            temporary.unlink(missing_ok=True)
         bounds = archive.header.lattice.to_world(np.stack([contents.low, contents.high])).tolist()
     low, high = bounds if contents.points else (None, None)
     return ExportSummary(output, form, contents.points, output.stat().st_size, low, high, tuple(notes))

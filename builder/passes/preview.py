@@ -12,7 +12,6 @@ from ...schemas.archive.index import Header
 from ...schemas.archive.vtkhdf import PREVIEW_NAME, VtkPoints, read_points
 from ...schemas.errors import CorruptError
 from ...schemas.process.interrupts import check_interrupt
-from ...schemas.process.new_file import publish
 from ...schemas.process.new_hdf5_file import new_hdf5_file
 from ..build_limits import MAX_PREVIEW_POINTS, PREVIEW_PART, WHOLE_PREVIEW_POINTS
 from ..kernels.points.voxel_records import first_of_each, point_hashes
@@ -71,7 +70,6 @@ def write_preview(folder: Path, executor: Executor | None = None, progress: Prog
         with VtkPoints(file, stored_columns(header), compressed=True) as out:
             world = header.lattice.to_world(chosen.lattice)
             out.append(np.rint(world / _ROUNDED) * _ROUNDED, chosen.columns)
-    publish(path)
     return len(chosen.lattice)
 
 

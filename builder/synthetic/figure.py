@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
+from ...schemas.process.new_file import new_file
 
 # Height that the proportions are given for [m]; other heights scale the whole figure.
 HEIGHT = 1.75
@@ -100,12 +101,8 @@ def write_figure(path: Path, points: NDArray[np.float64]) -> None:
         raise BadRequestError(f"{path}: cannot write {suffix!r}: expected .obj or .ply: rename the output")
     rows = "".join(f"{lead}{x!r} {y!r} {z!r}\n" for x, y, z in points.tolist())
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        temporary.write_text(head + rows, encoding="ascii")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with new_file(path) as file:
+        file.write((head + rows).encode("ascii"))
 
 
 def _surface(count: int, rng: np.random.Generator) -> NDArray[np.float64]:

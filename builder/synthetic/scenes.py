@@ -1,6 +1,5 @@
 """Generation of scenes: a façade or a town of façades, scanned and written with its ground truth."""
 
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...schemas.errors import BadRequestError
+from ...schemas.process.new_file import new_path
 from .facade import SILL, build_facade
 from .scanner import (
     LATTICE,
@@ -133,30 +133,25 @@ def _make(
     Memory is bounded by one station and its mesh.
     """
     truth_path = out.with_name(f"{out.stem}.truth.json")
-    truth_temporary = truth_path.with_name(f".{truth_path.name}.tmp")
     stations: list[StationTruth] = []
     facades: list[FacadeTruth] = []
     done = 0
-    try:
-        with open_target(out) as writer:
-            for number, job in enumerate(jobs):
-                mesh, truth = job.lot.surroundings(), job.lot.truth
-                scene = RayScene(mesh)
-                step, quotas = plan_stations(scene, job.places, job.points)
-                facades.append(truth)
-                for k, (place, quota) in enumerate(zip(job.places, quotas, strict=True)):
-                    scan = _moved(simulate_scan(scene, place, step, quota, (seed, number, k)), truth.origin)
-                    stations.append(
-                        StationTruth(len(stations) + 1, scan.place.position, place.yaw, scan.step, quota)
-                    )
-                    writer.write(len(stations), scan)
-                    done += quota
-                    if progress is not None:
-                        progress(done, points)
-            write_truth(truth_temporary, SceneTruth(seed, points, NOISE, tuple(stations), tuple(facades)))
-        os.replace(truth_temporary, truth_path)
-    finally:
-        truth_temporary.unlink(missing_ok=True)
+    with new_path(truth_path) as truth_temporary, open_target(out) as writer:
+        for number, job in enumerate(jobs):
+            mesh, truth = job.lot.surroundings(), job.lot.truth
+            scene = RayScene(mesh)
+            step, quotas = plan_stations(scene, job.places, job.points)
+            facades.append(truth)
+            for k, (place, quota) in enumerate(zip(job.places, quotas, strict=True)):
+                scan = _moved(simulate_scan(scene, place, step, quota, (seed, number, k)), truth.origin)
+                stations.append(
+                    StationTruth(len(stations) + 1, scan.place.position, place.yaw, scan.step, quota)
+                )
+                writer.write(len(stations), scan)
+                done += quota
+                if progress is not None:
+                    progress(done, points)
+        write_truth(truth_temporary, SceneTruth(seed, points, NOISE, tuple(stations), tuple(facades)))
     paths = tuple(sorted(out.iterdir())) if out.is_dir() else (out,)
     return GeneratedScene(paths, truth_path, done)
 

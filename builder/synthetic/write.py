@@ -1,11 +1,8 @@
 """Writers of simulated scans, station by station: LAZ or LAS, E57, or a folder of LAZ files.
 
-The output is written under a temporary name beside the target and renamed when complete; an aborted
-write leaves nothing. Memory: one station.
+Memory: one station.
 """
 
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date
@@ -16,6 +13,7 @@ import numpy as np
 import pye57
 
 from ...schemas.errors import BadRequestError
+from ...schemas.process.new_file import new_path
 from .scanner import LATTICE, SimulatedScan
 
 SUFFIXES = (".laz", ".las", ".e57")
@@ -130,14 +128,12 @@ def check_target(out: Path) -> None:
 
 @contextmanager
 def open_target(out: Path) -> Iterator[LasFile | LasFolder | E57File]:
-    """Yield a writer for `out`; rename the result into place on success and remove it on failure."""
+    """Yield a writer for `out`, which gets its name when it is complete; a failure leaves nothing."""
     check_target(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.tmp")
-    _remove(temporary)
     suffix = out.suffix.lower()
     writer: LasFile | LasFolder | E57File
-    try:
+    with new_path(out) as temporary:
         if suffix == ".e57":
             writer = E57File(temporary)
         elif suffix:
@@ -148,13 +144,3 @@ def open_target(out: Path) -> Iterator[LasFile | LasFolder | E57File]:
             yield writer
         finally:
             writer.close()
-        os.replace(temporary, out)
-    finally:
-        _remove(temporary)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..errors import CorruptError
 from ..process.interrupts import check_interrupt
-from ..process.new_file import publish, temporary_path
-from ..process.new_hdf5_file import new_hdf5_file
+from ..process.new_file import new_path
+from ..process.new_hdf5_file import hdf5_file, new_hdf5_file
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .index import DATASETS, INDEX_NAME, VOXEL_DTYPE, Header, index_columns, index_digest
 from .voxel import VoxelData
@@ -75,39 +75,34 @@ def write_shard(
     The file is verified by offsets before it is given its name.
     """
     rows = []
-    with new_hdf5_file(path) as file:
-        file.attrs["format"] = np.bytes_("solidcloud shard")
-        file.attrs["format_version"] = np.uint32(version)
-        file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
-        parent = file.create_group("voxels", track_times=False)
-        for voxel, record, low, high in voxels:
-            dtypes = (CELL_DTYPE, NODE_DTYPE, voxel_point_dtype(voxel))
-            group = parent.create_group(f"{voxel.key:016x}", track_times=False)
-            counts = (record.cell_rows, record.node_rows, record.point_rows)
-            frames = (record.cells, record.nodes, record.points)
-            row = np.zeros((), VOXEL_DTYPE)
-            row["key"], row["shard"], row["rows"], row["low"], row["high"] = (
-                voxel.key,
-                number,
-                counts,
-                low,
-                high,
-            )
-            row["leaves"] = record.leaf_rows
-            for i, name in enumerate(DATASETS):
-                offset, size = _write_frame(group, name, frames[i], counts[i], dtypes[i])
-                row["frame_offset"][i], row["frame_bytes"][i] = offset, size
-                row["frame_checksum"][i] = int.from_bytes(frames[i][-4:], "little")
-            rows.append(row)
-            file.check()
-    table = np.array(rows, VOXEL_DTYPE)
-    temporary = temporary_path(path)
-    try:
+    with new_path(path) as temporary:
+        with hdf5_file(temporary) as file:
+            file.attrs["format"] = np.bytes_("solidcloud shard")
+            file.attrs["format_version"] = np.uint32(version)
+            file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
+            parent = file.create_group("voxels", track_times=False)
+            for voxel, record, low, high in voxels:
+                dtypes = (CELL_DTYPE, NODE_DTYPE, voxel_point_dtype(voxel))
+                group = parent.create_group(f"{voxel.key:016x}", track_times=False)
+                counts = (record.cell_rows, record.node_rows, record.point_rows)
+                frames = (record.cells, record.nodes, record.points)
+                row = np.zeros((), VOXEL_DTYPE)
+                row["key"], row["shard"], row["rows"], row["low"], row["high"] = (
+                    voxel.key,
+                    number,
+                    counts,
+                    low,
+                    high,
+                )
+                row["leaves"] = record.leaf_rows
+                for i, name in enumerate(DATASETS):
+                    offset, size = _write_frame(group, name, frames[i], counts[i], dtypes[i])
+                    row["frame_offset"][i], row["frame_bytes"][i] = offset, size
+                    row["frame_checksum"][i] = int.from_bytes(frames[i][-4:], "little")
+                rows.append(row)
+                file.check()
+        table = np.array(rows, VOXEL_DTYPE)
         checksum = _verify_frames(temporary, table)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    publish(path)
     return table, checksum
 
 
@@ -157,4 +152,3 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
         file.attrs["sha256"] = np.frombuffer(index_digest(header.archive_id, columns), np.uint8)
         for name, column in columns.items():
             file.create_dataset(name, data=column)
-    publish(path)

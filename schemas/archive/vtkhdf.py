@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptError
-from ..process.new_file import publish
-from ..process.new_hdf5_file import NewHdf5File, new_hdf5_file
+from ..process.new_hdf5_file import NewHdf5File, hdf5_file
 
 PREVIEW_NAME = "preview.vtkhdf"
 
@@ -104,13 +103,12 @@ class VtkPoints:
 
 @contextmanager
 def vtk_file(path: Path, columns: Mapping[str, np.dtype]) -> Iterator[VtkPoints]:
-    """Create an uncompressed file of points, which gets its name when it is complete.
+    """Create an uncompressed file of points, under a name that `new_path` gave.
 
     Raises OSError, for example if the disk is full.
     """
-    with new_hdf5_file(path) as file, VtkPoints(file, columns, compressed=False) as points:
+    with hdf5_file(path) as file, VtkPoints(file, columns, compressed=False) as points:
         yield points
-    publish(path)
 
 
 class PointsRead(NamedTuple):

@@ -1,12 +1,12 @@
-"""Atomic writing of files: under a temporary name, synced, renamed, the folder synced.
+"""Writing of new files and folders: under a temporary name, synced, renamed, the folder above synced.
 
-A file therefore has its name only when it is complete and durable on disk. new_hdf5_file.py writes
-HDF5 files in the same way.
+They therefore have their name only when they are complete and durable on disk. new_hdf5_file.py
+writes HDF5 files.
 """
 
 import os
 import re
-import threading
+import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,53 +14,49 @@ from pathlib import Path
 from typing import BinaryIO
 
 TEMPORARY_SUFFIX = ".tmp"
+# The second form was used by earlier versions, whose units may still be running on a cluster.
 _TEMPORARY = re.compile(r".+\.([0-9a-f]{32}|[0-9a-f]{12}-\d+-\d+|directory)\.tmp")
-
-# Random id of this process, or of the one that it was forked from: several hosts use the same
-# process ids.
-_PROCESS = os.urandom(6).hex()
-
-
-def temporary_path(path: Path) -> Path:
-    """Return the temporary name under which this thread writes `path`.
-
-    Names differ between threads and processes, because a cluster may run one unit in two places at
-    once.
-    """
-    return path.with_name(f"{path.name}.{_PROCESS}-{os.getpid()}-{threading.get_ident()}{TEMPORARY_SUFFIX}")
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for writing that gets its name only when it is complete and durable on disk.
+def new_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path; the file or folder made there is renamed to `path` at the end.
 
-    Its temporary name is unique, because a unit that a cluster has given up may still be running.
+    Its name is unique, because a unit that a cluster has given up may still be running. After an
+    error, remove what was made. Replace an existing file, or an empty folder.
     """
     temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
     try:
-        with open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield temporary
+        if temporary.is_dir():
+            for inner in temporary.rglob("*"):
+                _sync(inner)
+        _sync(temporary)
         os.replace(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
 
 
-def publish(path: Path) -> None:
-    """Sync the temporary file of `path`, rename it, and sync its folder."""
-    temporary = temporary_path(path)
-    with open(temporary, "rb") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    sync_folder(path.parent)
+@contextmanager
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for writing that gets its name only when it is complete and durable on disk."""
+    with new_path(path) as temporary, open(temporary, "wb") as file:
+        yield file
 
 
 def sync_folder(folder: Path) -> None:
     """Make a rename inside this folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
+    _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    """Make a file, or the names in a folder, durable on disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

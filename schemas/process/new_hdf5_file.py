@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 
 from .interrupts import blocking_interrupts
-from .new_file import temporary_path
+from .new_file import new_path
 
 # No piece of HDF5's own structures is longer than this [bytes]; the longest is a group's list of
 # its links.
@@ -114,14 +114,23 @@ class NewHdf5File(h5py.File):  # type: ignore[misc]
 
 @contextlib.contextmanager
 def new_hdf5_file(path: Path) -> Iterator[NewHdf5File]:
-    """Open an HDF5 file under a temporary name; `publish` gives it its own name.
+    """Open an HDF5 file for writing that gets its name only when it is complete and durable on disk.
+
+    Errors and interrupts are those of `hdf5_file`.
+    """
+    with new_path(path) as temporary, hdf5_file(temporary) as file:
+        yield file
+
+
+@contextlib.contextmanager
+def hdf5_file(path: Path) -> Iterator[NewHdf5File]:
+    """Open an HDF5 file for writing, under a name that `new_path` gave.
 
     A failed write raises an OSError that names the file, and no file is left. Interrupts wait until
     the file is closed, or until `check_interrupt`.
     """
-    temporary = temporary_path(path)
     with blocking_interrupts() as deliver, contextlib.ExitStack() as stack:
-        disk = _Disk(temporary)
+        disk = _Disk(path)
         stack.callback(disk.close)
         try:
             with NewHdf5File(disk, deliver) as file:
@@ -130,7 +139,7 @@ def new_hdf5_file(path: Path) -> Iterator[NewHdf5File]:
             if disk.error is not None:
                 raise disk.error
         except BaseException as error:
-            temporary.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
             if disk.error is not None and isinstance(error, Exception):
                 raise disk.error from None
             raise

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...schemas.errors import BadRequestError
-from ...schemas.process.new_file import publish, temporary_path
+from ...schemas.process.new_file import new_path
 from .endpoints import canonical
 
 log = logging.getLogger(__name__)
@@ -163,14 +163,9 @@ def _write(path: Path, key: bytes) -> None:
     if not stat.S_ISDIR(folder.st_mode) or folder.st_uid != os.getuid():
         raise PermissionError(f"{path.parent} is not this user's own folder")
     os.chmod(path.parent, 0o700)
-    temporary = temporary_path(path)
-    try:
+    with new_path(path) as temporary:
         descriptor = os.open(
             temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
         )
         with open(descriptor, "w", encoding="ascii") as file:
             file.write(key.hex() + "\n")
-        publish(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise

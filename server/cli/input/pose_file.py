@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError, ScanError
+from ....schemas.process.new_file import new_path
 
 COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 RAY_COLUMNS = ("x", "y", "z", "dx", "dy", "dz")
@@ -108,15 +109,10 @@ def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float6
         for t, pose in zip(times.tolist(), poses, strict=True)
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("w", newline="", encoding="ascii") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows([repr(float(value)) for value in row] for row in rows)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with new_path(path) as temporary, temporary.open("w", newline="", encoding="ascii") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows([repr(float(value)) for value in row] for row in rows)
 
 
 def _numbers(where: str, row: list[str]) -> list[float]:

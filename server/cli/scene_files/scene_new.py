@@ -10,6 +10,7 @@ import numpy as np
 
 from ....schemas.archive.radius_model import STORED_MODELS
 from ....schemas.errors import BadRequestError, SolidcloudError
+from ....schemas.process.new_file import new_file
 from ....schemas.process.os_errors import write_error_words
 from ....schemas.scene.scene_file import SUFFIX, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
@@ -62,10 +63,11 @@ def new_scene(
     )
     text = scene_text(begin).encode()
     scene_name(parse_scene(text, f"{out} (not written)"), out)
+    if os.path.lexists(out) and not force:
+        raise BadRequestError(f"{out} exists: give another -o, or --force to replace it")
     try:
-        _write(out, text, force)
-    except FileExistsError:
-        raise BadRequestError(f"{out} exists: give another -o, or --force to replace it") from None
+        with new_file(out) as file:
+            file.write(text)
     except OSError as error:
         raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}") from None
 
@@ -87,23 +89,6 @@ def _named(avatars: Sequence[Path]) -> dict[str, Path]:
             )
         found[called] = file
     return found
-
-
-def _write(out: Path, text: bytes, force: bool) -> None:
-    """Write the file completely or not at all.
-
-    Raises FileExistsError if the file exists and `force` is not set.
-    """
-    written = out.with_name(f"{out.name}.{os.getpid()}.tmp") if force else out
-    with open(written, "xb") as opened:
-        try:
-            opened.write(text)
-            opened.close()
-            if force:
-                os.replace(written, out)
-        except BaseException:
-            written.unlink()
-            raise
 
 
 def _relative(path: Path, out: Path) -> str:

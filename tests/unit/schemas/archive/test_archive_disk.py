@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.schemas.process.new_file import publish
 from solidcloud.schemas.process.new_hdf5_file import new_hdf5_file
 
 
@@ -19,7 +18,6 @@ def write(path: Path, datasets: int = 40) -> None:
         for i in range(datasets):
             group = file.create_group(f"{i:016x}", track_times=False)
             group.create_dataset("points", data=np.arange(50 * i), track_times=False)
-    publish(path)
 
 
 @contextmanager

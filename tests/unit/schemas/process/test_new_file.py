@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import solidcloud.schemas.process.new_file as new_file_module
-from solidcloud.schemas.process.new_file import new_file, remove_temporaries
+from solidcloud.schemas.process.new_file import is_temporary, new_file, new_path, remove_temporaries
 
 
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,6 +24,29 @@ def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: 
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
     assert path.read_bytes() == b"one"
+
+
+def test_a_folder_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "stations"
+    synced: list[str] = []
+    sync = new_file_module._sync
+    monkeypatch.setattr(
+        new_file_module, "_sync", lambda synced_path: synced.append(synced_path.name) or sync(synced_path)
+    )
+    with new_path(path) as temporary:
+        assert is_temporary(temporary)
+        temporary.mkdir()
+        (temporary / "a.laz").write_bytes(b"one")
+        assert not path.exists()
+    assert (path / "a.laz").read_bytes() == b"one"
+    assert synced == ["a.laz", temporary.name, tmp_path.name]  # its files before it has its name
+    with pytest.raises(KeyboardInterrupt), new_path(tmp_path / "other") as temporary:
+        temporary.mkdir()
+        (temporary / "a.laz").write_bytes(b"half")
+        raise KeyboardInterrupt
+    with pytest.raises(OSError, match="not empty"), new_path(path) as temporary:
+        temporary.mkdir()
+    assert [p.name for p in tmp_path.iterdir()] == ["stations"]
 
 
 def test_what_has_no_name_is_removed(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a restart of an interrupted build keeps: this file decides it.
+"""Rules by which a restart keeps or discards the finished work of an interrupted build.
 
 The finished work of a build is in its hidden folder, certified by a journal: for each unit of work
 an entry, a small JSON file. It is written once everything it refers to is durable on disk. An entry

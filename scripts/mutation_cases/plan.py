@@ -79,10 +79,7 @@ NORMALS = tuple(
 TESTS: dict[str, tuple[str, ...]] = {
     "schemas/kernels/morton.py": (SCHEMAS + "kernels/test_morton.py",),
     "schemas/kernels/normal_codes.py": (SCHEMAS + "kernels/test_normal_codes.py",),
-    "schemas/kernels/record_rows.py": (
-        SCHEMAS + "kernels/test_record_links.py",
-        SCHEMAS + "kernels/test_record_rows.py",
-    ),
+    "schemas/kernels/record_rows.py": (SCHEMAS + "kernels/test_record_rows.py",),
     "builder/kernels/trees/bounding_sphere.py": (
         BUILDER + "kernels/trees/test_bounding_sphere.py::test_a_bound_is_as_tight_as_its_guess",
         BUILDER
@@ -119,14 +116,8 @@ TESTS: dict[str, tuple[str, ...]] = {
         BUILDER + "kernels/neighbours/test_nearest_neighbours.py::test_the_order_of_points_changes_nothing",
     ),
     "builder/kernels/points/content_hash.py": (BUILDER + "kernels/points/test_content_hash.py",),
-    "builder/kernels/neighbours/nearest_points.py": (
-        BUILDER + "kernels/neighbours/test_nearest_points.py",
-        BUILDER + "kernels/neighbours/test_box_tree.py",
-    ),
-    "builder/kernels/points/voxel_records.py": (
-        BUILDER + "kernels/points/test_voxel_records.py",
-        BUILDER + "kernels/points/test_enclosure.py",
-    ),
+    "builder/kernels/neighbours/nearest_points.py": (BUILDER + "kernels/neighbours/test_nearest_points.py",),
+    "builder/kernels/points/voxel_records.py": (BUILDER + "kernels/points/test_voxel_records.py",),
     "builder/kernels/points/occupied_cubes.py": (BUILDER + "kernels/points/test_occupied_cubes.py",),
     "builder/kernels/points/lzf_decoder.py": (BUILDER + "kernels/points/test_lzf_decoder.py",),
     "builder/kernels/neighbours/estimate_normals.py": (
@@ -139,8 +130,9 @@ TESTS: dict[str, tuple[str, ...]] = {
         + "voxel/test_point_normals.py::test_order_changes_nothing_and_a_heap_costs_what_a_point_does",
     ),
     "builder/kernels/points/octree_cells.py": (
-        BUILDER + "kernels/points/test_bisection.py",
-        BUILDER + "kernels/points/test_cell_spill.py",
+        BUILDER
+        + "kernels/points/test_octree_cells.py::test_the_first_that_is_not_below_is_found_in_every_part",
+        BUILDER + "kernels/points/test_octree_cells.py::test_a_cells_axes_stand_side_by_side",
         BUILDER + "kernels/points/test_octree_cells.py::test_cells_are_runs_of_the_sorted_codes",
         BUILDER + "kernels/points/test_octree_cells.py::test_a_cell_is_split_only_when_it_must_be",
         BUILDER + "kernels/points/test_octree_cells.py::test_a_cell_may_be_full",
@@ -151,7 +143,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "builder/kernels/points/spool_rows.py": (BUILDER + "kernels/points/test_spool_rows.py",),
     "builder/kernels/trees/build_tree.py": (
         BUILDER + "kernels/trees/test_build_tree.py",
-        BUILDER + "kernels/trees/test_top_bounds.py",
         BUILDER + "voxel/test_top_hierarchy.py",
     ),
     "server/kernels/core/voxels_in_reach.py": (

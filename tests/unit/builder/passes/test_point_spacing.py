@@ -18,6 +18,7 @@ from solidcloud.builder.passes.point_spacing import (
     PendingPoints,
     Sums,
     archive_mean,
+    mean_of_squares,
     refine_closest,
     sums_of,
 )
@@ -220,3 +221,14 @@ def test_sums_are_exact_however_long_distances_are() -> None:
 def test_a_single_place_has_no_closest_other(lattice: list[list[int]], tmp_path: Path) -> None:
     built_header(tmp_path, np.array(lattice), radius=0.5)
     assert archive_mean(tmp_path / "archive", 10**6) == (0.0, 0.0, 0)
+
+
+def test_sums_give_mean_and_standard_error() -> None:
+    values = [0.25, 0.5, 1.0, 4.0]
+    units = [int(v * SUM_UNITS) for v in values]
+    found = mean_of_squares(sum(units), sum(u * u for u in units), 4, everything=False)
+    assert found.mean == np.mean(values)
+    assert found.error == pytest.approx(np.std(values, ddof=1) / 2)
+    assert mean_of_squares(sum(units), 0, 4, everything=True).error == 0
+    assert mean_of_squares(0, 0, 0, everything=True) == (0, 0, 0)
+    assert mean_of_squares(units[0], units[0] ** 2, 1, everything=False).error == 0

@@ -1,4 +1,4 @@
-"""Work units run in order, in this process or in others; a failure stops what waits."""
+"""Work units run in order, in this process or in others; a failure stops what waits. Ranges hold every row once."""
 
 import os
 import signal
@@ -10,11 +10,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.transaction import make_executor
-from solidcloud.builder.run.executor import POINTS_WORTH_A_PROCESS, ProcessExecutor, worker_count
+from solidcloud.builder.run.executor import (
+    POINTS_WORTH_A_PROCESS,
+    ProcessExecutor,
+    jobs_of,
+    run_units,
+    voxel_ranges,
+    worker_count,
+)
+from solidcloud.builder.run.progress import Silent
 from solidcloud.schemas.errors import SolidcloudError
 
 
@@ -186,3 +195,34 @@ def test_processes_do_the_work_where_no_cluster_is_named() -> None:
     with make_executor(BuildConfig(), 1) as executor:
         assert isinstance(executor, ProcessExecutor)
         assert executor.jobs == 1
+
+
+M = 1 << 20
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 7])
+@pytest.mark.parametrize("counts", [[5], [M] * 100, [1, 40 * M, 2, 3], [0, 0, 9 * M, 0], list(range(1000))])
+def test_every_row_is_in_one_portion_and_the_largest_come_first(counts: list[int], jobs: int) -> None:
+    points = np.array(counts)
+    runs = voxel_ranges(points, jobs)
+    assert sorted(row for run in runs for row in run) == list(range(len(points)))
+    held = [int(points[list(run)].sum()) for run in runs]
+    assert held == sorted(held, reverse=True)
+    planned = max(M, int(points.sum()) // (8 * jobs))
+    assert all(h - points[run.stop - 1] <= planned for h, run in zip(held, runs, strict=True))
+    assert len(runs) <= points.sum() // planned + 1
+
+
+def test_no_rows_are_no_portions() -> None:
+    assert voxel_ranges(np.empty(0, np.int64), 2) == []
+
+
+def test_without_an_executor_units_run_here_in_order() -> None:
+    done: list[int] = []
+
+    class Counting(Silent):
+        def advance(self, amount: int) -> None:
+            done.append(amount)
+
+    assert list(run_units(None, lambda unit: unit * 2, [3, 1, 2], Counting(), lambda unit: unit)) == [6, 2, 4]
+    assert done == [3, 1, 2] and jobs_of(None) == 1

@@ -1,9 +1,17 @@
 """Every node of a BSH encloses all points below it, exactly."""
 
+import math
+
 import numpy as np
 import pytest
-from solidcloud.builder.voxel.point_hierarchy import Hierarchy, build_hierarchy
-from synthetic_scans import WITH_POINTS, make_steps
+from solidcloud.builder.voxel import point_hierarchy
+from solidcloud.builder.voxel.point_hierarchy import (
+    Hierarchy,
+    build_hierarchy,
+    build_local,
+    mean_closest_distance,
+)
+from synthetic_scans import WITH_POINTS, make_scan, make_steps
 
 pytestmark = pytest.mark.interpreted
 
@@ -50,3 +58,37 @@ def test_the_hierarchy_keeps_columns_apart_by_order() -> None:
     points = make_steps("duplicates", 3, 100, 1000)
     hierarchy = build_hierarchy(points, leaf=16, degree=4)
     assert sorted(hierarchy.tree.order.tolist()) == list(range(100))
+
+
+@pytest.mark.parametrize("kind", ["plane", "pillar", "noise", "duplicates"])
+def test_an_avatars_mean_equals_brute_force(kind: str) -> None:
+    points = make_scan(kind, 8, 200) - 1.0
+    local = build_local(points, leaf=8, degree=4)
+    distinct = np.unique(points, axis=0)
+    apart = np.sqrt(((distinct[:, None] - distinct) ** 2).sum(axis=2)) + np.where(
+        np.eye(len(distinct)), np.inf, 0
+    )
+    # A point and its neighbour are each less than sqrt(3) steps from their lattice points.
+    assert abs(mean_closest_distance(local) - apart.min(axis=1).mean()) <= 2 * math.sqrt(3) * local.step
+    world = local.low + local.hierarchy.points * local.step
+    assert (world <= points[local.hierarchy.tree.order]).all()
+    assert (points[local.hierarchy.tree.order] - world < 2 * local.step).all()
+
+
+@pytest.mark.parametrize("points", [[[1.0, 2, 3]], [[1.0, 2, 3]] * 50])
+def test_an_avatar_of_one_distinct_point_has_no_mean(points: list[list[float]]) -> None:
+    assert mean_closest_distance(build_local(np.array(points), leaf=32, degree=8)) == 0
+
+
+@pytest.mark.parametrize("extent", [1e-9, 1.0, 4.0, 4.1, 1e9])
+def test_an_avatar_of_any_extent_fits_its_lattice(extent: float) -> None:
+    points = np.array([[0.0, 0, 0], [extent, 0, 0], [0, extent / 3, 0]])
+    local = build_local(points, leaf=2, degree=2)
+    assert 0 <= local.hierarchy.points.min() <= local.hierarchy.points.max() <= 1 << 23
+    assert math.log2(local.step).is_integer()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5000])
+def test_distinct_points_are_those_of_numpy(count: int) -> None:
+    points = np.random.default_rng(count).integers(-8, 8, (count, 3))
+    assert np.array_equal(point_hierarchy._distinct(points), np.unique(points, axis=0))

@@ -1,9 +1,14 @@
-"""Test the octree of a voxel: every point in exactly one cell, capacity, depth and bounds."""
+"""Test the octree of a voxel: every point in exactly one cell, capacity, depth, bounds, and the cells' order."""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import (
+    by_axis,
+    by_cell,
+    first_at_least,
     is_ascending,
     merge_order,
     split_octree,
@@ -234,3 +239,29 @@ def test_a_voxel_gathered_from_runs_is_the_voxel(columns: tuple[str, ...]) -> No
     config = BuildConfig(cell_points=20, leaf=8)
     a, b = build_voxel(9, plain, 1000, config), build_voxel(9, gather_voxel(parts), 1000, config)
     assert encode_voxel(a, bytes(16)) == encode_voxel(b, bytes(16))
+
+
+@pytest.mark.interpreted
+def test_the_first_that_is_not_below_is_found_in_every_part() -> None:
+    values = np.array([0, 1, 1, 1, 4, 9, 9, 2**63, 2**64 - 1], np.uint64)
+    wanted = np.unique(np.concatenate([values, values + np.uint64(1), values - np.uint64(1)]))
+    for lo in range(len(values) + 1):
+        for hi in range(lo, len(values) + 1):
+            for value in wanted:
+                expected = lo + np.searchsorted(values[lo:hi], value)
+                assert first_at_least(values, lo, hi, value) == expected, (lo, hi, value)
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("sizes", [[1], [3, 1, 4], [2, 7, 1, 1, 9]])
+def test_a_cells_axes_stand_side_by_side(sizes: list[int]) -> None:
+    starts = np.cumsum([0, *sizes])
+    xyz = np.arange(3 * starts[-1], dtype=np.uint16).reshape(3, -1) + 500
+    flat = by_cell(xyz, starts)
+    expected = [xyz[:, a:b].ravel() for a, b in pairwise(starts)]
+    assert flat.tolist() == np.concatenate(expected).tolist()
+    assert np.array_equal(by_axis(flat, starts), xyz)
+    # Any run of cells alone.
+    some = slice(3 * int(starts[len(sizes) // 2]), None)
+    rest = starts[len(sizes) // 2 :]
+    assert np.array_equal(by_axis(flat[some], rest - rest[0]), xyz[:, rest[0] :])

@@ -22,7 +22,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
-from ...schemas.process.new_file import sync_folder
+from ...schemas.process.new_file import sync_path
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import position_hash_sum
@@ -259,7 +259,7 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
     try:
         for name in new:
             os.rename(change.folder / SHARD_FOLDER / name, shards / name)
-        sync_folder(shards)
+        sync_path(shards)
         os.replace(change.folder / INDEX_NAME, change.target / INDEX_NAME)
         change.published = True
     except BaseException:
@@ -274,5 +274,5 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
         raise
     if preview.exists():
         os.replace(preview, change.target / PREVIEW_NAME)
-    sync_folder(change.target)
+    sync_path(change.target)
     delete_orphans(change.target, named)

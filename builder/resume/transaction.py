@@ -15,7 +15,7 @@ from typing import Any
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.process.new_file import is_temporary, remove_temporaries, sync_folder
+from ...schemas.process.new_file import is_temporary, remove_temporaries, sync_path
 from ...schemas.process.os_errors import os_error_words
 from ..config import BuildConfig
 from ..run.executor import Executor, ProcessExecutor, worker_count
@@ -148,7 +148,7 @@ def recover(target: Path) -> None:
 
 def publish_folder(folder: Path, target: Path, overwrite: bool) -> None:
     """Rename the finished folder to its target."""
-    sync_folder(folder)
+    sync_path(folder)
     if target.exists() and overwrite and (target / INDEX_NAME).is_file():
         old = target.parent / f".{target.name}.old"
         os.rename(target, old)
@@ -163,4 +163,4 @@ def publish_folder(folder: Path, target: Path, overwrite: bool) -> None:
     # Remove files of a unit that was given up and is still running: from now on it cannot create
     # others.
     remove_temporaries(target)
-    sync_folder(target.parent)
+    sync_path(target.parent)

@@ -30,8 +30,8 @@ def new_path(path: Path) -> Iterator[Path]:
         yield temporary
         if temporary.is_dir():
             for inner in temporary.rglob("*"):
-                _sync(inner)
-        _sync(temporary)
+                sync_path(inner)
+        sync_path(temporary)
         os.replace(temporary, path)
     except BaseException:
         if temporary.is_dir():
@@ -39,7 +39,7 @@ def new_path(path: Path) -> Iterator[Path]:
         else:
             temporary.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
+    sync_path(path.parent)
 
 
 @contextmanager
@@ -49,13 +49,8 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
         yield file
 
 
-def sync_folder(folder: Path) -> None:
-    """Make a rename inside this folder survive a power cut."""
-    _sync(folder)
-
-
-def _sync(path: Path) -> None:
-    """Make a file, or the names in a folder, durable on disk."""
+def sync_path(path: Path) -> None:
+    """Make the bytes of a file, or the names in a folder, survive a power cut."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

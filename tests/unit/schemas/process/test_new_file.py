@@ -29,9 +29,9 @@ def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: 
 def test_a_folder_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "stations"
     synced: list[str] = []
-    sync = new_file_module._sync
+    sync = new_file_module.sync_path
     monkeypatch.setattr(
-        new_file_module, "_sync", lambda synced_path: synced.append(synced_path.name) or sync(synced_path)
+        new_file_module, "sync_path", lambda synced_path: synced.append(synced_path.name) or sync(synced_path)
     )
     with new_path(path) as temporary:
         assert is_temporary(temporary)

@@ -28,6 +28,7 @@ from .build_limits import (
     MAX_RECORD_POINTS,
     RADIUS_SAMPLE,
     SCRATCH_BYTES_A_POINT,
+    readers_that_fit,
 )
 from .config import BuildConfig
 from .passes.build_shards import Shard, build_shards
@@ -41,8 +42,7 @@ from .resume.build_identity import changed_inputs, describe_build, is_up_to_date
 from .resume.kept_work import BuildDirectory, build_directory, building_folder, remove_finished_work
 from .resume.lock import locked
 from .resume.transaction import Transaction, check_target, made_parents, publish_folder, recover
-from .run.memory_shares import readers_that_fit
-from .run.progress import Progress
+from .run.executor import Progress
 from .sources.coincident_scans import coincident_sources, coincident_text
 from .sources.scan_files import InputFile, open_input_files
 from .spool.run_files import filter_dtype, spool_dtype

@@ -23,6 +23,7 @@ from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
 from ...schemas.process.new_file import sync_path
+from ..build_limits import bytes_beside_records, readers_that_fit
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import position_hash_sum
@@ -30,8 +31,7 @@ from ..passes.preview import write_preview
 from ..passes.verify import voxel_faults
 from ..resume.lock import locked
 from ..resume.transaction import Transaction
-from ..run.memory_shares import bytes_beside_records, readers_that_fit
-from ..run.progress import Progress
+from ..run.executor import Progress
 from ..spool.run_files import spool_dtype
 from ..voxel.record_points import leaves_of
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ...schemas.errors import BadRequestError, ScanError
 from ..resume.build_identity import changed_inputs, describe_build
-from ..run.progress import Progress
+from ..run.executor import Progress
 from ..sources.scan_files import open_input_files
 from ..spool.spool import Spool
 from .added_scans import AddOptions, box_of, no_longer_unknown, source_of, spool_added, survey_added

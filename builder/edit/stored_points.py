@@ -31,7 +31,7 @@ from ..voxel.record_points import iter_points, leaves_of
 from ..voxel.voxel_octree import gather_voxel
 
 # Bytes per point held while a run is written: code and columns, and for one voxel order, sorted
-# copies and rows. This is in addition to the record that they are read from (memory_shares.py).
+# copies and rows. This is in addition to the record that they are read from (build_limits.py).
 RUN_BYTES_A_POINT = 60
 # Points of a record whose scan numbers are examined together.
 LOOKED_AT = 1 << 16

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ...schemas.errors import BadRequestError, CorruptError
 from ..config import BuildConfig
 from ..resume.kept_work import RUN_FOLDERS, Journal, RunsIntact, Work, run_unfinished
-from ..run.executor import Executor
-from ..run.progress import Progress
+from ..run.executor import Executor, Progress
 from ..spool.run_files import (
     RUN_SUFFIX,
     RunSums,

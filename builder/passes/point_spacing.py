@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ..kernels.neighbours.nearest_points import FAR, BoxTree, closest_in_record, make_box_tree, near_boxes
 from ..kernels.points.voxel_records import first_of_each
-from ..run.executor import Executor, jobs_of, run_units, voxel_ranges
-from ..run.progress import Progress, Silent
+from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges
 from ..voxel.record_points import hash_limit, iter_points, leaves_of, spheres_of
 
 # Voxels in which a point is queried at a time. A corner has 7 other voxels around it.

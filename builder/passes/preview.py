@@ -15,8 +15,7 @@ from ...schemas.process.interrupts import check_interrupt
 from ...schemas.process.new_hdf5_file import new_hdf5_file
 from ..build_limits import MAX_PREVIEW_POINTS, PREVIEW_PART, WHOLE_PREVIEW_POINTS
 from ..kernels.points.voxel_records import first_of_each, point_hashes
-from ..run.executor import Executor, jobs_of, run_units, voxel_ranges
-from ..run.progress import Progress, Silent
+from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges
 from ..voxel.record_points import hash_limit, iter_points, read_columns, record_columns, stored_columns
 
 # Coordinates are rounded to this [m]: they then compress to 6 bytes a point instead of 19.

@@ -17,8 +17,7 @@ from ...schemas.errors import BadRequestError, CorruptError, FormatError, Solidc
 from ...schemas.process.interrupts import check_interrupt
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import last_unenclosing_node, measure_points, position_hash_sum
-from ..run.executor import Executor, jobs_of, run_units, voxel_ranges, worker_count
-from ..run.progress import Progress, Silent
+from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges, worker_count
 from ..voxel.exact_enclosure import loose_nodes, sample_nodes
 from ..voxel.record_points import leaves_of, spheres_of, voxel_points
 from .preview import preview_faults

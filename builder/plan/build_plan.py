@@ -27,12 +27,13 @@ from ..build_limits import (
     RANGE_POINTS,
     RANGES,
     WHOLE_PREVIEW_POINTS,
+    jobs_that_fit,
+    memory_share,
     shard_points,
 )
 from ..config import DEFAULT_STEP, BuildConfig
 from ..passes.spool_pass import run_points
 from ..run.executor import worker_count
-from ..run.memory_shares import jobs_that_fit, memory_share
 from ..spool.run_files import spool_dtype
 from .rates import Rates
 

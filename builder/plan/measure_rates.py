@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..config import BuildConfig
 from ..pipeline import build_archive
-from ..run.progress import Progress, Silent
+from ..run.executor import Progress, Silent
 from ..sources.scan_files import open_scans
 from .rates import Rates, StageRate
 

@@ -1,6 +1,6 @@
 """State on disk by which an interrupted build continues: kept work, lock, transaction.
 
-May import builder/config.py, builder.run, builder.sources, builder.sources.common, builder.spool,
-schemas.
+May import builder/build_limits.py, builder/config.py, builder.run, builder.sources,
+builder.sources.common, builder.spool, schemas.
 Begin with kept_work.py, which decides what a restart keeps.
 """

@@ -29,10 +29,10 @@ from ...schemas.archive.index import SHARD_FOLDER
 from ...schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from ...schemas.process.interrupts import check_interrupt
 from ...schemas.process.new_file import TEMPORARY_SUFFIX, is_temporary, new_file, remove_temporaries
-from ..run.executor import Executor
-from ..run.progress import Progress, Stages
+from ..run.executor import Executor, Progress
 from ..spool.run_files import RunSums, is_run_damaged, run_sizes
 from .build_identity import check_same
+from .transaction import Transaction
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
@@ -322,7 +322,7 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def discard_damaged_runs(build_dir: BuildDirectory, stages: Stages) -> None:
+def discard_damaged_runs(build_dir: BuildDirectory, build: Transaction) -> None:
     """Read each run named by a journal entry once, before any run is used.
 
     A build may resume weeks later, and no later pass would detect corruption: a flipped bit in a run
@@ -338,13 +338,13 @@ def discard_damaged_runs(build_dir: BuildDirectory, stages: Stages) -> None:
     )
     if not total:
         return
-    with stages.stage("compare", total, "bytes"):
+    with build.stage("compare", total, "bytes"):
         for folder, entries in journalled.items():
             damaged = []
             for entry, runs in entries.items():
                 if any(is_run_damaged(build_dir.folder / folder / name, sums) for name, sums in runs.items()):
                     damaged.append(entry)
-                stages.progress.advance(sum(sum(sums[::2]) for sums in runs.values()))
+                build.progress.advance(sum(sum(sums[::2]) for sums in runs.values()))
             if damaged:
                 # This must come first: after a kill in between, the next build finds the same runs
                 # and returns here.

@@ -7,6 +7,7 @@ refers to a complete archive at every moment, because the renames that publish c
 import errno
 import os
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,17 +18,16 @@ from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.process.new_file import is_temporary, remove_temporaries, sync_path
 from ...schemas.process.os_errors import os_error_words
+from ..build_limits import jobs_that_fit, memory_share
 from ..config import BuildConfig
-from ..run.executor import Executor, ProcessExecutor, worker_count
-from ..run.memory_shares import jobs_that_fit, memory_share
-from ..run.progress import Progress, Silent, Stages
+from ..run.executor import Executor, ProcessExecutor, Progress, Silent, worker_count
 
 
-class Transaction(Stages):
-    """Archive that is being written, with the options and workers.
+class Transaction:
+    """Archive that is being written, with the options and workers, and the timer of its stages.
 
     target: its folder.  folder: the hidden folder.  what: "build" or "change".
-    executor: runs the work units, inside `workers`.
+    executor: runs the work units, inside `workers`.  seconds: of each stage so far.
     """
 
     executor: Executor
@@ -35,8 +35,9 @@ class Transaction(Stages):
     def __init__(
         self, what: str, target: Path, folder: Path, config: BuildConfig, progress: Progress | None
     ) -> None:
-        super().__init__(progress or Silent())
         self.what, self.target, self.folder, self.config = what, target, folder, config
+        self.progress: Progress = progress or Silent()
+        self.seconds: dict[str, float] = {}
 
     @property
     def outcome(self) -> str:
@@ -54,6 +55,25 @@ class Transaction(Stages):
         jobs = jobs_that_fit(worker_count(self.config.jobs, points), self.config)
         with make_executor(self.config, jobs) as self.executor:
             yield
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Time a stage that reports its own progress."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[None]:
+        """Time a stage and report it, with its total amount of work."""
+        with self.timed(name):
+            self.progress.start(name, total, unit)
+            try:
+                yield
+            finally:
+                self.progress.finish()
 
     def run(self, function: Callable[[Any], Any], units: Sequence[Any]) -> list[Any]:
         """Return function(unit) of each unit, in order; progress advances by `unit.points`."""

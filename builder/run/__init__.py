@@ -1,5 +1,5 @@
-"""Execution of work units: processes, a dask cluster, memory shares, progress.
+"""Execution of work units: processes, a dask cluster, progress.
 
-May import builder/config.py, schemas.
+May import builder/build_limits.py, schemas.
 Begin with executor.py.
 """

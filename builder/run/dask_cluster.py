@@ -21,9 +21,8 @@ from typing import Any, TypeVar
 
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.process.interrupts import blocking_sigint, check_interrupt
-from .executor import ASK_SECONDS, Result, Unit, results_in_order
-from .memory_shares import CLUSTER_WORKER_KILLED, cluster_worker_limit
-from .progress import Progress
+from ..build_limits import CLUSTER_WORKER_KILLED, cluster_worker_limit
+from .executor import ASK_SECONDS, Progress, Result, Unit, results_in_order
 from .software_versions import software_versions
 
 try:

@@ -1,6 +1,7 @@
 """Execution of pure work units in this process, in a process pool, or on a cluster.
 
-Results come in the order of the units.
+Results come in the order of the units. A progress listener learns how much is done; the command
+line draws it.
 """
 
 import multiprocessing
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
 from ...schemas.process.interrupts import blocking_sigint, check_interrupt
-from .progress import Progress
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
@@ -37,6 +37,38 @@ _RANGES_A_JOB = 8
 _MIN_POINTS = 1 << 20
 # How often a wait for a unit checks for an interrupt.
 ASK_SECONDS = 0.1
+
+
+class Progress(Protocol):
+    """Listener to the stages of long work.
+
+    The stages follow one another; the amounts of `advance` add up to about the total of the stage.
+    """
+
+    def start(self, stage: str, total: int, unit: str) -> None:
+        """Begin a stage; total is in `unit`, such as "points"."""
+        ...
+
+    def advance(self, amount: int) -> None:
+        """Report that `amount` more of the stage is done."""
+        ...
+
+    def finish(self) -> None:
+        """End the stage."""
+        ...
+
+
+class Silent:
+    """Progress listener that ignores every report."""
+
+    def start(self, stage: str, total: int, unit: str) -> None:
+        """Ignore the beginning of a stage."""
+
+    def advance(self, amount: int) -> None:
+        """Ignore the amount."""
+
+    def finish(self) -> None:
+        """Ignore the end of a stage."""
 
 
 class Executor(Protocol):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, ScanError
 from ...schemas.process.interrupts import check_interrupt
-from ..run.progress import Progress, Silent
+from ..run.executor import Progress, Silent
 from ..run.transient_errors import raise_transient
 from .coincident_scans import coincident_scan
 from .common.scan import Scan, library_errors, scan_error, sha256_of

@@ -12,7 +12,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from ....builder.run.progress import Progress
+from ....builder.run.executor import Progress
 from ....schemas.archive.archive import Archive
 from ....schemas.process.os_errors import check_writable
 from ..common.sphere_pictures import load_pyplot

@@ -13,6 +13,7 @@ from archive_edits import EVERYTHING, OPTIONS, A, Build, Files, refused
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from dense_voxels import KEY, rows_of, spooled
+from solidcloud.builder import build_limits as memory
 from solidcloud.builder.build_limits import SCRATCH_BYTES_A_POINT
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit import added_scans as added_module
@@ -22,7 +23,6 @@ from solidcloud.builder.edit.archive_change import Change
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.resume import transaction
-from solidcloud.builder.run import memory_shares as memory
 from solidcloud.builder.run.executor import ProcessExecutor
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.voxel_grid import voxel_coordinates

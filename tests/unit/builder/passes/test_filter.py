@@ -11,7 +11,7 @@ from solidcloud.builder.passes.filter import filtered_spool
 from solidcloud.builder.passes.filter_rules import MOVING, OUTLIER, THINNED
 from solidcloud.builder.resume.kept_work import Journal
 from solidcloud.builder.resume.transaction import make_executor
-from solidcloud.builder.run.progress import Silent
+from solidcloud.builder.run.executor import Silent
 from solidcloud.builder.spool import spool_blocks as blocks
 from solidcloud.builder.spool.run_files import filter_dtype, row_codes, spool_dtype, write_run
 from solidcloud.builder.spool.spool import Spool

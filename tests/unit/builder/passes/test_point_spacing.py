@@ -23,7 +23,7 @@ from solidcloud.builder.passes.point_spacing import (
     sums_of,
 )
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.run.progress import Progress, Silent
+from solidcloud.builder.run.executor import Progress, Silent
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import Header
 from synthetic_scans import make_steps, write_xyz

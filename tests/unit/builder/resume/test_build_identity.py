@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import solidcloud.builder.build_limits as memory
 import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.passes.survey as survey
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.run.memory_shares as memory
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.build_identity import check_same, describe_build

@@ -16,8 +16,7 @@ from solidcloud.builder.resume.kept_work import (
     run_unfinished,
 )
 from solidcloud.builder.resume.transaction import check_target, publish_folder
-from solidcloud.builder.run.executor import ProcessExecutor
-from solidcloud.builder.run.progress import Silent
+from solidcloud.builder.run.executor import ProcessExecutor, Silent
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 from solidcloud.schemas.process.new_file import new_file
 

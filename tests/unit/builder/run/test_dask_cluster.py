@@ -15,8 +15,7 @@ import dask
 import solidcloud.builder.run.dask_cluster as cluster_module
 from distributed import LocalCluster
 from solidcloud.builder.run.dask_cluster import ClusterExecutor, local_workers
-from solidcloud.builder.run.executor import WAITING
-from solidcloud.builder.run.progress import Silent
+from solidcloud.builder.run.executor import WAITING, Silent
 from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 

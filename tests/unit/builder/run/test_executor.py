@@ -18,12 +18,12 @@ from solidcloud.builder.resume.transaction import make_executor
 from solidcloud.builder.run.executor import (
     POINTS_WORTH_A_PROCESS,
     ProcessExecutor,
+    Silent,
     jobs_of,
     run_units,
     voxel_ranges,
     worker_count,
 )
-from solidcloud.builder.run.progress import Silent
 from solidcloud.schemas.errors import SolidcloudError
 
 

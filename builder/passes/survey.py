@@ -227,18 +227,13 @@ def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice,
     origin = np.min([s.low for s in surveys], axis=0)
     step, source = config.resolution, "given"
     if step is None:
-        step, source = _shared_step(surveys), "sources"
+        step, source = shared_step([s.scan.lattice for s in surveys if s.scan is not None]), "sources"
     if source == "sources" and not (
         step and max(MIN_STEP, config.voxel / MAX_VOXEL_STEPS) <= step <= config.voxel
     ):
         step, source = DEFAULT_STEP, "default"
     assert step is not None
     return make_lattice(origin, step, config.voxel), source
-
-
-def _shared_step(surveys: list[Survey]) -> float | None:
-    """Return the `shared_step` of the surveyed scans."""
-    return shared_step([s.scan.lattice for s in surveys if s.scan is not None])
 
 
 def shared_step(lattices: Sequence[SourceLattice | None]) -> float | None:

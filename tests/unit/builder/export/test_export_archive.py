@@ -20,6 +20,7 @@ from solidcloud.schemas.archive.index import Header
 from solidcloud.schemas.archive.voxel_grid import Lattice
 from solidcloud.schemas.archive.vtkhdf import read_points
 from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.process.new_file import is_temporary
 from solidcloud.server.cli.main import run
 from synthetic_scans import make_scan, write_las, write_ply
 
@@ -206,6 +207,8 @@ def test_a_failure_leaves_what_was_there(
     path.write_text("before")
 
     def full(*_: object) -> None:
+        (other,) = {*tmp_path.iterdir()} - {path}
+        assert is_temporary(other)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(export, "_write_points", full)

@@ -1,5 +1,6 @@
 """Test the figure: its number of points, its size, and their even distribution."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,18 @@ def test_files_read_back_to_the_same_bits(tmp_path: Path) -> None:
     vertices = plyfile.PlyData.read(tmp_path / "al.ply")["vertex"]
     assert np.array_equal(np.column_stack([vertices[axis] for axis in "xyz"]), figure)
     assert np.array_equal(trimesh.load(tmp_path / "al.ply").vertices, figure)
+
+
+def test_a_failure_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "al.obj").write_text("before")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_figure(tmp_path / "al.obj", figure_points(10))
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
 
 
 def test_what_cannot_be_made_is_refused(tmp_path: Path) -> None:

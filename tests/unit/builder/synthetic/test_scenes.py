@@ -11,6 +11,7 @@ from solidcloud.builder.synthetic.scanner import LATTICE, NOISE
 from solidcloud.builder.synthetic.scenes import GeneratedScene, make_facade, make_town
 from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
 from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.process.new_file import is_temporary
 
 
 def points_of(scene: GeneratedScene) -> NDArray[np.float64]:
@@ -100,6 +101,7 @@ def test_progress_ends_at_the_count(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["hall.laz", "hall.e57", "hall"])
 def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, name: str) -> None:
     def stop(done: int, whole: int) -> None:
+        assert all(is_temporary(path) for path in tmp_path.iterdir())
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -1,12 +1,15 @@
 """Test `solidcloud scene new` and `scene check`: file, table, one-line errors, exit codes."""
 
+import errno
 import json
+import os
 import re
 import shlex
 import shutil
 from pathlib import Path
 
 import pytest
+from solidcloud.schemas.process.new_file import is_temporary
 from solidcloud.schemas.scene.scene_file import parse_scene, read_scene
 from solidcloud.server.cli.main import run
 from solidcloud.server.scenes.scene_archives import is_scene_file
@@ -92,6 +95,25 @@ def test_what_is_there_is_replaced_only_with_force(folder: Path, capsys: pytest.
     assert (folder / "hall.toml").read_text() == "mine"
     assert new(folder, "--force") == 0
     assert read_scene(folder / "hall.toml").format == 1
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_a_scene_file_that_cannot_be_written_leaves_what_was_there(
+    force: bool, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "hall.toml"
+    if force:
+        path.write_text("mine")
+
+    def full(_: int) -> None:
+        assert path.exists() == force and is_temporary(next(folder.glob("hall.toml.*")))
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        assert new(folder, *["--force"] * force) == 2
+    assert "hall.toml: cannot be written: no space left on the disk: make room" in one_error(capsys)
+    assert [p.read_text() for p in folder.glob("hall.toml*")] == ["mine"] * force
 
 
 @pytest.mark.parametrize(

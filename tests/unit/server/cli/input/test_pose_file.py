@@ -1,5 +1,6 @@
 """Test pose files: written values read back, quaternions are checked, an invalid line is named."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,18 @@ def test_written_poses_read_back(tmp_path: Path, rng: np.random.Generator) -> No
     assert np.array_equal(found[:, :3, 3], poses[:, :3, 3])
     assert np.abs(found[:, :3, :3] - poses[:, :3, :3]).max() < 1e-14
     assert [path.name for path in tmp_path.iterdir()] == ["walk.csv"]
+
+
+def test_a_failure_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "walk.csv").write_text("before")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_poses(tmp_path / "walk.csv", np.zeros(1), np.eye(4)[None])
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
 
 
 def test_quaternions_turn_as_scipy_says(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -59,15 +59,15 @@ WORKER_BYTES = 110 << 20
 ALONE_BYTES = 150 << 20
 # Minimum that a worker needs: a part of a dense voxel (dense_voxel.py) and its surroundings.
 MIN_SHARE = 96 << 20
-# A build may exceed `--memory` by this much rather than be refused: 64 MB is less than Python with
-# numba.
+# A build may exceed `--memory` by this much, because `--memory 64MB` is less than Python with numba
+# takes.
 OVER_BYTES = 200 << 20
 # Memory of radius, preview and verify for a record: its frame, at most as long as its rows, the
 # byte planes of the rows, and this much per node. There are 1.2 to 1.4 times as many nodes as leaf
 # nodes if all were full.
 RECORD_BYTES_A_NODE = 72
 NODES_A_FULL_LEAF = 1.5
-# Memory of everything else they hold.
+# Other memory of these passes.
 RECORD_BYTES = 16 << 20
 
 # In addition to its share of --memory, a worker of the local cluster has memory for Python, numba,
@@ -87,9 +87,9 @@ OTHERWISE = " to resume, or a smaller --voxel and --fresh"
 def shard_points(points: int) -> int:
     """Return the number of points per shard of a dataset of `points` points.
 
-    It depends on nothing else, or the bytes of the archive would depend on the number of jobs.
-    Small datasets get a quarter of SHARD_POINTS, which gives each of two workers many shards and
-    lets them end at about the same time: with 10^7 points in 3 shards, one of them was idle for a
+    It depends only on `points`, so that the archive's bytes do not depend on the number of jobs.
+    Small datasets get a quarter of SHARD_POINTS, which gives each of two workers many shards, so
+    that they end at about the same time: with 10^7 points in 3 shards, one of them was idle for a
     quarter of the time.
     """
     # Voxels are not cut, so a shard may stay half empty. Two consecutive shards together hold more
@@ -98,7 +98,7 @@ def shard_points(points: int) -> int:
 
 
 def is_dense(points: int, config: BuildConfig) -> bool:
-    """Return whether a voxel of so many points is built in parts.
+    """Return whether a voxel of `points` points is built in parts.
 
     Balanced cells, an option kept for comparison, require the whole voxel.
     """
@@ -114,12 +114,12 @@ def check_normals(counts: NDArray[np.int64], config: BuildConfig) -> None:
     if "normal" in config.keep and is_dense(most, config):
         raise BadRequestError(
             f"--keep normal: a voxel of {config.voxel:g} m holds {most} points, too many to be held in memory: give a "
-            "smaller --voxel, or leave it out: a server estimates the normals it needs"
+            "smaller --voxel, or build without `--keep normal`: a server estimates normals"
         )
 
 
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
-    """Return how many of the wanted processes the memory bound allows, at least one."""
+    """Return how many of `jobs` processes the memory bound allows, at least one."""
     room = config.memory_bytes + OVER_BYTES - BUILDER_BYTES
     return max(1, min(jobs, room // (WORKER_BYTES + MIN_SHARE)))
 
@@ -150,8 +150,8 @@ def readers_that_fit(
 ) -> int:
     """Return how many of `jobs` processes may each hold the record of any voxel at the same time.
 
-    counts: (v,) points of the voxels.  otherwise: end of the advice, after the memory to give. The
-    result is `jobs` for an external scheduler, because the memory of its workers is not known here.
+    counts: (v,) points of the voxels.  otherwise: end of the error's advice, after the memory to
+    give. The result is `jobs` for an external scheduler, whose workers' memory is not known here.
     Raise SolidcloudError if not even one process may hold the largest record.
     """
     if config.scheduler or not len(counts):

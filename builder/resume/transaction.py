@@ -126,11 +126,13 @@ def make_executor(config: BuildConfig, jobs: int) -> Executor:
 
 
 def check_target(target: Path, overwrite: bool) -> None:
-    """Refuse to write to a target that holds anything else."""
+    """Raise BadRequestError for a target that is not a new folder, or an archive to overwrite."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if not (target / INDEX_NAME).is_file():
-        raise BadRequestError(f"{target}: exists and is no archive, expected a new folder: give another -o")
+        raise BadRequestError(
+            f"{target}: exists and is not an archive, expected a new folder: give another -o"
+        )
     if not overwrite:
         raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
     shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []

@@ -1,7 +1,7 @@
-"""Writing of new files and folders: under a temporary name, synced, renamed, the folder above synced.
+"""Writing of new files and folders: under a temporary name, synced, renamed, parent folder synced.
 
-They therefore have their name only when they are complete and durable on disk. new_hdf5_file.py
-writes HDF5 files.
+A file or folder therefore has its name only when it is complete and durable on disk.
+new_hdf5_file.py writes HDF5 files in this way.
 """
 
 import os

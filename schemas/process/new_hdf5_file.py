@@ -23,9 +23,8 @@ class _Disk:
     """File object for HDF5 that hides write errors from it and keeps the first one in `error`.
 
     With a full disk HDF5 2.0 crashed when it closed the file (SIGSEGV), or h5py printed an ignored
-    exception and went on. A write here therefore always succeeds. After a failed write, data is
-    kept in memory so that HDF5 can read it back: its own structures, but not records, which it does
-    not read back.
+    exception and continued. A write here therefore always succeeds. After a failed write, the data
+    that HDF5 reads back, its own structures, is kept in memory; records are not kept.
     """
 
     def __init__(self, path: Path) -> None:

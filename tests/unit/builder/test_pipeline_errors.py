@@ -122,10 +122,10 @@ def test_a_path_that_does_not_exist_is_an_error(skip_bad: bool, scans: list[Path
 def test_an_existing_target_is_refused(scans: list[Path], out: Path) -> None:
     (out / "a").mkdir()
     (out / "a" / "letter.txt").write_text("dear archive")
-    with pytest.raises(BadRequestError, match="exists and is no archive"):
+    with pytest.raises(BadRequestError, match="exists and is not an archive"):
         build(scans, out / "a", overwrite=True)
     (out / "b").write_text("a file")
-    with pytest.raises(BadRequestError, match="exists and is no archive"):
+    with pytest.raises(BadRequestError, match="exists and is not an archive"):
         build(scans, out / "b")
     build(scans, out / "c")
     before = content(out / "c")

@@ -1,4 +1,6 @@
-"""Compilation of kernels, and the cache of compiled code: the only module that imports numba.
+"""Compilation of kernels, and the cache of compiled code.
+
+Only this module and kernel_dispatcher.py import numba.
 
 numba's own cache unpickles and runs whatever its files contain, does not notice an edit in another
 file, and numbers its data files so that two processes may take the same number for two signatures.
@@ -24,6 +26,7 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
+from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
 
@@ -43,12 +46,14 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
 
     cache: store compiled code in `kernel_files()`.  options: numba's.
     """
-    compiled = numba.njit(**options)
 
     def decorate(function: Callable[..., Any]) -> Any:
-        kernel = compiled(function)
-        if cache and kernel is not function:  # interpreted, with NUMBA_DISABLE_JIT=1
-            kernel._cache = _KernelCache(function)
+        if config.DISABLE_JIT:
+            return function
+        kernel = Kernel(function, {"nopython": True, "boundscheck": None, **options})
+        if cache:
+            kernel._cache = _KernelCache(function, inner=False)
+            kernel.inner._cache = _KernelCache(function, inner=True)
         return kernel
 
     return decorate
@@ -61,12 +66,16 @@ def kernel_files() -> KernelFiles:
 
 
 class _KernelCache(_Cache):  # type: ignore[misc]
-    """Cache of one function's machine code, with numba's cache interface."""
+    """Cache of one function's compiled code, with numba's cache interface.
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    inner: for calls from other kernels, not from Python.
+    """
+
+    def __init__(self, function: Callable[..., Any], *, inner: bool) -> None:
         if function.__closure__ is not None:
             raise TypeError(f"kernel {function.__qualname__}: expected no variables of an enclosing function")
         self._function = function
+        self._inner = inner
         self._enabled = True
 
     @property
@@ -87,7 +96,8 @@ class _KernelCache(_Cache):  # type: ignore[misc]
             stored, reduced = pickle.loads(payload)
             if stored != sig:
                 raise ValueError(f"it is for {stored}, expected {sig}")
-            return CompileResult._rebuild(target_context, *reduced)
+            rebuild = rebuild_inner if self._inner else CompileResult._rebuild
+            return rebuild(target_context, *reduced)
         except Exception as error:
             kernel_files().discard(name, f"{type(error).__name__}: {error}")
             return None
@@ -96,7 +106,8 @@ class _KernelCache(_Cache):  # type: ignore[misc]
         """Store the compiled code for a signature."""
         if not self._enabled or data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
             return
-        kernel_files().write(self._name(sig, data.codegen), dumps((sig, data._reduce())))
+        reduced = reduce_inner(data) if self._inner else data._reduce()
+        kernel_files().write(self._name(sig, data.codegen), dumps((sig, reduced)))
 
     def enable(self) -> None:
         """Enable the cache."""
@@ -113,6 +124,7 @@ class _KernelCache(_Cache):  # type: ignore[misc]
         """Return the file name for a signature and a processor."""
         module, qualname = self._function.__module__, self._function.__qualname__
         decides = (
+            self._inner,
             _settings(),
             source_digest(module).hex(),
             module,
@@ -122,7 +134,8 @@ class _KernelCache(_Cache):  # type: ignore[misc]
             sig,
         )
         digest = hashlib.sha256(repr(decides).encode()).hexdigest()
-        return f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL] + f"-{digest}.kernel"
+        label = f"{module.partition('.')[2]}.{qualname}"[:_MAX_LABEL] + ".inner" * self._inner
+        return label + f"-{digest}.kernel"
 
 
 @functools.cache

@@ -13,15 +13,20 @@ This module uses parts of numba that may change with its next version: see pypro
 from typing import Any
 
 import llvmlite.binding as llvm
-from numba.core import compiler
+import numba.core.compiler
+import numba.core.dispatcher
 from numba.core.codegen import JITCodeLibrary
-from numba.core.dispatcher import _FunctionCompiler
 from numba.core.registry import CPUDispatcher
+
+# numba creates their attributes on import, invisible to type checkers.
+compiler: Any = numba.core.compiler
+dispatcher: Any = numba.core.dispatcher
+_Dispatcher: Any = CPUDispatcher
 
 _DEFAULTS: dict[str, Any] = compiler.Flags().values()
 
 
-def _values(self: compiler.Flags) -> dict[str, Any]:
+def _values(self: Any) -> dict[str, Any]:
     """Return all options of a compilation and their values."""
     return _DEFAULTS | self._values
 
@@ -31,7 +36,7 @@ def _values(self: compiler.Flags) -> dict[str, Any]:
 compiler.Flags.values = _values
 
 
-class Kernel(CPUDispatcher):  # type: ignore[misc]
+class Kernel(_Dispatcher):  # type: ignore[misc]
     """Function that Python calls, and that other kernels call as `inner`.
 
     function: its source.  options: numba's.
@@ -51,22 +56,22 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         return self.inner.get_overload(sig)
 
 
-class InnerKernel(CPUDispatcher):  # type: ignore[misc]
+class InnerKernel(_Dispatcher):  # type: ignore[misc]
     """Function that only other kernels can call."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options)
         self._compiler = _InnerCompiler(self)
 
-    def add_overload(self, cres: compiler.CompileResult) -> None:
+    def add_overload(self, cres: Any) -> None:
         """Store the code for a signature."""
         self.overloads[tuple(cres.signature.args)] = cres
 
 
-class _KernelCompiler(_FunctionCompiler):  # type: ignore[misc]
+class _KernelCompiler(dispatcher._FunctionCompiler):  # type: ignore[misc]
     """numba's compiler of a function that Python calls."""
 
-    def __init__(self, kernel: CPUDispatcher) -> None:
+    def __init__(self, kernel: Any) -> None:
         super().__init__(
             kernel.py_func,
             kernel.targetdescr,
@@ -75,7 +80,7 @@ class _KernelCompiler(_FunctionCompiler):  # type: ignore[misc]
             kernel._compiler.pipeline_class,
         )
 
-    def _compile_core(self, args: Any, return_type: Any) -> compiler.CompileResult:
+    def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
         compiled = self._compile(args, return_type, compiler.Flags(), None)
         # numba sets the environment of a function in that function's own machine code; an inner
@@ -84,9 +89,7 @@ class _KernelCompiler(_FunctionCompiler):  # type: ignore[misc]
             compiled.library.codegen.set_env(environment.env_name, environment)
         return compiled
 
-    def _compile(
-        self, args: Any, return_type: Any, flags: compiler.Flags, library: JITCodeLibrary | None
-    ) -> compiler.CompileResult:
+    def _compile(self, args: Any, return_type: Any, flags: Any, library: Any) -> Any:
         self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
         return compiler.compile_extra(
             self.targetdescr.typing_context,
@@ -104,7 +107,7 @@ class _KernelCompiler(_FunctionCompiler):  # type: ignore[misc]
 class _InnerCompiler(_KernelCompiler):
     """numba's compiler of a function that kernels call, up to LLVM code."""
 
-    def _compile_core(self, args: Any, return_type: Any) -> compiler.CompileResult:
+    def _compile_core(self, args: Any, return_type: Any) -> Any:
         """Compile one signature."""
         target = self.targetdescr.target_context
         library = _InnerLibrary(target.codegen(), self.py_func.__qualname__)
@@ -132,7 +135,7 @@ class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
 
-def reduce_inner(compiled: compiler.CompileResult) -> tuple[Any, ...]:
+def reduce_inner(compiled: Any) -> tuple[Any, ...]:
     """Return the parts of an inner kernel's code that a file stores."""
     compiled.fndesc.typemap = compiled.fndesc.calltypes = None  # cannot be stored, nobody reads them
     return (
@@ -155,7 +158,7 @@ def rebuild_inner(
     signature: Any,
     reload_init: Any,
     referenced: Any,
-) -> compiler.CompileResult:
+) -> Any:
     """Return an inner kernel's code from the parts that `reduce_inner` returned."""
     for initialise in reload_init:
         initialise()

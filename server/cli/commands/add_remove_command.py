@@ -42,7 +42,11 @@ def add(
     from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
-    with interruptible(lambda: _as_it_is(archive)), naming_write_errors(archive), progress_listener() as bars:
+    with (
+        interruptible(lambda: _archive_state(archive)),
+        naming_write_errors(archive),
+        progress_listener() as bars,
+    ):
         summary = add_scans(
             archive,
             scans,
@@ -74,14 +78,18 @@ def remove(
     from ....schemas.process.os_errors import naming_write_errors
     from ..output.progress_display import progress_listener
 
-    with interruptible(lambda: _as_it_is(archive)), naming_write_errors(archive), progress_listener() as bars:
+    with (
+        interruptible(lambda: _archive_state(archive)),
+        naming_write_errors(archive),
+        progress_listener() as bars,
+    ):
         summary = remove_scans(
             archive, scans, jobs=jobs, memory_bytes=parse_bytes(memory, "--memory"), progress=bars
         )
     _print(summary, "removed", as_json)
 
 
-def _as_it_is(archive: Path) -> str:
+def _archive_state(archive: Path) -> str:
     """Return a sentence about the state of an archive after a change to it was interrupted."""
     from ....schemas.archive.archive import Archive
     from ....schemas.errors import FormatError

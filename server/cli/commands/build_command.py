@@ -146,7 +146,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     built: list[BuildSummary] = []
     whole = f"{output} is complete: the build had finished"
     with (
-        interruptible(lambda: whole if built else _kept(output)),
+        interruptible(lambda: whole if built else _kept_work(output)),
         naming_write_errors(output),
         progress_listener(log_json) as listener,
     ):
@@ -168,7 +168,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
         print(f"left out: {fault}", file=sys.stderr)
 
 
-def _kept(output: Path) -> str:
+def _kept_work(output: Path) -> str:
     """Return a sentence about the files that an interrupted build leaves."""
     from ....builder.resume.kept_work import building_folder
 

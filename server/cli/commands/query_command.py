@@ -114,12 +114,12 @@ def query(
         _check_answered(client, asked, op)
         whole = joined(found)
         said: Any = whole.answers  # every answer type has verdict and outside
-        outside = _outside(client, whole.places, said.outside, said.verdict, word_of(said))
+        outside = _warn_outside(client, whole.places, said.outside, said.verdict, word_of(said))
     if as_json:
         print_json(answers_json(whole.times, said, outside))
     else:
         print(summary_line(said, outside))
-    return _say_unknown(client, op, word_of(said), asked, unknown_line(said, client.unanswered))
+    return _report_unknown(client, op, word_of(said), asked, unknown_line(said, client.unanswered))
 
 
 def _check_answered(client: "Client", asked: int, op: str) -> None:
@@ -130,7 +130,7 @@ def _check_answered(client: "Client", asked: int, op: str) -> None:
         raise BusyError(client.silence(op))
 
 
-def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) -> int:
+def _report_unknown(client: "Client", op: str, word: str, asked: int, line: str) -> int:
     """Warn on standard error about unanswered items, or else print `line` about unknown answers.
 
     Returns the exit code.
@@ -144,7 +144,7 @@ def _say_unknown(client: "Client", op: str, word: str, asked: int, line: str) ->
     return 0
 
 
-def _outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: str) -> Any:
+def _warn_outside(client: "Client", places: Any, leaves: Any, verdicts: Any, word: str) -> Any:
     """Warn on standard error about places outside the scan.
 
     Returns a mask of them, or None if the server no longer answers.
@@ -188,10 +188,10 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
                 waiting.clear()
         _check_answered(client, len(found), "move")
         verdicts = np.array([moved.get("verdict", 0) for moved in found])
-        outside = _outside(client, places, np.ones(len(found), bool), verdicts, "motions")
+        outside = _warn_outside(client, places, np.ones(len(found), bool), verdicts, "motions")
     if as_json:
         lie = [None] * len(found) if outside is None else outside.tolist()
         print_json([{**moved, "outside_scan": lies} for moved, lies in zip(found, lie, strict=True)])
     count = int((verdicts == Verdict.UNKNOWN).sum())
     line = f"{count} of {len(found)} motions are unknown: data in reach could not be read" if count else ""
-    return _say_unknown(client, "move", "motions", len(found), line)
+    return _report_unknown(client, "move", "motions", len(found), line)

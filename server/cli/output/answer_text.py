@@ -36,10 +36,10 @@ def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterato
     labels: (k,), what each answer is about.  times: (k,) [s], for `collide` only.
     """
     if isinstance(answers, CollideAnswers):
-        yield from _stretches(times, answers)
+        yield from _verdict_runs(times, answers)
         return
     for i, label in enumerate(labels):
-        yield f"{label}  {_NAMES[int(answers.verdict[i])]:<8}{_figure(answers, i)}".rstrip()
+        yield f"{label}  {_NAMES[int(answers.verdict[i])]:<8}{_result_text(answers, i)}".rstrip()
     if isinstance(answers, ObjectsAnswers):
         for (first, second), verdict in zip(
             answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True
@@ -86,11 +86,11 @@ def move_line(label: str, moved: Moved) -> str:
 
     The line has the verdict, final position, remaining motion, first obstacle and skipped effects.
     """
-    line = f"{label}  {_NAMES[moved.verdict]:<8}at {_place(moved.pose[0, :3, 3])}"
+    line = f"{label}  {_NAMES[moved.verdict]:<8}at {_point_text(moved.pose[0, :3, 3])}"
     if moved.left:
         line += f", {moved.left:.4f} m left"
     if moved.touched:
-        line += f", touching {_place(np.array(moved.touched[0].place))}"
+        line += f", touching {_point_text(np.array(moved.touched[0].place))}"
     if moved.skipped:
         line += f", without {', '.join(moved.skipped)}"
     return line
@@ -111,7 +111,7 @@ def answers_json(
     for name, of in array_fields(kind).items():
         column = getattr(answers, name)
         if len(column) == k and question.columns[name].rows in (Rows.ITEMS, Rows.BOUNDED):
-            values = _plain(column, vectors=bool(of.tail))
+            values = _json_column(column, vectors=bool(of.tail))
             for row, value in zip(rows, values, strict=True):
                 row[name] = _NAMES[value] if name == "verdict" else value
     totals = {name: getattr(answers, name) for name in _TOTALS}
@@ -120,7 +120,10 @@ def answers_json(
         row["outside_scan"] = lies
     if isinstance(answers, ContactsAnswers):
         for i, row in enumerate(rows):
-            row |= {"contacts": _rows(answers, "pair", i), "clusters": _rows(answers, "cluster", i)}
+            row |= {
+                "contacts": _contact_rows(answers, "pair", i),
+                "clusters": _contact_rows(answers, "cluster", i),
+            }
     if isinstance(answers, ObjectsAnswers):
         found = zip(answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True)
         totals["pairs"] = [{"objects": pair, "verdict": _NAMES[verdict]} for pair, verdict in found]
@@ -129,7 +132,7 @@ def answers_json(
     return {"answers": rows, **totals}
 
 
-def _stretches(times: list[float], answers: CollideAnswers) -> Iterator[str]:
+def _verdict_runs(times: list[float], answers: CollideAnswers) -> Iterator[str]:
     """Yield one line per run of equal verdicts."""
     found = zip(times, answers.verdict.tolist(), strict=True)
     for verdict, group in groupby(found, key=lambda pair: pair[1]):
@@ -138,7 +141,7 @@ def _stretches(times: list[float], answers: CollideAnswers) -> Iterator[str]:
         yield f"{span}  {_NAMES[verdict]}, {len(stretch)} poses"
 
 
-def _figure(answers: Cost, i: int) -> str:
+def _result_text(answers: Cost, i: int) -> str:
     """Format the result of one answer, without its verdict."""
     question = question_of(type(answers))
     form = _FORMS.get(question.name)
@@ -153,35 +156,35 @@ def _own_columns(question: Question[Any], answers: Cost, i: int) -> str:
 
 def _distance(answers: DistanceAnswers, i: int) -> str:
     if not math.isfinite(answers.signed_distance[i]):
-        return _beyond(answers, i)
+        return _nothing_in_reach(answers, i)
     bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
-    where = f"from {_place(answers.witness_avatar[i])} to {_place(answers.witness_cloud[i])}"
+    where = f"from {_point_text(answers.witness_avatar[i])} to {_point_text(answers.witness_cloud[i])}"
     return f"{answers.signed_distance[i]:.6f} m {where}{bounds}"
 
 
 def _nearest(answers: RaycastAnswers | WithinAnswers, i: int) -> str:
     if not math.isfinite(answers.distance[i]):
-        return _beyond(answers, i)
+        return _nothing_in_reach(answers, i)
     where = answers.hit[i] if isinstance(answers, RaycastAnswers) else answers.cloud_point[i]
     bounds = "" if answers.exact[i] else f", at least {answers.lower[i]:.6f} m"
-    return f"{answers.distance[i]:.6f} m at {_place(where)}{bounds}"
+    return f"{answers.distance[i]:.6f} m at {_point_text(where)}{bounds}"
 
 
 def _sweep(answers: SweepAnswers, i: int) -> str:
     if not math.isfinite(answers.upper[i]):
         return "" if answers.lower[i] >= 1 else f"clear up to {answers.lower[i]:.9f} of the motion"
     span = f"from {answers.lower[i]:.9f} to {answers.upper[i]:.9f} of the motion"
-    return f"{span}, at {_place(answers.witness_cloud[i])}"
+    return f"{span}, at {_point_text(answers.witness_cloud[i])}"
 
 
 def _contacts(answers: ContactsAnswers, i: int) -> str:
     if not answers.pairs_found[i]:
         return ""
-    clusters = _slice(answers.cluster_starts, i)
+    clusters = _rows_of_pose(answers.cluster_starts, i)
     text = f"{answers.pairs_found[i]} pairs in {clusters.stop - clusters.start} clusters"
     if clusters.start < clusters.stop:
         deepest = clusters.start
-        text += f", {answers.cluster_deepest[deepest]:.6f} m at {_place(answers.cluster_cloud[deepest])}"
+        text += f", {answers.cluster_deepest[deepest]:.6f} m at {_point_text(answers.cluster_cloud[deepest])}"
     return text
 
 
@@ -195,30 +198,30 @@ _FORMS: dict[str, Callable[[Any, int], str]] = {
 }
 
 
-def _beyond(answers: Any, i: int) -> str:
+def _nothing_in_reach(answers: Any, i: int) -> str:
     """Format an answer whose query found nothing within its reach."""
     return f"nothing within {answers.lower[i]:.6f} m" if answers.lower[i] > 0 else ""
 
 
-def _place(point: Any) -> str:
+def _point_text(point: Any) -> str:
     """Format a point [m]."""
     return " ".join(f"{value:.4f}" for value in point)
 
 
-def _rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
+def _contact_rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
     """Return the contacts ("pair") or clusters ("cluster") of one pose."""
     names = {name: name.removeprefix("cluster_") for name in CONTACTS.rows_of(f"{what}_starts")}
-    which = _slice(getattr(answers, f"{what}_starts"), i)
-    columns = [_plain(getattr(answers, name)[which], vectors=False) for name in names]
+    which = _rows_of_pose(getattr(answers, f"{what}_starts"), i)
+    columns = [_json_column(getattr(answers, name)[which], vectors=False) for name in names]
     return [dict(zip(names.values(), row, strict=True)) for row in zip(*columns, strict=True)]
 
 
-def _slice(starts: Any, i: int) -> slice:
+def _rows_of_pose(starts: Any, i: int) -> slice:
     """Return the rows of pose i."""
     return slice(int(starts[i]), int(starts[i + 1]))
 
 
-def _plain(column: Any, *, vectors: bool) -> list[Any]:
+def _json_column(column: Any, *, vectors: bool) -> list[Any]:
     """Convert a column to JSON values; elements that are not finite become None."""
     values: list[Any] = column.tolist()
     if column.dtype.kind != "f" or np.isfinite(column).all():

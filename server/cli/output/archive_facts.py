@@ -55,14 +55,14 @@ def archive_details(store: "VoxelStore") -> dict[str, Any]:
         "scans": [
             {"number": number, **said}
             for number, source in enumerate(archive.header.sources)
-            if not source.fault and (said := _of_source(source))
+            if not source.fault and (said := _source_details(source))
         ],
         "preview": preview.stat().st_size if preview.exists() else None,
         "warnings": list(coincident_sources(archive.header.sources)),
     }
 
 
-def _of_source(source: "Source") -> dict[str, Any]:
+def _source_details(source: "Source") -> dict[str, Any]:
     """Return a scan's scanner position, coordinate system, units and up axis, if not default."""
     scanner = source.pose[:3, 3].tolist()
     return {

@@ -48,7 +48,7 @@ def check_scene_file(path: Path, read_points: ReadPoints) -> Checked:
     name = scene_name(file, path)
     archives = find_archives(file, path)
     avatars = read_avatars(file, path, read_points)
-    left_out = _left_out(file, path, archives)
+    left_out = _removed_points(file, path, archives)
     return Checked(path, name, file, archives, avatars, left_out, list(_notes(file, archives, left_out)))
 
 
@@ -111,7 +111,7 @@ def scene_json(checked: Checked) -> dict[str, Any]:
     }
 
 
-def _left_out(file: SceneFile, path: Path, archives: list[FoundArchive]) -> int:
+def _removed_points(file: SceneFile, path: Path, archives: list[FoundArchive]) -> int:
     """Return the number of scan points that the effect `through` removes."""
     if not any(isinstance(effect, Through) for effect in file.effects):
         return 0

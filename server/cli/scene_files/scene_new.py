@@ -54,7 +54,7 @@ def new_scene(
     bounds = np.array([info.bounds for info in infos])
     begin = SceneContent(
         [_relative(folder, out) for folder in archives],
-        [(called, _relative(file, out)) for called, file in _named(avatars).items()],
+        [(called, _relative(file, out)) for called, file in _avatar_names(avatars).items()],
         effects,
         name,
         [model for model in STORED_MODELS if all(model in info.radius_models for info in infos)],
@@ -72,7 +72,7 @@ def new_scene(
         raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}") from None
 
 
-def _named(avatars: Sequence[Path]) -> dict[str, Path]:
+def _avatar_names(avatars: Sequence[Path]) -> dict[str, Path]:
     """Return the files of avatars by avatar name.
 
     The name is that of the file, with - for characters that a name must not contain.

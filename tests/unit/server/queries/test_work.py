@@ -1,8 +1,8 @@
-"""Answers about small fixed scenes, bit for bit, and the work done for them: both are what they were.
+"""Test that answers about small fixed scenes, and the work done for them, are unchanged.
 
-A kernel that prunes less, visits in another order or looks at more points than it did answers the same, so no judge of
-answers sees it. Where such a change is meant, `scripts/make_collide_scratch` writes the numbers anew, and the change of
-tests/golden/work.json shows what it costs.
+A kernel that prunes less, visits in another order or tests more points gives the same answers, so
+that no comparison of answers notices it. If such a change is intended, `scripts/make_work` writes
+the numbers again, and the change of tests/golden/work.json shows its cost.
 """
 
 import json

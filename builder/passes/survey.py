@@ -184,12 +184,6 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
     )
 
 
-def survey_scan(scan: Scan) -> Survey:
-    """Survey one scan in this process: bounds, counts, and whether it can be read to its end."""
-    parts = [survey_range(unit) for unit in ranges(scan, scan.declared_count or 0)]
-    return join_ranges(scan, parts, hash_file(scan.path))
-
-
 def unopened_survey(path: Path, fault: str, region: NDArray[np.float64] | None = None) -> Survey:
     """Return the survey of a file that cannot be opened, or that holds no scan if `fault` is empty.
 

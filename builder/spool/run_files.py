@@ -86,19 +86,6 @@ def position_hash(key: int, local: NDArray[np.int32], lattice: Lattice) -> int:
     return int(content_sum(np.ascontiguousarray((local + corner).T).view(np.uint64), SEEDS[0]))
 
 
-def write_run(path: Path, keys: NDArray[np.uint64], rows: NDArray) -> None:
-    """Sort rows (n,) and write them as the run `path` (NAME.run). n >= 1.
-
-    keys: (n,) voxel of each row.
-    """
-    order = np.lexsort((*canonical_columns(rows), row_codes(rows), keys))
-    rows, keys = rows[order], keys[order]
-    found, starts = np.unique(keys, return_index=True)
-    with new_run(path) as file:
-        file.write(rows.tobytes())
-    write_directory(path, found, np.append(starts, len(keys)).astype(np.int64))
-
-
 class SummedFile:
     """File being written, with the sums of its contents. sums: size, and `file_checksum`."""
 

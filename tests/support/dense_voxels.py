@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.spool.run_files import write_run
 from solidcloud.builder.spool.spool import Spool
 from solidcloud.builder.voxel.voxel_octree import BuiltVoxel
 from solidcloud.schemas.archive.codec import RecordShape, decode_voxel, voxel_point_dtype
 from solidcloud.schemas.archive.voxel import VoxelData
 from solidcloud.schemas.archive.voxel_grid import Lattice
+from written_runs import write_run
 
 KEY = 0x1C0000000000000  # voxel (0, 0, 0)
 COLUMNS = {"scan_index": "<u2", "intensity": "<f4"}

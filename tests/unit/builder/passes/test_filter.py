@@ -13,10 +13,11 @@ from solidcloud.builder.resume.kept_work import Journal
 from solidcloud.builder.resume.transaction import make_executor
 from solidcloud.builder.run.executor import Silent
 from solidcloud.builder.spool import spool_blocks as blocks
-from solidcloud.builder.spool.run_files import filter_dtype, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool.run_files import filter_dtype, row_codes, spool_dtype
 from solidcloud.builder.spool.spool import Spool
 from solidcloud.schemas.archive.voxel_grid import Lattice, voxel_coordinates, voxel_keys
 from solidcloud.schemas.errors import BadRequestError
+from written_runs import write_run
 
 STEP = 0.001
 ALL = frozenset({"scan", "intensity"})

@@ -19,7 +19,6 @@ from solidcloud.builder.passes import radius_classes as classes
 from solidcloud.builder.passes.radius_classes import class_limits, voxel_classes
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.spool.run_files import write_run
 from solidcloud.builder.spool.spool import Spool
 from solidcloud.builder.voxel import dense_record
 from solidcloud.builder.voxel import dense_voxel as dense
@@ -29,6 +28,7 @@ from solidcloud.schemas.archive.index import Header
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii, radius_distribution
 from solidcloud.schemas.errors import BadRequestError
 from synthetic_scans import make_scan, write_xyz
+from written_runs import write_run
 
 STEP = 0.001
 ALL = frozenset({"mean", "local", "border"})

@@ -21,11 +21,12 @@ from solidcloud.builder.passes.spool_pass import (
 )
 from solidcloud.builder.resume.kept_work import RunsIntact
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock
-from solidcloud.builder.spool.run_files import position_hash, ranks, row_codes, spool_dtype, write_run
+from solidcloud.builder.spool.run_files import position_hash, ranks, row_codes, spool_dtype
 from solidcloud.builder.spool.spool import Spool
 from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from synthetic_scans import make_scan
+from written_runs import write_run
 
 
 class Listed(Scan):

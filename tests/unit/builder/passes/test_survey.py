@@ -16,13 +16,18 @@ from solidcloud.builder.passes.survey import (
     load_part,
     ranges,
     survey_range,
-    survey_scan,
 )
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock, SourceLattice
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 from synthetic_scans import make_scan, write_las, write_xyz
+
+
+def survey_scan(scan: Scan) -> Survey:
+    """Survey one scan in this process."""
+    parts = [survey_range(unit) for unit in ranges(scan, scan.declared_count or 0)]
+    return join_ranges(scan, parts, hash_file(scan.path))
 
 
 class Listed(Scan):

@@ -17,12 +17,12 @@ from solidcloud.builder.spool.run_files import (
     read_directory,
     spool_dtype,
     write_directory,
-    write_run,
 )
 from solidcloud.builder.spool.spool import Spool
 from solidcloud.schemas.archive.archive_writer import file_checksum
 from solidcloud.schemas.archive.voxel_grid import make_lattice
 from solidcloud.schemas.errors import CorruptError
+from written_runs import write_run
 
 LATTICE = make_lattice((0, 0, 0), 0.001, 0.1)
 KEYS = np.array([3, 7, 1 << 61], np.uint64)

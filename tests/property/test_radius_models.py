@@ -87,7 +87,7 @@ def test_a_model_the_archive_does_not_hold_is_refused(tmp_path: Path) -> None:
     with Scene.open(case.archive) as scene:
         scene.add_avatar("avatar", [[0.0, 0, 0.0]], 0.01)
         assert scene.collide("avatar", pose, radius_model="local").verdict[0] == 1
-        with pytest.raises(BadRequestError, match=r"holds mean,local: .* --radius mean,local,border"):
+        with pytest.raises(BadRequestError, match=r"stores mean,local: .* --radius mean,local,border"):
             scene.collide("avatar", pose, radius_model="border")
         with pytest.raises(BadRequestError, match="expected mean, local"):
             scene.collide("avatar", pose, radius_model="nearest")

@@ -88,11 +88,11 @@ def test_the_class_of_some_points_together_stands_for_the_largest_of_their_radii
 
 
 def test_what_the_archive_does_not_hold_is_refused() -> None:
-    with pytest.raises(BadRequestError, match=r"holds mean: .* --radius mean,local"):
+    with pytest.raises(BadRequestError, match=r"stores mean: .* --radius mean,local"):
         class_radii("local", 0.01, ("mean",))
-    with pytest.raises(BadRequestError, match=r"holds mean,local: .* --radius mean,local,border"):
+    with pytest.raises(BadRequestError, match=r"stores mean,local: .* --radius mean,local,border"):
         class_radii("local+border", 0.01, ("mean", "local"))
-    with pytest.raises(BadRequestError, match=r"holds mean: .* --radius mean,local,border$"):
+    with pytest.raises(BadRequestError, match=r"stores mean: .* --radius mean,local,border$"):
         class_radii("border+local", 0.01, ("mean",))
     with pytest.raises(BadRequestError, match="at most"):
         class_radii("mean:8", 1.5, ("mean",))

@@ -242,7 +242,7 @@ def moments(seconds: float, count: int, rng: random.Random) -> list[float]:
 def interrupt_reading(
     folder: Path, name: str, points: int, count: int, seed: int, say: Callable[[str], None], *more: str
 ) -> Interrupts:
-    """Interrupt `count` builds of scans of one format, every second with --skip-bad.
+    """Interrupt `count` builds of scans of one format, half of them with --skip-bad.
 
     more: see `Format.interrupted`.
     """
@@ -260,7 +260,7 @@ def interrupt_reading(
         begun.end()
         seconds = time.perf_counter() - begin
     for k, moment in enumerate(moments(seconds, count, rng)):
-        plain.interrupted(moment, (k // 2) % 2 == 0, tally, *more)
+        plain.interrupted(moment, k % 4 in (0, 3), tally, *more)
     shutil.rmtree(plain.folder)
     say(
         f"{name}: {tally.counts['interrupted']} interrupted, {len(tally.bad)} bad, "

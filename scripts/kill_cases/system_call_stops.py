@@ -124,7 +124,9 @@ def all_calls(
 ) -> int:
     """Inject each fault at each call of a build, of one that overwrites, and of `add`.
 
-    every: only each K-th call; None: only one call of each name of `build` and `add`.
+    every: only each K-th call; None: one call of each name of `build` and `add`. Then `build` and
+        `add` share the faults: each command has every second one, so that each fault occurs at each
+        name that both commands call.
     Returns the number of calls.
     """
     points = 0
@@ -135,7 +137,7 @@ def all_calls(
     }
     if not every:
         del commands["build --overwrite"]
-    for name, make in commands.items():
+    for turn, (name, make) in enumerate(commands.items()):
         calls = calls_of(make())
         if name == "build --overwrite":
             # The calls equal those of the first build until names are changed; only the later ones
@@ -143,8 +145,10 @@ def all_calls(
             calls = calls[-12:]
         calls = calls[::every] if every else one_of_each(calls)
         for index, call in enumerate(calls):
-            for fault in FAULTS:
+            for number, fault in enumerate(FAULTS):
                 if fault == "ENOSPC" and call.name not in FULL:
+                    continue
+                if not every and (turn + CALLS.index(call.name) + number) % 2:
                     continue
                 points += 1
                 inject(make(), call, fault, tally, command=name)

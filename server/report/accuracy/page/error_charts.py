@@ -150,7 +150,7 @@ def draw_scatter(rows: Sequence[Row], errors: tuple[str, ...], scene_name: str, 
             label="Pareto front: no setting is both faster and better",
         ),
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     figure.suptitle(f"Cost and errors of a collision test: {scene_name}", fontsize=13)
     # Labels last: the layout moves the panels.
     figure.canvas.draw()

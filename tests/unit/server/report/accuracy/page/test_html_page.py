@@ -121,6 +121,18 @@ def test_the_main_chart_is_small_enough_for_a_readme(
     assert 10_000 < drawn[2]["main"].stat().st_size < 150_000
 
 
+@pytest.mark.parametrize("errors", [("doorway", "leak"), ("wrong", "distance")])
+def test_the_legend_lies_within_the_picture(
+    errors: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = []
+    monkeypatch.setattr(error_charts, "save_picture", lambda figure, target: figures.append(figure))
+    error_charts.draw_scatter(all_rows(), errors, "façade", tmp_path / "accuracy.png")
+    (figure,) = figures
+    legend = figure.legends[0].get_window_extent()
+    assert 0 <= legend.x0 and legend.x1 <= figure.bbox.width
+
+
 def test_the_default_stands_once_in_a_chart() -> None:
     points = points_of(all_rows(), "doorway")
     assert [p.label for p in points].count("default") == 1

@@ -130,7 +130,7 @@ def test_the_legend_lies_within_the_picture(
     error_charts.draw_scatter(all_rows(), errors, "façade", tmp_path / "accuracy.png")
     (figure,) = figures
     legend = figure.legends[0].get_window_extent()
-    assert 0 <= legend.x0 and legend.x1 <= figure.bbox.width
+    assert legend.x0 >= 0 and legend.x1 <= figure.bbox.width
 
 
 def test_the_default_stands_once_in_a_chart() -> None:

@@ -60,6 +60,33 @@ def content(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Return the address of a scheduler of another process, with two workers in another folder."""
+    code = (
+        "from distributed import LocalCluster; import sys\n"
+        "if __name__ == '__main__':\n"
+        "    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0') as cluster:\n"
+        "        print(cluster.scheduler_address, flush=True); sys.stdin.read()\n"
+    )
+    folder = tmp_path_factory.mktemp("cluster")
+    (folder / "there").mkdir()
+    (folder / "cluster.py").write_text(code)
+    process = subprocess.Popen(
+        [sys.executable, "-P", folder / "cluster.py"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=folder / "there",
+    )
+    assert process.stdin and process.stdout
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.stdin.close()
+        process.wait(30)
+
+
 class Killer(threading.Thread):
     """Thread that kills one worker of the cluster as soon as the first shard exists."""
 
@@ -109,7 +136,7 @@ def test_a_worker_killed_in_mid_build_changes_no_byte(
 
 
 def test_no_more_workers_read_records_back_than_may_hold_them(
-    scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scheduler: str, scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handed_out: list[int] = []
     submit, radius = cluster_module.ClusterExecutor.submit, pipeline_module._measure_radius
@@ -126,44 +153,23 @@ def test_no_more_workers_read_records_back_than_may_hold_them(
     monkeypatch.setattr(pipeline_module, "_measure_radius", from_here_on)
     monkeypatch.setattr(pipeline_module, "readers_that_fit", lambda *_: 1)
     monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
-    build_archive([scans], tmp_path / "hall", BuildConfig(voxel=VOXEL, cluster="local:2"))
+    build_archive([scans], tmp_path / "hall", BuildConfig(voxel=VOXEL, scheduler=scheduler))
     assert len(handed_out) > 20 and set(handed_out) == {1}
     assert content(tmp_path / "hall") == alone
 
 
 def test_a_scheduler_that_runs_elsewhere_makes_the_same_archive(
-    scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scheduler: str, scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Test workers that were started by hand in another folder than the builder's, with relative paths."""
-    code = (
-        "from distributed import LocalCluster; import sys\n"
-        "if __name__ == '__main__':\n"
-        "    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address='127.0.0.1:0') as cluster:\n"
-        "        print(cluster.scheduler_address, flush=True); sys.stdin.read()\n"
-    )
-    (tmp_path / "there").mkdir()
-    (tmp_path / "cluster.py").write_text(code)
-    scheduler = subprocess.Popen(
-        [sys.executable, "-P", tmp_path / "cluster.py"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path / "there",
-    )
-    assert scheduler.stdin and scheduler.stdout
-    try:
-        address = scheduler.stdout.readline().strip()
-        monkeypatch.chdir(scans)
-        archive = os.path.relpath(tmp_path / "hall")
-        config = BuildConfig(voxel=VOXEL, scheduler=address)
-        build_archive([Path(".")], Path(archive), config)
-        # The index contains the paths of the scans as given; everything else is the same.
-        found = content(tmp_path / "hall")
-        assert found.keys() == alone.keys()
-        assert {name for name in found if found[name] != alone[name]} <= {"index.h5"}
-    finally:
-        scheduler.stdin.close()
-        scheduler.wait(30)
+    monkeypatch.chdir(scans)
+    archive = os.path.relpath(tmp_path / "hall")
+    config = BuildConfig(voxel=VOXEL, scheduler=scheduler)
+    build_archive([Path(".")], Path(archive), config)
+    # The index contains the paths of the scans as given; everything else is the same.
+    found = content(tmp_path / "hall")
+    assert found.keys() == alone.keys()
+    assert {name for name in found if found[name] != alone[name]} <= {"index.h5"}
 
 
 def test_what_is_wrong_on_the_cluster_is_said_as_here(

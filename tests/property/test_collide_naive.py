@@ -36,7 +36,7 @@ def build(points: NDArray[np.float64], folder: str, **options: Any) -> archive_c
     return archive_cases.build(Path(folder), points, **options)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -34,7 +34,7 @@ def least_margin(a: NDArray[np.int64], scan: NDArray[np.int64], radii: NDArray[n
     return min(found)
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -21,7 +21,7 @@ from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

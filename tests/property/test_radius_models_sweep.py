@@ -32,7 +32,7 @@ def columns(answers: SweepAnswers, names: tuple[str, ...] = FOUND) -> list[str]:
     return [str(getattr(answers, name).tolist()) for name in names]
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=16, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),

@@ -28,7 +28,7 @@ def stored(case: archive_cases.Case, data: SceneData) -> NDArray[np.float64]:
     return np.asarray(naive.lattice_of(case.points, origin, step) * step + origin)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=35, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

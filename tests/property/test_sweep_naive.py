@@ -17,7 +17,7 @@ from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import QueryBudget
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=35, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),

@@ -15,13 +15,13 @@ SCRIPT = Path(__file__).parents[3] / "scripts" / "fuzz_readers"
 
 def test_damaged_scans_are_read_or_refused_by_name() -> None:
     """Test a share of the 10,000 cases of scripts/fuzz_readers."""
-    command = [sys.executable, str(SCRIPT), "--mutants", "308", "--seed", "5", "--jobs", "1"]
+    command = [sys.executable, str(SCRIPT), "--mutants", "198", "--seed", "5", "--jobs", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = json.loads(done.stdout)
     assert found["faults"] == [] and done.returncode == 0
-    assert found["mutants"] == 308 and set(found["by_seed"]) == set(SEEDS)
+    assert found["mutants"] == 198 and set(found["by_seed"]) == set(SEEDS)
     # The damage is neither always found by the first check nor too slight to be noticed.
-    assert found["outcomes"]["read"] > 30 and found["outcomes"]["refused"] > 100
+    assert found["outcomes"]["read"] > 20 and found["outcomes"]["refused"] > 60
 
 
 # Outcome to be found -> code that runs instead of reading a scan.
@@ -37,11 +37,14 @@ FAULTS = {
 }
 
 
-def reading(outcome: str, fault: str, path: Path) -> dict[str, Any]:
-    """Return the outcome of a scan and, with other limits, of a scan whose reading runs `fault`.
+@pytest.fixture(scope="module")
+def readings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """Return what the script finds, by outcome, of a scan whose reading runs the code of FAULTS.
 
     Runs in a separate process with only the script: the memory of its forks is measured.
     """
+    path = tmp_path_factory.mktemp("scan") / "a.las"
+    path.write_bytes(b"no scan")
     program = f"""
 import importlib.machinery, importlib.util, json, os, resource, signal, sys, time
 from pathlib import Path
@@ -50,30 +53,29 @@ from solidcloud.schemas.errors import ScanError
 loader = importlib.machinery.SourceFileLoader("fuzz_readers", {str(SCRIPT)!r})
 fuzz = importlib.util.module_from_spec(importlib.util.spec_from_loader("fuzz_readers", loader))
 loader.exec_module(fuzz)
-def read_all(path):
-    {fault}
 path = Path({str(path)!r})
 first = fuzz.read_mutant(3, "a.las", path, 1 << 40)
 pages = [int(count) * resource.getpagesize() for count in Path("/proc/self/statm").read_text().split()]
-outcome = {outcome!r}
-room = pages[0] + (100 << 20) if outcome == "Unable to allocate" else 1 << 40
-fuzz.MAX_SECONDS = 1 if outcome == "over 1 s" else 7
-fuzz.LONGEST_WAIT = 0.5 if outcome == "over 7 s" else 60.0
-fuzz.MAX_BYTES = 20 << 20 if outcome.endswith("MB") else fuzz.MAX_BYTES
-fuzz.read_all = read_all
-print(json.dumps([first._asdict(), fuzz.read_mutant(3, "a.las", path, room)._asdict()]))
+most_bytes, found = fuzz.MAX_BYTES, {{}}
+for outcome, fault in {FAULTS!r}.items():
+    room = pages[0] + (100 << 20) if outcome == "Unable to allocate" else 1 << 40
+    fuzz.MAX_SECONDS = 1 if outcome == "over 1 s" else 7
+    fuzz.LONGEST_WAIT = 0.5 if outcome == "over 7 s" else 60.0
+    fuzz.MAX_BYTES = 20 << 20 if outcome.endswith("MB") else most_bytes
+    code = compile(fault, "fault", "exec")
+    fuzz.read_all = lambda path: exec(code, globals() | {{"path": path}})
+    found[outcome] = fuzz.read_mutant(3, "a.las", path, room)._asdict()
+print(json.dumps([first._asdict(), found]))
 """
     done = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
     first, found = json.loads(done.stdout)
-    assert first["outcome"] == "refused" and found["number"] == 3
+    assert first["outcome"] == "refused" and {each["number"] for each in found.values()} == {3}
     return found
 
 
 @pytest.mark.parametrize("outcome", FAULTS)
-def test_each_kind_of_fault_is_found(outcome: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.las"
-    path.write_bytes(b"no scan")
-    found = reading(outcome, FAULTS[outcome], path)
+def test_each_kind_of_fault_is_found(outcome: str, readings: dict[str, dict[str, Any]]) -> None:
+    found = readings[outcome]
     if outcome == "Unable to allocate":
         assert found["outcome"] == "another error" and outcome in found["message"]
     else:

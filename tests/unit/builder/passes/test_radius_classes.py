@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 
 import naive_classes
@@ -70,7 +71,13 @@ def cloud(kind: str, seed: int, count: int = 400, size: int = 1500) -> NDArray[n
 
 
 def judge(lattice: NDArray[np.int64], step: str = "0.001") -> tuple[NDArray[np.uint8], int]:
-    """The class (n,) of each point by brute force, and how many have too few neighbours."""
+    """Return the class (n,) of each point by brute force, and how many have too few neighbours."""
+    return _judge(np.ascontiguousarray(lattice).tobytes(), step)
+
+
+@lru_cache(maxsize=4)  # the same points in other voxels are judged once
+def _judge(points: bytes, step: str) -> tuple[NDArray[np.uint8], int]:
+    lattice = np.frombuffer(points, np.int64).reshape(-1, 3)
     of_place = naive_classes.judge(lattice, step)
     judged = [of_place[tuple(point)] for point in lattice.tolist()]
     classes = np.array([found.local + RIM_BIT * found.rim for found in judged], np.uint8)

@@ -34,7 +34,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.interpreted
 @pytest.mark.timeout(900)  # the first run may have to compile everything
 def test_threads_change_no_byte(archive: Path) -> None:
-    count = 60 if INTERPRETED else 10_000
+    count = 40 if INTERPRETED else 10_000
     asked = mixed_requests.requests(count)
     assert len(Counter(op for op, _ in asked)) == 8
     with Archive(archive) as opened, Scene.open(archive) as scene:

@@ -17,7 +17,6 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_floor(tmp_path_factory.mktemp("floor"))
 
 
-@pytest.mark.interpreted
 def test_query_agrees_with_the_floor(
     archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

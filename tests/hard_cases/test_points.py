@@ -33,11 +33,11 @@ def stored(case: archive_cases.Case) -> np.ndarray:
 
 @pytest.mark.case(
     7,
-    "10^6 identical points (10^4 interpreted): one cell over its capacity, a tree of the usual height, contact exact",
+    "10^6 identical points (2,000 interpreted): one cell over its capacity, a tree of the usual height, contact exact",
 )
 @pytest.mark.interpreted
 def test_case_07_identical_points_build_and_answer(tmp_path: Path) -> None:
-    count = 10_000 if INTERPRETED else 1_000_000
+    count = 2_000 if INTERPRETED else 1_000_000
     points = np.full((count, 3), 0.125)
     case = archive_cases.build(tmp_path, points, voxel=8.0)
     with Archive(case.archive) as archive:
@@ -102,8 +102,8 @@ def test_case_10_points_on_borders_are_each_in_one_cell(tmp_path: Path) -> None:
 )
 @pytest.mark.interpreted
 def test_case_11_contact_across_borders_for_any_voxels(tmp_path: Path, rng: np.random.Generator) -> None:
-    points, avatar = synthetic_scans.make_scan("noise", 6, 800), rng.uniform(-0.3, 0.3, (20, 3))
-    count = 20 if INTERPRETED else 80
+    size, count = (200, 12) if INTERPRETED else (800, 80)
+    points, avatar = synthetic_scans.make_scan("noise", 6, size), rng.uniform(-0.3, 0.3, (20, 3))
     poses = archive_cases.near_poses(rng, points, avatar, count, 0.06)
     lows = points.min(axis=0)
     found = []
@@ -163,11 +163,11 @@ def test_case_12_the_deepest_level_is_one_lattice_step(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     13,
-    "10^6 points in 5 cm beside 100 over 8 m (10^4 interpreted): work grows with the levels, in build and queries",
+    "10^6 points in 5 cm beside 100 over 8 m (4,000 interpreted): work grows with the levels, in build and queries",
 )
 @pytest.mark.interpreted
 def test_case_13_a_million_to_one_in_one_voxel(tmp_path: Path, rng: np.random.Generator) -> None:
-    sizes = (100, 10_000) if INTERPRETED else (10_000, 1_000_000)
+    sizes = (40, 4_000) if INTERPRETED else (10_000, 1_000_000)
     thin = rng.uniform(0, 8, (100, 3))
     thin[:2] = [[0, 0, 0], [7.9, 7.9, 7.9]]
     avatar = rng.uniform(-0.02, 0.02, (30, 3))

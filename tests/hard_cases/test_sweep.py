@@ -131,7 +131,7 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     """A rod that turns about one end, up to half a turn, against pillars around it."""
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("pillar", 5, 400), radius=0.01)
     rod = np.linspace(0, 0.6, 40)[:, None] * [1.0, 0, 0]
-    count = 60
+    count = 20 if INTERPRETED else 60
     first = np.array(
         [archive_cases.pose_of(turn_z(a), np.array([0.5, 1.0, 1.0])) for a in rng.uniform(0, 7, count)]
     )
@@ -141,7 +141,7 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     with judged_sweeps.opened(case) as data:
         answers = judged_sweeps.ask(data, rod, 0.005, first, last)
         judged_sweeps.judge(case, data, rod, 0.005, first, last, answers)
-    assert 10 < (answers.verdict == Verdict.CONTACT).sum() < count - 5
+    assert count / 6 < (answers.verdict == Verdict.CONTACT).sum() < count - 5
     assert (answers.verdict != Verdict.UNKNOWN).all() and answers.exact.all()
 
 
@@ -152,7 +152,7 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
 @pytest.mark.interpreted
 def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np.random.Generator) -> None:
     """Segment by segment, and a segment piece by piece; what lies beyond the contact is never loaded."""
-    points = rng.uniform(0, 1, (6000, 3)) * [60.0, 2, 2]
+    points = rng.uniform(0, 1, (1500 if INTERPRETED else 6000, 3)) * [60.0, 2, 2]
     points = points[(np.abs(points[:, 1:] - 1).max(axis=1) > 0.3) | (points[:, 0] > 50)]
     case = archive_cases.build(tmp_path, points, voxel=1.0, radius=0.05)
     body = rng.uniform(-0.1, 0.1, (10, 3))

@@ -16,7 +16,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.simulation.world.frame import Body
 
 # Pushes of a test, and of the one that is asked for with -m slow.
-PUSHES, MANY = (800, 100_000) if not INTERPRETED else (6, 6)
+PUSHES, MANY = (800, 100_000) if not INTERPRETED else (3, 3)
 REST = 1_000 if not INTERPRETED else 5
 SIZE = 2.4 if not INTERPRETED else 1.6
 # Pushes go so far [m].
@@ -125,7 +125,7 @@ def test_who_pushes_into_walls_creases_and_corners_does_not_tremble(
 def test_at_rest_not_a_bit_moves(rooms: archive_cases.Case, effects: tuple[AnyEffect, ...]) -> None:
     with play(rooms.archive, Stop(), Sweep(), *effects) as game:
         body = game.body(effect_rooms.person(), effect_rooms.at(SIZE / 4, 0.05, -SIZE / 2 + 0.2, 0.3))
-        for _ in range(30):
+        for _ in range(5 if INTERPRETED else 30):
             game.go(body, (0.0, 0.0, 0.0))
         rests = body.pose.tobytes()
         for _ in range(REST):

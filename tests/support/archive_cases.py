@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import naive
 import numpy as np
 import synthetic_scans
+from kept_archives import build_or_copy
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
 from solidcloud.server.scene import Scene
 
 # 2^-10 m. A product of metres and a power of two is exact in float64, and so are the shifts and
@@ -38,7 +38,7 @@ def build(folder: Path, points: NDArray[np.float64], **options: Any) -> Case:
     number = sum(1 for _ in folder.iterdir())
     scan = synthetic_scans.write_ply(folder / f"{number}.ply", points)
     options = {"voxel": 0.5, "resolution": 1e-4, "radius": 0.01, "jobs": 1} | options
-    build_archive([scan], folder / f"archive{number}", BuildConfig(**options))
+    build_or_copy([scan], folder / f"archive{number}", BuildConfig(**options))
     return Case(folder / f"archive{number}", points)
 
 

@@ -135,13 +135,13 @@ def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) 
     return Made(store, buffer.arena, loaded, arrays, broad, int(radii.max()), coarse)
 
 
-def scattered(folder: Path) -> Made:
-    """Return eight voxels with hierarchies of a few levels.
+def build_scattered(folder: Path) -> Path:
+    """Build an archive of eight voxels with hierarchies of a few levels.
 
     Some have fewer leaf nodes than a slot holds.
     """
     points = synthetic_scans.make_scan("noise", 3, 2500) ** 2 / synthetic_scans.SIZE
-    return open_made(archive_cases.build(folder, points, voxel=1.0, leaf=2, degree=3, cell_points=50).archive)
+    return archive_cases.build(folder, points, voxel=1.0, leaf=2, degree=3, cell_points=50).archive
 
 
 def least_margin(

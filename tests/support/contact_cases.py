@@ -8,9 +8,9 @@ import naive_contacts
 import numpy as np
 import radius_class_archives
 import synthetic_scans
+from kept_archives import build_or_copy
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
 from solidcloud.server.archives.archive_info import describe
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
@@ -56,7 +56,7 @@ def open_case(
     paths = [synthetic_scans.write_ply(own / f"{i}.ply", points[which == i]) for i in range(scan_count)]
     options = {"voxel": 0.5, "resolution": 1e-4, "radius": 0.01, "jobs": 1} | options
     keep = frozenset({"scan"}) if kept else frozenset()
-    build_archive(paths, own / "archive", BuildConfig(keep=keep, **options))
+    build_or_copy(paths, own / "archive", BuildConfig(keep=keep, **options))
     store = VoxelStore(own / "archive")
     data = make_scene_data(store.archive, VoxelCache(store, budget_bytes))
     # Scan numbers as users see them: rows of SceneInfo.sources.

@@ -8,9 +8,9 @@ import archive_cases
 import numpy as np
 import radius_class_archives
 import synthetic_scans
+from kept_archives import build_or_copy
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.scene.effect_table import Through, ThroughBox
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.through_effect import store_without
@@ -78,7 +78,7 @@ def build(folder: Path, parts: list[NDArray[np.float64]]) -> Path:
         digests.append(digest)
     assert digests == sorted(digests)
     with radius_class_archives.any_classes():
-        build_archive(files, folder / "archive", BuildConfig(**OPTIONS))
+        build_or_copy(files, folder / "archive", BuildConfig(**OPTIONS))
     return folder / "archive"
 
 

@@ -43,7 +43,20 @@ def any_classes(
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "voxel_classes", others)
-        yield
+        _replacing.append(classes_of)
+        try:
+            yield
+        finally:
+            _replacing.pop()
+
+
+# The functions of the `any_classes` that are entered, the innermost last.
+_replacing: list[Callable[[NDArray[np.int32]], NDArray[np.uint8]]] = []
+
+
+def replaced_classes() -> Callable[[NDArray[np.int32]], NDArray[np.uint8]] | None:
+    """Return the function that `any_classes` builds with; None outside of it."""
+    return _replacing[-1] if _replacing else None
 
 
 def stored_radii(folder: Path, model: str | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,6 +1,7 @@
 """Archives of two halves of a scan and of the whole, for tests of several archives."""
 
 import os
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ RADIUS = 0.02
 OPTIONS: dict[str, Any] = {
     "resolution": STEP, "leaf": 8, "degree": 3, "cell_points": 24, "keep": frozenset({"scan"}),
 }  # fmt: skip
-COUNT = 12 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else 60
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+COUNT = 12 if INTERPRETED else 60
 
 
 def halves() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -42,14 +44,25 @@ def halves() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class Built:
-    """Archives of each half, and of both as two scans."""
+    """Archives of each half, and of both as two scans; built at first use."""
 
     def __init__(self, folder: Path) -> None:
-        self.points = halves()
-        self.first, self.second = (
-            archive_cases.build(folder, part, **OPTIONS).archive for part in self.points
-        )
-        self.whole = archive_cases.build(folder, np.vstack(self.points), **OPTIONS).archive
+        self.points, self._folder = halves(), folder
+
+    @cached_property
+    def first(self) -> Path:
+        """Build the archive of one half."""
+        return archive_cases.build(self._folder, self.points[0], **OPTIONS).archive
+
+    @cached_property
+    def second(self) -> Path:
+        """Build the archive of the other half."""
+        return archive_cases.build(self._folder, self.points[1], **OPTIONS).archive
+
+    @cached_property
+    def whole(self) -> Path:
+        """Build the archive of both."""
+        return archive_cases.build(self._folder, np.vstack(self.points), **OPTIONS).archive
 
 
 def several(*archives: tuple[Path, Any], **options: Any) -> Scene:

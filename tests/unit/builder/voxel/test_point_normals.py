@@ -1,5 +1,6 @@
 """Normals estimated when an archive is built: those of the definition, stored, checked, changed with the scans."""
 
+import os
 from pathlib import Path
 
 import naive_normals
@@ -25,6 +26,7 @@ from solidcloud.schemas.kernels.normal_codes import NO_NORMAL, normal_code
 
 pytestmark = pytest.mark.interpreted
 
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 STEPS = 5000
 
 
@@ -111,7 +113,7 @@ def test_sums_at_the_bound_are_exact() -> None:
 
 # --- archives ---------------------------------------------------------------------------------------------
 
-POINTS = synthetic_scans.make_scan("corner", 8, 300)
+POINTS = synthetic_scans.make_scan("corner", 8, 150 if INTERPRETED else 300)
 
 
 def build(folder: Path, points: NDArray[np.float64] = POINTS, name: str = "scan", **options: object) -> Path:
@@ -157,7 +159,7 @@ def test_an_archive_has_the_normals_of_its_points(tmp_path: Path, options: dict[
     archive = build(tmp_path, **options)
     codes = stored(archive)
     assert codes == expected(archive)
-    assert sum(code != NO_NORMAL for code in codes.values()) > 100
+    assert sum(code != NO_NORMAL for code in codes.values()) > len(POINTS) / 3
     with Archive(archive) as opened:
         assert opened.header.format_version == 4
         assert opened.header.normal_reach == opened.header.options["normal_reach"] == 0.3
@@ -182,7 +184,8 @@ def test_without_normals_nothing_is_another(tmp_path: Path) -> None:
 def test_normals_change_with_the_scans(tmp_path: Path) -> None:
     archive = build(tmp_path)
     before = stored(archive)
-    more = synthetic_scans.write_ply(tmp_path / "more.ply", synthetic_scans.make_scan("pillar", 9, 200))
+    pillar = synthetic_scans.make_scan("pillar", 9, 100 if INTERPRETED else 200)
+    more = synthetic_scans.write_ply(tmp_path / "more.ply", pillar)
     add_scans(archive, [more], jobs=1)
     added = stored(archive)
     assert added == expected(archive) and added != before

@@ -7,8 +7,6 @@ import pytest
 from solidcloud.server.archives import ask_archives
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 
-pytestmark = pytest.mark.interpreted
-
 
 @pytest.fixture
 def flags(monkeypatch):

@@ -19,8 +19,6 @@ from solidcloud.server.archives.merge_answers import answers_in_world, limit_pai
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in Verdict)
 INF = np.inf
 
-pytestmark = pytest.mark.interpreted
-
 
 def answers(kind: Any, k: int, **columns: Any) -> Any:
     """Answers of k poses, unknown but for what is given."""

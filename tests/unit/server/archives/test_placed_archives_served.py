@@ -208,7 +208,6 @@ def test_what_is_refused_says_why(built: Built, both: Scene) -> None:
         Scene([], "hall")
 
 
-@pytest.mark.interpreted
 def test_the_inverse_of_a_pose_carries_back(rng: np.random.Generator) -> None:
     assert archive_pose(np.eye(4)) is None and archive_pose(None) is None
     for _ in range(20):

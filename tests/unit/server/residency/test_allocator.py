@@ -9,8 +9,6 @@ from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.eviction import make_policy
 
-pytestmark = pytest.mark.interpreted
-
 
 class Filled:
     """A room whose runs are filled with their row numbers, as a load would."""

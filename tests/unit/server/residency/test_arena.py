@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer
 
-pytestmark = pytest.mark.interpreted
-
 
 def test_views_share_one_aligned_buffer() -> None:
     buffer = ArenaBuffer(1000)

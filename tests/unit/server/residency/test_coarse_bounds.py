@@ -1,6 +1,7 @@
 """Coarse tops: what a slot holds, who gets one, and that what cannot be read, or was read before, changes nothing."""
 
 import os
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import radius_class_archives
 import synthetic_scans
-from coarse_tops import ROOM, Made, open_made, scattered
+from coarse_tops import ROOM, Made, build_scattered, open_made
 from numpy.typing import NDArray
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, class_radii
@@ -22,11 +23,19 @@ from solidcloud.server.kernels.core.scene_arrays import CLASS_SHIFT, COUNT, COUN
 from solidcloud.server.residency.coarse_bounds import SLOT_BYTES, CoarseBounds, drop_clear_pairs
 from solidcloud.server.residency.voxel_store import VoxelStore
 
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+
+
+@pytest.fixture(scope="module")
+def scattered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build an archive of eight voxels."""
+    return build_scattered(tmp_path_factory.mktemp("scattered"))
+
 
 @pytest.fixture
-def made(tmp_path: Path) -> Made:
-    """Eight voxels; see there."""
-    return scattered(tmp_path)
+def made(scattered: Path, tmp_path: Path) -> Made:
+    """Open a copy of the archive, which the test may damage."""
+    return open_made(shutil.copytree(scattered, tmp_path / "archive"))
 
 
 def enclosing(top: NDArray[np.int32], points: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -63,9 +72,8 @@ def damage(store: VoxelStore, row: int, dataset: int) -> None:
 def test_the_nodes_of_a_top_enclose_all_points(
     tmp_path: Path, kind: str, voxel: float, options: dict
 ) -> None:
-    made = open_made(
-        archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 7, 700), voxel=voxel, **options).archive
-    )
+    scan = synthetic_scans.make_scan(kind, 7, 300 if INTERPRETED else 700)
+    made = open_made(archive_cases.build(tmp_path, scan, voxel=voxel, **options).archive)
     degree, leaves = options.get("degree", 16), made.store.archive.voxels["leaves"]
     for row in range(made.voxels):
         made.coarse.store_from_archive(made.store, row)
@@ -112,7 +120,7 @@ def test_no_point_has_a_larger_sphere_than_its_node_says(tmp_path: Path, voxel: 
     with radius_class_archives.any_classes():
         case = archive_cases.build(
             tmp_path,
-            synthetic_scans.make_scan("noise", 5, 900),
+            synthetic_scans.make_scan("noise", 5, 300 if INTERPRETED else 900),
             voxel=voxel,
             leaf=2,
             degree=2,

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.residency.eviction import POLICIES, EvictionPolicy, make_policy, prefetches
 
-pytestmark = pytest.mark.interpreted
-
 BUDGET = 1000
 
 

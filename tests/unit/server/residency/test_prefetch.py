@@ -10,7 +10,6 @@ from solidcloud.server.residency.motion_prediction import PredictedVoxels, User
 from solidcloud.server.residency.prefetch import Prefetcher
 from solidcloud.server.residency.voxel_cache import VoxelCache
 
-pytestmark = pytest.mark.interpreted
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right
 ANNA = ("client", "anna")
 

@@ -6,7 +6,6 @@ import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.runtime.path_threads import PathThreads
 
-pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0
 
 

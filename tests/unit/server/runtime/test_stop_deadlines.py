@@ -8,7 +8,6 @@ import pytest
 from solidcloud.server.runtime import stop_flag as stop_module
 from solidcloud.server.runtime.stop_flag import Deadlines, StopFlag
 
-pytestmark = pytest.mark.interpreted
 DEADLINE = 20.0
 FAR = 1e9
 

@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 from solidcloud.server.runtime.threads import start_thread
 
-pytestmark = pytest.mark.interpreted
-
 
 def test_a_thread_runs_its_function_under_its_name() -> None:
     said = []

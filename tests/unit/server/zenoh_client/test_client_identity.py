@@ -2,12 +2,9 @@
 
 import threading
 
-import pytest
 import zenoh
 from solidcloud.server.zenoh_client.client_identity import ClientIdentity
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
-
-pytestmark = pytest.mark.interpreted
 
 
 def test_an_id_is_closed_while_other_threads_send_queries_under_it():

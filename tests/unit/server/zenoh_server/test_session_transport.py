@@ -3,12 +3,9 @@
 from collections import deque
 from types import SimpleNamespace
 
-import pytest
 import zenoh
 from solidcloud.server.zenoh_server.fair_queues import LivelinessTokens
 from solidcloud.server.zenoh_server.session_transport import SceneSessions
-
-pytestmark = pytest.mark.interpreted
 
 
 class Payload:

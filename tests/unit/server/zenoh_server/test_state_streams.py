@@ -6,8 +6,6 @@ from solidcloud.server.scene_interface import EncodedReply
 from solidcloud.server.zenoh_server import state_streams
 from solidcloud.server.zenoh_server.state_streams import IDLE_SECONDS, StateStreams
 
-pytestmark = pytest.mark.interpreted
-
 
 class Query:
     """A query for states. replies: payloads sent.  ended: whether no more come.  gone: whether its client is."""

@@ -1,11 +1,8 @@
 """Wishes that wait to be read: clients in turn, each bounded."""
 
-import pytest
 from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.server.zenoh_server import command_mailboxes as waiting_wishes
 from solidcloud.server.zenoh_server.command_mailboxes import WaitingCommands
-
-pytestmark = pytest.mark.interpreted
 
 
 def all_of(waiting):

@@ -8,7 +8,7 @@ import archive_cases
 import numpy as np
 import pytest
 import radius_class_archives
-from coarse_tops import ROOM, Made, open_made, rows_of, scattered
+from coarse_tops import ROOM, Made, build_scattered, open_made, rows_of
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
@@ -23,18 +23,33 @@ from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Open an archive of eight voxels."""
+    return open_made(build_scattered(tmp_path_factory.mktemp("scattered")))
+
+
 @pytest.fixture
-def made(tmp_path: Path) -> Made:
-    """Eight voxels; see there."""
-    return scattered(tmp_path)
+def made(opened: Made) -> Made:
+    """Return the eight voxels without coarse bounds."""
+    return opened._replace(coarse=CoarseBounds(opened.voxels, ROOM))
 
 
-def corner(folder: Path) -> Made:
-    """Two walls and a floor, one voxel, and room between them."""
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Open an archive of a floor and two walls, in one voxel."""
     side = np.stack(np.meshgrid(*[np.linspace(0.05, 3.95, 60)] * 2), axis=-1).reshape(-1, 2)
     flat = np.column_stack([side, np.full(len(side), 0.05)])
-    scan = np.concatenate([np.roll(flat, shift, axis=1) for shift in range(3)])
+    wall = flat[:: 7 if INTERPRETED else 1]
+    scan = np.concatenate([flat, np.roll(wall, 1, axis=1), np.roll(wall, 2, axis=1)])
+    folder = tmp_path_factory.mktemp("walls")
     return open_made(archive_cases.build(folder, scan, voxel=16.0, radius=0.02, resolution=1e-3).archive)
+
+
+@pytest.fixture
+def corner(walls: Made) -> Made:
+    """Return the floor and the walls without coarse bounds."""
+    return walls._replace(coarse=CoarseBounds(walls.voxels, ROOM))
 
 
 def shifted(*places: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -46,44 +61,43 @@ BODY = make_avatar(np.random.default_rng(1).uniform([-0.2, -0.2, 0.1], [0.2, 0.2
 
 
 @pytest.mark.interpreted
-def test_a_pose_between_walls_is_settled_and_one_at_a_wall_is_not(tmp_path: Path) -> None:
-    made = corner(tmp_path)
+def test_a_pose_between_walls_is_settled_and_one_at_a_wall_is_not(corner: Made) -> None:
     poses = shifted((2, 2, 2), (2, 2, -0.1), (0.1, 2, 2), (1.5, 2.5, 1.5))
-    reach = made.reach(BODY, poses)
+    reach = corner.reach(BODY, poses)
     assert rows_of(reach) == [[0]] * 4
-    found, settled = drop_clear_pairs(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    found, settled = drop_clear_pairs(corner.arrays, corner.coarse.arrays, BODY.arrays, poses, reach)
     assert found is reach and settled == 0  # no voxel has a slot
-    made.fill()
-    found, settled = drop_clear_pairs(made.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    corner.fill()
+    found, settled = drop_clear_pairs(corner.arrays, corner.coarse.arrays, BODY.arrays, poses, reach)
     assert (rows_of(found), settled) == ([[], [0], [0], []], 2)
     for name in ("scales", "units", "boxes", "outside"):
         assert getattr(found, name) is getattr(reach, name)
-    resident = made.resident(0)
-    found, settled = drop_clear_pairs(resident.arrays, made.coarse.arrays, BODY.arrays, poses, reach)
+    resident = corner.resident(0)
+    found, settled = drop_clear_pairs(resident.arrays, corner.coarse.arrays, BODY.arrays, poses, reach)
     assert found is reach and settled == 0
 
 
 @pytest.mark.interpreted
-def test_feet_above_a_floor_are_settled_by_their_points(tmp_path: Path) -> None:
-    made = corner(tmp_path)
-    made.fill()
+def test_feet_above_a_floor_are_settled_by_their_points(corner: Made) -> None:
+    corner.fill()
     # 4 cm, and then so low that they are in contact. The sphere around the body reaches below the floor in both.
     lowest = float(BODY.points[:, 2].min())
     poses = shifted((2, 2, 0.05 + 0.04 - lowest), (2, 2, 0.05 + 0.02 - lowest))
-    assert made.settled(BODY, poses) == ([[0], [0]], [[0], []])
+    assert corner.settled(BODY, poses) == ([[0], [0]], [[0], []])
     verdict, counts = np.zeros(2, np.uint8), np.zeros((3, 2), np.uint32)
-    reach = made.reach(BODY, poses)
-    collide_poses(poses, BODY.arrays, made.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts)
+    reach = corner.reach(BODY, poses)
+    collide_poses(
+        poses, BODY.arrays, corner.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts
+    )
     assert verdict.tolist() == [CLEAR, CONTACT]
 
 
-def test_an_avatar_of_many_points_is_settled_by_its_front(tmp_path: Path) -> None:
-    made = corner(tmp_path)
-    made.fill()
+def test_an_avatar_of_many_points_is_settled_by_its_front(corner: Made) -> None:
+    corner.fill()
     many = make_avatar(np.random.default_rng(2).uniform(-0.2, 0.2, (20_000, 3)), 0.005)
     assert many.arrays.first[many.arrays.front_first] >= 0  # inner nodes
     poses = shifted((2, 2, 2), (2, 2, 0.24), (0.8, 0.8, 0.8))
-    assert made.settled(many, poses) == ([[0]] * 3, [[0], [], [0]])
+    assert corner.settled(many, poses) == ([[0]] * 3, [[0], [], [0]])
 
 
 @pytest.mark.interpreted
@@ -112,18 +126,20 @@ def test_resident_voxels_and_those_without_a_slot_stay(made: Made, rng: np.rando
 def test_what_is_settled_of_a_long_avatar_is_clear(made: Made, rng: np.random.Generator) -> None:
     """A rod, much of which is far from its middle: along each axis, at random places."""
     made.fill()
-    everything = made.resident(*range(made.voxels))
+    everything, count = made.resident(*range(made.voxels)), 10 if INTERPRETED else 30
     for axis in range(3):
         rod = make_avatar(
             np.roll(np.column_stack([np.linspace(-0.6, 0.6, 40), np.zeros((40, 2))]), axis, axis=1), 0.01
         )
-        poses = shifted(*rng.uniform(0, 2, (30, 3)).tolist())
+        poses = shifted(*rng.uniform(0, 2, (count, 3)).tolist())
         before, gone = made.settled(rod, poses)
         assert 0 < sum(map(len, gone)) < sum(map(len, before))
         starts = np.cumsum([0, *map(len, gone)])
         reach = made.reach(rod, poses)._replace(starts=starts, rows=np.array(list(chain(*gone)), np.int64))
-        verdict, counts = np.zeros(30, np.uint8), np.zeros((3, 30), np.uint32)
-        collide_poses(poses, rod.arrays, everything.arrays, reach, np.arange(30), NO_LIMIT, verdict, counts)
+        verdict, counts = np.zeros(count, np.uint8), np.zeros((3, count), np.uint32)
+        collide_poses(
+            poses, rod.arrays, everything.arrays, reach, np.arange(count), NO_LIMIT, verdict, counts
+        )
         assert (verdict == CLEAR).all()
 
 

@@ -1,11 +1,14 @@
 """Ways ahead and the voxels they bring within reach, against brute force over all voxels at many moments."""
 
+import os
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.voxel_grid import KEY_BIAS
 from solidcloud.schemas.kernels.morton import morton_encode
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.kernels.prediction import track_prediction
 from solidcloud.server.kernels.prediction.track_prediction import (
     MAX_CELLS,
     PredictionLimits,
@@ -19,6 +22,7 @@ from solidcloud.server.kernels.prediction.track_prediction import (
 
 pytestmark = pytest.mark.interpreted
 
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 VOXEL_STEPS = 100
 MOTION = PredictionLimits(history=0.5, speed=15.0, acceleration=6.0, fade=0.5)
 
@@ -54,7 +58,7 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
     rng = np.random.default_rng([side, count])
     index = scattered(rng, side, count)
     met = 0
-    for turn in range(40):
+    for turn in range(6 if INTERPRETED and reach > 100 else 40):
         way = np.cumsum(rng.normal(0, 1, (9, 3)) * rng.choice([0.0, 5.0, 60.0], (9, 1)), axis=0)
         way += index.low[rng.integers(len(index.low))] + rng.uniform(-20, 20, 3)
         if turn % 5 == 0:
@@ -119,9 +123,13 @@ def test_far_outside_the_scene_nothing_is_wanted() -> None:
 
 
 @pytest.mark.parametrize(("beyond", "found"), [(-1, 1), (0, 0)])
-def test_no_more_cells_are_looked_at_than_are_said(beyond: int, found: int) -> None:
+def test_no_more_cells_are_looked_at_than_are_said(
+    monkeypatch: pytest.MonkeyPatch, beyond: int, found: int
+) -> None:
     """A row of voxels that a ball comes down to at its end, which is looked at last."""
-    count = MAX_CELLS + 1 + beyond
+    most = 500 if INTERPRETED else MAX_CELLS
+    monkeypatch.setattr(track_prediction, "MAX_CELLS", most)
+    count = most + 1 + beyond
     coordinates = np.column_stack([np.arange(count), np.zeros((count, 2), np.int64)])
     base = coordinates * VOXEL_STEPS
     keys = morton_encode((coordinates + KEY_BIAS).astype(np.uint64))

@@ -23,8 +23,6 @@ TAILS = {
     6.0: 9.8659e-10,
 }
 
-pytestmark = pytest.mark.interpreted
-
 
 @pytest.mark.parametrize(("away", "tail"), TAILS.items())
 def test_one_scan_has_the_tail_of_the_normal_distribution(away: float, tail: float) -> None:

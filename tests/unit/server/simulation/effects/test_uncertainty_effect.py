@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import synthetic_scans
 from effect_frames import body_of, flip_a_byte, report, world_of
+from kept_archives import build_or_copy
 from msgspec import structs
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_table import Uncertainty
 from solidcloud.schemas.wire.answers import Verdict
@@ -39,7 +39,7 @@ def opened(folder: Path, *clouds: NDArray[np.float64], keep: bool = True) -> Any
         for number, points in enumerate(clouds)
     ]
     options = {"voxel": 4.0, "resolution": 1e-5, "radius": RADIUS, "jobs": 1}
-    build_archive(paths, folder / "archive", BuildConfig(keep=frozenset({"scan"} if keep else ()), **options))
+    build_or_copy(paths, folder / "archive", BuildConfig(keep=frozenset({"scan"} if keep else ()), **options))
     with Scene.open(folder / "archive", "scene") as scene:
         yield scene
 

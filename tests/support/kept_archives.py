@@ -1,0 +1,39 @@
+"""Archives that this process has built before: copied, not built again."""
+
+import atexit
+import functools
+import shutil
+import tempfile
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+
+import radius_class_archives
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.pipeline import build_archive
+
+# Larger archives are not kept [bytes of all scans].
+MOST_BYTES = 1 << 18
+_kept: dict[Hashable, Path] = {}
+
+
+def build_or_copy(scans: Sequence[Path], target: Path, config: BuildConfig) -> None:
+    """Build an archive of scans in `target`, or copy the one that was built of equal scans with equal options.
+
+    A copy names the paths of the scans that it was built of. Their names are equal, their folders may not be.
+    """
+    contents = tuple((scan.name, scan.read_bytes()) for scan in scans)
+    key = (contents, repr(config), radius_class_archives.replaced_classes())
+    if key in _kept:
+        shutil.copytree(_kept[key], target)
+        return
+    build_archive(scans, target, config)
+    if sum(len(content) for _, content in contents) <= MOST_BYTES:
+        _kept[key] = Path(shutil.copytree(target, _folder() / str(len(_kept))))
+
+
+@functools.cache
+def _folder() -> Path:
+    """Make a folder that lasts as long as the process."""
+    folder = Path(tempfile.mkdtemp(prefix="solidcloud-archives-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

@@ -81,7 +81,7 @@ import numpy as np
 from solidcloud.schemas.wire.encoding import encode, JSON
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.simulation.world import collision_world as world
-from solidcloud.server.simulation.effects import pipeline
+from solidcloud.server.simulation.effects import effect_pipeline
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.make_simulation import make_simulation
 def child(names):

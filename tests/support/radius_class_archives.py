@@ -28,6 +28,10 @@ def hashed_classes(local: NDArray[np.int32]) -> NDArray[np.uint8]:
     return (mixed % RADIUS_CLASSES).astype(np.uint8)
 
 
+# The functions of the `any_classes` that are entered, the innermost last.
+_replacing: list[Callable[[NDArray[np.int32]], NDArray[np.uint8]]] = []
+
+
 @contextmanager
 def any_classes(
     classes_of: Callable[[NDArray[np.int32]], NDArray[np.uint8]] = hashed_classes,
@@ -48,10 +52,6 @@ def any_classes(
             yield
         finally:
             _replacing.pop()
-
-
-# The functions of the `any_classes` that are entered, the innermost last.
-_replacing: list[Callable[[NDArray[np.int32]], NDArray[np.uint8]]] = []
 
 
 def replaced_classes() -> Callable[[NDArray[np.int32]], NDArray[np.uint8]] | None:

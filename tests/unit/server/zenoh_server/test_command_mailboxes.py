@@ -203,7 +203,7 @@ def test_a_wish_that_is_too_large_is_refused_unread(floor):
     )
     run(frames)
     assert [said(answer).code for _, answer in sent] == ["too_large", "bad_request"]
-    assert "524289 bytes" in said(sent[0][1]).message and "has none" in said(sent[1][1]).message
+    assert "524289 bytes" in said(sent[0][1]).message and "has no objects" in said(sent[1][1]).message
 
 
 def test_a_user_too_many_is_busy_and_the_others_go_on(floor):

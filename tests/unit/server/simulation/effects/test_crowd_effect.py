@@ -204,7 +204,7 @@ def test_a_margin_beyond_reason_is_refused(tmp_path: Path) -> None:
 def test_what_is_not_declared_is_not_imported() -> None:
     program = """
 import sys
-from solidcloud.server.simulation.effects import pipeline, stop_effect, sweep_effect
+from solidcloud.server.simulation.effects import effect_pipeline, stop_effect, sweep_effect
 names = ["simulation.effects." + name for name in ("crowd_effect", "objects_effect")]
 names += ["simulation.world." + name for name in ("bodies", "body_obstacles")]
 names += ["kernels.bodies." + name for name in ("body_sweep", "moving_bodies")]

@@ -102,13 +102,13 @@ def messages() -> dict[str, dict[str, str]]:
         encodings[name] = find(name, "schemas.wire.encoding", "schemas.encoding")
 
     def of(kind: str) -> Any:
-        return find(kind, "schemas.wire.requests", "schemas.requests")
+        return find(kind, "schemas.wire.requests", "schemas.wire.path_messages", "schemas.requests")
 
-    move = find("MoveRequest", "schemas.wire.move_messages", "schemas.wire.moves", "schemas.moves")
+    move = find("MoveRequest", "schemas.wire.motion_messages", "schemas.moves")
     given = content()
     poses, origins = given["poses"], given["origins"]
     avatar, rows = {"avatar": "al"}, {"avatar": "al", "poses": poses}
-    items = [of("ObjectItem")(avatar="al", group=1 + number) for number in range(8)]
+    items = [of("ObjectEntry ObjectItem")(avatar="al", group=1 + number) for number in range(8)]
     requests = {
         "add_avatar": of("AddAvatarRequest")(name="al", points=given["figure"]),
         "collide": of("CollideRequest")(**rows, margin=0.02),

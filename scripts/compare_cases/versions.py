@@ -1,5 +1,6 @@
 """Shared code of comparisons of two versions: cases, names in either version, a checkout of a commit."""
 
+import contextlib
 import importlib
 import subprocess
 import sys
@@ -19,12 +20,16 @@ EFFECTS = ("stop", "sweep", "slide", "step", "ground")
 
 
 def find(name: str, *modules: str) -> Any:
-    """Return a name from the first of these modules that exists; versions differ in where it is defined."""
+    """Return a name from the first of these modules that has it; versions differ in where it is defined.
+
+    name: names, separated by spaces, of which one version has one and another another.
+    """
     for module in modules:
-        try:
-            return getattr(importlib.import_module(f"solidcloud.{module}"), name)
-        except ModuleNotFoundError:
-            continue
+        with contextlib.suppress(ModuleNotFoundError):
+            found = importlib.import_module(f"solidcloud.{module}")
+            for each in name.split():
+                if hasattr(found, each):
+                    return getattr(found, each)
     raise ImportError(f"{name} is in none of {', '.join(modules)}")
 
 

@@ -17,7 +17,6 @@ from solidcloud.schemas.archive.radius_model import (
 from solidcloud.schemas.archive.units import UNITS_PER_METRE
 from solidcloud.schemas.errors import BadRequestError
 
-pytestmark = pytest.mark.interpreted
 ALL = ("mean", "local", "border")
 
 

@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 from solidcloud.schemas.archive.rigid_pose import check_rigid, rigid_fault, rigid_pose
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 
-pytestmark = pytest.mark.interpreted
-
 
 def changed(row: int, column: int, value: float) -> NDArray[np.float64]:
     """Return the identity with one number changed."""

@@ -53,7 +53,6 @@ def floor(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
     return effect_rooms.build(tmp_path_factory.mktemp("floor"), effect_rooms.plane((-1, -1, 0), (1, 1, 0)))
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize(
     ("effects", "imported"),
     [

@@ -1,4 +1,4 @@
-"""Test ten seconds of scripts/chaos. Limits that depend on the machine's speed are generous."""
+"""Test six seconds of scripts/chaos. Limits that depend on the machine's speed are generous."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
 def test_no_answer_is_wrong_whatever_is_done_to_server_and_clients() -> None:
-    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "10", "--points", "20000", "--requests", "180"]
+    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "6", "--points", "20000", "--requests", "180"]
     # With this seed the first fault kills the server.
     done = subprocess.run(
         [*command, "--seed", "6", "--recovery", "60", "--stop", "30"],

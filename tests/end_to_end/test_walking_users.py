@@ -123,7 +123,7 @@ def compiled() -> dict[str, int]:
         for name, module in sorted(sys.modules.items())
         if name.startswith("solidcloud.") and "kernels" in name
         for key, kernel in vars(module).items()
-        if hasattr(kernel, "signatures")
+        if not isinstance(kernel, type) and hasattr(kernel, "signatures")
     }
 
 

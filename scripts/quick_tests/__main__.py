@@ -49,7 +49,7 @@ def main() -> int:
     failed = bool(selected) and run_all(selected, began, options.limit)
     others = [path for path in tests if Path(path).name.startswith("test_") and path not in files]
     print(
-        f"not selected: {len(others)} test files; scripts/test runs all, hard cases with every index checked"
+        f"not selected: {len(others)} test files; scripts/test runs all"
     )
     return int(failed)
 

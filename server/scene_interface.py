@@ -9,7 +9,9 @@ import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
-from typing import Any, NamedTuple, Protocol, TypeVar, Unpack
+from typing import Any, NamedTuple, NoReturn, Protocol, Self, TypeVar, Unpack
+
+from msgspec import structs
 
 from ..schemas.errors import SolidcloudError
 from ..schemas.wire.answers import (
@@ -181,8 +183,11 @@ class FrameResult(NamedTuple):
     about: bytes = b""
 
 
-class LatestState(NamedTuple):
-    """The last state of a session's avatar, and the time since it arrived [s]."""
+class LatestState(State, frozen=True, eq=False, kw_only=True):
+    """The last state of a session's avatar, with its age.
+
+    age: time since it arrived [s].
+    """
 
     state: State
     age: float
@@ -208,6 +213,11 @@ class ServedSimulation(Protocol):
 
 
 class ServedScene(Protocol):
+    @classmethod
+    def of(cls, state: State, age: float) -> Self:
+        """Return a state with its age."""
+        return cls(**structs.asdict(state), age=age)
+
     """Scene that answers a server's requests, or refuses them with a SolidcloudError. Thread-safe.
 
     `ask`, `path` and `move` take the parameters of the same methods of `Scene`. Each calls

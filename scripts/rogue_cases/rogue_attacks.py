@@ -164,7 +164,7 @@ def _walked(victim: Victim, z: float) -> list[str]:
             if state.pose[0, 0, 3] != 0.0 or state.pose[0, 2, 3] != z or state.seq > 10**8:
                 return [f"at {state.pose[0, :3, 3].tolist()}, number {state.seq}"]
         latest = victim.session.latest()
-        return [] if latest is not None and latest.state is state else ["another state than the last"]
+        return [] if latest is not None and latest.frame == state.frame else ["another state than the last"]
     except SolidcloudError as error:
         return [f"{type(error).__name__}: {error}"]
 

@@ -111,13 +111,13 @@ class LocalSession:
             raise error
 
     def latest(self) -> LatestState | None:
-        """Return the last state and its age, or None before the first one.
+        """Return the last state, with its age, or None before the first one.
 
         Raise, once, the error of a frame refused since then.
         """
         with self._changed:
             self._raise_error()
-            return None if self._latest is None else LatestState(self._latest, monotonic() - self._when)
+            return None if self._latest is None else LatestState.of(self._latest, monotonic() - self._when)
 
     def wait(self, seq: int, timeout: float = 5.0) -> State:
         """Return the state of a command, or of a newer one.

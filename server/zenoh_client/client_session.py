@@ -238,13 +238,15 @@ class ClientSession:
                     log.debug("sending again: %s", error)
 
     def latest(self) -> LatestState | None:
-        """Return the last state and its age; None before the first one.
+        """Return the last state, with its age; None before the first one.
 
         Raise, once, the last error since that state.
         """
         with self._changed:
             self._raise_error()
-            return None if self._latest is None else LatestState(self._latest, monotonic() - self._received)
+            return (
+                None if self._latest is None else LatestState.of(self._latest, monotonic() - self._received)
+            )
 
     def wait(self, seq: int, timeout: float = 5.0) -> State:
         """Wait for the state of a motion command or of a newer one, and return it.

@@ -73,7 +73,7 @@ def test_a_rogue_at_a_dead_servers_port_is_never_believed(endpoint, seal, caplog
                 for _ in range(COUNT):
                     with pytest.raises(BusyError, match="no state"):
                         session.wait(session.wish(pose_at(0.0, 2.0)), 0.1)
-                assert session.latest().state.pose[0, 2, 3] == 1.0
+                assert session.latest().pose[0, 2, 3] == 1.0
                 with Client(endpoint, scene="floor", timeout=1.0) as another:
                     another.add_avatar("al", POINTS, 0.125)
                     assert asked_of(another, impostor) == [], "the file is still there"
@@ -108,7 +108,7 @@ def test_without_a_key_replies_are_taken_as_they_come_and_that_is_said_once(
         with client.session("al") as session:
             # It stores no state for a query that comes after the motion command.
             eventually(lambda: session.wish(pose_at(0.0, 1.0)) and session.latest() is not None)
-            assert session.latest().state.pose[0, 2, 3] == 9.0
+            assert session.latest().pose[0, 2, 3] == 9.0
     said = [record.getMessage() for record in caplog.records if "no key of the server" in record.getMessage()]
     assert len(said) == 1
 

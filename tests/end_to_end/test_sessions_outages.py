@@ -107,14 +107,14 @@ def test_a_session_goes_on_with_a_server_that_was_restarted(endpoint):
 
 def keep_wishing(session, wish, first):
     """Send motion commands until the server replies, as a viewer does; the very first gives a pose."""
-    before = session.latest().state.seq if session.latest() else 0
+    before = session.latest().seq if session.latest() else 0
     found = []
 
     def answered():
         session.wish(pose_at(0.25, 1.0)) if first and not found else wish()
         latest = session.latest()
-        if latest is not None and latest.state.seq > before:
-            found.append(latest.state)
+        if latest is not None and latest.seq > before:
+            found.append(latest)
         return len(found) > 5
 
     eventually(answered)
@@ -156,4 +156,4 @@ def test_a_killed_server_leaves_a_log_that_replays(endpoint, tmp_path):
     found = replay(floor_simulation(), records)
     assert found == (200, 200, 0, None, None)
     last = [record for record in records if isinstance(record, FrameRecord)][-1]
-    assert last.said[0].pose == session.latest().state.pose.tobytes()
+    assert last.said[0].pose == session.latest().pose.tobytes()

@@ -107,8 +107,8 @@ def test_users_block_one_another_until_one_of_them_leaves(
                 standing.wait(standing.wish(pose_at(0.0)), DEADLINE)
                 walker.wait(walker.wish(pose_at(-1.5)), DEADLINE)
                 assert walk(walker, 1.0)[0] == pytest.approx(-2 * RADIUS, abs=0.01)
-                assert walker.latest().state.crowd.met == 1
-                assert walker.latest().state.touched[0].what.endswith("/body")
+                assert walker.latest().crowd.met == 1
+                assert walker.latest().touched[0].what.endswith("/body")
                 assert walk(standing, 0.5)[0] == 0.5, "who is met may go on"
                 assert walk(walker, 1.0)[0] == pytest.approx(0.5 - 2 * RADIUS, abs=0.01)
             one.close()

@@ -14,6 +14,7 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
+from ..schemas.archive.pose_arrays import make_poses, one_pose
 from ..schemas.errors import BadRequestError, BusyError, InternalError, SolidcloudError, TooLargeError
 from ..schemas.wire import key_expressions
 from ..schemas.wire.answers import Cost, Part, Verdict
@@ -23,7 +24,7 @@ from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_pat
 from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.question_table import QUESTIONS
 from ..schemas.wire.request_limits import MAX_POSES
-from ..schemas.wire.requests import has_tolerance_or_budget, make_poses, make_positions
+from ..schemas.wire.requests import QuestionOptions, has_tolerance_or_budget, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
 from .scene_interface import QueryMethods
@@ -67,6 +68,8 @@ class Client(QueryMethods):
     unanswered: number of poses, rays, points, motions and objects so far that are `UNKNOWN` because
     no server answered.
     """
+
+    known_options = QuestionOptions.__optional_keys__
 
     def __init__(
         self,
@@ -153,6 +156,8 @@ class Client(QueryMethods):
         listed as `UNKNOWN`.
         """
         fields = request_fields(question, arguments, options)
+        if not self.known_options.issuperset(options):
+            self.refuse_options(question, options)
         return self._ask_in_batches(question, fields, options)
 
     def _ask_in_batches(
@@ -205,15 +210,16 @@ class Client(QueryMethods):
             self.unanswered += count
 
     def move(self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS) -> Moved:
-        """Return the pose that an avatar reaches from one pose (1, 4, 4) to another in a frame.
+        """Return the pose that an avatar reaches from one pose to another in a frame.
 
+        pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world.
         The scene's effects apply, and nothing is stored. seconds: duration of the frame. If no
         server answers, the result is `pose_from` with the verdict `UNKNOWN`.
         """
         request = MoveRequest(
             avatar=name,
-            pose_from=make_poses(pose_from, "pose_from"),
-            pose_to=make_poses(pose_to, "pose_to"),
+            pose_from=one_pose(pose_from, "pose_from")[None],
+            pose_to=one_pose(pose_to, "pose_to")[None],
             seconds=float(seconds),
         )
         payload = self._connection.ask_about("move", encode(request), [name])
@@ -227,8 +233,8 @@ class Client(QueryMethods):
     def path(self, name: str, poses: Any, op: str = "collide", **parameters: Any) -> Iterator[Part]:
         """Answer `op` (collide, distance, contacts, sweep) along up to 100,000 poses, in a request.
 
-        name: of the avatar.  poses: (k, 4, 4), avatar to world. A sweep has k - 1 motions, each
-        from one pose to the next.
+        name: of the avatar.  poses: (k, 4, 4) or (4, 4), avatar to world. A sweep has k - 1
+        motions, each from one pose to the next.
         parameters: of `op` besides the poses, including tolerance and budgets; `budget_ms` is for
         the whole path.
         Yield answers for items [first, first + n) of `total` as they arrive, in order and without

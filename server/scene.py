@@ -17,6 +17,7 @@ from ..schemas.wire.stats import StatsAnswer
 from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats
+from .avatars.client_avatars import check_owner
 from .observability.request_stats import RequestStats
 from .queries.context.query_context import SceneData
 from .residency.voxel_cache import VoxelCache
@@ -262,8 +263,9 @@ class Scene(SceneQuestions):
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
-        """Return the pose that an avatar reaches from one pose (1, 4, 4) to another in a frame.
+        """Return the pose that an avatar reaches from one pose to another in a frame.
 
+        pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world.
         seconds: duration of the frame. Nothing is stored. See `Simulation.move`.
         """
         return self.simulation.move(name, pose_from, pose_to, seconds, client=client, stop=stop)
@@ -274,6 +276,7 @@ class Scene(SceneQuestions):
         It takes motion commands and returns the resulting states. Each command is simulated in a
         separate frame. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
         """
+        check_owner(client)
         return LocalSession(self.simulation, User(client, check_name(avatar, "avatar of a session")))
 
     def drop_client(self, client: str) -> None:

@@ -6,7 +6,7 @@ numba.
 """
 
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from typing import Any, NamedTuple, NoReturn, Protocol, Self, TypeVar, Unpack
@@ -27,9 +27,9 @@ from ..schemas.wire.answers import (
 )
 from ..schemas.wire.key_expressions import User
 from ..schemas.wire.motion_messages import Moved, State, Wish
-from ..schemas.wire.question_rules import Question
+from ..schemas.wire.question_rules import Question, suggestion_for
 from ..schemas.wire.question_table import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
-from ..schemas.wire.requests import QuestionOptions
+from ..schemas.wire.requests import DEFAULT_REACH, QuestionOptions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
 from .runtime.stop_flag import StopFlag
@@ -56,10 +56,17 @@ class QueryOptions(QuestionOptions, total=False):
 class QueryMethods:
     """The queries that have one answer each. `Scene` and `Client` implement `ask`.
 
-    name: of an avatar.  poses: (k, 4, 4) float64, avatar to world.  margin: distance below which
-    two spheres count as in contact [m].  reach: farthest distance worth reporting [m].
+    name: of an avatar.
+    poses: one (4, 4) or many (k, 4, 4) float64, avatar to world; one is a batch of one, and its
+    answers have length 1. `solidcloud.poses` makes poses from quaternions, angles and rotations,
+    and from rotations of float32 numbers, which are rounded too far to be accepted.
+    margin: distance below which two spheres count as in contact [m].
+    reach: farthest distance worth reporting [m].
     options: tolerance [m], budget_ms, budget_visits and radius_model, as in WIRE.md.
     """
+
+    # Names of the options that `ask` takes.
+    known_options: frozenset[str] = QueryOptions.__optional_keys__
 
     def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A:
         """Answer a question.
@@ -69,6 +76,15 @@ class QueryMethods:
         """
         raise NotImplementedError
 
+    def refuse_options(self, question: Question[Any], options: Mapping[str, Any]) -> NoReturn:
+        """Raise TypeError for the options that are not known, and suggest one that is."""
+        takes = [*question.parameters, *sorted(self.known_options)]
+        name = next(name for name in options if name not in self.known_options)
+        raise TypeError(
+            f"{type(self).__name__}.{question.name}() got an unexpected keyword argument {name!r}: "
+            f"{suggestion_for(name, takes)}it takes {', '.join(takes)}"
+        )
+
     def collide(
         self, name: str, poses: Any, margin: float = 0.0, **options: Unpack[QueryOptions]
     ) -> CollideAnswers:
@@ -76,9 +92,12 @@ class QueryMethods:
         return self.ask(COLLIDE, name, poses, margin, **options)
 
     def distance(
-        self, name: str, poses: Any, reach: float, **options: Unpack[QueryOptions]
+        self, name: str, poses: Any, reach: float = DEFAULT_REACH, **options: Unpack[QueryOptions]
     ) -> DistanceAnswers:
-        """Measure for k poses the distance from an avatar to the scene, up to `reach`."""
+        """Measure for k poses the distance from an avatar to the scene, up to `reach`: 1 m.
+
+        A larger reach takes more time, and loads more of the archive.
+        """
         return self.ask(DISTANCE, name, poses, reach, **options)
 
     def contacts(
@@ -101,7 +120,10 @@ class QueryMethods:
         margin: float = 0.0,
         **options: Unpack[QueryOptions],
     ) -> SweepAnswers:
-        """Find for k motions between two poses the first contact of an avatar with the scene."""
+        """Find for k motions between two poses the first contact of an avatar with the scene.
+
+        pose_from, pose_to: equally many, as `poses`.
+        """
         return self.ask(SWEEP, name, pose_from, pose_to, margin, **options)
 
     def raycast(
@@ -122,7 +144,7 @@ class QueryMethods:
     ) -> ObjectsAnswers:
         """Test avatars against the scene and against each other.
 
-        objects: (name, pose (4, 4), group = 1, mask = all bits) each.
+        objects: (name, pose, group = 1, mask = all bits) each, a pose (4, 4) or (1, 4, 4).
         """
         return self.ask(OBJECTS, objects, margin, **options)
 
@@ -189,8 +211,12 @@ class LatestState(State, frozen=True, eq=False, kw_only=True):
     age: time since it arrived [s].
     """
 
-    state: State
     age: float
+
+    @classmethod
+    def of(cls, state: State, age: float) -> Self:
+        """Return a state with its age."""
+        return cls(**structs.asdict(state), age=age)
 
 
 class ServedSimulation(Protocol):
@@ -213,11 +239,6 @@ class ServedSimulation(Protocol):
 
 
 class ServedScene(Protocol):
-    @classmethod
-    def of(cls, state: State, age: float) -> Self:
-        """Return a state with its age."""
-        return cls(**structs.asdict(state), age=age)
-
     """Scene that answers a server's requests, or refuses them with a SolidcloudError. Thread-safe.
 
     `ask`, `path` and `move` take the parameters of the same methods of `Scene`. Each calls

@@ -1,20 +1,26 @@
 """Check that a pose is rigid: a rotation and a translation (NUMERICS.md N6).
 
 It applies to poses of archives, of objects, of users in frames, and in scene files. Poses of
-queries
-may also scale: a kernel checks thousands of them (server/kernels/core/voxels_in_reach.py).
+queries may also scale: a kernel checks thousands of them (server/kernels/core/voxels_in_reach.py).
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..errors import BadRequestError, BadTransformError
+from .pose_arrays import one_pose
 from .voxel_grid import MAX_COORDINATE
 
 # Largest deviation of a rotation's Gram matrix from the identity.
 RIGID_TOLERANCE = 1e-9
+# Advice about a rotation that is off by rounding; those of float32 numbers are off by about 1e-7.
+RENORMALISE = "solidcloud.poses.renormalise returns the nearest rotation"
+# Largest deviation of a Gram matrix for which that advice is given; beyond it, the pose is a
+# mistake.
+_ROUNDED = 1e-2
 
 
 def gram(pose: Sequence[Sequence[float]]) -> list[list[float]]:
@@ -38,9 +44,10 @@ def rigid_fault(pose: Sequence[Sequence[float]], tolerance: float = RIGID_TOLERA
         reason = "it mirrors"
     else:
         return None
+    advice = f": {RENORMALISE}" if reason.startswith("off") and np.max(off) <= _ROUNDED else ""
     return (
         f"not rigid, {reason}: expected a row-major 4x4 pose of a rotation, within {tolerance:g}, and a "
-        "translation, last row 0 0 0 1"
+        f"translation, last row 0 0 0 1{advice}"
     )
 
 
@@ -54,15 +61,13 @@ def check_rigid(
     return pose
 
 
-def rigid_pose(pose: ArrayLike, where: str, tolerance: float = RIGID_TOLERANCE) -> NDArray[np.float64]:
-    """Return a copy (4, 4) of a rigid pose, after checking it.
+def rigid_pose(pose: Any, where: str, tolerance: float = RIGID_TOLERANCE) -> NDArray[np.float64]:
+    """Return a copy (4, 4) of a rigid pose, given as (4, 4) or (1, 4, 4), after checking it.
 
     where: start of error messages. Raises BadRequestError for a wrong shape, a number that is not
     finite or a translation of over 1e9 m, BadTransformError for a pose that is not rigid.
     """
-    array = np.array(pose, np.float64, order="C")
-    if array.shape != (4, 4):
-        raise BadRequestError(f"{where}: shape {array.shape}: expected 4 rows of 4 numbers")
+    array = one_pose(pose, where).copy()
     if not np.isfinite(array).all() or np.abs(array[:3, 3]).max() > MAX_COORDINATE:
         raise BadRequestError(f"{where}: expected finite numbers, and a translation within 1e9 m")
     return check_rigid(array, where, tolerance)

@@ -36,8 +36,9 @@ def check_name(name: str, what: str) -> str:
 
     what: noun for the name in the error message, such as "scene".
     """
-    if not _NAME.fullmatch(name):
-        raise BadRequestError(f"{what} {name!r}: expected 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'")
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        found = repr(name[:80]) if isinstance(name, str) else f"named by a {type(name).__name__}"
+        raise BadRequestError(f"{what} {found}: expected 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'")
     return name
 
 

@@ -5,17 +5,18 @@ if the scene does not declare the effect.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from ..archive.pose_arrays import make_poses, one_pose
 from ..errors import BadRequestError
 from .answers import Verdict
 from .arrays import Poses
 from .request_limits import MAX_FRAME_SECONDS
-from .requests import Count, Length, Name, Request, check_one_pose, make_poses
+from .requests import Count, Length, Name, Request, check_one_pose
 
 Vector = tuple[float, float, float]
 
@@ -88,13 +89,23 @@ def motion_fields(pose: Any, velocity: Any) -> tuple[Poses, Vector | None]:
     """Return pose and velocity of a motion command as the fields of a `Wish`.
 
     pose: (4, 4) or (1, 4, 4), or None.  velocity: 3 numbers [m/s], or None.
-    Raise BadRequestError unless a velocity has 3 numbers.
+    Raise BadRequestError for a pose of another shape, or unless a velocity has 3 numbers.
     """
-    poses = np.empty((0, 4, 4)) if pose is None else np.asarray(pose, np.float64).reshape(-1, 4, 4)
+    poses = np.empty((0, 4, 4)) if pose is None else one_pose(pose)[None]
     speed = None if velocity is None else tuple(float(part) for part in velocity)
     if speed is not None and len(speed) != 3:
         raise BadRequestError(f"velocity of {len(speed)} numbers: expected 3 [m/s]")
-    return np.ascontiguousarray(poses), speed
+    return poses, speed
+
+
+def object_poses(objects: Mapping[str, Any] | None) -> dict[str, list[list[float]]]:
+    """Return the poses of objects, (4, 4) or (1, 4, 4) each, as the field of a `Wish`.
+
+    Raise BadRequestError for a pose of another shape.
+    """
+    return {
+        name: one_pose(pose, f"pose of object {name!r}").tolist() for name, pose in (objects or {}).items()
+    }
 
 
 class Touched(msgspec.Struct, frozen=True, omit_defaults=True):

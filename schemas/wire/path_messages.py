@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from ..errors import BadRequestError
 from .answers import Cost
 from .arrays import Poses, array_fields
-from .question_rules import Rows
+from .question_rules import Rows, suggestion_for
 from .question_table import path_questions, question_of
 from .request_limits import MAX_CONTACTS
 from .requests import Count, Duration, Length, ModelName, Name, QuestionRequest, Request
@@ -26,8 +26,8 @@ class PathRequest(Request, frozen=True):
     avatar: the name under which it was added.  poses: (k, 4, 4) float64, at most 100,000.
     op: "collide", "distance", "contacts" or "sweep"; a sweep has k - 1 motions, each from one pose
     to the next.
-    The other parameters are null if `op` does not take them, or for their default. "distance"
-    requires `reach`. `budget_ms` limits the whole path.
+    The other parameters are null if `op` does not take them, or for their default. `budget_ms`
+    limits the whole path.
     """
 
     avatar: Name
@@ -70,7 +70,8 @@ def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
     for name in parameters:
         if name not in taken:
             raise BadRequestError(
-                f"{name} is not a parameter of {op} along a path: it takes {', '.join(taken)}"
+                f"{name} is not a parameter of {op} along a path: {suggestion_for(name, taken)}it takes "
+                f"{', '.join(taken)}"
             )
     for name in own.required:
         if name in own.parameters and parameters.get(name) is None:

@@ -7,6 +7,7 @@ tests of WIRE.md. No numba here. The functions that answer are in server/queries
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from enum import Enum, auto
 from functools import cache, cached_property
 from itertools import pairwise
@@ -16,10 +17,11 @@ import numpy as np
 from msgspec.structs import fields as struct_fields
 from numpy.typing import NDArray
 
+from ..archive.pose_arrays import make_poses
 from ..errors import BadRequestError, InternalError
 from .answers import Cost, Verdict
 from .arrays import ArrayType, Poses, array_fields
-from .requests import Length, QuestionRequest, make_objects, make_poses, make_vectors
+from .requests import Length, QuestionRequest, make_objects, make_vectors
 
 A = TypeVar("A", bound=Cost)
 
@@ -145,7 +147,7 @@ class Question(Generic[A]):
         return tuple(name for name in self.fields if not (name == "poses" and "objects" in self.fields))
 
     @cached_property
-    def _defaults(self) -> dict[str, Any]:
+    def defaults(self) -> dict[str, Any]:
         """Return the defaults of the request's fields."""
         return {field.name: field.default for field in struct_fields(self.request) if not field.required}
 
@@ -153,12 +155,12 @@ class Question(Generic[A]):
     def other_defaults(self) -> dict[str, Any]:
         """Return the defaults that differ from those of `QuestionRequest`."""
         usual = {field.name: field.default for field in struct_fields(QuestionRequest)}
-        return {name: self._defaults[name] for name in usual if self._defaults[name] != usual[name]}
+        return {name: self.defaults[name] for name in usual if self.defaults[name] != usual[name]}
 
     @cached_property
     def required(self) -> tuple[str, ...]:
         """Return the names in `fields` that have no default."""
-        return tuple(name for name in self.fields if name not in self._defaults)
+        return tuple(name for name in self.fields if name not in self.defaults)
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -196,7 +198,7 @@ class Question(Generic[A]):
         names = self.arguments
         if len(given) == len(names):
             return given
-        rest = [named.pop(name, self._defaults.get(name, given)) for name in names[len(given) :]]
+        rest = [named.pop(name, self.defaults.get(name, given)) for name in names[len(given) :]]
         if len(given) > len(names) or any(value is given for value in rest):
             raise TypeError(f"{self.name}: expected the arguments {', '.join(names)}")
         return (*given, *rest)
@@ -220,7 +222,7 @@ class Question(Generic[A]):
         name, row_bytes = self.listed
         rows = given.get(name)
         if rows is None:
-            rows = self._defaults[name]
+            rows = self.defaults[name]
         return min(most, max(1, most_bytes // (row_bytes * max(1, rows))))
 
     def unknown(self, k: int, *, bounded: bool = True) -> A:
@@ -339,6 +341,12 @@ def request_fields(
         if a != b:
             raise BadRequestError(f"{a} {first} and {b} {second}: expected equal numbers")
     return fields
+
+
+def suggestion_for(name: str, names: Sequence[str]) -> str:
+    """Return a question that suggests the valid name nearest to a wrong one; "" if none is near."""
+    close = get_close_matches(name, names, 1)
+    return f"did you mean {close[0]!r}? " if close else ""
 
 
 @cache

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypedDict, get_type_hints
 import msgspec
 import numpy as np
 
+from ..archive.pose_arrays import float64_array, one_pose
 from ..archive.radius_model import parse_radius_model
 from ..errors import BadRequestError, TooLargeError
 from .arrays import Poses, Positions
@@ -26,7 +27,9 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
 ModelName = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
 
-_FLOAT64 = np.dtype("<f8")
+# Default of DistanceRequest's `reach` [m]. A constant, and not derived from the scene, so that
+# answers do not depend on what is in memory.
+DEFAULT_REACH = 1.0
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -121,7 +124,7 @@ class DistanceRequest(QuestionRequest, frozen=True):
 
     avatar: Name
     poses: Poses
-    reach: Length
+    reach: Length = DEFAULT_REACH
 
 
 class ContactsRequest(QuestionRequest, frozen=True):
@@ -237,7 +240,7 @@ def make_vectors(vectors: Any, what: str) -> Positions:
 
     what: name of the vectors, for messages. Raises BadRequestError.
     """
-    array = _as_float64(what, vectors)
+    array = float64_array(vectors, what)
     if array.ndim != 2 or array.shape[1] != 3:
         raise BadRequestError(f"{what} of shape {array.shape}: expected (n, 3)")
     try:
@@ -247,28 +250,16 @@ def make_vectors(vectors: Any, what: str) -> Positions:
     return array  # type: ignore[return-value]
 
 
-def make_poses(poses: Any, what: str = "poses") -> Poses:
-    """Convert poses to the wire's array type: (k, 4, 4) float64. Raises BadRequestError.
-
-    what: name of the poses, for messages. Only the shape is checked here; the server checks that
-    poses are rigid.
-    """
-    array = _as_float64(what, poses)
-    if array.ndim != 3 or array.shape[1:] != (4, 4):
-        raise BadRequestError(f"{what} of shape {array.shape}: expected (k, 4, 4), avatar to world")
-    return array  # type: ignore[return-value]
-
-
 def check_one_pose(what: str, poses: Poses) -> None:
     """Raise BadRequestError unless there is exactly one pose."""
     if poses.shape != (1, 4, 4):
-        raise BadRequestError(f"{what} of shape {poses.shape}: expected (1, 4, 4), avatar to world")
+        raise BadRequestError(f"{what} of shape {poses.shape}: expected one pose, (1, 4, 4), avatar to world")
 
 
 def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectEntry], Poses]:
     """Convert objects and their poses to the wire's types.
 
-    objects: (name, pose, group = 1, mask = all groups), poses (4, 4) float64.
+    objects: (name, pose, group = 1, mask = all groups), each pose (4, 4) or (1, 4, 4).
     Raises BadRequestError naming an invalid object, TooLargeError for more than `MAX_OBJECTS`.
     """
     _check_count(objects)
@@ -279,9 +270,10 @@ def make_objects(objects: Sequence[Sequence[Any]]) -> tuple[list[ObjectEntry], P
                 f"object {number} of {len(entry)} values: expected name, pose and optionally group and mask"
             )
         items.append(ObjectEntry(entry[0], *(_as_bits(number, value) for value in entry[2:])))
-    if not items:
-        return items, make_poses(np.zeros((0, 4, 4)))
-    return items, make_poses([entry[1] for entry in objects])
+    poses = np.empty((len(items), 4, 4))
+    for number, entry in enumerate(objects):
+        poses[number] = one_pose(entry[1], f"pose of object {number}")
+    return items, poses  # type: ignore[return-value]
 
 
 def _check_count(objects: Sequence[Any]) -> None:
@@ -306,16 +298,12 @@ def check_finite(name: str, array: np.ndarray) -> None:
         raise ValueError(f"{name}{where} is {array[tuple(where)]}, expected finite numbers")
 
 
-def _as_float64(name: str, values: Any) -> np.ndarray:
-    """Return numbers as a C-ordered little-endian float64 array, or raise BadRequestError."""
-    try:
-        return np.ascontiguousarray(values, _FLOAT64)
-    except (TypeError, ValueError) as error:
-        raise BadRequestError(f"{name}: {error}: expected an array of numbers") from None
-
-
-def _check_name(_: str, name: str) -> None:
-    """Raise BadRequestError for an avatar name that is empty or too long."""
+def check_avatar_name(name: Any) -> None:
+    """Raise BadRequestError for an avatar name that is no string, empty or too long."""
+    if not isinstance(name, str):
+        raise BadRequestError(
+            f"avatar named by a {type(name).__name__}: expected a string of 1 to {MAX_NAME_LENGTH} characters"
+        )
     if not 1 <= len(name) <= MAX_NAME_LENGTH:
         raise BadRequestError(
             f"avatar {name[:64]!r} of {len(name)} characters: expected 1 to {MAX_NAME_LENGTH}"
@@ -366,7 +354,7 @@ def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
     for name, hint in get_type_hints(kind, include_extras=True).items():
         kinds = {hint, *getattr(hint, "__args__", ())}
         if Name in kinds:
-            found.append((name, _check_name))
+            found.append((name, lambda _, value: check_avatar_name(value)))
         elif ModelName in kinds:
             found.append((name, _check_model))
         elif Length in kinds:

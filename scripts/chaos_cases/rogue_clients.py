@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import zenoh
 from rogue_cases.rogue_attacks import widths, zeros
+from solidcloud.schemas.archive.pose_arrays import make_poses
 from solidcloud.schemas.wire import key_expressions
 from solidcloud.schemas.wire.encoding import MSGPACK, encode
-from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, ContactsRequest, make_poses
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, ContactsRequest
 from solidcloud.server.zenoh_common.zenoh_settings import session_config
 
 from .fixtures import SCENE

@@ -1,9 +1,10 @@
 """Collision detection with scanned point clouds: the public names of `import solidcloud`.
 
-`open` and `Scene` answer in this process, `connect` and `Client` over zenoh. Each name is imported
-when it is first used: `import solidcloud` alone loads no library, and `Client` loads neither numba
-nor h5py. Setuptools installs this file as the package `solidcloud`, to which its imports are
-relative. May import server/client.py, server/scene.py, schemas.
+`open` and `Scene` answer in this process, `connect` and `Client` over zenoh. `poses` makes poses
+from quaternions, Euler angles and rotations. Each name is imported when it is first used: `import
+solidcloud` alone loads no library, and `Client` loads neither numba nor h5py. Setuptools installs
+this folder as the package `solidcloud`, to which its imports are relative. May import
+server/client.py, server/scene.py, schemas.
 """
 
 import importlib
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from . import poses
     from .schemas.errors import (
         BadDataError,
         BadRequestError,
@@ -57,12 +59,14 @@ __all__ = [
     "__version__",
     "connect",
     "open",
+    "poses",
 ]
 
 _MODULES = {
     "Client": ".server.client",
     "Scene": ".server.scene",
     "Verdict": ".schemas.wire.answers",
+    "poses": ".poses",
     **{name: ".schemas.errors" for name in __all__ if name.endswith("Error")},
 }
 
@@ -97,7 +101,8 @@ def __getattr__(name: str) -> Any:
 
         value: Any = metadata.version("solidcloud")
     elif name in _MODULES:
-        value = getattr(importlib.import_module(_MODULES[name], __name__), name)
+        module = importlib.import_module(_MODULES[name], __name__)
+        value = module if name == "poses" else getattr(module, name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

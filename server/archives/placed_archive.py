@@ -173,14 +173,18 @@ class ArchiveGeneration:
     def record_user(self, user: User, avatar: AvatarModel, poses: Any, around: float) -> bool:
         """Record the position of a user: the last of at most _MAX_USER_POSES poses of its avatar.
 
-        poses: (k, 4, 4), avatar to archive, not checked yet.
+        poses: (k, 4, 4) or (4, 4), avatar to archive, not checked yet.
         around: margin or reach, in addition to the radii of avatar and scan [m].
         Return whether the voxels in reach are used in passing (`QueryBudget.scan`), because there
         are more poses or the user teleported.
         """
         # A request with other arguments will be refused, or has no voxels to prefetch.
-        if not isinstance(poses, np.ndarray) or poses.dtype != _FLOAT64 or poses.shape[1:] != (4, 4):
+        if not isinstance(poses, np.ndarray) or poses.dtype != _FLOAT64:
             return False
+        if poses.shape[1:] != (4, 4):
+            if poses.shape != (4, 4):
+                return False
+            poses = poses[None]
         if not len(poses) or not len(avatar.points):
             return False
         if not isinstance(around, _NUMBER) or not 0 <= around <= _MAX_AROUND:

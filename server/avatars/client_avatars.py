@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
 from ...schemas.wire.encoding import avatar_digest
-from ...schemas.wire.requests import make_positions
+from ...schemas.wire.key_expressions import check_name
+from ...schemas.wire.requests import check_avatar_name, make_positions
 from ...schemas.wire.stats import AvatarStats
 from ..scene_interface import EVERYBODY, THIS_PROCESS, AvatarLimits, record_avatar
 from .avatar_model import AvatarModel, make_avatar
@@ -51,6 +52,16 @@ class _Entry:
         self.used = time.monotonic()
 
 
+def check_owner(client: str) -> None:
+    """Raise BadRequestError unless an avatar's owner is a client, this process or the product itself.
+
+    Owners that begin with "*", such as `EVERYBODY`, are of the product, and cannot be those of
+    clients.
+    """
+    if client != THIS_PROCESS and not str(client).startswith(EVERYBODY):
+        check_name(client, "client")
+
+
 class Avatars:
     """Avatars by client and name. Thread-safe.
 
@@ -69,24 +80,31 @@ class Avatars:
     def get(self, name: str, client: str) -> AvatarModel:
         """Return an avatar of a client or of the scene, and record its use.
 
-        Raise UnknownAvatarError.
+        Raise UnknownAvatarError, or BadRequestError for names that no avatar or client can have.
         """
-        with self._lock:
-            for owner in (client, EVERYBODY):
-                entry = self._clients.get(owner, {}).get(name)
-                if entry is not None and entry.model is not None:
-                    entry.used = time.monotonic()
-                    record_avatar(entry.model.digest)
-                    return entry.model
+        try:
+            with self._lock:
+                for owner in (client, EVERYBODY):
+                    entry = self._clients.get(owner, {}).get(name)
+                    if entry is not None and entry.model is not None:
+                        entry.used = time.monotonic()
+                        record_avatar(entry.model.digest)
+                        return entry.model
+        except TypeError:  # an array given as a name has no hash
+            check_avatar_name(name)
+        check_avatar_name(name)
+        check_owner(client)
         raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
 
     def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
         """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
 
         radius: as for `make_avatar`. An avatar with the name of a scene avatar must equal it, and
-        shares its arrays. Raise BadRequestError if the name belongs to a different avatar,
+        shares its arrays. Raise BadRequestError if a name is invalid or belongs to a different avatar,
         TooLargeError beyond the limits.
         """
+        check_avatar_name(name)
+        check_owner(client)
         array = make_positions(points)
         shared = None if client == EVERYBODY else self._scene_avatar(name)
         if shared is not None:

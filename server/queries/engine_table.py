@@ -79,7 +79,9 @@ def warm_engines(data: SceneData, place: Sequence[float]) -> None:
     for budget in (EXACT, *limits):
         collide(data, avatar, poses, 0.0, budget)  # several poses use other kernels than one pose
         for question in (one for one in QUESTIONS.values() if not one.whole):
-            arguments = [samples[name] for name in question.arguments if name in question.required]
+            arguments = [
+                samples[name] for name in question.arguments if name in question.required or name in samples
+            ]
             tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
             ENGINES[question.name](data, *arguments, budget=budget._replace(tolerance=tolerance))
         objects(data, [avatar, avatar], poses, groups, groups, budget=budget)

@@ -77,7 +77,7 @@ def path_question(
     budget = make_budget(tolerance, **budgets, stop=stop)._replace(scan=True, share=0.5)
     poses = kernel_poses(poses)  # copied here at most once, so that no part copies its poses
     around = next(name for name in question.parameters if name in ("margin", "reach"))
-    other = to_units(given.get(around, 0.0), around)
+    other = to_units(given.setdefault(around, question.defaults[around]), around)
     scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(

@@ -10,10 +10,11 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import ArrayLike
 
+from ...schemas.archive.pose_arrays import make_poses
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.question_rules import Question
-from ...schemas.wire.requests import make_objects, make_poses, make_vectors
+from ...schemas.wire.requests import make_objects, make_vectors
 from ..archives.ask_archives import PathParts, PreparedQuery, Rows, ask_along, ask_each, make_legs, rows_of
 from ..archives.merge_answers import limit_pairs
 from ..archives.placed_archive import ArchiveGeneration, PlacedArchive
@@ -75,6 +76,8 @@ class SceneQuestions(QueryMethods):
         """
         complete = len(arguments) == len(question.arguments)
         given = arguments if complete else question.all_arguments(arguments, options)
+        if options and not self.known_options.issuperset(options):
+            self.refuse_options(question, options)
         if question.other_defaults:
             options = question.other_defaults | options
         if self._alone is None or question.whole:
@@ -97,7 +100,7 @@ class SceneQuestions(QueryMethods):
             try:
                 answers: _A = ENGINES[question.name](data, *subject, budget=budget)
             except StoppedError:
-                answers = unknown_answers(question, _count(rows), budget)
+                answers = unknown_answers(question, _count(question, rows), budget)
             else:
                 if budget.stop:
                     answers = structs.replace(answers, stopped=budget.stop.reason)
@@ -211,9 +214,10 @@ class SceneQuestions(QueryMethods):
         stop: StopFlag = NO_STOP,
         **parameters: Any,
     ) -> Iterator[Part]:
-        """Answer `op` (collide, distance, contacts, sweep) along poses (k, 4, 4), in ordered parts.
+        """Answer `op` (collide, distance, contacts, sweep) along poses, in ordered parts.
 
-        name: of the avatar.  op: a sweep has k - 1 motions, from each pose to the next.
+        name: of the avatar.  poses: (k, 4, 4) or (4, 4), avatar to world.
+        op: a sweep has k - 1 motions, from each pose to the next.
         threads: parts computed at a time.  client: owner of the avatar.
         parameters: of `op` besides the poses, including tolerance and budgets. `budget_ms` is for
         the whole path.
@@ -260,6 +264,8 @@ def _terms(
     return with_stop(data, budget.stop), budget
 
 
-def _count(rows: ArrayLike) -> int:
-    """Return the number of rows of an argument; 0 for one that has no length."""
+def _count(question: Question[Any], rows: ArrayLike) -> int:
+    """Return the number of items of an argument; 0 for one that has no length."""
+    if question.about_avatars:
+        return len(make_poses(rows))
     return len(rows) if isinstance(rows, Sized) else 0

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError
 from ...schemas.wire.key_expressions import User
-from ...schemas.wire.motion_messages import State, Wish, motion_fields
+from ...schemas.wire.motion_messages import State, Wish, motion_fields, object_poses
 from ..scene_interface import FrameCommand, LatestState
 from .simulation import Simulation
 
@@ -59,19 +59,21 @@ class LocalSession:
         velocity: Any = None,
         turn: float = 0.0,
         *,
-        objects: Mapping[str, list[list[float]]] | None = None,
+        objects: Mapping[str, Any] | None = None,
         time: float | None = None,
     ) -> int:
         """Simulate one frame with a motion command: either a pose or a velocity.
 
         pose: (4, 4) or (1, 4, 4) float64.  velocity: (3,) [m/s].  turn: with a velocity, about the
-        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves.
+        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves, by
+        name.
         time: of the command, on a clock that does not go backwards [s]; None: this process's clock.
         Return the number of the command, which its state has as `seq`. Raise BadRequestError for an
         invalid command, or if the session is closed. If the frame is refused, `latest`, `wait` and
         `states` raise its error.
         """
         poses, speed = motion_fields(pose, velocity)
+        moved = object_poses(objects)
         with self._commands:
             if not self._open:
                 raise BadRequestError(
@@ -84,7 +86,7 @@ class LocalSession:
                 pose=poses,
                 velocity=speed,
                 turn=float(turn),
-                objects=dict(objects or {}),
+                objects=moved,
             )
             self._seq = wish.seq
             (outcome,) = self._simulation.step([FrameCommand(self._user, wish)], now)

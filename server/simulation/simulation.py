@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ...schemas.archive.pose_arrays import one_pose
 from ...schemas.archive.rigid_pose import check_rigid
 from ...schemas.errors import (
     BadRequestError,
@@ -28,7 +29,6 @@ from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
 from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest, State, Wish
-from ...schemas.wire.requests import make_poses
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
@@ -147,16 +147,17 @@ class Simulation:
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
-        """Move avatar `name` from one pose (1, 4, 4) towards another for one frame; keep no state.
+        """Move avatar `name` from one pose towards another for one frame; keep no state.
 
+        pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world, rigid.
         seconds: duration of the frame [s].  stop: ends the frame early: the avatar stays, and its
         verdict is unknown.
         Raises BadRequestError, BadTransformError, UnknownAvatarError.
         """
         request = MoveRequest(
             avatar=name,
-            pose_from=make_poses(pose_from, "pose_from"),
-            pose_to=make_poses(pose_to, "pose_to"),
+            pose_from=one_pose(pose_from, "pose_from")[None],
+            pose_to=one_pose(pose_to, "pose_to")[None],
             seconds=float(seconds),
         )
         user = User(client, name)

@@ -8,7 +8,7 @@ import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
@@ -25,7 +25,7 @@ from ...schemas.errors import (
 )
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer, encode
-from ...schemas.wire.motion_messages import State, Wish, motion_fields
+from ...schemas.wire.motion_messages import State, Wish, motion_fields, object_poses
 from ...schemas.wire.scene_messages import ErrorReply
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
@@ -188,19 +188,21 @@ class ClientSession:
         velocity: Any = None,
         turn: float = 0.0,
         *,
-        objects: dict[str, list[list[float]]] | None = None,
+        objects: Mapping[str, Any] | None = None,
         time: float | None = None,
     ) -> int:
         """Send a motion command with either a pose or a velocity; return its number.
 
         pose: (4, 4) or (1, 4, 4) float64.  velocity: (3,) [m/s].  turn: with a velocity, about the
-        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves.
+        scene's up axis [rad/s].  objects: poses of the scene's objects that this user moves, by
+        name.
         time: of the command, on a clock that does not go backwards [s]; None: this process's clock.
         The state that results has the number as `seq`. Without a server, the command is lost and no
         states arrive. The last command is sent again every second, for at most 5 s, until its state
         arrives. Raise BadRequestError for an invalid command, or if the session is closed.
         """
         poses, speed = motion_fields(pose, velocity)
+        moved = object_poses(objects)
         with self._publishing:
             wish = Wish(
                 seq=self._numbers.next(),
@@ -208,7 +210,7 @@ class ClientSession:
                 pose=poses,
                 velocity=speed,
                 turn=float(turn),
-                objects=objects or {},
+                objects=moved,
             )
             self._publish(wish)
             self._sent, self._time = self._published, wish.time

@@ -50,7 +50,9 @@ def query(
     margin: Annotated[
         float | None, typer.Option(help="Gap up to which two spheres count as in contact [m]; default 0.")
     ] = None,
-    reach: Annotated[float | None, typer.Option(help="Maximum distance to report [m].")] = None,
+    reach: Annotated[
+        float | None, typer.Option(help="Maximum distance to report [m]; distance: 1 by default.")
+    ] = None,
     limit: Annotated[
         int | None, typer.Option(help="Contacts listed per pose, deepest first; default 100.")
     ] = None,

@@ -179,9 +179,18 @@ def _add_body(
     """Add the avatar of a query; return its positions at the poses, or on motions between them."""
     points = read_points(query.given["avatar"])
     radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
-    reach = query.given.get("reach", query.given.get("margin", 0.0))
     ends = (poses[:-1], poses[1:]) if moving else (poses, poses)
-    return BodyPlaces(box_of(points)[None], np.array([radius or 0.0]), reach, *ends)
+    return BodyPlaces(box_of(points)[None], np.array([radius or 0.0]), _around(query), *ends)
+
+
+def _around(query: Query) -> float:
+    """Return the margin or reach of a query, in addition to the radii [m]; 0 if it has neither."""
+    question = QUESTIONS.get(query.along if query.op == "path" else query.op)
+    if question is None or question.around is None:
+        return 0.0
+    name = question.arguments[question.around]
+    around: float = query.given.get(name, question.defaults.get(name, 0.0))
+    return around
 
 
 def _ask_objects(

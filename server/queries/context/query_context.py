@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ....schemas.archive.archive import Archive
+from ....schemas.archive.pose_arrays import make_poses
 from ....schemas.archive.radius_model import class_radii
+from ....schemas.archive.rigid_pose import RENORMALISE
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
-from ....schemas.wire.requests import make_poses
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core import voxels_in_reach as pose_checks
 from ...kernels.core.scene_arrays import SceneArrays, block_words
@@ -49,7 +50,7 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     pose_checks.SHEARED: (
         BadTransformError,
         "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
-        "most, within 1e-9: renormalise it",
+        f"most, within 1e-9: {RENORMALISE}",
     ),
     pose_checks.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
     pose_checks.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
@@ -96,7 +97,7 @@ class SceneData(NamedTuple):
 
 
 def kernel_poses(poses: ArrayLike) -> NDArray[np.float64]:
-    """Return poses (k, 4, 4) in a writable array. Raise BadRequestError.
+    """Return poses, (4, 4) or (k, 4, 4), in a writable array (k, 4, 4). Raise BadRequestError.
 
     numba would compile the kernels again for a read-only array.
     """

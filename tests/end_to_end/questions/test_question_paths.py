@@ -87,7 +87,7 @@ def test_a_bad_pose_far_along_a_path_is_named_before_any_part(scene, client, mon
     [
         ("raycast", {}, "expected one of collide, distance, contacts, sweep"),
         ("collide", {"reach": 1.0}, "reach is not a parameter of collide"),
-        ("distance", {}, "needs reach"),
+        ("distance", {"reech": 1.0}, "did you mean 'reach'"),
         ("distance", {"reach": 1.0, "limit": 3}, "limit is not a parameter of distance"),
         ("sweep", {"margin": -1.0}, "margin"),
         ("collide", {"tolerance": np.inf}, "tolerance"),

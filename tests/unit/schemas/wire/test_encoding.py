@@ -5,6 +5,7 @@ import re
 import msgspec
 import numpy as np
 import pytest
+from solidcloud.schemas.archive.pose_arrays import make_poses
 from solidcloud.schemas.errors import BadRequestError, InternalError, TooLargeError
 from solidcloud.schemas.wire import request_limits
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
@@ -20,7 +21,6 @@ from solidcloud.schemas.wire.question_table import check_answers, make_unknown
 from solidcloud.schemas.wire.requests import (
     AddAvatarRequest,
     CollideRequest,
-    make_poses,
     make_positions,
 )
 from solidcloud.schemas.wire.scene_messages import (
@@ -291,7 +291,7 @@ def test_too_many_points_are_refused_before_they_are_sent():
         make_positions(np.zeros((request_limits.MAX_AVATAR_POINTS + 1, 3)))
 
 
-@pytest.mark.parametrize("poses", [np.eye(4), np.zeros((2, 3, 4)), "text", [[1, 2], [3]]])
+@pytest.mark.parametrize("poses", [np.eye(3), np.zeros((2, 3, 4)), np.zeros(16), "text", [[1, 2], [3]]])
 def test_poses_of_the_wrong_shape_are_refused_before_they_are_sent(poses):
     with pytest.raises(BadRequestError):
         make_poses(poses)

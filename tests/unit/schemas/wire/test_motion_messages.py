@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.motion_messages import motion_fields
+from solidcloud.schemas.wire.motion_messages import motion_fields, object_poses
 
 
 @pytest.mark.parametrize(
@@ -24,3 +24,17 @@ def test_a_velocity_is_three_numbers_and_no_pose():
 def test_a_velocity_of_another_length_is_refused(velocity):
     with pytest.raises(BadRequestError, match=f"velocity of {len(velocity)} numbers: expected 3"):
         motion_fields(None, velocity)
+
+
+@pytest.mark.parametrize("pose", [np.eye(3), np.zeros(16), np.tile(np.eye(4), (2, 1, 1)), "text"])
+def test_what_is_not_one_pose_is_refused(pose):
+    with pytest.raises(BadRequestError, match=r"^pose"):
+        motion_fields(pose, None)
+    with pytest.raises(BadRequestError, match=r"^pose of object 'door'"):
+        object_poses({"door": pose})
+
+
+def test_poses_of_objects_are_lists_of_numbers():
+    given = {"door": np.eye(4), "cart": np.eye(4, dtype=np.float32)[None], "box": np.eye(4).tolist()}
+    assert object_poses(given) == dict.fromkeys(given, np.eye(4).tolist())
+    assert object_poses(None) == {}

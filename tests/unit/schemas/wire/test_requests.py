@@ -9,6 +9,7 @@ from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_request, enco
 from solidcloud.schemas.wire.path_messages import PathRequest
 from solidcloud.schemas.wire.request_limits import MAX_OBJECTS
 from solidcloud.schemas.wire.requests import (
+    AddAvatarRequest,
     CollideRequest,
     ContactsRequest,
     DistanceRequest,
@@ -17,6 +18,7 @@ from solidcloud.schemas.wire.requests import (
     RaycastRequest,
     SweepRequest,
     WithinRequest,
+    check_avatar_name,
     make_objects,
 )
 
@@ -107,6 +109,23 @@ def test_numbers_of_numpys_are_numbers(encoding):
         ContactsRequest("al", POSES, 2.5)
 
 
+def test_a_distance_defaults_to_a_metre():
+    assert DistanceRequest("al", POSES).reach == 1.0
+    raw = msgspec.msgpack.encode({"avatar": "al", "poses": b""})
+    assert decode_request(DistanceRequest, raw).reach == 1.0
+    assert PathRequest("al", POSES, "distance").parameters() == {}
+
+
+@pytest.mark.parametrize("name", ["", "a" * 65, 3, None, VECTORS])
+def test_a_name_that_no_avatar_can_have_is_refused(name):
+    with pytest.raises(BadRequestError, match=r"^avatar .*1 to 64"):
+        check_avatar_name(name)
+    if name is not None:  # which the server refuses, because null is no string
+        with pytest.raises(BadRequestError, match=r"^avatar .*1 to 64"):
+            AddAvatarRequest(name, VECTORS)
+    check_avatar_name("a visitor")
+
+
 def test_a_sweep_defaults_to_a_micrometre():
     assert SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES).tolerance == 1e-6
     assert CollideRequest("al", POSES).tolerance == 0.0
@@ -132,7 +151,7 @@ def test_as_many_of_each_are_expected(kind, values):
 
 def test_objects_as_they_are_given():
     items, poses = make_objects(
-        [("al", POSES[0]), ("bo", POSES[1] * 2, np.uint32(4)), ("al", POSES[2].tolist(), 1, 6)]
+        [("al", POSES[0]), ("bo", POSES[1:2] * 2, np.uint32(4)), ("al", POSES[2].tolist(), 1, 6)]
     )
     assert items == [ObjectEntry("al"), ObjectEntry("bo", 4), ObjectEntry("al", 1, 6)]
     assert np.array_equal(poses, [POSES[0], POSES[1] * 2, POSES[2]])
@@ -144,7 +163,7 @@ def test_objects_as_they_are_given():
     [
         (("al",), "object 0 of 1 values"),
         (("al", POSES[0], 1, 2, 3), "object 0 of 5 values"),
-        (("al", np.eye(3)), "expected .k, 4, 4."),
+        (("al", np.eye(3)), r"pose of object 0 of shape \(3, 3\): expected one pose, \(4, 4\)"),
         (("al", POSES[0], 1.5), "object 0: group or mask 1.5"),
         (("al", POSES[0], -1), "group"),
         (("al", POSES[0], 1, 2**32), "mask"),
@@ -169,7 +188,6 @@ def test_too_many_objects_are_too_large():
     [
         ({"op": "collide", "reach": 1.0}, "reach is not a parameter of collide"),
         ({"op": "sweep", "limit": 3}, "limit is not a parameter of sweep"),
-        ({"op": "distance"}, "needs reach"),
         ({"op": "distance", "reach": 1.0, "margin": 0.0}, "margin is not a parameter"),
         ({"op": "contacts", "reach": 1.0}, "reach is not a parameter of contacts"),
     ],

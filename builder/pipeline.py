@@ -8,7 +8,7 @@ it.
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,6 +45,7 @@ from .resume.transaction import Transaction, check_target, made_parents, publish
 from .run.executor import Progress
 from .sources.coincident_scans import coincident_sources, coincident_text
 from .sources.scan_files import InputFile, open_input_files
+from .sources.scan_warnings import ScanFacts, find_warnings
 from .spool.run_files import filter_dtype, spool_dtype
 from .spool.spool import Spool
 
@@ -62,7 +63,7 @@ class BuildSummary(NamedTuple):
     lattice_step, moved_max, radius, radius_error: [m], see schemas/archive/index.py Header.
     faults: faults of the scans that were left out.
     already: whether the archive with the same scans and options existed, so that nothing was built.
-    warnings: sentences about scans in the archive that are probably wrong.
+    warnings: lines about scans in the archive that are probably wrong.
     """
 
     archive: Path
@@ -85,7 +86,11 @@ class BuildSummary(NamedTuple):
 
 
 def build_archive(
-    paths: Sequence[Path], target: Path, config: BuildConfig, progress: Progress | None = None
+    paths: Sequence[Path],
+    target: Path,
+    config: BuildConfig,
+    progress: Progress | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> BuildSummary:
     """Build an archive in the folder `target` from scan files and folders.
 
@@ -95,6 +100,9 @@ def build_archive(
     index alone) and the options in `config.identity()`. They do not depend on the order of paths,
     the number of jobs, the memory bound, or how often the build was interrupted. An existing
     archive of the same scans and options is left as it is.
+
+    warn: receives each warning about the scans (scan_warnings.py) as soon as the survey shows it;
+    the summary lists them too.
 
     Raise ScanError naming every unusable scan (`skip_bad` leaves these out and marks their region
     as unknown), and BadRequestError for impossible options. If the survey of a new build raises one
@@ -112,15 +120,17 @@ def build_archive(
             remove_finished_work(target, what)
             with Archive(target) as archive:
                 header, voxels, shards = archive.header, len(archive.voxels), archive.shard_count()
-            return _summary(build, header, voxels, shards, begin, already=True)
+            facts = [ScanFacts(scan) for item in inputs for scan in item.scans]
+            found = _warn(facts, config, warn)
+            return _summary(build, header, voxels, shards, begin, found, already=True)
         check_target(target, config.overwrite)
         with build_directory(target, what, fresh=config.fresh) as build_dir:
-            header, built = _build(inputs, what, build_dir, build)
+            header, built, found = _build(inputs, what, build_dir, build, warn)
             _check_unchanged(inputs, what, build_dir, config)
             check_interrupt()
             with build.timed("publish"):
                 publish_folder(build_dir.archive, target, config.overwrite)
-    return _summary(build, header, sum(len(s.rows) for s in built), len(built), begin)
+    return _summary(build, header, sum(len(s.rows) for s in built), len(built), begin, found)
 
 
 def _build(
@@ -128,12 +138,15 @@ def _build(
     what: Mapping[str, Any],
     build_dir: BuildDirectory,
     build: Transaction,
-) -> tuple[Header, list[Shard]]:
-    """Run all passes; `build_dir.archive` then contains a verified archive."""
+    warn: Callable[[str], None] | None,
+) -> tuple[Header, list[Shard], tuple[str, ...]]:
+    """Run all passes; `build_dir.archive` then contains a verified archive. Return the warnings too."""
     about, config = sum(_about(item) for item in inputs), build.config
     with build.workers(about):
         build_dir.staffed = True
         surveys, faulty = survey_scans(inputs, about, build_dir, build)
+        facts = [ScanFacts(s.scan, np.stack([s.low, s.high]), s.count) for s in surveys if s.scan is not None]
+        found = _warn(facts, config, warn)
         lattice, lattice_source = choose_lattice(surveys, config)
         _check_request(surveys, lattice, config)
         build_dir.surveyed = True
@@ -169,7 +182,18 @@ def _build(
         build.executor.at_once = readers
         header = _measure_radius(header, shards, build_dir.archive, build)
         _read_back(build_dir.archive, header.points, spool, build)
-    return header, shards
+    return header, shards, found
+
+
+def _warn(
+    facts: Sequence[ScanFacts], config: BuildConfig, warn: Callable[[str], None] | None
+) -> tuple[str, ...]:
+    """Return the warnings about the scans, each of which is also passed to `warn`."""
+    found = tuple(warning.text for warning in find_warnings(facts, config.radius))
+    if warn is not None:
+        for text in found:
+            warn(text)
+    return found
 
 
 def filter_points(
@@ -280,7 +304,14 @@ def _is_whole(inputs: Sequence[InputFile], build: Transaction) -> bool:
 
 
 def _summary(
-    build: Transaction, header: Header, voxels: int, shards: int, begin: float, *, already: bool = False
+    build: Transaction,
+    header: Header,
+    voxels: int,
+    shards: int,
+    begin: float,
+    warnings: tuple[str, ...],
+    *,
+    already: bool = False,
 ) -> BuildSummary:
     """Make the summary of a complete archive."""
     target = build.target
@@ -302,7 +333,7 @@ def _summary(
         skipped=dict(sum((Counter(s.skipped) for s in header.sources), Counter())),
         faults=tuple(s.fault for s in header.sources if s.fault),
         already=already,
-        warnings=coincident_sources(header.sources),
+        warnings=(*warnings, *coincident_sources(header.sources)),
     )
 
 

@@ -73,6 +73,7 @@ class SceneStats:
     extent: greatest length along an axis [m], or None.  assumed: sentences.
     packed: bytes per point of the records of a sample, with scan and intensity if they are kept;
     None: not measured.
+    warnings: lines about scans that are probably a mistake.
     """
 
     points: int
@@ -86,6 +87,7 @@ class SceneStats:
     extent: float | None = None
     assumed: tuple[str, ...] = ()
     packed: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def hypothetical_scene(
@@ -162,6 +164,7 @@ class BuildPlan:
     rests_on: tuple[str, ...]
     assumed: tuple[str, ...]
     limits: tuple[Limit, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return a JSON value; each limit says whether it binds."""
@@ -212,6 +215,7 @@ def estimate(scene: SceneStats, config: BuildConfig, rates: Rates, target: Path 
         seconds=sum(stages.values()),
         rests_on=(f"{rates.rests_on}, on {rates.machine}, {rates.cores} cores",),
         assumed=(*scene.assumed, *_assumed(config, rates, jobs)),
+        warnings=scene.warnings,
     )
     return replace(plan, limits=_limits(plan, scene, config, directories, target))
 

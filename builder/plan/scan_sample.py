@@ -20,6 +20,7 @@ from ..config import DEFAULT_STEP, BuildConfig
 from ..passes.survey import shared_step
 from ..sources.common.scan import Scan
 from ..sources.scan_files import InputFile, open_input_files
+from ..sources.scan_warnings import ScanFacts, find_warnings
 from .build_plan import BuildPlan, SceneStats, estimate
 from .packed_sample import BrokenScanError, Packed, packed_sample
 from .rates import Rates, load_rates
@@ -209,6 +210,9 @@ def sample_scene(
         extent=None if bounds is None else float((bounds[1] - bounds[0]).max()),
         assumed=tuple(assumed),
         packed=None if packed is None else packed.bytes_a_point,
+        warnings=tuple(
+            warning.text for warning in find_warnings([ScanFacts(scan) for scan in scans], config.radius)
+        ),
     )
 
 

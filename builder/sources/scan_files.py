@@ -9,6 +9,7 @@ import importlib
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from .common.scan import Scan, library_errors, scan_error, sha256_of
 from .format_table import FORMATS, UNSUPPORTED
 from .placed_scan import METRES, place_scan
 from .scan_list import LIST_SUFFIX, ScanEntry, read_scan_list
+from .scan_warnings import ScanFacts, find_warnings
 from .surface_samples import SurfaceSamples
 
 _FORMATS = {row.suffix: row for row in FORMATS}
@@ -148,32 +150,41 @@ def inspect_scans(
     """List the scans of files and folders by their headers, in the order of `find_scan_files`.
 
     A file that cannot be read, or that holds no scan (possible in E57), becomes an entry with a
-    fault. Raise ScanError for a path that does not exist and a folder without scans,
-    BadRequestError for a file that is named twice.
+    fault. An entry also has the warnings about its scan (scan_warnings.py). Raise ScanError for a
+    path that does not exist and a folder without scans, BadRequestError for a file that is named
+    twice.
     """
     files = find_scan_files(paths)
     _check_once((path, 0) for path in files)
     progress = progress or Silent()
     progress.start("inspect", len(files), "files")
     entries: list[ScanEntry] = []
+    numbers: list[int] = []
+    facts: list[ScanFacts] = []
     for path in files:
-        entries += _inspect_file(path, with_sha256)
+        found, scans = _inspect_file(path, with_sha256)
+        numbers += range(len(entries), len(entries) + len(scans))
+        facts += [ScanFacts(place_scan(scan)) for scan in scans]
+        entries += found
         progress.advance(1)
     progress.finish()
+    for warning in find_warnings(facts):
+        entry = entries[numbers[warning.number]]
+        entries[numbers[warning.number]] = replace(entry, warnings=(*entry.warnings, warning.text))
     return entries
 
 
-def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
-    """List the scans of one file."""
+def _inspect_file(path: Path, with_sha256: bool) -> tuple[list[ScanEntry], list[Scan]]:
+    """List the scans of one file; return the entries, and the scans unless they cannot be opened."""
     digest = ""
     try:
         digest = sha256_of(path) if with_sha256 else ""
         scans = open_scans(path)
     except ScanError as error:
-        return [ScanEntry(path, bounds=header_bounds(path), sha256=digest, fault=str(error))]
+        return [ScanEntry(path, bounds=header_bounds(path), sha256=digest, fault=str(error))], []
     if not scans:
-        return [ScanEntry(path, sha256=digest, fault=f"{path}: holds no scan, expected at least one")]
-    return [
+        return [ScanEntry(path, sha256=digest, fault=f"{path}: holds no scan, expected at least one")], []
+    entries = [
         ScanEntry(
             path,
             scan.index,
@@ -187,10 +198,11 @@ def _inspect_file(path: Path, with_sha256: bool) -> list[ScanEntry]:
             scan.crs,
             digest,
             fault=scan.fault,
-            warning=coincident_scan(scan),
+            warnings=tuple(filter(None, [coincident_scan(scan)])),
         )
         for scan in scans
     ]
+    return entries, scans
 
 
 def open_input_files(paths: Sequence[Path], spacing: float | None = None) -> list[InputFile]:

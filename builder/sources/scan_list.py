@@ -50,7 +50,7 @@ class ScanEntry:
     pose: (4, 4), or None.  units, up: keys of METRES and TURNS.  scale: additional factor.
     crs: text of the coordinate reference system, or "".  sha256: of the file, "" if not requested.
     use: whether a build reads the scan.  fault: why it cannot be read, or "".
-    warning: what looks wrong, or ""; not written to a list.
+    warnings: what looks wrong, one line each; not written to a list.
     """
 
     path: Path
@@ -66,7 +66,7 @@ class ScanEntry:
     sha256: str = ""
     use: bool = True
     fault: str = ""
-    warning: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:

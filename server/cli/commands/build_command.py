@@ -144,13 +144,20 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     from ..output.progress_display import progress_listener
 
     built: list[BuildSummary] = []
+    said: set[str] = set()
+
+    def warn(text: str) -> None:
+        """Print a warning at once: the build may take hours."""
+        said.add(text)
+        print(f"warning: {text}", file=sys.stderr)
+
     whole = f"{output} is complete: the build had finished"
     with (
         interruptible(lambda: whole if built else _kept_work(output)),
         naming_write_errors(output),
         progress_listener(log_json) as listener,
     ):
-        built.append(build_archive(scans, output, config, listener))
+        built.append(build_archive(scans, output, config, listener, None if log_json else warn))
     summary = built[0]
     if as_json:
         print_json({**summary._asdict(), "archive": str(summary.archive)})
@@ -163,7 +170,8 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
             file=sys.stderr,
         )
     for warning in summary.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        if warning not in said:
+            print(f"warning: {warning}", file=sys.stderr)
     for fault in summary.faults:
         print(f"left out: {fault}", file=sys.stderr)
 
@@ -184,14 +192,10 @@ def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_jso
     from ....builder.plan.rates import load_rates
     from ....builder.plan.scan_sample import sample_scene
     from ....builder.sources.scan_files import open_input_files
-    from ..output.console import print_facts
-    from .plan_command import plan_facts
+    from .plan_command import print_plan
 
     with interruptible():
         found = estimate(
             sample_scene(open_input_files(scans, config.spacing), config), config, load_rates(), output
         )
-    if as_json:
-        print_json(found.as_json())
-    else:
-        print_facts(plan_facts(found))
+    print_plan(found, as_json)

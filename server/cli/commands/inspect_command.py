@@ -55,8 +55,8 @@ def inspect(
             write_scan_list(output or DEFAULT_LIST, entries)
         print(f"{output or DEFAULT_LIST}: {len(entries)} scans", file=sys.stderr)
     for entry in entries:
-        if entry.warning:
-            print(f"warning: {entry.warning}", file=sys.stderr)
+        for warning in entry.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
     faults = [entry.fault for entry in entries if entry.fault]
     for fault in faults:
         print_error(fault, 3)
@@ -79,7 +79,7 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
         "sha256": entry.sha256,
         "use": entry.use,
         "fault": entry.fault,
-        "warning": entry.warning,
+        "warnings": list(entry.warnings),
     }
 
 

@@ -1,6 +1,7 @@
 """`solidcloud plan`: estimate the cost of a build without running it."""
 
 import math
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -65,7 +66,6 @@ def plan(
     from ....builder.plan.build_plan import estimate, hypothetical_scene
     from ....builder.plan.rates import load_rates
     from ....schemas.errors import BadRequestError
-    from ..output.console import print_facts
     from ..output.progress_display import progress_listener
 
     if bool(scans) == (points is not None):
@@ -96,10 +96,19 @@ def plan(
         from ....builder.plan.scan_sample import plan_build
 
         found = plan_build(scans or [], config, output, rates, quick=quick)
+    print_plan(found, as_json)
+
+
+def print_plan(plan: "BuildPlan", as_json: bool) -> None:
+    """Print a plan, and its warnings on standard error."""
+    from ..output.console import print_facts
+
     if as_json:
-        print_json(found.as_json())
+        print_json(plan.as_json())
     else:
-        print_facts(plan_facts(found))
+        print_facts(plan_facts(plan))
+    for warning in plan.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
 
 
 def _number(text: str) -> int:

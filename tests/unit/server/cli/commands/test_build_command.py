@@ -25,7 +25,7 @@ def caught_config(arguments: str, scan: Path, monkeypatch: pytest.MonkeyPatch) -
     """Return the configuration that a command line produces."""
     caught: list[BuildConfig] = []
 
-    def instead(paths: Any, target: Path, config: BuildConfig, progress: Any) -> Any:
+    def instead(paths: Any, target: Path, config: BuildConfig, *_: Any) -> Any:
         caught.append(config)
         raise KeyboardInterrupt
 

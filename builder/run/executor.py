@@ -45,8 +45,12 @@ class Progress(Protocol):
     The stages follow one another; the amounts of `advance` add up to about the total of the stage.
     """
 
-    def start(self, stage: str, total: int, unit: str) -> None:
-        """Begin a stage; total is in `unit`, such as "points"."""
+    def start(self, stage: str, total: int, unit: str, costs: Sequence[float] | None = None) -> None:
+        """Begin a stage; total is in `unit`, such as "points".
+
+        costs: (total,) relative expected time of each unit of work, in order, if the units are few
+        and unlike; None: they are alike.
+        """
         ...
 
     def advance(self, amount: int) -> None:
@@ -61,7 +65,7 @@ class Progress(Protocol):
 class Silent:
     """Progress listener that ignores every report."""
 
-    def start(self, stage: str, total: int, unit: str) -> None:
+    def start(self, stage: str, total: int, unit: str, costs: Sequence[float] | None = None) -> None:
         """Ignore the beginning of a stage."""
 
     def advance(self, amount: int) -> None:

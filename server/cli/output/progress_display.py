@@ -4,9 +4,10 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from statistics import median
 from types import TracebackType
 from typing import Self, TextIO
 
@@ -23,6 +24,9 @@ RATE_SECONDS = 30.0
 # Work reported within this time of a stage's start was done earlier, by an interrupted build, and
 # does not count for the rate.
 HEAD_START_SECONDS = 0.05
+# With units of known relative cost: least number of measured units for an estimate, and the multiple
+# of the usual time that marks a unit that did more, such as compiling, and tells nothing of others.
+MEASURED_UNITS, UNUSUAL = 3, 4.0
 # Interval between two lines of one stage without a terminal, as text for people and as JSON for
 # programs.
 LINE_SECONDS, JSON_SECONDS = 10.0, 1.0
@@ -32,17 +36,33 @@ class StageProgress:
     """Progress, rate and remaining time of one stage of work.
 
     done, total: in `unit`.  clock: seconds since any epoch.
+    costs: see `builder.run.executor.Progress`. The remaining time then follows from the costs left
+    and the measured time of the units done; otherwise from the recent rate.
     """
 
-    def __init__(self, stage: str, total: int, unit: str, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        stage: str,
+        total: int,
+        unit: str,
+        clock: Callable[[], float],
+        costs: Sequence[float] | None = None,
+    ) -> None:
         self.stage, self.total, self.unit, self.done = stage, total, unit, 0
         self.ended = False
+        self._costs = None if costs is None else list(costs)
+        # Cost and seconds of each report so far, and the time of the last one.
+        self._measured: list[tuple[float, float]] = []
+        self._last = clock()
         self._clock, self._begin, self._before = clock, clock(), 0
         self._samples = deque([(self._begin, 0)])
 
     def advance(self, amount: int) -> None:
         """Record that `amount` more is done."""
         now = self._clock()
+        if self._costs is not None and amount:
+            self._measured.append((sum(self._costs[self.done : self.done + amount]), now - self._last))
+            self._last = now
         self.done += amount
         if now - self._begin < HEAD_START_SECONDS:
             self._before = self.done
@@ -77,18 +97,34 @@ class StageProgress:
     @property
     def left(self) -> float | None:
         """Return the estimated remaining time [s]; None while unknown."""
-        rate = self.rate
         if self.ended:
             return 0.0
+        if self._costs is not None:
+            return self._left_by_costs(self._costs)
+        rate = self.rate
         if rate is None or not self.total:
             return None
         return max(0.0, (self.total - self.done) / rate - (self._clock() - self._samples[-1][0]))
+
+    def _left_by_costs(self, costs: list[float]) -> float | None:
+        """Return the remaining time [s] by the costs of the units left; None while unknown.
+
+        The unit at work counts for no less than nothing, however long it takes.
+        """
+        measured = [(cost, seconds) for cost, seconds in self._measured if cost > 0]
+        if len(measured) < MEASURED_UNITS:
+            return None
+        usual = median(seconds / cost for cost, seconds in measured)
+        kept = [(cost, seconds) for cost, seconds in measured if seconds <= UNUSUAL * usual * cost]
+        pace = sum(seconds for _, seconds in kept) / sum(cost for cost, _ in kept)
+        now, *later = costs[self.done :] or [0.0]
+        return max(0.0, pace * now - (self._clock() - self._last)) + pace * sum(later)
 
 
 class Listener:
     """Receiver of progress reports and context manager. Subclasses display the reports.
 
-    Implements the protocol `builder.progress.Progress` and the callback of `builder.synthetic`.
+    Implements the protocol `builder.run.executor.Progress` and the callback of `builder.synthetic`.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -105,10 +141,10 @@ class Listener:
     ) -> None:
         pass
 
-    def start(self, stage: str, total: int, unit: str) -> None:
+    def start(self, stage: str, total: int, unit: str, costs: Sequence[float] | None = None) -> None:
         """Begin a stage. Raises Interrupted if a signal has arrived."""
         check_interrupt()
-        self._pace = StageProgress(stage, total, unit, self._clock)
+        self._pace = StageProgress(stage, total, unit, self._clock, costs)
         self._began(self._pace)
 
     def advance(self, amount: int) -> None:

@@ -19,10 +19,11 @@ from ..common.sphere_pictures import load_pyplot
 from .measurement.engine_settings import (
     Archives,
     Setting,
+    compare_costs,
     compare_engine,
-    count_timed,
     engine_settings,
     radius_settings,
+    time_costs,
     time_engine,
 )
 from .measurement.measured_scene import MeasuredScene, archive_scene, generated_scene
@@ -83,7 +84,7 @@ def measure(
     progress.advance(1)
     progress.finish()
     with Archives(measured, scratch) as archives:
-        progress.start("reference", 2, "parts")
+        progress.start("reference", 2, "parts", [1.0, 1.0])
         reference = find_reference(archives.scene(measured.config), measured, plan)
         progress.advance(1)
         with Archive(archives.folder(measured.config)) as opened:
@@ -149,14 +150,17 @@ def measure_engine(
     def tick() -> None:
         progress.advance(1)
 
-    progress.start("verdicts", len(settings), "settings")
+    costs = compare_costs(settings, measured.config)
+    progress.start("verdicts", len(settings), "settings", costs)
     compare_engine(settings, archives, measured, reference, tick)
     progress.finish()
     if measured.truth is not None:
-        progress.start("doors, walls", sum(s.row.knob in USER_ERROR_KNOBS for s in settings), "settings")
+        costs = [1.0] * sum(s.row.knob in USER_ERROR_KNOBS for s in settings)
+        progress.start("doors, walls", len(costs), "settings", costs)
         measure_user_errors(settings, archives, measured, plan, tick)
         progress.finish()
-    progress.start("times", count_timed(settings) * plan.loops, "settings")
+    costs = time_costs(settings) * plan.loops
+    progress.start("times", len(costs), "settings", costs)
     time_engine(settings, archives, measured, plan, tick)
     progress.finish()
 
@@ -172,11 +176,11 @@ def measure_generated_scenes(
     def tick() -> None:
         progress.advance(1)
 
-    progress.start("sheet", count_sheet(), "settings")
+    progress.start("sheet", count_sheet(), "settings", [1.0] * count_sheet())
     rows = measure_sheet(scratch, tick)
     progress.finish()
     if plan.made_models:
-        progress.start("doors made", FACADES, "façades")
+        progress.start("doors made", FACADES, "façades", [1.0] * FACADES)
         measure_generated_doors(settings, scratch / "doors", plan, tick)
         progress.finish()
     return rows

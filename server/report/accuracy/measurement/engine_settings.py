@@ -41,6 +41,9 @@ Floats = NDArray[np.float64]
 Tick = Callable[[], None]
 
 DECODE_LOOPS = 3
+# Relative time of the first setting of an archive, which builds it, where a comparison takes 1; and
+# the time of a pose apart from its node and pair tests, in tests.
+BUILD_COST, POSE_COST = 2.0, 60.0
 # A budget of node visits that is never spent. A tolerance without a budget is answered exactly;
 # with a budget, the engine uses the search that may stop within the tolerance.
 UNSPENT = 1 << 40
@@ -269,9 +272,25 @@ def time_engine(
         setting.row.times = subject.mean / default.mean
 
 
-def count_timed(settings: list[Setting]) -> int:
-    """Return the number of settings that `time_engine` times."""
-    return len({(_key(s.config), *sorted(s.options.items())) for s in settings})
+def compare_costs(settings: list[Setting], built: BuildConfig) -> list[float]:
+    """Return the relative time of each setting in `compare_engine`. built: its archive exists."""
+    known, found = {_key(built)}, []
+    for setting in settings:
+        key = _key(setting.config)
+        found.append(1.0 if key in known else 1.0 + BUILD_COST)
+        known.add(key)
+    return found
+
+
+def time_costs(settings: list[Setting]) -> list[float]:
+    """Return the relative time of each setting that `time_engine` times, by the tests of its poses.
+
+    `compare_engine` has counted these.
+    """
+    rows: dict[tuple[Any, ...], Row] = {}
+    for setting in settings:
+        rows.setdefault((_key(setting.config), *sorted(setting.options.items())), setting.row)
+    return [POSE_COST + row.node_tests + row.pair_tests for row in rows.values()]
 
 
 def fill_times(row: Row, subject: TimedSetting) -> None:

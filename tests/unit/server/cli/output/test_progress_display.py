@@ -78,6 +78,41 @@ def test_many_small_steps_are_few_samples(clock: Clock) -> None:
     assert pace.rate == pytest.approx(10_000)
 
 
+def test_units_of_known_cost_give_a_measured_time_left(clock: Clock) -> None:
+    """The first setting of `accuracy` compiles for minutes: 58 more of its kind would be hours."""
+    costs = [1.0] * 10 + [5.0] * 10  # the later settings each build an archive
+    pace = StageProgress("verdicts", 20, "settings", clock, costs)
+    clock.now += 220
+    pace.advance(1)
+    assert pace.left is None, "one unit, which compiled, says nothing about the others"
+    for _ in range(9):
+        clock.now += 2
+        pace.advance(1)
+    assert pace.left == pytest.approx(10 * 10)
+    clock.now += 4  # the next unit is at work
+    assert pace.left == pytest.approx(96)
+    clock.now += 60  # longer than expected
+    assert pace.left == pytest.approx(90)
+    pace.advance(1)
+    for _ in range(4):
+        clock.now += 10
+        pace.advance(1)
+    assert pace.left == pytest.approx(5 * 10)
+    clock.now += 50
+    pace.advance(5)
+    assert pace.left == 0
+    pace.end()
+    assert pace.left == 0 and pace.done == 20
+
+
+def test_a_unit_without_cost_and_more_units_than_announced(clock: Clock) -> None:
+    pace = StageProgress("doors made", 3, "façades", clock, [0.0, 1.0, 1.0])
+    for _ in range(5):
+        clock.now += 1
+        pace.advance(1)
+        assert pace.left is None or pace.left >= 0
+
+
 def work(listener: Listener, clock: Clock, stages: tuple[tuple[str, int, str, int], ...]) -> None:
     """Run stages of ten steps, each of 3 s."""
     for stage, total, unit, step in stages:

@@ -10,6 +10,7 @@ from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError
 
 DEFAULT_STEP = 1e-4
+DEFAULT_VOXEL = 8.0
 CELL_KINDS = ("octree", "balanced")
 
 
@@ -105,7 +106,7 @@ class BuildConfig:
     processes on this machine do the work.
     """
 
-    voxel: float = 8.0
+    voxel: float = DEFAULT_VOXEL
     resolution: float | None = None
     degree: int = 8
     leaf: int = 32

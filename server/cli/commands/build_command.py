@@ -138,8 +138,11 @@ def build(
 
 def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: bool, as_json: bool) -> None:
     """Build the archive and print its summary."""
+    from ....builder.passes.archive_summary import summarize_archive
     from ....builder.pipeline import build_archive
+    from ....schemas.archive.archive import Archive
     from ....schemas.process.os_errors import naming_write_errors
+    from ..output.archive_facts import print_summary
     from ..output.console import print_build
     from ..output.progress_display import progress_listener
 
@@ -159,10 +162,13 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     ):
         built.append(build_archive(scans, output, config, listener, None if log_json else warn))
     summary = built[0]
+    with Archive(output) as archive:
+        short = summarize_archive(archive)
     if as_json:
-        print_json({**summary._asdict(), "archive": str(summary.archive)})
+        print_json({**summary._asdict(), "archive": str(summary.archive), "summary": short.as_json()})
     else:
         print_build(summary)
+        print_summary(short)
     if summary.already:
         print(
             f"{output}: already complete, with these scans and these options: nothing was built. Only its index was "

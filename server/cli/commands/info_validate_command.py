@@ -8,25 +8,31 @@ from .command_options import ArchivePath, AsJson, print_error, print_json
 
 
 def info(archive: ArchivePath, as_json: AsJson = False) -> None:
-    """Describe an archive: scans, points, bounds, radius, size."""
+    """Describe an archive: scans, points, bounds, radius, size.
+
+    Ends with what matters: points, area, spacing, radius, voxel size, and what to look at if it looks wrong.
+    """
     import msgspec
 
+    from ....builder.passes.archive_summary import summarize_archive
     from ....schemas.archive.radius_model import radius_distribution
     from ...archives.archive_info import describe
     from ...residency.voxel_store import VoxelStore
-    from ..output.archive_facts import archive_details, detail_facts
+    from ..output.archive_facts import archive_details, detail_facts, print_summary
     from ..output.console import print_info
 
     store = VoxelStore(archive)
     found = describe(store, archive.resolve().name)
     header = store.archive.header
     classes = radius_distribution(header.models, header.radius_counts, header.radius_capped)
-    details = archive_details(store)
+    details, summary = archive_details(store), summarize_archive(store.archive)
     store.close()
     if as_json:
-        print_json({**msgspec.to_builtins(found), "radius_classes": msgspec.to_builtins(classes), **details})
+        described = {**msgspec.to_builtins(found), "radius_classes": msgspec.to_builtins(classes), **details}
+        print_json({**described, "summary": summary.as_json()})
     else:
         print_info(found, classes, detail_facts(details))
+        print_summary(summary)
 
 
 def validate(

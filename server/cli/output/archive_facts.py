@@ -6,11 +6,12 @@ Of an archive, these are the details beyond those in `SceneInfo`.
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from .console import bytes_text, print_facts
+from .console import bytes_text, length_text, print_facts
 
 if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
     from ....builder.export.export_archive import ExportSummary
+    from ....builder.passes.archive_summary import ArchiveSummary
     from ....schemas.archive.index import Source
     from ...residency.voxel_store import VoxelStore
 
@@ -28,6 +29,36 @@ def _export_facts(done: "ExportSummary") -> Iterator[tuple[str, str]]:
         yield "bounds", f"{low} .. {high} m"
     for note in done.notes:
         yield "note", note
+
+
+def print_summary(summary: "ArchiveSummary") -> None:
+    """Print what matters about an archive: the last lines of `build` and `info`."""
+    print()
+    print_facts(summary_facts(summary))
+
+
+def summary_facts(summary: "ArchiveSummary") -> Iterator[tuple[str, str]]:
+    """Yield the figures of an archive's summary as names and texts."""
+    yield "points", f"{summary.points:,}"
+    area = "unknown" if summary.area is None else f"about {_rounded_area(summary.area)} m² of surface"
+    yield "area", f"{area} ({summary.area_from})"
+    if summary.spacing is not None:
+        yield "spacing", f"{length_text(summary.spacing)} ({summary.spacing_from})"
+    yield "radius", f"{length_text(summary.radius)} ({summary.radius_from})"
+    yield (
+        "voxel size",
+        f"{summary.voxel:g} m ({summary.voxel_from}): {summary.voxels:,} voxels, {summary.points_a_voxel:,.0f} points "
+        f"in the mean, {summary.densest:,} in the densest",
+    )
+    yield "bytes a point", f"{summary.bytes_a_point:.2f}"
+    for number, line in enumerate(summary.look_at):
+        yield "" if number else "if it looks wrong", line
+
+
+def _rounded_area(square_metres: float) -> str:
+    """Format an area with two significant digits: it is an estimate."""
+    rounded = float(f"{square_metres:.2g}")
+    return f"{rounded:,.0f}" if rounded >= 10 else f"{rounded:g}"
 
 
 def archive_details(store: "VoxelStore") -> dict[str, Any]:

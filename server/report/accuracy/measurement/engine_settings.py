@@ -290,7 +290,7 @@ def time_costs(settings: list[Setting]) -> list[float]:
     rows: dict[tuple[Any, ...], Row] = {}
     for setting in settings:
         rows.setdefault((_key(setting.config), *sorted(setting.options.items())), setting.row)
-    return [POSE_COST + row.node_tests + row.pair_tests for row in rows.values()]
+    return [POSE_COST + (row.node_tests or 0.0) + (row.pair_tests or 0.0) for row in rows.values()]
 
 
 def fill_times(row: Row, subject: TimedSetting) -> None:

@@ -14,6 +14,7 @@ its readers; the last one to leave closes its files and releases its memory.
 import math
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -106,7 +107,15 @@ class ArchiveGeneration:
             residency.on_loaded = lambda row, where: remember(row, arena, where)
         # If coarse bounds of all voxels do not fit, only those of requested voxels are stored.
         fill = coarse_filler(coarse, store) if coarse is not None and coarse.has_room_for_all else None
-        self.prefetcher = Prefetcher(residency, around, prefetch=ahead, idle=fill)
+        weak = weakref.ref(self)  # the prefetcher's thread must not keep a generation alive
+
+        def running_requests() -> bool:
+            generation = weak()
+            return generation is not None and generation._readers > 1
+
+        self.prefetcher = Prefetcher(
+            residency, around, prefetch=ahead, idle=fill, running_requests=running_requests
+        )
         figure = make_scene_data(store.archive, residency, bounds, coarse)
         data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
         self.data = data

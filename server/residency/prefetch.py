@@ -36,6 +36,10 @@ IDLE_REST = 4.0
 # Share of the budget that is kept for users' current positions; the rest is available to all
 # requests.
 KEPT_SHARE = 0.5
+# The first plan compiles for 7 s where nothing is compiled yet (scripts/bench_compile). It begins when
+# no request is running, so that the first answer does not wait for it: asked every ANSWER_REST [s], at
+# most for FIRST_ANSWER_SECONDS after the first pose.
+ANSWER_REST, FIRST_ANSWER_SECONDS = 0.02, 120.0
 # Quantile of the measured load times that predictions assume.
 LOAD_TIME_QUANTILE = 0.9
 
@@ -58,6 +62,7 @@ class Prefetcher:
         *,
         prefetch: bool = True,
         idle: Callable[[], bool] | None = None,
+        running_requests: Callable[[], bool] | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Make a prefetcher without a thread.
@@ -65,6 +70,7 @@ class Prefetcher:
         prefetch: whether to prefetch; if False, load only owed voxels and keep users' voxels.
         idle: called repeatedly when there is nothing to load, until it returns False; each call
         does some milliseconds of work.
+        running_requests: returns whether requests are running; the first plan waits for them.
         clock: returns the time [s].
         """
         self._residency, self._tracks, self._clock, self._prefetch = residency, tracks, clock, prefetch
@@ -74,6 +80,8 @@ class Prefetcher:
         self._thread: threading.Thread | None = None
         self._stopped = self._seen = False
         self._idle = idle
+        self._running_requests = running_requests  # None once a plan was made
+        self._first_seen = math.inf
         self._failed: dict[int, float] = {}  # row -> time; a request for the voxel tries again
         residency.on_owed = self._owed
 
@@ -109,6 +117,7 @@ class Prefetcher:
     def warm(self, center: tuple[float, float, float]) -> None:
         """Make a plan for a dummy user, so that all kernels are compiled before the first user."""
         user = ("", "")
+        self._running_requests = None
         self._tracks.record_pose(user, self._clock(), center, 1.0)
         self._tracks.plan(self._clock(), 0.0)
         self._tracks.kept(self._clock())
@@ -151,7 +160,9 @@ class Prefetcher:
         due = -math.inf
         while True:
             now = self._clock()
-            if self._seen and now >= due:
+            if self._seen and now >= due and self._waits_for_first_answer(now):
+                due = now + ANSWER_REST
+            elif self._seen and now >= due:
                 self._seen = False
                 need, due = self._planned(now)
                 queue = deque(need.items() if self._prefetch else ())
@@ -169,6 +180,16 @@ class Prefetcher:
             if not self._work.wait(SILENCE if self._residency.kept else None):
                 self._seen = True
             self._work.clear()
+
+    def _waits_for_first_answer(self, now: float) -> bool:
+        """Return whether the first plan is still to wait for running requests."""
+        if self._running_requests is None:
+            return False
+        self._first_seen = min(self._first_seen, now)
+        if now < self._first_seen + FIRST_ANSWER_SECONDS and self._running_requests():
+            return True
+        self._running_requests = None
+        return False
 
     def _rest(self, seconds: float) -> None:
         """Pause; an owed load or `stop` ends the pause."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.residency.motion_prediction import PredictedVoxels, User
-from solidcloud.server.residency.prefetch import Prefetcher
+from solidcloud.server.residency.prefetch import ANSWER_REST, FIRST_ANSWER_SECONDS, Prefetcher
 from solidcloud.server.residency.voxel_cache import VoxelCache
 
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right
@@ -42,7 +42,7 @@ class Wishes:
         need = np.array([self.wanted[row] for row in rows])
         return PredictedVoxels(np.array(rows, np.int64), need)
 
-    def kept(self, now: float, after: float) -> np.ndarray:
+    def kept(self, now: float, after: float = 0.0) -> np.ndarray:
         """What users stand in."""
         return np.array(self.standing, np.int64)
 
@@ -221,3 +221,35 @@ def test_after_a_stop_nothing_is_loaded() -> None:
     time.sleep(0.02)
     assert not table.store.loads
     table.prefetcher.stop()
+
+
+def test_the_first_plan_waits_for_the_first_answer_and_no_longer_than_its_limit() -> None:
+    running, now = [True], [0.0]
+    table = Table([1, 1], 4, running_requests=lambda: running[0], clock=lambda: now[0])
+    table.wishes.wanted = {1: 0.0}
+    with table.prefetcher:
+        table.see()
+        assert until(lambda: table.prefetcher.running)
+        time.sleep(0.2)
+        assert not table.wishes.plans
+        running[0], now[0] = False, ANSWER_REST  # it is answered
+        assert until(lambda: table.resident() == [1])
+        running[0], now[0] = True, 10.0
+        table.see()
+        assert until(lambda: table.wishes.plans == 2), "later plans wait for nobody"
+    late = Table([1], 4, running_requests=lambda: True, clock=lambda: now[0])
+    with late.prefetcher:
+        late.see()
+        assert until(lambda: late.prefetcher._first_seen == 10.0)
+        now[0] += FIRST_ANSWER_SECONDS
+        assert until(lambda: late.wishes.plans == 1)
+
+
+def test_a_warm_prefetcher_waits_for_nobody() -> None:
+    table = Table([1], 4, running_requests=lambda: True)
+    table.wishes.path_distances = table.wishes.leave = lambda *_: None  # type: ignore[attr-defined]
+    with table.prefetcher:
+        table.prefetcher.warm((0.0, 0.0, 0.0))
+        before = table.wishes.plans
+        table.see()
+        assert until(lambda: table.wishes.plans > before)

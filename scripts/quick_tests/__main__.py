@@ -48,9 +48,7 @@ def main() -> int:
         print(f"every test depends on {path}: run scripts/test")
     failed = bool(selected) and run_all(selected, began, options.limit)
     others = [path for path in tests if Path(path).name.startswith("test_") and path not in files]
-    print(
-        f"not selected: {len(others)} test files; scripts/test runs all"
-    )
+    print(f"not selected: {len(others)} test files; scripts/test runs all")
     return int(failed)
 
 

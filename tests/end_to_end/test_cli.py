@@ -87,7 +87,7 @@ def test_help_loads_no_numpy(verb: str) -> None:
             2,
             "--reach is not an option of --op collide",
         ),
-        ("query --scene hall --op distance --avatar {scan} --poses {scan}", 2, "--op distance needs --reach"),
+        ("query --scene hall --op within --points {scan}", 2, "--op within needs --reach"),
         (
             "query --scene hall --op raycast --reach 1 --poses {scan}",
             2,

@@ -61,13 +61,13 @@ def ask_all(folder: Path) -> dict[str, list[str]]:
         str(RADIUS),
     ]
     return {
-        "distance": [*ball, "--reach", "1"],
+        "distance": ball,  # up to 1 m
         "contacts": [*ball, "--limit", "5"],
         "sweep": [*ball, "--tolerance", "0.001"],
         "raycast": ["--rays", str(folder / "rays.csv"), "--reach", "2"],
         "within": ["--points", str(folder / "loose.xyz"), "--reach", "1"],
         "objects": ["--objects", str(folder / "objects.csv"), "--radius", str(RADIUS)],
-        "path": [*ball, "--along", "distance", "--reach", "1"],
+        "path": [*ball, "--along", "distance"],
     }
 
 

@@ -228,7 +228,7 @@ def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves
             ("door", (at(0) * 2).tolist(), BadTransformError, "not rigid"),
             ("door", at(float("nan")).tolist(), BadRequestError, "finite"),
             ("door", at(2e9).tolist(), BadRequestError, "within 1e9 m"),
-            ("door", at(0)[:3].tolist(), BadRequestError, "4 rows"),
+            ("door", at(0)[:3].tolist(), BadRequestError, "expected one pose"),
         ]
         for name, pose, error, text in refused:
             with pytest.raises(error, match=text):

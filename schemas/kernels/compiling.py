@@ -26,6 +26,7 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
+from .compile_progress import CompileProgress
 from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
@@ -39,6 +40,7 @@ config: Any = numba_config
 _UNRELATED = frozenset({"CACHE_DIR", "COLOR_SCHEME", "NUMBA_DEFAULT_NUM_THREADS", "NUMBA_NUM_THREADS"})
 # A file name holds 255 bytes; the digest takes 64.
 _MAX_LABEL = 150
+_progress = CompileProgress()
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -91,6 +93,7 @@ class _KernelCache(_Cache):  # type: ignore[misc]
         name = self._name(sig, target_context.codegen())
         payload = kernel_files().read(name)
         if payload is None:
+            _progress.begin()
             return None
         try:
             stored, reduced = pickle.loads(payload)
@@ -104,6 +107,7 @@ class _KernelCache(_Cache):  # type: ignore[misc]
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store the compiled code for a signature."""
+        _progress.end()
         if not self._enabled or data.library.has_dynamic_globals or any(not x.can_cache for x in data.lifted):
             return
         reduced = reduce_inner(data) if self._inner else data._reduce()

@@ -84,7 +84,7 @@ ALLOWED = {
         "archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
         "report/accuracy"
     ),
-    "server/cli": "cli/commands",
+    "server/cli": "cli/commands cli/output",
     "server/api": "client.py scene.py",
 }
 

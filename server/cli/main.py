@@ -1,20 +1,22 @@
-"""The command `solidcloud`: its subcommands (verbs) and its exit codes.
+"""The command `solidcloud`: its subcommands (verbs), its exit codes, and completion in a shell.
 
 Every verb imports its dependencies inside its function: `--help` must print without loading numpy.
 Exit codes: 0 success; 1 failure; 2 invalid request; 3 invalid data; 130 interrupted.
 """
 
 import contextlib
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.process.interrupts import deferring_interrupts
 from ...schemas.process.os_errors import os_error_line
+from ...schemas.process.own_command import NAME, path_advice
 from .commands import accuracy_command as accuracy
 from .commands import add_remove_command as add_remove
 from .commands import build_command as build
@@ -33,12 +35,12 @@ from .commands.command_options import print_error
 # Rich markup is off: importing it doubles the time of --help, to more than the 0.3 s allowed.
 app = typer.Typer(
     help="Collision queries on scanned point clouds: build an archive, serve it, query it.",
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 makers = typer.Typer(
-    help="Generate test scans with known ground truth, avatars and walks.", rich_markup_mode=None
+    help="Generate test scans, avatars and walks. The ground truth of the scans is known.",
+    rich_markup_mode=None,
 )
 app.add_typer(makers, name="make")
 makers.command("facade")(make.make_facade)
@@ -71,9 +73,29 @@ for verb in (
 ):
     app.command()(verb)
 
+# The variable by which a shell asks for completions; its name and content are typer's.
+_COMPLETION = f"_{NAME.upper()}_COMPLETE"
 # Verbs that wait for a server or for a user: an interrupt ends them immediately. All other verbs
 # compute, and end at their next interrupt check.
 WAITING = frozenset({"serve", "query", "reload", "top"})
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib import metadata
+
+        print(f"{NAME} {metadata.version(NAME)}")
+        raise typer.Exit
+
+
+@app.callback()
+def _take_options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Declare the options of `solidcloud` itself."""
 
 
 def main() -> None:
@@ -135,6 +157,8 @@ def _find_verb(arguments: Sequence[str]) -> tuple[Any, str, list[str]]:
     while rest and rest[0] in getattr(command, "commands", ()):
         command = command.commands[rest[0]]
         name += f" {rest.pop(0)}"
+    if advice := path_advice():
+        command.epilog = "\b\n" + advice  # \b: keep the lines
     return command, name, rest
 
 

@@ -26,6 +26,7 @@ from ...schemas.errors import (
     UnknownSceneError,
     error_from_code,
 )
+from ...schemas.process.own_command import own_command
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer
 from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ScenesAnswer
@@ -253,7 +254,7 @@ class ServerConnection:
 
     def _start_command(self) -> str:
         """Return the command that starts a server of this scene."""
-        return f"solidcloud serve ARCHIVE --name {self._scene} --listen {self._endpoint}"
+        return f"{own_command()} serve ARCHIVE --name {self._scene} --listen {self._endpoint}"
 
     def _explain_silence(self, operation: str, seconds: float, waited: float) -> str:
         """Return a message on why no server answered a request.
@@ -303,7 +304,7 @@ def scenes_at(
     if not versions:
         raise BusyError(
             f"no server answered at {endpoint} within {timeout:g} s: "
-            f"start one with: solidcloud serve ARCHIVE --listen {endpoint}"
+            f"start one with: {own_command()} serve ARCHIVE --listen {endpoint}"
         )
     return sorted(served)
 

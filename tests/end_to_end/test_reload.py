@@ -19,6 +19,7 @@ import synthetic_scans
 from frozen_processes import freeze
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
+from solidcloud.schemas.process.own_command import own_command
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.scene_messages import ReloadAnswer
 from solidcloud.server.cli.main import run
@@ -200,7 +201,7 @@ def test_what_cannot_be_opened_is_said_and_the_old_one_served_on(
 def test_a_reload_that_nobody_answers_says_so(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
     with Client(endpoint, scene="floor") as client, pytest.raises(BusyError) as told:
         client.reload()
-    advice = f"start one with: solidcloud serve ARCHIVE --name floor --listen {endpoint}"
+    advice = f"start one with: {own_command()} serve ARCHIVE --name floor --listen {endpoint}"
     absent = f"no server of scene 'floor' at {endpoint}, expected one that answers 'reload': {advice}"
     assert str(told.value) == absent, "nobody waits for 600 s where there is nobody"
     assert run(["reload", "--scene", "floor", "--connect", endpoint]) == 1
@@ -261,7 +262,7 @@ def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
         killer.join()
     assert str(told.value) == (
         f"the server of scene 'hall' at {endpoint} is gone, expected its answer to 'reload': start one with: "
-        f"solidcloud serve ARCHIVE --name hall --listen {endpoint}"
+        f"{own_command()} serve ARCHIVE --name hall --listen {endpoint}"
     )
 
 

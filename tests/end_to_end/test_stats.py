@@ -249,7 +249,7 @@ def watch_until_the_server_goes(endpoint: str, serving: "subprocess.Popen[str]")
     _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == 1
     assert re.fullmatch(
-        r"error: (the|no) server of scene 'hall' .*start one with: solidcloud serve .*\n", errors
+        r"error: (the|no) server of scene 'hall' .*start one with: \S*solidcloud serve .*\n", errors
     )
     assert serving.wait(DEADLINE) == 0
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_server import FloorScene, floor_simulation
+from solidcloud.schemas.process.own_command import own_command
 from solidcloud.schemas.wire.answers import CollideAnswers, Verdict
 from solidcloud.schemas.wire.motion_messages import Moved
 from solidcloud.server import client as client_module
@@ -74,7 +75,7 @@ def test_a_question_that_nobody_answers_fails(
     (line,) = shown.err.splitlines()
     assert line == (
         f"error: no server of scene 'floor' at {endpoint}, expected one that answers {op.split()[0]!r}: "
-        f"start one with: solidcloud serve ARCHIVE --name floor --listen {endpoint}"
+        f"start one with: {own_command()} serve ARCHIVE --name floor --listen {endpoint}"
     )
 
 
@@ -99,7 +100,7 @@ def test_every_other_verb_that_asks_a_server_fails(
     assert shown.out.strip() == ""
     (line,) = shown.err.splitlines()
     assert line.startswith("error: no server ") and endpoint in line
-    assert "start one with: solidcloud serve ARCHIVE" in line
+    assert f"start one with: {own_command()} serve ARCHIVE" in line
 
 
 @pytest.mark.parametrize("verb", ["query", "reload", "top"])
@@ -153,7 +154,7 @@ def test_where_some_answers_do_not_come_the_others_are_printed(
     assert line.startswith(
         f"error: 4 of 6 poses were not answered: the server of scene 'floor' at {endpoint} is gone"
     )
-    assert "within 5 s: try again, or start one with: solidcloud serve ARCHIVE" in line
+    assert f"within 5 s: try again, or start one with: {own_command()} serve ARCHIVE" in line
 
 
 class Doubts(FloorScene):

@@ -1,7 +1,10 @@
 """Test the demonstration on a small scan: its figures are consistent, and its server stops afterwards."""
 
 import json
+import shlex
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +24,11 @@ def corridor(tmp_path: Path) -> Path:
     return tmp_path / "corridor.xyz"
 
 
-def test_walk_through_a_wall_touches_it_there_and_nowhere_else(corridor: Path, tmp_path: Path) -> None:
+def test_walk_through_a_wall_touches_it_there_and_nowhere_else(
+    corridor: Path, tmp_path: Path, endpoint: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     report = demonstrate(tmp_path / "out", [corridor])
+    check_commands(capfd.readouterr().out, endpoint, report["summary"])
     assert json.loads((tmp_path / "out" / "walk.json").read_text()) == report
     summary, frames = report["summary"], report["frames"]
     assert summary["frames"] == len(frames) == 1200
@@ -36,6 +42,21 @@ def test_walk_through_a_wall_touches_it_there_and_nowhere_else(corridor: Path, t
     assert sum(frame["hits"] for frame in frames) == summary["hits"] > 0
     assert all(0 < frame["engine_us"] < frame["round_trip_us"] for frame in frames)
     assert (tmp_path / "out" / "walk.png").read_bytes().startswith(b"\x89PNG")
+
+
+def check_commands(said: str, endpoint: str, summary: dict[str, Any]) -> None:
+    """Check that the commands at the end of the demonstration work as they are printed."""
+    serve, query = (line.strip() for line in said.splitlines() if line.startswith("  ") and " --" in line)
+    with subprocess.Popen(
+        shlex.split(f"{serve} --listen {endpoint}"), stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None and server.stdout.readline().startswith("serving demo at")
+        done = subprocess.run(
+            f"{query} --connect {endpoint}", shell=True, capture_output=True, text=True, check=False
+        )
+        server.terminate()
+    verdicts = f"1200 poses: {summary['clear']} clear, {summary['contact']} contact, 0 unknown"
+    assert done.returncode == 0 and verdicts in done.stdout, done.stdout[-300:] + done.stderr
 
 
 def test_demonstration_of_a_missing_scan_says_so(tmp_path: Path) -> None:

@@ -69,10 +69,11 @@ def remove(
     memory: Memory = "2GB",
     as_json: AsJson = False,
 ) -> None:
-    """Remove scans from an archive that was built with --keep scan.
+    """Remove scans from an archive.
 
-    Only the voxels that the scans touch are built again. The result is a new generation, which a
-    running server serves after solidcloud reload.
+    The archive must have been built with --keep scan. Only the voxels that the scans touch are
+    built again. The result is a new generation, which a running server serves after solidcloud
+    reload.
     """
     from ....builder.edit.edit_archive import remove_scans
     from ....schemas.process.os_errors import naming_write_errors

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ....builder.sources.format_table import FORMATS
-from .command_options import AsJson, interruptible, parse_bytes, print_json
+from ....schemas.process.own_command import own_command
+from .command_options import AsJson, among, interruptible, parse_bytes, print_json
 
 if TYPE_CHECKING:
     from ....builder.config import BuildConfig
@@ -35,7 +36,10 @@ def build(
     leaf: Annotated[int, typer.Option(help="Maximum number of points of a leaf node.")] = 32,
     cells: Annotated[
         str,
-        typer.Option(help="octree, or balanced: also merge octree cells, so that all trees have one height."),
+        typer.Option(
+            help="octree, or balanced: also merge octree cells, so that all trees have one height.",
+            autocompletion=among("octree", "balanced"),
+        ),
     ] = "octree",
     jobs: Annotated[int, typer.Option(help="Worker processes; 0: one per core.")] = 0,
     memory: Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")] = "2GB",
@@ -172,7 +176,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     if summary.already:
         print(
             f"{output}: already complete, with these scans and these options: nothing was built. Only its index was "
-            "checked; `solidcloud validate` reads its records, --overwrite builds it again",
+            f"checked; `{own_command()} validate` reads its records, --overwrite builds it again",
             file=sys.stderr,
         )
     for warning in summary.warnings:

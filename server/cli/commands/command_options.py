@@ -18,6 +18,7 @@ from ....schemas.process.interrupts import (
     interrupt_pending,
     stop_insisting,
 )
+from ....schemas.process.own_command import with_own_command
 
 ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
 KeyFile = Annotated[
@@ -55,9 +56,20 @@ def print_error(message: str, code: int) -> int:
     """Print an error on standard error and return the exit code.
 
     The message becomes one line; only indented lines, as in lists, stay on lines of their own.
+    Commands in it are written as a shell can run them.
     """
-    print("error: " + re.sub(r"\s*\n(?!  )", " ", message.rstrip()), file=sys.stderr)
+    line = re.sub(r"\s*\n(?!  )", " ", message.rstrip())
+    print(f"error: {with_own_command(line)}", file=sys.stderr)
     return code
+
+
+def among(*words: str) -> Callable[[str], list[str]]:
+    """Return a function by which a shell completes one of these words."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in words if word.startswith(incomplete)]
+
+    return complete
 
 
 def print_json(value: Any) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, interruptible, needs_extra, print_json
+from .command_options import ArchivePath, AsJson, among, interruptible, needs_extra, print_json
 
 
 def export(
@@ -21,7 +21,12 @@ def export(
         ),
     ] = None,
     form: Annotated[
-        str | None, typer.Option("--format", help="laz, las, ply or vtkhdf; default: from the file's suffix.")
+        str | None,
+        typer.Option(
+            "--format",
+            help="laz, las, ply or vtkhdf; default: from the file's suffix.",
+            autocompletion=among("laz", "las", "ply", "vtkhdf"),
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     as_json: AsJson = False,

@@ -8,9 +8,10 @@ from .command_options import ArchivePath, AsJson, print_error, print_json
 
 
 def info(archive: ArchivePath, as_json: AsJson = False) -> None:
-    """Describe an archive: scans, points, bounds, radius, size.
+    """Describe an archive: scans, points, size.
 
-    Ends with what matters: points, area, spacing, radius, voxel size, and what to look at if it looks wrong.
+    Ends with what matters: points, area, spacing, radius, voxel size, and what to look at if it
+    looks wrong.
     """
     import msgspec
 

@@ -26,7 +26,7 @@ def inspect(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan list.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Describe scans and write an editable list of them.
+    """Describe scans and write a list to edit.
 
     The description comes from the headers of the scans. Exit code 3: a scan is broken.
     """

@@ -1,10 +1,12 @@
 """`solidcloud make`: test scans with known ground truth, avatars and walks."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from ....schemas.errors import BadRequestError
 from .command_options import interruptible, needs_extra
 
 ScanOutput = Annotated[
@@ -13,6 +15,7 @@ ScanOutput = Annotated[
         "-o", "--output", help=".laz, .las or .e57 file, or a folder for one LAZ file per scanner station."
     ),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same points.")]
 
 
@@ -21,11 +24,14 @@ def make_facade(
     points: Annotated[int, typer.Option(help="Exact number of points of the scan.")] = 587_923,
     seed: Seed = 2012,
     door: Annotated[float, typer.Option(help="Clear width of the main door [m].")] = 1.60,
+    overwrite: Overwrite = False,
 ) -> None:
-    """Make a scan of a Gothic façade by casting rays.
+    """Make a scan of a Gothic façade.
 
-    Its ground truth is written beside the scan, as NAME.truth.json.
+    The scan is made by casting rays. Its ground truth is written beside the scan, as
+    NAME.truth.json.
     """
+    _check_new(output, overwrite)
     with needs_extra("made"):
         from ....builder.synthetic.scenes import make_facade as make_it
     from ....schemas.process.os_errors import naming_write_errors
@@ -42,11 +48,14 @@ def make_town(
         int, typer.Option(help="Exact number of points of all scans; it determines the number of façades.")
     ],
     seed: Seed = 2012,
+    overwrite: Overwrite = False,
 ) -> None:
-    """Make scans of a town of façades, each as dense as that of make facade.
+    """Make scans of a town of façades.
 
-    The ground truth is written beside the scans, as NAME.truth.json.
+    Each scan is as dense as that of make facade. The ground truth is written beside the scans, as
+    NAME.truth.json.
     """
+    _check_new(output, overwrite)
     with needs_extra("made"):
         from ....builder.synthetic.scenes import make_town as make_it
     from ....schemas.process.os_errors import naming_write_errors
@@ -62,8 +71,10 @@ def make_figure(
     points: Annotated[int, typer.Option(help="Exact number of points of the figure.")] = 3617,
     seed: Seed = 2012,
     height: Annotated[float, typer.Option(help="Height of the figure [m].")] = 1.75,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make an avatar: a human figure in mid-stride."""
+    _check_new(output, overwrite)
     from ....builder.synthetic.figure import figure_points, write_figure
     from ....schemas.process.os_errors import naming_write_errors
 
@@ -76,11 +87,14 @@ def make_walk(
     truth: Annotated[Path, typer.Argument(help="NAME.truth.json, as make facade writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV file of poses to write.")],
     frames: Annotated[int, typer.Option(min=2, help="Number of poses, 30 per second.")] = 1200,
+    overwrite: Overwrite = False,
 ) -> None:
-    """Write the poses of a walk through a façade of make facade.
+    """Write the poses of a walk through a façade.
 
-    The columns are t,x,y,z,qw,qx,qy,qz, as solidcloud query reads them.
+    The façade must be one of make facade. The columns are t,x,y,z,qw,qx,qy,qz, as solidcloud query
+    reads them.
     """
+    _check_new(output, overwrite)
     from ....builder.synthetic.truth import read_truth
     from ....builder.synthetic.walk import walk_poses
     from ....schemas.process.os_errors import naming_write_errors
@@ -89,3 +103,9 @@ def make_walk(
     with interruptible(), naming_write_errors(output):
         write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))
     print(f"{frames} poses in {output}")
+
+
+def _check_new(output: Path, overwrite: bool) -> None:
+    """Raise BadRequestError if a file exists that may not be replaced."""
+    if not overwrite and os.path.lexists(output) and not output.is_dir():
+        raise BadRequestError(f"{output}: exists, expected no such file: give another -o, or --overwrite")

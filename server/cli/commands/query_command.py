@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, KeyFile, print_error, print_json
+from .command_options import AsJson, KeyFile, among, print_error, print_json
 
 if TYPE_CHECKING:
     from ...client import Client
 
 # Options that are not parameters of the query.
 _NOT_OF_THE_QUESTION = ("scene", "op", "connect", "key_file", "as_json")
+_ALONG = ("collide", "distance", "contacts", "sweep")
 
 
 def query(
@@ -24,7 +25,8 @@ def query(
     op: Annotated[
         str,
         typer.Option(
-            help="collide, distance, contacts, sweep, raycast, within, objects, move, or path (answered in parts)."
+            help="collide, distance, contacts, sweep, raycast, within, objects, move, or path (answered in parts).",
+            autocompletion=among(*_ALONG, "raycast", "within", "objects", "move", "path"),
         ),
     ] = "collide",
     avatar: Annotated[
@@ -44,7 +46,11 @@ def query(
         Path | None, typer.Option(help="CSV file of objects: avatar,x,y,z,qw,qx,qy,qz,group,mask.")
     ] = None,
     along: Annotated[
-        str | None, typer.Option(help="Query along a path: collide (default), distance, contacts or sweep.")
+        str | None,
+        typer.Option(
+            help="Query along a path: collide (default), distance, contacts or sweep.",
+            autocompletion=among(*_ALONG),
+        ),
     ] = None,
     connect: Annotated[str, typer.Option(help="Zenoh endpoint of the server.")] = "tcp/127.0.0.1:7447",
     margin: Annotated[
@@ -83,7 +89,7 @@ def query(
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> int:
-    """Query a server about poses, rays, points or objects.
+    """Query a server about poses, rays, points.
 
     Items that lie outside the scan's bounds, even with their reach, are counted in a warning on
     standard error.

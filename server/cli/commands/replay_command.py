@@ -21,9 +21,9 @@ def replay(
     cache: Annotated[str, typer.Option(help="Memory bound of decoded voxels.")] = "512MB",
     as_json: AsJson = False,
 ) -> int:
-    """Simulate a log again and compare bit for bit.
+    """Simulate a log again and compare poses.
 
-    Compares the pose of every frame. Exit code 1: some poses differ.
+    Compares the pose of every frame, bit for bit. Exit code 1: some poses differ.
     """
     from ...scene import Scene
     from ...simulation.replay import check_same

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import parse_bytes
+from .command_options import among, parse_bytes
 
 
 def serve(
@@ -21,7 +21,8 @@ def serve(
     policy: Annotated[
         str,
         typer.Option(
-            help="Eviction policy of the voxel cache: lru, lru+prefetch, distance or s3fifo. All but lru prefetch."
+            help="Eviction policy of the voxel cache: lru, lru+prefetch, distance or s3fifo. All but lru prefetch.",
+            autocompletion=among("lru", "lru+prefetch", "distance", "s3fifo"),
         ),
     ] = "lru+prefetch",
     metrics_port: Annotated[
@@ -73,9 +74,10 @@ def serve(
         bool, typer.Option("--insecure", help="Allow an endpoint that other hosts can reach.")
     ] = False,
 ) -> None:
-    """Serve an archive or a scene over zenoh until interrupted.
+    """Serve an archive or a scene until Ctrl-C.
 
-    An archive is served with the effect stop: an avatar that touches the scan is stopped.
+    Clients connect over zenoh. An archive is served with the effect stop: an avatar that touches the
+    scan is stopped.
     """
     import logging
     import os

@@ -16,7 +16,10 @@ def top(
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show live statistics of a server's cache and users until Ctrl-C."""
+    """Show live statistics of a server.
+
+    They are about its cache and its users, and are updated until Ctrl-C.
+    """
     import msgspec
 
     from ....schemas.errors import BadRequestError

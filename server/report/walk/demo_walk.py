@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from ....builder.config import BuildConfig
 from ....builder.pipeline import build_archive
-from ....builder.synthetic.figure import figure_points
+from ....builder.synthetic.figure import figure_points, write_figure
 from ....schemas.errors import SolidcloudError
+from ....schemas.process.own_command import own_command, shown_path
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.scene_messages import SceneInfo
 from ...cli.output.console import bytes_text, print_build, print_facts
@@ -90,6 +91,7 @@ def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False
 
     draw_walk(out / "walk.png", walk, frames, avatar)
     print(f"wrote {out / 'walk.json'} and {out / 'walk.png'}; the archive is {summary.archive}")
+    _print_commands(out, summary.archive, avatar, walk)
     return report
 
 
@@ -179,6 +181,16 @@ def _scan_walk(scans: Sequence[Path], points: int) -> Walk:
     along = int(np.argmax(np.ptp(poses[:, :2, 3], axis=0)))
     path = f"a straight line along {'xy'[along]} through the middle, over the lowest dense points, z up"
     return Walk(times, poses, path, thinned, along)
+
+
+def _print_commands(out: Path, archive: Path, avatar: NDArray[np.float64], walk: Walk) -> None:
+    """Write the avatar and the poses into `out`; print commands that serve and query the archive."""
+    figure, poses = out / "figure.obj", out / "poses.csv"
+    write_figure(figure, avatar)
+    write_poses(poses, walk.times, walk.poses)
+    print("to do this with your own programs, serve the archive, and query it in a second terminal:")
+    print(f"  {own_command()} serve {shown_path(archive)} --name demo")
+    print(f"  {own_command()} query --scene demo --avatar {shown_path(figure)} --poses {shown_path(poses)}")
 
 
 def _spread(values: NDArray[np.float64]) -> dict[str, float]:

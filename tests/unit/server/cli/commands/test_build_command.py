@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.pipeline as pipeline
 from solidcloud.builder.config import BuildConfig
+from solidcloud.schemas.process.own_command import own_command
 from solidcloud.server.cli.main import run
 
 
@@ -97,7 +98,7 @@ def test_who_interrupts_is_told_how_to_go_on(
     told = capsys.readouterr()
     assert json.loads(told.out)["already"] is True
     assert "already complete, with these scans and these options: nothing was built" in told.err
-    assert "Only its index was checked; `solidcloud validate` reads its records" in told.err
+    assert f"Only its index was checked; `{own_command()} validate` reads its records" in told.err
 
 
 def test_progress_is_json_where_asked_for(

@@ -31,6 +31,7 @@ from .commands import scene_command as scene
 from .commands import serve_command as serve
 from .commands import top_command as top
 from .commands.command_options import print_error
+from .output.compile_notice import compile_notices
 
 # Rich markup is off: importing it doubles the time of --help, to more than the 0.3 s allowed.
 app = typer.Typer(
@@ -100,7 +101,13 @@ def _take_options(
 
 def main() -> None:
     """Run the command and exit."""
-    code = run(sys.argv[1:])
+    if _COMPLETION in os.environ:
+        app(prog_name=NAME)  # prints the completions and exits
+    arguments = sys.argv[1:]
+    # `serve` reports compilation until it serves. With --log-json, programs read standard error.
+    quiet = not arguments or arguments[0] in (*WAITING, "doctor") or "--log-json" in arguments
+    with contextlib.nullcontext() if quiet else compile_notices():
+        code = run(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all output is printed: only Python's shutdown remains
     sys.exit(code)
 

@@ -203,7 +203,7 @@ class RequestDispatcher:
         """Warm every scene, so that the first client does not wait for compilation."""
         start_deadlines()
         for scene in self._scenes.values():
-            log.info("warming %s: the first start on a machine compiles, for a minute or two", scene.name)
+            log.info("warming %s", scene.name)
             scene.warm()
             if scene.simulation is not None:
                 scene.simulation.warm()

@@ -89,6 +89,7 @@ def serve(
     from ...zenoh_common.key_files import read_given_key
     from ...zenoh_server.serve_loop import serve as serve_scenes
     from ...zenoh_server.server_config import ServerConfig
+    from ..output.compile_notice import compile_notices
     from .kernel_rehearsal import rehearse
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
@@ -111,6 +112,7 @@ def serve(
         read_given_key(key_file)  # raises before the archive is opened and warmed
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
+        start.enter_context(compile_notices())
         if start.enter_context(files.starting()):
             rehearse(what, files)
         scene = stack.enter_context(Scene.open(what, name, budget_bytes=budget, policy=policy))

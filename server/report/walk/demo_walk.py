@@ -25,6 +25,8 @@ from ....schemas.errors import SolidcloudError
 from ....schemas.process.own_command import own_command, shown_path
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.scene_messages import SceneInfo
+from ...cli.input.pose_file import write_poses
+from ...cli.output.compile_notice import compile_notices
 from ...cli.output.console import bytes_text, print_build, print_facts
 from ...cli.output.progress_display import progress_listener
 from ...client import Client
@@ -73,7 +75,7 @@ def demonstrate(out: Path, scans: Sequence[Path] = (), *, realtime: bool = False
     out.mkdir(parents=True, exist_ok=True)
     facade = None if scans else make_scan(out)
     scans = scans or [out / "facade.laz"]
-    with progress_listener() as bars:
+    with progress_listener() as bars, compile_notices():
         summary = build_archive(scans, out / "archive", BuildConfig(overwrite=True), bars)
     print_build(summary)
     walk = _facade_walk(scans, facade, summary.points) if facade else _scan_walk(scans, summary.points)

@@ -78,9 +78,10 @@ ALLOWED = {
     "server/report/accuracy/measurement": "avatars residency scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
     "server/report/accuracy": "report/common report/accuracy/measurement report/accuracy/page",
-    "server/report/walk": "client.py residency cli/output scene.py report/common",
+    "server/report/walk": "cli/input client.py residency cli/output scene.py report/common",
+    "server/cli/doctor": "cli/output scene.py",
     "server/cli/commands": (
-        "cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency cli/output "
+        "cli/doctor cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency cli/output "
         "archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
         "report/accuracy"
     ),

@@ -45,6 +45,11 @@ Frame = bytes | mmap.mmap
 _MIN_BLOCK_BYTES = 4
 
 
+def zstd_version() -> str:
+    """Return the version of the zstd library."""
+    return ".".join(map(str, zstandard.ZSTD_VERSION))
+
+
 class Expansion(NamedTuple):
     """Limit of a frame's content size: `free` bytes or `ratio` per byte of the frame, if more."""
 

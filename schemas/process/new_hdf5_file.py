@@ -19,6 +19,11 @@ from .new_file import new_path
 _MAX_METADATA = 1 << 20
 
 
+def hdf5_version() -> str:
+    """Return the version of the HDF5 library."""
+    return str(h5py.version.hdf5_version)
+
+
 class _Disk:
     """File object for HDF5 that hides write errors from it and keeps the first one in `error`.
 

@@ -20,6 +20,7 @@ from ...schemas.process.own_command import NAME, path_advice
 from .commands import accuracy_command as accuracy
 from .commands import add_remove_command as add_remove
 from .commands import build_command as build
+from .commands import doctor_command as doctor
 from .commands import export_command as export
 from .commands import info_validate_command as info_validate
 from .commands import inspect_command as inspect
@@ -71,6 +72,7 @@ for verb in (
     plan.plan,
     top.top,
     replay.replay,
+    doctor.doctor,
 ):
     app.command()(verb)
 

@@ -27,6 +27,7 @@ VERBS = [
     "top",
     "replay",
     "make",
+    "doctor",
 ]
 NESTED = ["make facade", "make town", "make figure", "make walk", "scene", "scene new", "scene check"]
 

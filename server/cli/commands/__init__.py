@@ -1,6 +1,6 @@
 """Commands of `solidcloud`, one file each; a command imports its dependencies when it runs.
 
-May import server.archives, server.avatars, server.cli.input, server.cli.output,
+May import server.archives, server.avatars, server.cli.doctor, server.cli.input, server.cli.output,
 server.cli.scene_files, server/client.py, server.report.accuracy,
 server.report.accuracy.measurement, server.report.accuracy.page, server.residency, server/scene.py,
 server.simulation, server.zenoh_client, server.zenoh_common, server.zenoh_server, builder, schemas.

@@ -74,7 +74,7 @@ ALLOWED = {
         "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes"
     ),
     "server/report/common": "cli/input avatars scene.py",
-    "server/cli/scene_files": "residency archives scenes",
+    "server/cli/scene_files": "residency archives scenes scene.py",
     "server/report/accuracy/measurement": "avatars residency scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
     "server/report/accuracy": "report/common report/accuracy/measurement report/accuracy/page",

@@ -10,7 +10,7 @@ from .command_options import AsJson, print_json
 
 def new(
     archives: Annotated[list[Path], typer.Argument(help="Folders of archives.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Scene file to write.")] = Path("scene.toml"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")] = Path("scene.toml"),
     name: Annotated[
         str | None, typer.Option(help="Scene name for clients; default: the file name without suffix.")
     ] = None,
@@ -23,25 +23,42 @@ def new(
     effects: Annotated[
         str, typer.Option(help="Effects to enable, separated by commas; the others are commented out.")
     ] = "stop",
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a scene file with every field explained."""
-    import shlex
+    """Write a scene file, every field explained.
 
+    Users start on the floor near the middle, at a place where the avatars were tried.
+    """
+    import shlex
+    import sys
+
+    from ....schemas.process.own_command import own_command
+    from ...avatars.avatar_file import read_avatar
     from ..scene_files.scene_new import new_scene
 
     wanted = [effect.strip() for effect in effects.split(",") if effect.strip()]
-    new_scene(out, archives, avatar or [], effects=wanted, name=name, force=force)
-    print(f"{out}: written; edit it, then: {shlex.join(['solidcloud', 'scene', 'check', str(out)])}")
+    spawn = new_scene(
+        output,
+        archives,
+        avatar or [],
+        effects=wanted,
+        name=name,
+        overwrite=overwrite,
+        read_points=read_avatar,
+    )
+    if spawn is None:
+        print(f"{output}: no place to stand was found: see [spawn] in it", file=sys.stderr)
+    print(f"{output}: written; edit it, then: {own_command()} {shlex.join(['scene', 'check', str(output)])}")
 
 
 def check(
     file: Annotated[Path, typer.Argument(help="Scene file.")],
     as_json: AsJson = False,
 ) -> None:
-    """Check a scene file and describe the scene and its effects in their order.
+    """Check a scene file and describe the scene.
 
-    Exit code 2: the file is invalid. Exit code 3: an archive or avatar it names is invalid.
+    The effects are listed in their order. Exit code 2: the file is invalid. Exit code 3: an archive
+    or avatar it names is invalid.
     """
     from ...avatars.avatar_file import read_avatar
     from ..output.console import print_facts

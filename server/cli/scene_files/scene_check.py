@@ -22,6 +22,9 @@ from ...scenes.scene_archives import (
     store_opener,
 )
 
+# The origin of an avatar that stands on the highest point may be this far above it [m].
+_STANDING_HEIGHT = 3.0
+
 
 class Checked(NamedTuple):
     """A valid scene file.
@@ -150,7 +153,10 @@ def _notes(file: SceneFile, archives: list[FoundArchive], left_out: int) -> Iter
             )
     if file.spawn is not None:
         low, high = _bounds(file, archives)
-        if not all(a <= x <= b for a, x, b in zip(low, file.spawn.position, high, strict=True)):
+        beyond = _STANDING_HEIGHT
+        if not all(
+            a - beyond <= x <= b + beyond for a, x, b in zip(low, file.spawn.position, high, strict=True)
+        ):
             yield f"spawn lies outside the bounds of the archives, {_numbers(low)} .. {_numbers(high)} m"
 
 

@@ -1,5 +1,6 @@
 """Creation of a scene file, after checking everything it names."""
 
+import errno
 import os
 import re
 from collections.abc import Sequence
@@ -7,21 +8,28 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ....builder.synthetic.figure import HEIGHT, figure_points
 from ....schemas.archive.radius_model import STORED_MODELS
 from ....schemas.errors import BadRequestError, SolidcloudError
 from ....schemas.process.new_file import new_file
 from ....schemas.process.os_errors import write_error_words
-from ....schemas.scene.scene_file import SUFFIX, parse_scene, scene_name
+from ....schemas.scene.scene_file import SUFFIX, SceneFile, parse_scene, scene_name
 from ....schemas.wire.key_expressions import check_name
 from ...archives.archive_info import describe
 from ...residency.voxel_store import VoxelStore
+from ...scene import DEFAULT_BUDGET, Scene
+from ...scenes.scene_archives import ReadPoints, find_archives, open_archives, read_avatars
 from .scene_text import SceneContent, scene_text
+from .spawn_search import CLEARANCE, add_body, find_spawn
 
 # Characters that an avatar's name must not contain (schemas/scene/scene_file.py, SceneName), and
 # its maximum length.
 _NO_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _LONGEST_NAME = 64
+# Points of the figure that stands at the spawn of a scene without avatars.
+_FIGURE_POINTS = 1000
 
 
 def new_scene(
@@ -31,13 +39,15 @@ def new_scene(
     *,
     effects: Sequence[str],
     name: str | None = None,
-    force: bool = False,
-) -> None:
-    """Write a scene file with archives, avatars named after their files, and effects.
+    overwrite: bool = False,
+    read_points: ReadPoints,
+) -> Sequence[float] | None:
+    """Write a scene file with archives, avatars named after their files, effects, and a spawn.
 
-    force: replace an existing file.
+    Returns the position of the spawn, None if no place for it was found.
+    overwrite: replace an existing file.  read_points: returns the points of an avatar's file.
     Raises BadRequestError for content that a scene file must not have and for an existing file,
-    FormatError or CorruptError for an invalid archive.
+    FormatError or CorruptError for an invalid archive, ScanError for an invalid avatar.
     """
     if out.suffix != SUFFIX:
         raise BadRequestError(
@@ -62,14 +72,48 @@ def new_scene(
         bounds[:, 1].max(axis=0).tolist(),
     )
     text = scene_text(begin).encode()
-    scene_name(parse_scene(text, f"{out} (not written)"), out)
-    if os.path.lexists(out) and not force:
-        raise BadRequestError(f"{out} exists: give another -o, or --force to replace it")
+    parsed = parse_scene(text, f"{out} (not written)")
+    called = scene_name(parsed, out)
+    if os.path.lexists(out) and not overwrite:
+        raise BadRequestError(f"{out} exists: give another -o, or --overwrite to replace it")
+    if not out.absolute().parent.is_dir():
+        error = FileNotFoundError(errno.ENOENT, "")
+        raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}")
+    spawn, note = _find_spawn(parsed, out, called, read_points)
+    text = scene_text(begin._replace(spawn=spawn, spawn_note=note)).encode()
     try:
         with new_file(out) as file:
             file.write(text)
     except OSError as error:
         raise SolidcloudError(f"{out}: cannot be written: {write_error_words(error, out)}") from None
+    return spawn
+
+
+def _find_spawn(
+    file: SceneFile, out: Path, name: str, read_points: ReadPoints
+) -> tuple[Sequence[float] | None, str]:
+    """Return a position where the avatars of a scene file stand, if one is found, and a note on it.
+
+    Without avatars, a generated figure takes their place.
+    """
+    found = find_archives(file, out)
+    avatars = {
+        each.info.name: (each.points, each.info.radius) for each in read_avatars(file, out, read_points)
+    }
+    given: dict[str, tuple[NDArray[np.float64], float | None]] = {**avatars}
+    who = ", ".join(avatars)
+    if not avatars:
+        given, who = {"figure": (figure_points(_FIGURE_POINTS), None)}, f"a figure of {HEIGHT:g} m"
+    try:
+        archives = open_archives(file, out, name, found, DEFAULT_BUDGET, "lru", lambda _: None)
+        with Scene(archives, name) as scene:
+            spawn = find_spawn(scene, add_body(scene, given))
+    except SolidcloudError as error:
+        words = "".join(each if each.isprintable() else " " for each in str(error))
+        return None, f"No place to stand could be searched: {words}."
+    if spawn is None:
+        return None, f"No place near the middle was found where {who} would stand clear on a floor."
+    return spawn, f"Tried when this file was written: {who} clear, {CLEARANCE:g} m above a floor."
 
 
 def _avatar_names(avatars: Sequence[Path]) -> dict[str, Path]:

@@ -28,6 +28,8 @@ class SceneContent(NamedTuple):
     archives: paths, relative to the file.  avatars: (name, path).
     effects: names of the effects to enable.  models: radius models that all archives store.
     low, high: bounds of the archives, world frame [m].
+    spawn: position of users at their start, world frame [m]; None: an example, commented out.
+    spawn_note: sentence about how the spawn was found, or why there is none.
     """
 
     archives: Sequence[str]
@@ -37,6 +39,8 @@ class SceneContent(NamedTuple):
     models: Sequence[str]
     low: Sequence[float]
     high: Sequence[float]
+    spawn: Sequence[float] | None = None
+    spawn_note: str = ""
 
 
 def scene_text(begin: SceneContent) -> str:
@@ -147,13 +151,14 @@ def _places(begin: SceneContent) -> Iterator[str]:
     yield ""
     yield from _comment(
         "Initial pose of users: position of the avatar's origin; heading about the up axis, in degrees. Default: the "
-        "pose that the user sends."
+        f"pose that the user sends. {begin.spawn_note}".rstrip()
     )
-    middle = [round((low + high) / 2, 3) for low, high in zip(begin.low[:2], begin.high[:2], strict=True)]
+    middle = [round((low + high) / 2, 3) for low, high in zip(begin.low, begin.high, strict=True)]
+    off = "#" if begin.spawn is None else ""
     yield from (
-        "#[spawn]",
-        f"#position = {toml_value([*middle, round(begin.low[2], 3)])}",
-        "#heading = 0.0",
+        f"{off}[spawn]",
+        f"{off}position = {toml_value(list(begin.spawn or middle))}",
+        f"{off}heading = 0.0",
         "",
     )
 

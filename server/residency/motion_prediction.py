@@ -221,15 +221,15 @@ class UserTracks:
         options = self._options._replace(horizon=self.ahead.horizon(load_seconds))
         rows, need, paths = plan_tracks(self._snapshot(), now, options, self._index)
         self._planned_paths = paths, self._planned_paths[1] + 1
-        return PredictedVoxels(rows, need)
+        order = np.argsort(need, kind="stable")
+        return PredictedVoxels(rows[order], need[order])
 
     def kept(self, now: float, after: float = EXPIRY) -> NDArray[np.int64]:
-        """Return the rows (n,), each once, that users can touch at their current positions.
+        """Return the rows (n,), ascending, that users can touch at their current positions.
 
         Users whose last pose is more than `after` seconds old are ignored.
         """
-        rows: NDArray[np.int64] = rows_kept(self._snapshot(), now, after, self._options, self._index)
-        return rows
+        return np.unique(rows_kept(self._snapshot(), now, after, self._options, self._index))
 
     def rows_in_reach(
         self, centers: NDArray[np.float64], reaches: NDArray[np.float64]

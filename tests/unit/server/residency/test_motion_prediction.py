@@ -397,4 +397,4 @@ def test_what_several_want_is_wanted_once_and_when_the_first_needs_it(seed: int)
         found = list(zip(found_rows.tolist(), found_need.tolist(), strict=True))
         assert dict(found) == first and len(found) == len(first)
         places = {row: int(np.flatnonzero((rows == row) & (need == when))[0]) for row, when in found}
-        assert found == sorted(found, key=lambda each: (each[1], places[each[0]])), "equals as they came"
+        assert found == sorted(found, key=lambda each: places[each[0]]), "in their order"

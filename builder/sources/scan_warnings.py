@@ -306,8 +306,10 @@ def _radius_of_scans(facts: _Numbered, radius: float) -> list[ScanWarning]:
 def radius_warning(radius: float, spacing: float) -> str:
     """Return what is wrong with a given radius [m] for points of this spacing [m]; "" if it fits.
 
-    A radius of 0 is a choice: the points themselves.
+    A radius of 0 is a choice: the points themselves. A spacing of 0, of duplicates, tells nothing.
     """
+    if not spacing:
+        return ""
     if radius and spacing < TOO_DENSE * radius:
         what = f"--radius {radius:g} is {radius / spacing:,.0f} times the distance between points"
         return f"{what}, about {length_text(spacing)}: walls grow by {length_text(radius)}: give it in metres"

@@ -159,6 +159,10 @@ def test_a_radius_is_compared_with_the_spacing(radius: float, wrong: str) -> Non
     assert wrong in text if wrong else text == ""
 
 
+def test_no_radius_is_compared_with_the_spacing_of_duplicates() -> None:
+    assert radius_warning(0.02, 0.0) == ""
+
+
 def test_inspect_plan_and_build_say_the_same(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     scan = write_xyz(tmp_path / "room.xyz", room() * 1000)
     lines = []

@@ -36,7 +36,7 @@ IDLE_REST = 4.0
 # Share of the budget that is kept for users' current positions; the rest is available to all
 # requests.
 KEPT_SHARE = 0.5
-# The first plan compiles for 7 s where nothing is compiled yet (scripts/bench_compile). It begins when
+# The first plan compiles for 4 s where nothing is compiled yet (scripts/bench_compile). It begins when
 # no request is running, so that the first answer does not wait for it: asked every ANSWER_REST [s], at
 # most for FIRST_ANSWER_SECONDS after the first pose.
 ANSWER_REST, FIRST_ANSWER_SECONDS = 0.02, 120.0

@@ -3,14 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-from bench_engine_cases.engine_picture import FAINT, INK, goals_table, write_picture
+from bench_engine_cases.engine_picture import FAINT, SERIES, goals_table, text_on, write_picture
 from measurement.bench_results import Part, goal_rows, number
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .build_runs import REST, Built
 
-STAGES = ("#1b6ca8", "#74b3df", "#d98b2b", "#7a4fa3", "#2e8b57", "#c9a227", "#b79bd1", "#4d4d4d")
-REST_COLOUR = "#c8ccd0"
+REST_COLOUR = "#ececec"
 LIMIT = "#c0392b"
 
 
@@ -55,7 +54,7 @@ def draw(
 def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]]) -> None:
     """Draw nanoseconds per point of each stage, one bar per size, and the machine's limits below."""
     names = [*dict.fromkeys(name for built in builds for name in built.stages if name != REST), REST]
-    colours = {name: STAGES[k % len(STAGES)] for k, name in enumerate(names)} | {REST: REST_COLOUR}
+    colours = {name: SERIES[k % len(SERIES)] for k, name in enumerate(names)} | {REST: REST_COLOUR}
     longest = max(built.seconds / built.points for built in builds) * 1e9
     labels: list[str] = []
     for k, built in enumerate(builds):
@@ -66,8 +65,15 @@ def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]])
             axes.barh(row, width, left=at, height=0.8, color=colours[name], label=name if k == 0 else None)
             if width > 0.08 * longest:
                 text = f"{width:.0f}, {width * built.points / built.seconds / 1e9:.0%}"
-                colour = INK if name == REST else "white"
-                axes.text(at + width / 2, row, text, ha="center", va="center", fontsize=8, color=colour)
+                axes.text(
+                    at + width / 2,
+                    row,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color=text_on(colours[name]),
+                )
             at += width
         rate = f" {at:.0f}: {built.points / built.seconds / 1e6:.2f} M points/s"
         axes.text(at, row, rate, va="center", fontsize=9, weight="bold")
@@ -77,7 +83,15 @@ def _stages(axes: Any, builds: list[Built], limits: dict[int, dict[str, float]])
             axes.barh(row, width, height=0.45, color=LIMIT)
             axes.text(width, row, f" {number(width)}", va="center", fontsize=8, color=LIMIT)
     axes.axvline(500, color=FAINT, ls="--", lw=1.2)
-    axes.text(500, -0.9, " goal: 2 M points/s", fontsize=8, color=FAINT, va="center")
+    axes.annotate(
+        "goal: 2 M points/s",
+        (500, -0.9),
+        xytext=(4, 0),
+        textcoords="offset points",
+        fontsize=8,
+        color=FAINT,
+        va="center",
+    )
     axes.set_yticks(range(len(labels)), labels, fontsize=8.5)
     axes.set(ylim=(len(labels) - 0.4, -1.3), xlim=(0, max(longest * 1.25, 600)))
     title = "time, ns a point: stages of each build, and what reading, writing, decoding take alone"
@@ -91,12 +105,15 @@ def _memory(axes: Any, builds: list[Built], bound: int) -> None:
     for k, built in enumerate(builds):
         samples = built.watched.samples
         axes.plot(
-            [s.at / built.seconds for s in samples], [s.pss / 2**20 for s in samples], color=STAGES[k % len(STAGES)],
+            [s.at / built.seconds for s in samples], [s.pss / 2**20 for s in samples], color=SERIES[k % len(SERIES)],
             lw=1.4, label=f"{built.points:,} points",
         )  # fmt: skip
     for limit, text in ((bound, "--memory"), (bound + (200 << 20), "goal: 200 MB more")):
         axes.axhline(limit / 2**20, color=LIMIT, ls="--", lw=1.1)
-        axes.text(0.0, limit / 2**20, f" {text}", fontsize=8, color=LIMIT, va="bottom")
+        axes.text(
+            0.005, limit / 2**20, text, fontsize=8, color=LIMIT, va="bottom",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+        )  # fmt: skip
     axes.set(xlim=(0, 1), ylim=(0, None), xlabel="share of the build's time")
     axes.set_title("memory of all processes together (sum of PSS), MB", loc="left", fontsize=11)
     axes.legend(fontsize=8, frameon=False, loc="lower right")
@@ -105,7 +122,7 @@ def _memory(axes: Any, builds: list[Built], bound: int) -> None:
 
 def _sizes(axes: Any, sizes: list[Any], cases: list[str]) -> None:
     """Draw bytes per point: the archive, and LAZ of the same xyz where it exists."""
-    for shift, what, colour in ((-0.2, "archive", STAGES[0]), (0.2, "LAZ", "#8a8a8a")):
+    for shift, what, colour in ((-0.2, "archive", SERIES[0]), (0.2, "LAZ", "#8a8a8a")):
         own = [f for f in sizes if f.what == what]
         places = [cases.index(f.case) + shift for f in own]
         axes.barh(

@@ -7,9 +7,11 @@ from bench_engine_cases.engine_picture import FAINT, INK, VERDICTS, goals_table,
 from measurement.bench_results import MISSED, Part, goal_rows
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
+# By effect, in the order in which they run. Lightness differs between all of them, most between
+# neighbours in the stack, so that they also differ in a grey print.
 COLOURS = {
-    "objects": "#8c6d31", "crowd": "#c49c39", "stop": "#1b6ca8", "sweep": "#1b6ca8", "slide": "#74b3df",
-    "step": "#2e8b57", "ground": "#8fce9f", "proximity": "#7a4fa3", "contacts": "#d98b2b", "uncertainty": "#c0625a",
+    "objects": "#937233", "crowd": "#e8c96c", "stop": "#082d52", "sweep": "#4191d3", "slide": "#cee6f6",
+    "step": "#175b34", "ground": "#7bc68e", "proximity": "#52287b", "contacts": "#e28d23", "uncertainty": "#b43628",
 }  # fmt: skip
 # Frames averaged for a smooth line: a third of a second.
 SMOOTH = 10
@@ -45,13 +47,23 @@ def _stack(axes, company: dict[str, np.ndarray], limit: float) -> None:  # type:
     kernel = np.ones(SMOOTH) / SMOOTH
     values = [1e6 * np.convolve(company[name], kernel, mode="same") for name in names]
     at = np.arange(len(values[0])) / 30.0
-    axes.stackplot(at, values, labels=names, colors=[COLOURS[name] for name in names], linewidth=0)
+    axes.stackplot(
+        at, values, labels=names, colors=[COLOURS[name] for name in names], edgecolor="white", linewidth=0.4
+    )
     axes.axhline(limit, color=VERDICTS[MISSED], lw=1.2, ls="--")
     axes.set(xlim=(0, at[-1]), xlabel="time on the walk [s]", ylabel="time of a frame [µs]")
-    title = f"all effects together, means of {SMOOTH} frames; dashed: what walking is to take in the mean, {limit:g} µs"
-    axes.set_title(title, loc="left", fontsize=11)
+    title = f"all effects together, means of {SMOOTH} frames; dashed: target of the mean frame of walking, {limit:g} µs"
+    axes.set_title(title, loc="left", fontsize=11, pad=26)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="upper left", ncols=len(names), frameon=False, fontsize=9)
+    # Between the title and the panel: the stacks reach the top of the panel.
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 0.99),
+        ncols=len(names),
+        frameon=False,
+        fontsize=9,
+        borderaxespad=0.2,
+    )
 
 
 def _means(axes, parts: list[Part]) -> None:  # type: ignore[no-untyped-def]
@@ -79,5 +91,6 @@ def _means(axes, parts: list[Part]) -> None:  # type: ignore[no-untyped-def]
             axes.text(company[name], k + 0.2, f" {company[name]:.1f}", va="center", fontsize=8, color=FAINT)
     axes.set_yticks(at, names)
     axes.invert_yaxis()
+    axes.margins(x=0.15)  # room for the numbers
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title("mean of a frame [µs]: alone (full), in company (pale)", loc="left", fontsize=11)

@@ -4,6 +4,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+from matplotlib.colors import to_rgb
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from measurement.bench_results import MET, MISSED, Figure, Part, busy, goal_rows, limit_text, number
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
@@ -12,15 +13,19 @@ from .collide_section import CAPT_PART, TABLE_PART
 from .compared_sides import BRUTE, CAPT, CAPT16, COLLIDE, OURS, SCIPY, TABLE
 from .growth_section import FACADES
 
+# Lightness differs between all sides, so that they also differ in a grey print.
 COLOURS = {
-    OURS: "#1b6ca8",
-    TABLE: "#d98b2b",
-    CAPT: "#7a4fa3",
-    CAPT16: "#b79bd1",
-    SCIPY: "#8a8a8a",
-    BRUTE: "#4d4d4d",
+    OURS: "#124972",
+    TABLE: "#d58726",
+    CAPT: "#7b50a4",
+    CAPT16: "#dacce8",
+    SCIPY: "#7f7f7f",
+    BRUTE: "#1f1f1f",
 }
-LIGHTER = "#74b3df"  # our second archive
+LIGHTER = "#85bde3"  # our second archive
+MARKERS = {OURS: "o", TABLE: "s", CAPT: "^", CAPT16: "v", SCIPY: "D", BRUTE: "X"}
+# For other pictures: lightness differs between all of them, most between neighbours.
+SERIES = ("#0f3c5d", "#85bde3", "#634084", "#d98928", "#232323", "#30925c", "#e8d187", "#8b5875")
 VERDICTS = {MET: "#2e8b57", MISSED: "#c0392b"}
 INK, FAINT = "#222222", "#777777"
 
@@ -60,6 +65,12 @@ def write_picture(figure: Any, title: str, parts: list[Part], target: Path) -> N
     figure.suptitle(title, fontsize=13, color=VERDICTS[MISSED] if warning else INK)
     figure.savefig(target)
     load_pyplot().close(figure)
+
+
+def text_on(colour: str) -> str:
+    """Return the colour of a text that is legible on a colour: white on a dark one, else ink."""
+    red, green, blue = to_rgb(colour)
+    return "white" if 0.2126 * red + 0.7152 * green + 0.0722 * blue < 0.55 else INK
 
 
 def _colour(side: str, ours: list[str]) -> str:
@@ -122,6 +133,7 @@ def _sets(axes: Any, sets: list[Figure], cases: list[str]) -> None:
             colour, label = _colour(side, ours), side
         axes.scatter(
             [f.value for f in own], [cases.index(f.case) for f in own], s=58, color=colour, label=label,
+            marker=MARKERS[OURS] if side.startswith(OURS) else MARKERS.get(side, "P"),
             zorder=4 if side.startswith(OURS) else 3,  # ours on top
             edgecolors="white", linewidths=0.6,
         )  # fmt: skip

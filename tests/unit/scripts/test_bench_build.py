@@ -10,6 +10,7 @@ import pytest
 from bench_build_cases import build_limits, build_picture, build_rates, build_runs, build_sizes, build_watch
 from bench_build_cases.build_watch import Sample, Watched
 from measurement.bench_results import Part
+from picture_checks import alike_in_grey, covered, drawn_figures, overlaps
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.plan.rates import StageRate
@@ -194,5 +195,8 @@ def test_picture_is_drawn_of_any_sections(tmp_path: Path) -> None:
     sizes.add("façade", "", "LAZ", 2.0, "B/point")
     for name, parts in (("a.png", [part]), ("b.png", [part, sizes])):
         limits = {1000: {"read": 0.1, "write": 0.2}}
-        build_picture.draw(parts, {}, runs, limits, 1 << 30, "machine", tmp_path / name)
+        with drawn_figures() as figures:
+            build_picture.draw(parts, {}, runs, limits, 1 << 30, "machine", tmp_path / name)
+        (figure,) = figures
+        assert alike_in_grey(figure) == [] and overlaps(figure) == [] and covered(figure) == []
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

@@ -13,6 +13,7 @@ from bench_engine_cases import compared_sides, engine_picture
 from measurement import bench_results, machine, query_poses
 from measurement.contact_definition import Judge, least_distance
 from measurement.machine import Clock
+from picture_checks import alike_in_grey, covered, drawn_figures, overlaps
 from scipy.spatial import cKDTree
 from solidcloud.builder.synthetic.facade import build_facade
 from solidcloud.builder.synthetic.walk import walk_poses
@@ -237,7 +238,10 @@ def test_the_report_is_written_and_drawn(tmp_path: Path) -> None:
     with open(tmp_path / "out" / "engine.csv", newline="") as file:
         assert [row["side"] for row in csv.DictReader(file)] == ["ours, voxel 32 m", compared_sides.TABLE]
     for number, parts in enumerate((a_report(), [bench_results.Part("memory")])):
-        engine_picture.draw(parts, {}, "a machine", tmp_path / f"{number}.png")
+        with drawn_figures() as figures:
+            engine_picture.draw(parts, {}, "a machine", tmp_path / f"{number}.png")
+        (figure,) = figures
+        assert alike_in_grey(figure) == [] and overlaps(figure) == [] and covered(figure) == []
         assert (tmp_path / f"{number}.png").read_bytes().startswith(b"\x89PNG")
 
 

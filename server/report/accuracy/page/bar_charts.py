@@ -12,8 +12,9 @@ from ..measurement.setting_results import RADIUS, Row
 
 # Colours of the pictures' palette: halves the file size without losing a colour.
 PALETTE = 256
+# They differ in lightness, so that bars and lines also differ in a grey print.
 MODEL_COLOURS = {
-    "mean": "#2f2a26", "local": "#1f7a8c", "border": "#c8553d", "local+border": "#7a5195", "fixed": "#b8860b",
+    "mean": "#2f2a26", "local": "#1e7586", "border": "#ce6954", "local+border": "#5b3c6f", "fixed": "#d2990d",
 }  # fmt: skip
 
 
@@ -21,7 +22,7 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
     """Draw the times (p50 to p99) and the errors of each setting of one knob, side by side."""
     pyplot = load_pyplot()
     figure, (times, wrong) = pyplot.subplots(
-        1, 2, figsize=(9.0, 1.3 + 0.34 * len(rows)), sharey=True, layout="constrained", width_ratios=[1.3, 1]
+        1, 2, figsize=(9.0, 1.5 + 0.34 * len(rows)), sharey=True, layout="constrained", width_ratios=[1.3, 1]
     )
     for i, row in enumerate(rows):
         colour = "black" if row.default else "#1f7a8c"
@@ -44,7 +45,7 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
     times.invert_yaxis()
     most = max((row.p99_us or 0.0) for row in rows)
     times.set_xlim(0, most * 1.08)
-    times.set_xlabel("time per pose [µs]: p50 to p99 of groups of poses, mean as a point")
+    times.set_xlabel("time per pose [µs]\np50 to p99 of groups of poses, mean as a point")
     left = np.zeros(len(rows))
     for name, colour in (("early", "#d62839"), ("late", "#5b1a8b"), ("unknown", "#b9b2a8")):
         share = np.array([getattr(row, name) / max(row.poses, 1) * 100 for row in rows])
@@ -52,7 +53,7 @@ def draw_knob(knob: str, rows: Sequence[Row], target: Path) -> Path:
         left += share
     wrong.set_xlim(0, max(1.0, float(left.max()) * 1.15))
     than = "mean's" if knob == RADIUS else "the exact ones"
-    wrong.set_xlabel(f"verdicts that differ from {than} [% of poses]")
+    wrong.set_xlabel(f"verdicts that differ\nfrom {than} [% of poses]")
     # Above the panel, clear of the bars.
     wrong.legend(frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3)
     for panel in (times, wrong):

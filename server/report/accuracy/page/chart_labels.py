@@ -7,8 +7,9 @@ import numpy as np
 
 FONT = 9.0
 # Distances of a label from its anchor, in points: beside it first, then farther away with a line to
-# it.
-NEAR, FAR, FARTHER = 11.0, 27.0, 45.0
+# it, until it covers no other.
+NEAR = 11.0
+DISTANCES = (NEAR, 27.0, 45.0, 65.0, 90.0, 120.0, 155.0, 195.0)
 TURNS = 16
 # Half the size of a star or a ring, in points.
 MARK = 8.0
@@ -41,7 +42,7 @@ def place_labels(
         box = text.get_window_extent(renderer)
         half_width, half_height = box.width / 2, box.height / 2
         best, least = (0.0, 0.0), np.inf
-        for step, distance in enumerate((NEAR, FAR, FARTHER)):
+        for step, distance in enumerate(DISTANCES):
             for k in range(TURNS):
                 turn = 2 * np.pi * k / TURNS
                 dx = np.cos(turn) * (distance * scale + half_width)

@@ -266,7 +266,7 @@ def _trade(panel: Any, rows: Sequence[Row]) -> Wanted:
                 _mark(panel, *place, row)
             anchors.append(place)
             labels.append(f"{row.setting}, default" if row.default else row.setting)
-            colours.append(colour)
+            colours.append(INK)
     best = pareto_front(
         [(1.0, x, max(y, 0.0)) for x, y in anchors]
     )  # times are ignored: other panels show them

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from picture_checks import alike_in_grey, covered, drawn_figures, overlaps, share_of_figure
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -15,7 +16,7 @@ from solidcloud.server.cli.input.pose_file import write_poses
 from solidcloud.server.report.common.paper_case import Case, archive_points, given_case
 from solidcloud.server.report.common.sphere_pictures import LevelSpheres, level_spheres, render_spheres
 from solidcloud.server.report.walk import walkthrough
-from solidcloud.server.report.walk.path_figure import contact_spans, rolling_median
+from solidcloud.server.report.walk.path_figure import Curve, contact_spans, draw_path, rolling_median
 from solidcloud.server.report.walk.walkthrough import PLAIN, SLAB, Structure
 
 SEED = 7
@@ -189,3 +190,26 @@ def test_contact_spans_are_the_runs_of_contact() -> None:
 
 def test_rolling_median_drops_a_single_peak() -> None:
     assert rolling_median(np.array([1.0, 1, 9, 1, 2]), 3).tolist() == [1, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize("degrees", [(4,), (4, 8), (4, 5, 6, 8, 10, 12, 16)])
+def test_path_figure_is_legible_in_grey_and_nothing_overlaps(
+    degrees: tuple[int, ...], tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(SEED)
+    curves = {
+        kind: [Curve(degree, rng.uniform(1e-5, 9e-5, 90)) for degree in degrees] for kind in (SLAB, PLAIN)
+    }
+    contact = np.arange(90) % 30 < 5
+    with drawn_figures() as figures:
+        draw_path(
+            np.arange(90) / 30,
+            curves,
+            np.full(90, 1e-6),
+            contact,
+            {4: 17.0, 8: 19.0},
+            tmp_path / "figure7.png",
+        )
+    (figure,) = figures
+    assert alike_in_grey(figure) == [] and overlaps(figure) == [] and covered(figure) == []
+    assert share_of_figure(figure) > 0.75

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from picture_checks import alike_in_grey, covered, drawn_figures, overlaps, share_of_figure
 from solidcloud.builder.config import BuildConfig
 from solidcloud.server.report.accuracy.measurement.engine_settings import engine_settings, radius_settings
 from solidcloud.server.report.accuracy.measurement.measurement_plan import BRIEF
@@ -112,6 +113,15 @@ def test_the_page_fetches_nothing_and_names_every_knob_and_setting(
     assert page.count("<img") == len(charts)
     for data in re.findall(r"data:image/png;base64,([^\"]+)", page):
         assert base64.b64decode(data).startswith(b"\x89PNG")
+
+
+def test_every_chart_is_legible_in_grey_and_nothing_overlaps(tmp_path: Path) -> None:
+    with drawn_figures() as figures:
+        charts = draw_charts(all_rows(), "made façade", tmp_path)
+    assert len(figures) == len(charts)
+    for figure in figures:
+        assert alike_in_grey(figure) == [] and overlaps(figure) == [] and covered(figure) == []
+        assert share_of_figure(figure) > 0.75
 
 
 def test_the_main_chart_is_small_enough_for_a_readme(

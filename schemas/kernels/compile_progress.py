@@ -3,7 +3,8 @@
 A burst is a sequence of compilations without a long pause: those that one query needs when nothing
 is stored yet. One message follows after the burst's first second, then one every ten seconds. They
 are warnings if somebody watches the standard error stream, otherwise information, so that a
-program's output does not change.
+program's output does not change. The commands print their own lines, which count all processes
+(server/cli/output/compile_notice.py).
 """
 
 import logging

@@ -5,6 +5,7 @@ there what it compiles, and other processes wait for it (schemas/kernels/kernel_
 is printed if all kernels are there, or within the first second.
 """
 
+import logging
 import os
 import signal
 import sys
@@ -93,8 +94,14 @@ class CompileNotice:
 
 @contextmanager
 def compile_notices() -> Iterator[None]:
-    """Print lines on standard error while kernels are compiled in this block, by any process."""
+    """Print lines on standard error while kernels are compiled in this block, by any process.
+
+    They replace the messages about this process alone (schemas/kernels/compile_progress.py).
+    """
     ended = threading.Event()
+    own = logging.getLogger("solidcloud.schemas.kernels.compile_progress")
+    level = own.level
+    own.setLevel(logging.ERROR)
 
     def watch() -> None:
         # Signals are for the main thread, which runs the handlers and may wait in a system call.
@@ -114,6 +121,7 @@ def compile_notices() -> Iterator[None]:
     try:
         yield
     finally:
+        own.setLevel(level)
         ended.set()
         thread.join(1.0)
 

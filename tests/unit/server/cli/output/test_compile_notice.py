@@ -1,5 +1,6 @@
 """Test the lines on standard error while kernels are compiled: only when they are, and counted."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from solidcloud.schemas.kernels import compile_progress
 from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.server.cli.output import compile_notice
 from solidcloud.server.cli.output.compile_notice import CompileNotice, compile_notices
@@ -126,3 +128,10 @@ def test_the_command_says_that_it_compiles_the_first_time_alone(tmp_path: Path) 
         assert done.returncode == 0, done.stderr
         said.append("compil" in done.stderr)
     assert said == [True, False]
+
+
+def test_messages_of_this_process_are_replaced() -> None:
+    own = logging.getLogger(compile_progress.__name__)
+    with compile_notices():
+        assert not own.isEnabledFor(logging.WARNING)
+    assert own.isEnabledFor(logging.WARNING)

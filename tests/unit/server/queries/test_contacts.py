@@ -248,7 +248,7 @@ def test_lengths_that_are_none_are_refused(row: ScanCase, length: float) -> None
 @pytest.mark.parametrize(
     ("poses", "error"),
     [
-        (np.eye(4), BadRequestError),
+        (np.eye(3), BadRequestError),
         (np.full((1, 4, 4), np.nan), BadRequestError),
         (np.diag([1.0, 1, 2, 1])[None], BadTransformError),
         (at((2e9, 0, 0)), BadTransformError),

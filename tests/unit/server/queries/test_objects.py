@@ -135,7 +135,7 @@ def test_what_is_refused(data: SceneData) -> None:
     for arguments, error, text in [
         (([BALL], at(0, 1), [1, 1], [1, 1]), BadRequestError, "1 avatars, 2 poses"),
         (([BALL], at(0), [1, 1], [1]), BadRequestError, "2 groups"),
-        (([BALL], np.eye(4), [1], [1]), BadRequestError, "shape"),
+        (([BALL], np.eye(3), [1], [1]), BadRequestError, "shape"),
         (([BALL] * 2, at(0, 1), [1, 1], [1, 1], -1.0), BadRequestError, "margin"),
         (([BALL] * 2, at(0, 1), [1, 1], [1, 1], 15.5), BadRequestError, "add up to 16.5 m"),
         (([BALL] * 2, at(0, np.nan), [1, 1], [1, 1]), BadRequestError, "pose 1 holds nan"),

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
+from ...schemas.kernels import compile_progress
 from ...schemas.process.interrupts import blocking_sigint, check_interrupt
 
 Unit = TypeVar("Unit")
@@ -170,11 +171,13 @@ def worker_count(jobs: int, points: int) -> int:
     return min(os.cpu_count() or 1, max(1, points // POINTS_WORTH_A_PROCESS))
 
 
-def _begin_worker() -> None:
+def _begin_worker(compile_messages: int) -> None:
     """Ignore SIGINT, because the builder stops its workers.
 
     End this worker if the builder is killed.
+    compile_messages: level of messages on compilation in the builder, which may print its own.
     """
+    compile_progress.log.setLevel(compile_messages)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked since the process started
     threading.Thread(target=_end_with_builder, daemon=True).start()
@@ -201,8 +204,11 @@ class ProcessExecutor:
         # Spawn, not fork: a fork copies locks that other threads hold, such as those of a progress
         # bar.
         context = multiprocessing.get_context("spawn")
+        level = (compile_progress.log.level,)
         self._pool = (
-            ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker) if jobs > 1 else None
+            ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=level)
+            if jobs > 1
+            else None
         )
 
     def __enter__(self) -> Self:

@@ -107,7 +107,7 @@ def main() -> None:
         app(prog_name=NAME)  # prints the completions and exits
     arguments = sys.argv[1:]
     # `serve` reports compilation until it serves. With --log-json, programs read standard error.
-    quiet = not arguments or arguments[0] in (*WAITING, "doctor") or "--log-json" in arguments
+    quiet = not arguments or arguments[0] in (*WAITING, "doctor") or {"--log-json", "--help"} & {*arguments}
     with contextlib.nullcontext() if quiet else compile_notices():
         code = run(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all output is printed: only Python's shutdown remains

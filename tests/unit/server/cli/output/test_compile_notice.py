@@ -6,9 +6,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
+from solidcloud.builder.run.executor import ProcessExecutor
 from solidcloud.schemas.kernels import compile_progress
 from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.server.cli.output import compile_notice
@@ -135,3 +137,10 @@ def test_messages_of_this_process_are_replaced() -> None:
     with compile_notices():
         assert not own.isEnabledFor(logging.WARNING)
     assert own.isEnabledFor(logging.WARNING)
+
+
+def test_messages_of_worker_processes_are_replaced() -> None:
+    with compile_notices(), ProcessExecutor(2) as executor:
+        assert executor.submit(attrgetter("level"), compile_progress.log).result() == logging.ERROR
+    with ProcessExecutor(2) as executor:
+        assert executor.submit(attrgetter("level"), compile_progress.log).result() == logging.NOTSET

@@ -1,12 +1,19 @@
 """`solidcloud add`, `remove` and `reload`: write and hot-reload a new generation of an archive."""
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, KeyFile, interruptible, parse_bytes, print_json
+from .command_options import (
+    ArchivePath,
+    AsJson,
+    KeyFile,
+    interruptible,
+    parse_bytes,
+    print_json,
+    print_warning,
+)
 
 if TYPE_CHECKING:
     from ....builder.edit.rebuild_voxels import ChangeSummary
@@ -105,7 +112,7 @@ def _archive_state(archive: Path) -> str:
 def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
     """Print the summary of a change, with its warnings on standard error."""
     for warning in summary.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        print_warning(warning)
     now = summary.radius_now
     if as_json:
         print_json(

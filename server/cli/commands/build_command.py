@@ -9,7 +9,7 @@ import typer
 
 from ....builder.sources.format_table import FORMATS
 from ....schemas.process.own_command import own_command
-from .command_options import AsJson, among, interruptible, parse_bytes, print_json
+from .command_options import AsJson, among, interruptible, parse_bytes, print_json, print_warning
 
 if TYPE_CHECKING:
     from ....builder.config import BuildConfig
@@ -156,7 +156,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     def warn(text: str) -> None:
         """Print a warning at once: the build may take hours."""
         said.add(text)
-        print(f"warning: {text}", file=sys.stderr)
+        print_warning(text)
 
     whole = f"{output} is complete: the build had finished"
     with (
@@ -181,7 +181,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
         )
     for warning in summary.warnings:
         if warning not in said:
-            print(f"warning: {warning}", file=sys.stderr)
+            print_warning(warning)
     for fault in summary.faults:
         print(f"left out: {fault}", file=sys.stderr)
 

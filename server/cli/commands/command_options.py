@@ -63,6 +63,11 @@ def print_error(message: str, code: int) -> int:
     return code
 
 
+def print_warning(message: str) -> None:
+    """Print a warning on standard error. Commands in it are written as a shell can run them."""
+    print(f"warning: {with_own_command(message)}", file=sys.stderr)
+
+
 def among(*words: str) -> Callable[[str], list[str]]:
     """Return a function by which a shell completes one of these words."""
 

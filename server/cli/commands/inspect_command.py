@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, interruptible, print_error, print_json
+from .command_options import AsJson, interruptible, print_error, print_json, print_warning
 
 if TYPE_CHECKING:
     from ....builder.sources.scan_list import ScanEntry
@@ -56,7 +56,7 @@ def inspect(
         print(f"{output or DEFAULT_LIST}: {len(entries)} scans", file=sys.stderr)
     for entry in entries:
         for warning in entry.warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+            print_warning(warning)
     faults = [entry.fault for entry in entries if entry.fault]
     for fault in faults:
         print_error(fault, 3)

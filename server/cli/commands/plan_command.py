@@ -1,14 +1,13 @@
 """`solidcloud plan`: estimate the cost of a build without running it."""
 
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .command_options import AsJson, interruptible, parse_bytes, print_json
+from .command_options import AsJson, interruptible, parse_bytes, print_json, print_warning
 
 if TYPE_CHECKING:
     from ....builder.plan.build_plan import BuildPlan, Limit
@@ -108,7 +107,7 @@ def print_plan(plan: "BuildPlan", as_json: bool) -> None:
     else:
         print_facts(plan_facts(plan))
     for warning in plan.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        print_warning(warning)
 
 
 def _number(text: str) -> int:

@@ -4,13 +4,12 @@ The options of questions are written out here and not read from schemas/wire/que
 builds the options of all commands at each start, which importing the declarations would double.
 """
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, KeyFile, among, print_error, print_json
+from .command_options import AsJson, KeyFile, among, print_error, print_json, print_warning
 
 if TYPE_CHECKING:
     from ...client import Client
@@ -148,7 +147,7 @@ def _report_unknown(client: "Client", op: str, word: str, asked: int, line: str)
             f"{client.unanswered} of {asked} {word} were not answered: {client.silence(op)}", 1
         )
     if line:
-        print(f"warning: {line}", file=sys.stderr)
+        print_warning(line)
     return 0
 
 
@@ -168,7 +167,7 @@ def _warn_outside(client: "Client", places: Any, leaves: Any, verdicts: Any, wor
         return None
     outside = lying_outside(places, leaves, verdicts, info)
     if outside.any():
-        print(f"warning: {outside_line(places, outside, info, word)}", file=sys.stderr)
+        print_warning(outside_line(places, outside, info, word))
     return outside
 
 

@@ -1,12 +1,11 @@
 """`solidcloud replay`: simulate the frames of a log again and compare them bit for bit."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from .command_options import AsJson, parse_bytes, print_json
+from .command_options import AsJson, parse_bytes, print_json, print_warning
 
 
 def replay(
@@ -37,7 +36,7 @@ def replay(
     with Scene.open(path, begin.scene, budget_bytes=parse_bytes(cache, "--cache")) as scene:
         simulation = scene.simulation
         if not check_same(begin, simulation, path):
-            print(f"warning: {path} is not the scene file that was logged", file=sys.stderr)
+            print_warning(f"{path} is not the scene file that was logged")
         found = replay_log(simulation, records)
     if as_json:
         first = None if found.first is None else str(found.first)

@@ -7,6 +7,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ....schemas.process.own_command import with_own_command
+
 if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
     from ....builder.pipeline import BuildSummary
@@ -15,13 +17,13 @@ if TYPE_CHECKING:
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
-    """Print names and values in two columns."""
+    """Print names and values in two columns. Commands are written as a shell can run them."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for name, value in facts:
         # As Text: brackets in a path are not markup.
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(with_own_command(value)))
     Console().print(table)
 
 

@@ -73,17 +73,21 @@ ALLOWED = {
     "server/scene.py": (
         "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes"
     ),
-    "server/report/common": "cli/input avatars scene.py",
+    "server/report/common": "cli/input avatars residency scene.py",
     "server/cli/scene_files": "residency archives scenes scene.py",
     "server/report/accuracy/measurement": "avatars residency scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
     "server/report/accuracy": "report/common report/accuracy/measurement report/accuracy/page",
-    "server/report/walk": "cli/input client.py residency cli/output scene.py report/common",
+    "server/report/load/users": "cli/input client.py avatars residency report/common",
+    "server/report/load/runs": "client.py scene.py report/common report/load/users",
+    "server/report/load/page": "report/common report/load/runs report/load/users",
+    "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
+    "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/commands": (
         "cli/doctor cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency cli/output "
         "archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
-        "report/accuracy"
+        "report/accuracy report/common report/load/runs report/load"
     ),
     "server/cli": "cli/commands cli/output",
     "server/api": "client.py scene.py",
@@ -112,6 +116,7 @@ DOORS = {
         "server/zenoh_client/",
         "server/zenoh_common/",
         "server/zenoh_server/",
+        "server/report/load/users/",
     ),
     "numba": ("schemas/kernels/compiling.py", "schemas/kernels/kernel_dispatcher.py"),
     "llvmlite": ("schemas/kernels/compiling.py", "schemas/kernels/kernel_dispatcher.py"),

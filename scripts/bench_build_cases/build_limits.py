@@ -12,16 +12,6 @@ BLOCK = 8 << 20
 CHUNK = 1 << 18
 
 
-def forget(path: Path) -> bool:
-    """Drop a file from the page cache to force reading from disk; return whether this is possible."""
-    if not hasattr(os, "posix_fadvise"):
-        return False
-    with open(path, "rb") as file:
-        os.fsync(file.fileno())  # only clean pages can be dropped
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-    return True
-
-
 def read_seconds(path: Path) -> float:
     """Time reading a file from start to end."""
     buffer = bytearray(BLOCK)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from bench_engine_cases.engine_picture import FAINT, SERIES, goals_table, text_on, write_picture
-from measurement.bench_results import Part, goal_rows, number
+from solidcloud.server.report.common.bench_results import Part, goal_rows, number
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .build_runs import REST, Built

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from measurement.bench_results import BUSY
-from measurement.machine import cpu_name, say
 from solidcloud.builder.plan.measure_rates import read_rates
 from solidcloud.builder.plan.rates import Rates, StageRate
 from solidcloud.builder.plan.scan_sample import CUBES
+from solidcloud.server.report.common.bench_results import BUSY
+from solidcloud.server.report.common.machine import cpu_name, say
 
 from .build_limits import write_seconds
 from .build_runs import REST, Built

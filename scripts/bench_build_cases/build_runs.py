@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from measurement.machine import say
+from solidcloud.server.report.common.machine import say
 
 from .build_watch import Sample, Watched, last_json, watch
 

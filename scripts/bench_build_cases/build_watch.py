@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from solidcloud.server.report.common.machine import parse_rollup
+
 PROC = Path("/proc")
 # Sampling period [s]: a shorter-lived array is missed; the builder frees no array that fast.
 PERIOD = 0.05
@@ -69,16 +71,6 @@ class Watched:
     def peak_anonymous(self) -> int | None:
         """Return the maximum anonymous memory at one moment [bytes]."""
         return max((s.anonymous for s in self.samples), default=None)
-
-
-def parse_rollup(text: str) -> tuple[int, int]:
-    """Return PSS and anonymous memory [bytes] from a process's smaps_rollup."""
-    found = {"Pss": 0, "Anonymous": 0}
-    for line in text.splitlines():
-        name, _, rest = line.partition(":")
-        if name in found:
-            found[name] = int(rest.split()[0]) * 1024
-    return found["Pss"], found["Anonymous"]
 
 
 def parse_parent(text: str) -> int:

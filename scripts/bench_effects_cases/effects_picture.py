@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_engine_cases.engine_picture import FAINT, INK, VERDICTS, goals_table, write_picture
-from measurement.bench_results import MISSED, Part, goal_rows
+from solidcloud.server.report.common.bench_results import MISSED, Part, goal_rows
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 # By effect, in the order in which they run. Lightness differs between all of them, most between

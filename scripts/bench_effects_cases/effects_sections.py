@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from measurement.bench_results import Part
-from measurement.machine import Clock
 from solidcloud.schemas.scene.effect_table import Crowd, effect_name
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.through_effect import store_without

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from measurement.bench_results import Part
 from measurement.measured_archives import facade_archives
 from measurement.query_poses import Floats, walk_at
 from solidcloud.builder.synthetic.facade import build_facade
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.truth import FacadeTruth
+from solidcloud.server.report.common.bench_results import Part
 
 from .compared_sides import OURS, Place
 

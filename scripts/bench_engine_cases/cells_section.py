@@ -5,8 +5,8 @@ This is the future work of [Fig12] section 8, and the reason for the default of
 repetition: nothing is kept between calls.
 """
 
-from measurement.bench_results import Part
-from measurement.machine import Clock, say
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock, say
 from solidcloud.server.report.common.paper_case import PAPER_VOXEL, STEP, made_case
 from solidcloud.server.report.walk.cell_comparison import compare_cells
 

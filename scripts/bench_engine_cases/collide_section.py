@@ -3,9 +3,9 @@
 import time
 
 import numpy as np
-from measurement.bench_results import Part, ratio
-from measurement.machine import Clock, say
 from measurement.query_poses import PoseSet, classes, free_space, gaps, jittered
+from solidcloud.server.report.common.bench_results import Part, ratio
+from solidcloud.server.report.common.machine import Clock, say
 
 from .bench_context import Bench
 from .compared_sides import BRUTE, CAPT, COLLIDE, SCIPY, TABLE, compare_set, evenly

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measurement.bench_results import Part
 from measurement.contact_definition import Judge
-from measurement.machine import Clock, say
 from measurement.measured_archives import contact_distance, stored_points
 from measurement.query_poses import Floats, PoseSet, gaps, jittered
 from numpy.typing import NDArray
@@ -21,7 +19,9 @@ from peers.peers_program import Peers
 from peers.reference_verdicts import Case
 from scipy.spatial import cKDTree
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.report.walk.walkthrough import open_whole
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock, say
+from solidcloud.server.report.common.whole_scene import open_whole
 from solidcloud.server.scene import Scene
 
 TABLE = "multilevel voxel table"

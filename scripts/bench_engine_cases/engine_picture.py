@@ -6,7 +6,16 @@ from typing import Any
 
 from matplotlib.colors import to_rgb
 from matplotlib.ticker import FuncFormatter, NullFormatter
-from measurement.bench_results import MET, MISSED, Figure, Part, busy, goal_rows, limit_text, number
+from solidcloud.server.report.common.bench_results import (
+    MET,
+    MISSED,
+    Figure,
+    Part,
+    busy,
+    goal_rows,
+    limit_text,
+    number,
+)
 from solidcloud.server.report.common.sphere_pictures import load_pyplot
 
 from .collide_section import CAPT_PART, TABLE_PART

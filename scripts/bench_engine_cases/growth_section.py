@@ -13,14 +13,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from measurement.bench_results import Part
-from measurement.machine import Clock, cores, say
 from measurement.measured_archives import build
 from measurement.query_poses import walk_at
 from solidcloud.builder.synthetic.scenes import make_town
 from solidcloud.builder.synthetic.town import POINTS_PER_FACADE
 from solidcloud.builder.synthetic.truth import read_truth
-from solidcloud.server.report.walk.walkthrough import open_whole
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock, cores, say
+from solidcloud.server.report.common.whole_scene import open_whole
 from solidcloud.server.scene import Scene
 
 from .bench_context import Bench

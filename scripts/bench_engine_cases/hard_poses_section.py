@@ -1,9 +1,9 @@
 """Section `hard`: the façade with poses that are hard for a hierarchy; every side beside ours."""
 
 import numpy as np
-from measurement.bench_results import Part
-from measurement.machine import Clock, say
 from measurement.query_poses import PoseSet, along_walls, feet_on_floor, free_space, inside_columns
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock, say
 
 from .bench_context import Bench
 from .collide_section import CASE

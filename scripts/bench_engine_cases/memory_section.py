@@ -3,9 +3,9 @@
 import time
 
 import numpy as np
-from measurement.bench_results import Part
-from measurement.machine import Clock
 from measurement.measured_archives import PAPER_VOXEL, archive_bytes
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
 

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
-from measurement.bench_results import Part
-from measurement.machine import Clock, cores, say
 from measurement.query_poses import Floats, jittered, walk_at
 from solidcloud.schemas.wire.answers import Part as Answers
 from solidcloud.server.client import Client
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock, cores, say
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
 

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
-from measurement.bench_results import Part, ratio
 from measurement.contact_definition import least_distance
-from measurement.machine import Clock
 from measurement.query_poses import Floats, jittered
+from solidcloud.server.report.common.bench_results import Part, ratio
+from solidcloud.server.report.common.machine import Clock
 from solidcloud.server.scene import Scene
 
 from .bench_context import Bench, attempt

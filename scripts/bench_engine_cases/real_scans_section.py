@@ -5,13 +5,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from measurement.bench_results import Part
-from measurement.machine import Clock, say
 from measurement.measured_archives import build, stored_points
 from measurement.query_poses import PoseSet, near_surfaces, random_poses
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadDataError
+from solidcloud.server.report.common.bench_results import Part
 from solidcloud.server.report.common.floor_walk import floor_walk
+from solidcloud.server.report.common.machine import Clock, say
 
 from .bench_context import Bench
 from .compared_sides import OURS, Place, compare_set

@@ -5,8 +5,8 @@ frame, with the paper's own table; this section times them too. Its poses are th
 repetition: nothing is kept between calls.
 """
 
-from measurement.bench_results import Part
-from measurement.machine import Clock, say
+from solidcloud.server.report.common.bench_results import Part
+from solidcloud.server.report.common.machine import Clock, say
 from solidcloud.server.report.common.paper_case import PAPER_VOXEL, STEP, Case, made_case
 from solidcloud.server.report.walk.walkthrough import DEGREES, build_structures, measure
 

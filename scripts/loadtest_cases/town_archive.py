@@ -1,31 +1,13 @@
-"""Archive that a load test serves: a given one, or a generated town that is kept in a folder."""
+"""Archive that scripts/loadtest serves: a generated town that is kept in a folder."""
 
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-from bench_build_cases.build_runs import COMMAND
-from measurement.machine import say
+from solidcloud.server.report.common.machine import say
 
-
-def find(
-    archive: Path | None, truth: Path | None, points: int, voxel: float, work: Path
-) -> tuple[Path, Path]:
-    """Return the archive and its truth, given or of a generated town of this many points.
-
-    The town is generated where `work` has none. Raises SystemExit for a missing truth.
-    """
-    if archive is None:
-        archive, beside = made_town(work, points, voxel)
-    else:
-        beside = archive.with_name(f"{archive.stem}.truth.json")
-    truth = truth or beside
-    if not truth.exists():
-        raise SystemExit(
-            f"{truth}: not there: name the truth that was written beside the scan of the town with --truth"
-        )
-    return archive, truth
+COMMAND = [sys.executable, "-P", "-m", "solidcloud.server.cli.main"]
 
 
 def made_town(work: Path, points: int, voxel: float) -> tuple[Path, Path]:

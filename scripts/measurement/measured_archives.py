@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.server.report.common.machine import say
 from solidcloud.server.scene import Scene
-
-from .machine import say
 
 PAPER_VOXEL, DEFAULT_VOXEL = 32, 8  # [m]; 32 holds the whole façade, like the paper's single voxel
 STEP = 1e-4  # lattice step of the targets [m]

@@ -4,10 +4,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from loadtest_cases.user_traces import Centers
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.report.load.users.user_traces import Centers
 from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions, UserTracks
 
 # User id of sweeps, which belong to no user and have no position; duration of one sweep through all

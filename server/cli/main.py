@@ -24,6 +24,7 @@ from .commands import doctor_command as doctor
 from .commands import export_command as export
 from .commands import info_validate_command as info_validate
 from .commands import inspect_command as inspect
+from .commands import loadtest_command as loadtest
 from .commands import make_command as make
 from .commands import plan_command as plan
 from .commands import query_command as query
@@ -71,6 +72,7 @@ for verb in (
     add_remove.reload,
     plan.plan,
     top.top,
+    loadtest.loadtest,
     replay.replay,
     doctor.doctor,
 ):
@@ -80,7 +82,7 @@ for verb in (
 _COMPLETION = f"_{NAME.upper()}_COMPLETE"
 # Verbs that wait for a server or for a user: an interrupt ends them immediately. All other verbs
 # compute, and end at their next interrupt check.
-WAITING = frozenset({"serve", "query", "reload", "top"})
+WAITING = frozenset({"serve", "query", "reload", "top", "loadtest"})
 
 
 def _print_version(wanted: bool) -> None:

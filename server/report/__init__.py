@@ -1,4 +1,4 @@
-"""Reports: `solidcloud accuracy` and the demo.
+"""Reports: `solidcloud accuracy`, `solidcloud loadtest` and the demo.
 
 May import builder, schemas.
 Begin with accuracy/accuracy_report.py or walk/demo_walk.py.

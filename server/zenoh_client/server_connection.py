@@ -9,7 +9,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -110,6 +110,29 @@ class ServerConnection:
         if not self._answered:
             self._check_served()
         return None
+
+    def send(
+        self, operation: str, request: bytes, names: Sequence[str], came: Callable[[bytes | Exception], None]
+    ) -> None:
+        """Send a request without waiting.
+
+        came: receives the bytes of the answer, or the error of an error reply, in the thread that
+        receives it; it is not called without a reply.
+        """
+        querier, query = self._query(operation, request, names)
+
+        def received(reply: zenoh.Reply) -> None:
+            try:
+                payload = _payload_of(reply, query)
+            except Exception as error:
+                came(error)
+                return
+            if payload is not None:
+                came(payload)
+
+        # In the receiving thread: by default zenoh starts a thread for each request.
+        handler = zenoh.handlers.Callback(received, indirect=False)
+        querier.get(handler, payload=request, encoding=_ENCODING, attachment=query.nonce)
 
     def require(self, operation: str, request: bytes = b"") -> bytes:
         """Return the answer to a request about the scene itself; raise BusyError without one."""

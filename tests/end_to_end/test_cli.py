@@ -21,6 +21,7 @@ VERBS = [
     "serve",
     "query",
     "accuracy",
+    "loadtest",
     "add",
     "remove",
     "reload",

@@ -1,4 +1,4 @@
-"""CSV files of poses (t,x,y,z,qw,qx,qy,qz, one row per pose), rays and objects.
+"""CSV files of poses (t,x,y,z,qw,qx,qy,qz, one row per pose), rays and objects; TUM files of poses.
 
 This is the only module that converts between quaternions and matrices.
 """
@@ -21,6 +21,8 @@ OBJECT_COLUMNS = ("avatar", "x", "y", "z", "qw", "qx", "qy", "qz", "group", "mas
 # A quaternion that deviates more than this from unit length is a mistake, not rounding
 # (NUMERICS.md, case 4): using |q| = 1.01 without normalising it would scale space by 2 %.
 UNIT_WITHIN = 1e-6
+# In TUM files, which round to four digits.
+TUM_UNIT_WITHIN = 1e-3
 
 
 class ObjectRow(NamedTuple):
@@ -43,6 +45,33 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     rows = [
         _unit_quaternion(where, _numbers(where, row), 4) for where, row in _read_rows(path, COLUMNS, "poses")
     ]
+    table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+    return table[:, 0].copy(), _matrices(table)
+
+
+def read_tum_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read times (k,) [s] and poses (k, 4, 4), avatar to world [m], from a file in the TUM format.
+
+    A line holds `timestamp tx ty tz qx qy qz qw`; lines that begin with # are comments. Quaternions
+    within 1e-3 of unit length are normalised.
+    Raises the same errors as `read_poses`.
+    """
+    rows = []
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise ScanError(f"{path}: {error.strerror}: expected a TUM file of poses: check the path") from None
+    except UnicodeDecodeError as error:
+        raise ScanError(f"{path}: {error}: expected a TUM file of poses: check the file") from None
+    for number, line in enumerate(lines, 1):
+        values = line.split()
+        if not values or values[0].startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        if len(values) != len(COLUMNS):
+            raise BadRequestError(f"{where}: {len(values)} values: expected timestamp tx ty tz qx qy qz qw")
+        t, x, y, z, qx, qy, qz, qw = _numbers(where, values)
+        rows.append(_unit_quaternion(where, [t, x, y, z, qw, qx, qy, qz], 4, TUM_UNIT_WITHIN))
     table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
     return table[:, 0].copy(), _matrices(table)
 
@@ -126,12 +155,12 @@ def _numbers(where: str, row: list[str]) -> list[float]:
     return values
 
 
-def _unit_quaternion(where: str, values: list[float], first: int) -> list[float]:
+def _unit_quaternion(where: str, values: list[float], first: int, within: float = UNIT_WITHIN) -> list[float]:
     """Return the values with those from `first` on, a quaternion, checked and normalised."""
     length = math.hypot(*values[first:])
-    if abs(length - 1) > UNIT_WITHIN:
+    if abs(length - 1) > within:
         raise BadRequestError(
-            f"{where}: quaternion of length {length:.9g}: expected 1 within {UNIT_WITHIN:g}: normalise it"
+            f"{where}: quaternion of length {length:.9g}: expected 1 within {within:g}: normalise it"
         )
     return values[:first] + [value / length for value in values[first:]]
 

@@ -33,7 +33,7 @@ def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     middle = float(np.median(points[:, across])) if len(points) else 0.0
     near = points[np.abs(points[:, across] - middle) < HALF]
     places = np.arange(low[along], high[along] + SPACING, SPACING)
-    floors = np.array([_floor(near[np.abs(near[:, along] - place) < HALF, 2]) for place in places])
+    floors = np.array([floor_height(near[np.abs(near[:, along] - place) < HALF, 2]) for place in places])
     known = np.isfinite(floors)
     if not known.any():
         raise BadDataError(
@@ -51,7 +51,7 @@ def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     return np.arange(FRAMES) / RATE, poses
 
 
-def _floor(heights: NDArray[np.float64]) -> float:
+def floor_height(heights: NDArray[np.float64]) -> float:
     """Return the top of the lowest dense layer of heights (n,) [m]; NaN if there are too few."""
     if len(heights) < 5:
         return np.nan

@@ -1,6 +1,6 @@
 """The demo: a walk through a scan over zenoh, and the walkthrough of [Fig12].
 
 May import server.cli.input, server.cli.output, server/client.py, server.report.common,
-server.residency, server/scene.py, builder, schemas.
+server/scene.py, builder, schemas.
 Begin with demo_walk.py.
 """

@@ -21,7 +21,8 @@ from ....schemas.archive.voxel import Links, VoxelData
 from ....schemas.errors import InternalError, SolidcloudError
 from ....schemas.wire.answers import Verdict
 from ..common.paper_case import Case
-from .walkthrough import AVATAR, Say, open_whole
+from ..common.whole_scene import open_whole
+from .walkthrough import AVATAR, Say
 
 # Kind of cells and maximum number of points of a cell: octrees with several limits (some of which
 # make most trees one height by splitting alone), and balanced cells.

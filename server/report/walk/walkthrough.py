@@ -23,11 +23,10 @@ from ....builder.config import BuildConfig
 from ....builder.pipeline import build_archive
 from ....schemas.errors import InternalError, SolidcloudError
 from ....schemas.wire.answers import Verdict
-from ...residency.arena import ArenaBuffer
-from ...residency.voxel_store import VoxelStore
 from ...scene import Scene
 from ..common.paper_case import Case
 from ..common.sphere_pictures import draw_spheres, level_spheres, load_pyplot
+from ..common.whole_scene import open_whole
 from .paper_figures import PAPER_FPS, PAPER_MACHINE, paper_rows
 from .path_figure import Curve, draw_path
 
@@ -115,16 +114,6 @@ def time_frames(scene: Scene, avatar: str, poses: NDArray[np.float64]) -> NDArra
         scene.collide(avatar, pose)
         spent[i] = time.perf_counter() - begin
     return spent
-
-
-def open_whole(folder: Path) -> Scene:
-    """Open an archive with a cache for all its voxels: the walk is timed, not the loading."""
-    store = VoxelStore(folder)
-    try:
-        budget = sum(ArenaBuffer.rounded(int(size)) for size in store.sizes)
-    finally:
-        store.close()
-    return Scene.open(folder, budget_bytes=budget)
 
 
 def measure(case: Case, structures: list[Structure], loops: int, say: Say) -> NDArray[np.float64]:

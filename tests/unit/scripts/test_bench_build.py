@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from bench_build_cases import build_limits, build_picture, build_rates, build_runs, build_sizes, build_watch
 from bench_build_cases.build_watch import Sample, Watched
-from measurement.bench_results import Part
 from picture_checks import alike_in_grey, covered, drawn_figures, overlaps
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.plan.rates import StageRate
+from solidcloud.server.report.common.bench_results import Part
 
 ROLLUP = """55b859773000-7ffce90ef000 ---p 00000000 00:00 0                          [rollup]
 Rss:                1672 kB

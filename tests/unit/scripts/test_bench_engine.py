@@ -10,13 +10,14 @@ import naive
 import numpy as np
 import pytest
 from bench_engine_cases import compared_sides, engine_picture
-from measurement import bench_results, machine, query_poses
+from measurement import query_poses
 from measurement.contact_definition import Judge, least_distance
-from measurement.machine import Clock
 from picture_checks import alike_in_grey, covered, drawn_figures, overlaps
 from scipy.spatial import cKDTree
 from solidcloud.builder.synthetic.facade import build_facade
 from solidcloud.builder.synthetic.walk import walk_poses
+from solidcloud.server.report.common import bench_results, machine
+from solidcloud.server.report.common.machine import Clock
 
 PLANE = np.array([[x, y, 0.0] for x in np.arange(0, 2, 0.05) for y in np.arange(0, 2, 0.05)])
 BODY = np.array([[0.0, 0, 0.1], [0.1, 0, 0.1], [0, 0, 1.0]])

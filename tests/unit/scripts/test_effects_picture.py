@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bench_effects_cases import effects_picture
-from measurement.bench_results import Part
 from picture_checks import (
     LEAST_STEP,
     alike_in_grey,
@@ -17,6 +16,7 @@ from picture_checks import (
     share_of_figure,
 )
 from solidcloud.schemas.scene.effect_table import ORDER
+from solidcloud.server.report.common.bench_results import Part
 
 SHOWN = list(effects_picture.COLOURS)
 

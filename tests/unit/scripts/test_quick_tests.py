@@ -87,7 +87,7 @@ def test_a_changed_test_comes_first_and_a_helper_selects_its_users() -> None:
 def test_scripts_and_documents_select_the_tests_that_name_them() -> None:
     assert chosen("schemas/WIRE.md") == ["tests/test_layers.py", "tests/end_to_end/test_wire.py"]
     assert chosen("scripts/simulate_cache") == ["tests/unit/scripts/test_loadtest.py"]
-    assert chosen("scripts/loadtest_cases/user_traces.py") == ["tests/unit/scripts/test_loadtest.py"]
+    assert chosen("scripts/loadtest_cases/town_archive.py") == ["tests/unit/scripts/test_loadtest.py"]
     assert chosen("CHANGELOG.md") == []
 
 
@@ -97,7 +97,7 @@ def test_scripts_and_documents_select_the_tests_that_name_them() -> None:
         ("server/queries/collide.py", "solidcloud.server.queries.collide"),
         ("server/queries/__init__.py", "solidcloud.server.queries"),
         ("server/api/__init__.py", "solidcloud"),
-        ("scripts/loadtest_cases/user_traces.py", "loadtest_cases.user_traces"),
+        ("scripts/loadtest_cases/town_archive.py", "loadtest_cases.town_archive"),
         ("tests/support/clouds.py", "clouds"),
         ("scripts/setup", None),
     ],

@@ -11,7 +11,6 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from loadtest_cases.user_traces import Centers, Trace, save
 from numpy.typing import NDArray
 from project_scripts import load_script
 from simulate_cache_cases.policy_replay import Loading, Outcome, Replay
@@ -25,6 +24,7 @@ from simulate_cache_cases.replay_requests import (
 )
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
+from solidcloud.server.report.load.users.user_traces import Centers, Trace, save
 from solidcloud.server.residency.eviction import POLICIES
 from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS
 

@@ -12,17 +12,18 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.synthetic.figure import figure_points
-from solidcloud.schemas.wire.encoding import encode
-from solidcloud.schemas.wire.requests import CollideRequest
-from solidcloud.server.client import Client
 
-from . import frame_outcomes as results
-from . import server_process, user_traces
-from .frame_outcomes import Frames
-from .server_process import Memory
-from .user_process import AVATAR, LAST_ANSWERS, Job
-from .user_traces import Trace
+from .....builder.synthetic.figure import figure_points
+from .....schemas.wire.encoding import encode
+from .....schemas.wire.requests import CollideRequest
+from ....client import Client
+from ..users import frame_outcomes as results
+from ..users import user_process, user_traces
+from ..users.frame_outcomes import Frames
+from ..users.user_process import AVATAR, LAST_ANSWERS, Job
+from ..users.user_traces import Trace
+from . import load_server
+from .load_server import Memory
 
 LEAD = 0.5  # from the start command to the users until the first frame is due [s]
 STRIP = 12  # snapshots of the resident voxels, evenly over a run
@@ -33,14 +34,14 @@ class Setup:
     """Settings common to all runs.
 
     work: a folder for logs and the files that processes exchange.
-    points: of the avatar.
+    avatar: (n, 3) points of every user's avatar [m].
     processes: maximum processes of users.
     budget_ms: time budget of each request; None: an answer waits for its voxels.
     """
 
     archive: Path
     work: Path
-    points: int = 3617
+    avatar: NDArray[np.float64] = field(default_factory=figure_points)
     processes: int = 2
     budget_ms: float | None = None
 
@@ -69,6 +70,13 @@ class Outcome:
     faults: list[str] = field(default_factory=list)
 
 
+def save_avatar(setup: Setup) -> str:
+    """Write the avatar's points for the processes of users; return the path."""
+    path = setup.work / "avatar.npy"
+    np.save(path, setup.avatar)
+    return str(path)
+
+
 def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: bool = False) -> Outcome:
     """Serve the archive with a cache of `budget` bytes and drive the users of a trace.
 
@@ -76,12 +84,12 @@ def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: 
     Raises ServerError where something did not start.
     """
     log = setup.work / "server.log"
-    with server_process.serving(setup.archive, budget, policy, log) as served, ExitStack() as stack:
-        watcher = server_process.Watcher(served.process)
+    with load_server.serving(setup.archive, budget, policy, log) as served, ExitStack() as stack:
+        watcher = load_server.Watcher(served.process)
         watcher.look(True)
         empty = watcher.memory.rss[-1]
         watcher.start()
-        job = Job(served.endpoint, "", "", server_process.SCENE, setup.points, setup.budget_ms)
+        job = Job(served.endpoint, "", "", load_server.SCENE, save_avatar(setup), setup.budget_ms)
         if adversary:
             job = msgspec.structs.replace(job, archive=str(setup.archive), budget=budget)
         # Adversaries share their knowledge within one process: in several processes none would know
@@ -104,7 +112,7 @@ def run(setup: Setup, trace: Trace, budget: int, policy: str | None, adversary: 
 
 def run_echo(setup: Setup, trace: Trace, request_bytes: int, reply_bytes: int) -> Outcome:
     """Run the same load on a bare echo: as many sessions, as many requests at the same times and sizes."""
-    with server_process.echoing(reply_bytes, setup.work / "echo.log") as endpoint, ExitStack() as stack:
+    with load_server.echoing(reply_bytes, setup.work / "echo.log") as endpoint, ExitStack() as stack:
         job = Job(endpoint, "", "", request_bytes=request_bytes)
         users = Users(stack, setup, trace, job, setup.processes)
         start = users.go()
@@ -118,10 +126,10 @@ def message_sizes(setup: Setup, trace: Trace, budget: int) -> tuple[int, int]:
     pose = trace.pose[:1]
     request = CollideRequest(AVATAR, pose, 0.0, budget_ms=setup.budget_ms)
     with (
-        server_process.serving(setup.archive, budget, None, setup.work / "server.log") as served,
-        Client(served.endpoint, scene=server_process.SCENE) as client,
+        load_server.serving(setup.archive, budget, None, setup.work / "server.log") as served,
+        Client(served.endpoint, scene=load_server.SCENE) as client,
     ):
-        client.add_avatar(AVATAR, figure_points(setup.points))
+        client.add_avatar(AVATAR, setup.avatar)
         return len(encode(request)), len(encode(client.collide(AVATAR, pose)))
 
 
@@ -132,7 +140,9 @@ class Users:
         """Start the processes. stack: ends the processes."""
         names = np.unique(trace.user)
         count = max(1, min(processes, len(names)))
-        self._length, self._processes, self._outs = float(trace.time[-1]), [], []
+        self._length = float(trace.time[-1])
+        self._processes: list[subprocess.Popen[str]] = []
+        self._outs: list[Path] = []
         commands = []
         for number in range(count):
             paths = {what: str(setup.work / f"users-{number}.{what}.npz") for what in ("trace", "out")}
@@ -141,16 +151,20 @@ class Users:
             path = setup.work / f"users-{number}.json"
             path.write_bytes(msgspec.json.encode(msgspec.structs.replace(job, **paths)))
             commands.append(
-                (server_process.script("user_process", str(path)), setup.work / f"users-{number}.log")
+                (
+                    load_server.module_command(user_process.__name__, str(path)),
+                    setup.work / f"users-{number}.log",
+                )
             )
             self._outs.append(Path(paths["out"]))
         for command, log in commands:
-            self._processes.append(stack.enter_context(server_process.running(command, log, "ready")))
+            self._processes.append(stack.enter_context(load_server.running(command, log, "ready")))
 
     def go(self) -> float:
         """Send the start time to all; return it."""
         start = time.monotonic() + LEAD
         for process in self._processes:
+            assert process.stdin is not None
             process.stdin.write(f"{start!r}\n")
             process.stdin.flush()
         return start
@@ -165,7 +179,7 @@ class Users:
                 code = "none: still at work"
             if code != 0:
                 said = out.with_name(out.name.replace(".out.npz", ".log")).read_text(errors="replace")
-                raise server_process.ServerError(
+                raise load_server.ServerError(
                     f"a process of users ended with exit code {code}: {said[-2000:]}"
                 )
         return [results.load(out) for out in self._outs]
@@ -180,7 +194,7 @@ class Strip:
         self._length = length
         self._done = threading.Event()
         self._thread: threading.Thread | None = None
-        self._client = Client(endpoint, scene=server_process.SCENE)
+        self._client = Client(endpoint, scene=load_server.SCENE)
 
     def __enter__(self) -> "Strip":
         self._client.__enter__()
@@ -202,7 +216,7 @@ class Strip:
             at = (number + 0.5) / STRIP * self._length
             if self._done.wait(max(0.0, start + at - time.monotonic())):
                 return
-            stats = server_process.ask_stats(self._client)
+            stats = load_server.ask_stats(self._client)
             if stats is None:
                 return
             self.pictures.append((at, np.array(stats.keys, np.uint64)))
@@ -210,7 +224,7 @@ class Strip:
     def end(self) -> Any:
         """Stop taking snapshots; return the server's final statistics, or None."""
         self._done.set()
-        return server_process.ask_stats(self._client)
+        return load_server.ask_stats(self._client)
 
 
 def cores() -> int:

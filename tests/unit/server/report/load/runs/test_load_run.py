@@ -1,24 +1,19 @@
-"""Test the parts of scripts/loadtest: the clock of frames, adversaries, processes. Nothing is timed."""
+"""Test the parts of a load test: the clock of frames, adversaries, processes. Nothing is timed."""
 
 import os
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from loadtest_cases import (
-    frame_clock,
-    load_run,
-    server_process,
-    town_archive,
-)
-from loadtest_cases.adversary_user import Adversary, LruModel
-from loadtest_cases.archive_voxels import Voxels
-from loadtest_cases.frame_outcomes import ANSWERED
-from loadtest_cases.user_traces import Trace
 from numpy.typing import NDArray
+from solidcloud.server.report.load.runs import load_run, load_server
+from solidcloud.server.report.load.users import frame_clock
+from solidcloud.server.report.load.users.adversary_user import Adversary, LruModel
+from solidcloud.server.report.load.users.archive_voxels import Voxels
+from solidcloud.server.report.load.users.frame_outcomes import ANSWERED
+from solidcloud.server.report.load.users.user_traces import Trace
 
 
 class Clock:
@@ -124,24 +119,15 @@ def test_an_adversary_knows_what_else_its_pose_needs() -> None:
     assert found.needed(0) == [0, 1] and found.needed(2) == [1, 2, 3]
 
 
-def test_an_option_is_found_by_its_whole_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        server_process, "serve_help", lambda: "| --cache  TEXT  Decoded [default: 512MB] | --policy-file  |"
-    )
-    assert server_process.takes("--cache")
-    assert not server_process.takes("--policy")
-    assert not server_process.takes("--cach")
-
-
 def test_a_policy_is_named_only_where_one_is_given() -> None:
-    command = server_process.serve_command(Path("a.scd"), "tcp/127.0.0.1:1", 1000, None)
+    command = load_server.serve_command(Path("a.scd"), "tcp/127.0.0.1:1", 1000, None)
     assert command[-2:] == ["--cache", "1000"] and "--policy" not in command
-    assert server_process.serve_command(Path("a"), "e", 1000, "lru")[-2:] == ["--policy", "lru"]
+    assert load_server.serve_command(Path("a"), "e", 1000, "lru")[-2:] == ["--policy", "lru"]
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="the system does not say")
 def test_memory_of_a_process_is_seen() -> None:
-    watcher = server_process.Watcher(os.getpid())
+    watcher = load_server.Watcher(os.getpid())
     watcher.look(True)
     held = np.ones(1 << 25, np.uint8)
     watcher.look(False)
@@ -151,24 +137,17 @@ def test_memory_of_a_process_is_seen() -> None:
 
 
 def test_the_most_memory_is_read_from_a_status() -> None:
-    assert server_process.parse_high("VmPeak:\t 9 kB\nVmHWM:\t    21 kB\nVmRSS: 1 kB\n") == 21 * 1024
-    assert server_process.parse_high("VmRSS: 1 kB\n") == 0
+    assert load_server.parse_high("VmPeak:\t 9 kB\nVmHWM:\t    21 kB\nVmRSS: 1 kB\n") == 21 * 1024
+    assert load_server.parse_high("VmRSS: 1 kB\n") == 0
 
 
 def test_a_process_that_ends_before_it_is_ready_says_why(tmp_path: Path) -> None:
     code = "import sys; print('no room', file=sys.stderr); sys.exit(3)"
     with (
-        pytest.raises(server_process.ServerError, match="no room"),
-        server_process.running([sys.executable, "-c", code], tmp_path / "log", "ready"),
+        pytest.raises(load_server.ServerError, match="no room"),
+        load_server.running([sys.executable, "-c", code], tmp_path / "log", "ready"),
     ):
         pass
-
-
-def test_a_truth_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=re.escape("town.truth.json")):
-        town_archive.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)
-    (tmp_path / "town.truth.json").write_text("{}")
-    assert town_archive.find(tmp_path / "town.scd", None, 1, 8.0, tmp_path)[1] == tmp_path / "town.truth.json"
 
 
 def test_users_in_processes_ask_every_frame_of_a_trace_and_hear_of_each(tmp_path: Path) -> None:

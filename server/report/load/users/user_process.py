@@ -13,18 +13,17 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 import numpy as np
 import zenoh
-from solidcloud.builder.synthetic.figure import figure_points
-from solidcloud.schemas.wire.answers import CollideAnswers
-from solidcloud.schemas.wire.encoding import MSGPACK, decode_answer, encode
-from solidcloud.schemas.wire.requests import CollideRequest
-from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.client import Client
 
+from .....schemas.wire.answers import CollideAnswers
+from .....schemas.wire.encoding import decode_answer, encode
+from .....schemas.wire.requests import CollideRequest
+from ....avatars.avatar_model import make_avatar
+from ....client import Client
 from . import frame_outcomes as results
 from . import user_traces
 from .adversary_user import Adversary, make_adversary
@@ -42,28 +41,28 @@ class Job(msgspec.Struct, frozen=True):
     trace, out: paths.
     scene: "" to query a bare echo with request_bytes.
     archive, budget: of the server, for adversaries; "": the poses are the trace's.
-    points: of the avatar.
+    avatar: path of its points.
     """
 
     endpoint: str
     trace: str
     out: str
     scene: str = ""
-    points: int = 3617
+    avatar: str = ""
     budget_ms: float | None = None
     request_bytes: int = 0
     archive: str = ""
     budget: int = 0
 
 
-Came = Callable[[Any], None]
+Came = Callable[[bytes | Exception], None]
 
 
 class Asker(Protocol):
     """Interface of one user's session."""
 
     def send(self, payload: bytes, came: Came) -> None:
-        """Send a request; `came` is called with zenoh's reply, in another thread."""
+        """Send a request; `came` receives the answer or its error, in another thread."""
 
 
 class SceneUser(Client):
@@ -71,9 +70,7 @@ class SceneUser(Client):
 
     def send(self, payload: bytes, came: Came) -> None:
         """Send a `collide` request; see `Asker`."""
-        # Called in the receiving thread: the default starts a thread for each request.
-        handler = zenoh.handlers.Callback(came, indirect=False)
-        self._querier("collide").get(handler, payload=payload, encoding=zenoh.Encoding(MSGPACK))
+        self._connection.send("collide", payload, [AVATAR], came)
 
 
 class EchoUser:
@@ -97,7 +94,12 @@ class EchoUser:
 
     def send(self, payload: bytes, came: Came) -> None:
         """Query the echo; see `Asker`."""
-        self._querier.get(zenoh.handlers.Callback(came, indirect=False), payload=payload)
+
+        def received(reply: zenoh.Reply) -> None:
+            ok = reply.ok
+            came(RuntimeError("an error reply of the echo") if ok is None else ok.payload.to_bytes())
+
+        self._querier.get(zenoh.handlers.Callback(received, indirect=False), payload=payload)
 
 
 class Run:
@@ -113,7 +115,7 @@ class Run:
         self._echo = bytes(job.request_bytes)
         self._adversary: Adversary | None = None
         if job.archive:
-            avatar = make_avatar(figure_points(job.points))
+            avatar = make_avatar(np.load(job.avatar))
             self._adversary = make_adversary(Path(job.archive), job.budget, avatar)
 
     def ask(self, askers: dict[int, Asker], number: int) -> None:
@@ -125,19 +127,18 @@ class Run:
             CollideRequest(AVATAR, self.trace.pose[number : number + 1], 0.0, budget_ms=self.job.budget_ms)
         )  # fmt: skip
         self.frames.sent[number] = time.monotonic()
-        askers[user].send(payload, lambda reply: self._came(number, reply))
+        askers[user].send(payload, lambda answer: self._came(number, answer))
 
-    def _came(self, number: int, reply: Any) -> None:
-        """Record one reply; called in a zenoh thread."""
+    def _came(self, number: int, payload: bytes | Exception) -> None:
+        """Record one answer; called in a zenoh thread."""
         frames = self.frames
         try:
-            if reply.ok is None:
-                self._refused(number, reply.err.payload.to_bytes()[:300].decode(errors="replace"))
+            if isinstance(payload, Exception):
+                self._refused(number, str(payload)[:300])
             elif not self.job.scene:
-                reply.ok.payload.to_bytes()
                 frames.done[number], frames.status[number] = time.monotonic(), ANSWERED
             else:
-                answer = decode_answer(CollideAnswers, reply.ok.payload.to_bytes())
+                answer = decode_answer(CollideAnswers, payload)
                 frames.done[number] = time.monotonic()
                 frames.verdict[number] = answer.verdict[0]
                 frames.hits[number], frames.misses[number] = answer.hits, answer.misses
@@ -173,7 +174,7 @@ def main() -> None:
         for user in np.unique(trace.user).tolist():
             if job.scene:
                 client = stack.enter_context(SceneUser(job.endpoint, scene=job.scene))
-                client.add_avatar(AVATAR, figure_points(job.points))
+                client.add_avatar(AVATAR, np.load(job.avatar))
                 askers[user] = client
             else:
                 askers[user] = stack.enter_context(EchoUser(job.endpoint, user))
@@ -185,3 +186,7 @@ def main() -> None:
         pace(run.frames.due.tolist(), lambda number: run.ask(askers, number))
         run.wait()
     results.save(Path(job.out), run.frames, pose=trace.pose, faults=np.array(run.faults, np.str_))
+
+
+if __name__ == "__main__":
+    main()

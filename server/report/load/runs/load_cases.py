@@ -5,14 +5,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from measurement.bench_results import Part, ratio
 from numpy.typing import NDArray
 
-from . import frame_outcomes as results
-from .frame_outcomes import PERCENTILES, Figures
+from ...common.bench_results import Part, ratio
+from ..users import frame_outcomes as results
+from ..users.frame_outcomes import PERCENTILES, Figures
+from ..users.user_traces import ADVERSARY, Trace, of_users
 from .load_run import Outcome
-from .server_process import Memory
-from .user_traces import ADVERSARY, Trace, of_users
+from .load_server import Memory
 
 Floats = NDArray[np.float64]
 
@@ -243,12 +243,12 @@ def summary(ran: Ran) -> dict[str, object]:
     """Return a run for JSON: the case, its figures, memory and bytes over time."""
     f = ran.figures._asdict()
     plain = {name: [_number(v) for v in np.atleast_1d(value)] for name, value in f.items()}
-    plain = {name: values[0] if np.ndim(f[name]) == 0 else values for name, values in plain.items()}
+    values = {name: found[0] if np.ndim(f[name]) == 0 else found for name, found in plain.items()}
     case = {
         name: getattr(ran.case, name) for name in ("section", "kind", "users", "share", "policy", "speed")
     }
     return {
-        **case, "budget": ran.budget, "figures": plain, "wrong": ran.wrong, "mean_speed": _number(ran.speed),
+        **case, "budget": ran.budget, "figures": values, "wrong": ran.wrong, "mean_speed": _number(ran.speed),
         "stats": None if ran.stats is None else msgspec.to_builtins(msgspec.structs.replace(ran.stats, keys=None)),
         "empty_rss": ran.empty, "peak_rss": ran.peak, "pss": ran.memory.pss,
         "resident": [column.tolist() for column in ran.resident], "rss": [column.tolist() for column in ran.rss],

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.synthetic.walk import RAMP, SOLE_HEIGHT, STRIDE
+
+from .....builder.synthetic.walk import RAMP, SOLE_HEIGHT, STRIDE
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Test the figures, targets and page of scripts/loadtest, computed from given frames."""
+"""Test the figures, targets and page of a load test, computed from given frames."""
 
 import json
 from pathlib import Path
@@ -6,21 +6,19 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from loadtest_cases import (
-    frame_outcomes,
-    load_cases,
-    load_page,
-    load_pictures,
-    verdict_check,
-)
-from loadtest_cases.archive_voxels import Voxels
-from loadtest_cases.frame_outcomes import ANSWERED, NOTHING, REFUSED, Frames
-from loadtest_cases.load_cases import ECHO, Case, Ran
-from loadtest_cases.server_process import Memory
-from loadtest_cases.user_traces import Trace
-from measurement.bench_results import MET, MISSED, Part, goal_rows
+from matplotlib.text import Text
+from picture_checks import alike_in_grey, drawn_figures, overlaps
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.stats import StatsAnswer
+from solidcloud.server.report.common.bench_results import MET, MISSED, Part, goal_rows
+from solidcloud.server.report.load.page import load_page, load_pictures
+from solidcloud.server.report.load.runs import load_cases, verdict_check
+from solidcloud.server.report.load.runs.load_cases import ECHO, Case, Ran
+from solidcloud.server.report.load.runs.load_server import Memory
+from solidcloud.server.report.load.users import frame_outcomes
+from solidcloud.server.report.load.users.archive_voxels import Voxels
+from solidcloud.server.report.load.users.frame_outcomes import ANSWERED, NOTHING, REFUSED, Frames
+from solidcloud.server.report.load.users.user_traces import Trace
 
 CLEAR, CONTACT, UNKNOWN = (int(v) for v in (Verdict.CLEAR, Verdict.CONTACT, Verdict.UNKNOWN))
 
@@ -219,3 +217,70 @@ def test_a_run_that_is_wrong_is_said() -> None:
     assert (
         len(part.wrong) == 1 and "2 verdicts" in part.wrong[0] and sum("busy" in r for r in part.remarks) == 1
     )
+
+
+def test_the_page_of_a_running_test_says_so_and_reloads_itself(tmp_path: Path) -> None:
+    target = tmp_path / "load.html"
+    state = load_page.PageState("kinds: stroll, 8 users", 3, 14, 130.0)
+    load_page.write_page([Part("kinds")], {}, [], "a hall", target, state)
+    text = target.read_text()
+    assert (
+        "running: kinds: stroll, 8 users (3 of 14 runs, 2 min so far)" in text
+        and 'http-equiv="refresh"' in text
+    )
+    load_page.write_page([Part("kinds")], {}, [], "a hall", target, state._replace(now="", done=14))
+    assert "running" not in target.read_text() and "refresh" not in target.read_text()
+
+
+def test_labels_keep_their_order_and_a_distance() -> None:
+    heights = np.array([0.5, 0.52, 0.51, 0.9, 0.1])
+    found = load_pictures.spread(heights, 0.06)
+    assert np.argsort(found).tolist() == np.argsort(heights).tolist()
+    assert (np.diff(np.sort(found)) >= 0.06 - 1e-6).all()
+    assert found[3:].tolist() == [0.9, 0.1], "nothing is near them"
+    assert load_pictures.spread(np.full(4, 0.5), 0.1) == pytest.approx([0.35, 0.45, 0.55, 0.65], abs=0.01)
+
+
+def overlapping(axes) -> list[tuple[str, str]]:
+    """Return pairs of texts that overlap in a drawn picture."""
+    figure = axes.figure
+    figure.canvas.draw()
+    boxes = [(text.get_text(), Text.get_window_extent(text)) for text in axes.texts]  # without its line
+    return [(a, b) for k, (a, one) in enumerate(boxes) for b, other in boxes[k + 1 :] if one.overlaps(other)]
+
+
+def test_no_texts_overlap_and_no_legend_entries_look_alike() -> None:
+    kinds = [
+        ran(Case("kinds", kind, 8, 0.1, policy), CALM) for kind in ("stroll", "run") for policy in ("a", "b")
+    ]
+    budgets = [
+        ran(Case("budgets", kind, 8, share, policy), CALM)
+        for kind in ("stroll", "tour", "teleport") for policy in ("lru+prefetch", "lru") for share in (0.1, 0.4)
+    ]  # fmt: skip
+    speeds = [
+        ran(Case("speeds", "stroll", 8, 0.1, policy, speed), CALM, speed=speed)
+        for policy in ("lru+prefetch", "lru") for speed in (1.5, 5.0)
+    ]  # fmt: skip
+    crowd = [ran(Case("users", "stroll", n, 1.1, side), CALM) for n in (8, 64) for side in (None, ECHO)]
+    with drawn_figures() as figures:
+        load_pictures.hit_rate(budgets)
+        load_pictures.stalls(speeds)
+        load_pictures.round_trips(crowd)
+        load_pictures.bytes_over_time(kinds)
+    assert [overlaps(figure) for figure in figures] == [[]] * 4
+    assert [alike_in_grey(figure) for figure in figures] == [[]] * 4
+
+
+def test_names_of_lines_stand_beside_the_axes_without_overlap() -> None:
+    figure, axes = load_pictures._axes("title")
+    ends = []
+    for k, level in enumerate((1.0, 1.02, 1.05, 30.0, 33.0)):
+        axes.plot([0, 1], [level, level])
+        ends.append((1.0, level, f"line {k}", "#000000"))
+    axes.set_yscale("log")
+    load_pictures._settle(axes)
+    load_pictures.label_ends(axes, ends)
+    assert len(axes.texts) == 5 and overlapping(axes) == []
+    right = axes.get_window_extent().x1
+    assert all(Text.get_window_extent(text).x0 > right for text in axes.texts)
+    load_pictures.png(figure)

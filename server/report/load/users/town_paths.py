@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.builder.synthetic.facade import FORECOURT_Y, NAVE_X, NAVE_Y
-from solidcloud.builder.synthetic.town import PITCH_X, PITCH_Y
-from solidcloud.builder.synthetic.truth import FacadeTruth, SceneTruth
-from solidcloud.builder.synthetic.walk import floor_height
+
+from .....builder.synthetic.facade import FORECOURT_Y, NAVE_X, NAVE_Y
+from .....builder.synthetic.town import PITCH_X, PITCH_Y
+from .....builder.synthetic.truth import FacadeTruth, SceneTruth
+from .....builder.synthetic.walk import floor_height
 
 Floats = NDArray[np.float64]
 Cell = tuple[int, int]  # column, row of a façade in the town
@@ -50,6 +51,22 @@ class Town(NamedTuple):
     def only(self, cell: Cell) -> "Town":
         """Return the town of only one of its façades."""
         return Town({cell: self.facades[cell]})
+
+    def spots(self, count: int, rng: np.random.Generator) -> Floats:
+        """Return places to stand; see `Ground`."""
+        return spots(self, count, rng)
+
+    def wander(self, length: float, inside: float, rng: np.random.Generator, hurried: bool) -> Floats:
+        """Return the corners of a walk; see `Ground`."""
+        return wander(self, length, inside, rng, hurried)
+
+    def tour(self, rng: np.random.Generator) -> Floats:
+        """Return the corners of a loop; see `Ground`."""
+        return tour(self, rng)
+
+    def crowded(self) -> "Town":
+        """Return the façade in the middle, through whose door a crowd goes."""
+        return self.only(self.cells[len(self.cells) // 2])
 
     def floor(self, xy: Floats) -> Floats:
         """Return the height of the floor [m] (k,) below positions (k, 2).

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.voxel_store import VoxelStore
+
+from ....residency.arena import ArenaBuffer
+from ....residency.voxel_store import VoxelStore
 
 
 class Voxels(NamedTuple):
@@ -16,12 +17,14 @@ class Voxels(NamedTuple):
     boxes: (v, 2, 3) of each one's points, world [m].
     sizes: (v,) int64, bytes each takes in a cache.
     radius: of the scan's points [m].
+    points: their number.
     """
 
     keys: NDArray[np.uint64]
     boxes: NDArray[np.float64]
     sizes: NDArray[np.int64]
     radius: float
+    points: int = 0
 
     @property
     def decoded(self) -> int:
@@ -46,6 +49,7 @@ def read_voxels(archive: Path) -> Voxels:
         corners = np.stack([base + found.voxels["low"], base + found.voxels["high"]], axis=1)
         boxes = corners * lattice.step + np.array(lattice.origin)
         sizes = np.array([ArenaBuffer.rounded(int(size)) for size in store.sizes], np.int64)
-        return Voxels(found.voxels["key"].astype(np.uint64), boxes, sizes, float(header.radius))
+        keys = found.voxels["key"].astype(np.uint64)
+        return Voxels(keys, boxes, sizes, float(header.radius), header.points)
     finally:
         store.close()

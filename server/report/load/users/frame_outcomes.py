@@ -1,12 +1,12 @@
 """Outcome of every frame of a run, and the figures derived from it."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.schemas.wire.answers import Verdict
 
+from .....schemas.wire.answers import Verdict
 from .frame_clock import after_first, stalled
 
 Floats = NDArray[np.float64]
@@ -89,7 +89,8 @@ def merged(parts: list[Frames]) -> Frames:
 
 def save(path: Path, frames: Frames, **more: NDArray) -> None:
     """Write frames and further arrays as .npz."""
-    np.savez(path, **frames._asdict(), **more)
+    arrays: dict[str, Any] = {**frames._asdict(), **more}
+    np.savez(path, **arrays)
 
 
 def load(path: Path) -> tuple[Frames, dict[str, NDArray]]:

@@ -1,6 +1,5 @@
 """Server under load: a separate process on loopback, its options, and its memory over time."""
 
-import functools
 import os
 import re
 import socket
@@ -15,20 +14,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_build_cases.build_runs import COMMAND
-from bench_build_cases.build_watch import parse_rollup
 from numpy.typing import NDArray
-from solidcloud.schemas.errors import SolidcloudError
+
+from .....schemas.errors import SolidcloudError
+from ...common.machine import parse_rollup
+from ..users import echo_process
 
 SCENE = "load"
-SCRIPTS = Path(__file__).resolve().parents[1]
+COMMAND = [sys.executable, "-P", "-m", "solidcloud.server.cli.main"]
 START_SECONDS = 900.0  # the first start on a machine compiles
 STOP_SECONDS = 20.0
 # RSS is inexpensive to read. PSS visits all mappings and blocks the process's mmap for some ms.
 RSS_PERIOD, PSS_PERIOD = 0.05, 1.0
 
 
-class ServerError(RuntimeError):
+class ServerError(SolidcloudError):
     """Failed start or early end of the server; the message holds its output."""
 
 
@@ -125,35 +125,19 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
-@functools.cache
-def serve_help() -> str:
-    """Return the output of `solidcloud serve --help`."""
-    shown = subprocess.run(
-        [*COMMAND, "serve", "--help"], capture_output=True, text=True, check=True,
-        env={**os.environ, "COLUMNS": "250", "TERM": "dumb"},
-    )  # fmt: skip
-    return shown.stdout
-
-
-def takes(option: str) -> bool:
-    """Return whether `solidcloud serve` accepts this option."""
-    return re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", serve_help()) is not None
-
-
 def serve_command(archive: Path, endpoint: str, budget: int, policy: str | None) -> list[str]:
     """Return the command that serves an archive. policy: None: the server's default."""
     command = [*COMMAND, "serve", str(archive), "--name", SCENE, "--listen", endpoint, "--cache", str(budget)]
     return command + (["--policy", policy] if policy else [])
 
 
-def script(module: str, *arguments: str) -> list[str]:
-    """Return the command that runs `main` of a module of this folder, without hiding library modules."""
-    code = f"import sys; sys.path.append({str(SCRIPTS)!r}); from loadtest_cases.{module} import main; main()"
-    return [sys.executable, "-c", code, *arguments]
+def module_command(module: str, *arguments: str) -> list[str]:
+    """Return the command that runs a module, by its full name."""
+    return [sys.executable, "-P", "-m", module, *arguments]
 
 
 @contextmanager
-def started(command: list[str], log: Path) -> Iterator[subprocess.Popen]:
+def started(command: list[str], log: Path) -> Iterator[subprocess.Popen[str]]:
     """Start a process and end it afterwards, by SIGTERM first. log: receives its standard error."""
     with (
         open(log, "w") as errors,
@@ -168,7 +152,7 @@ def started(command: list[str], log: Path) -> Iterator[subprocess.Popen]:
 
 
 @contextmanager
-def running(command: list[str], log: Path, ready: str) -> Iterator[subprocess.Popen]:
+def running(command: list[str], log: Path, ready: str) -> Iterator[subprocess.Popen[str]]:
     """Start a process and wait for a line that begins with `ready`.
 
     Raises ServerError where it ended before, or was too slow.
@@ -181,7 +165,7 @@ def running(command: list[str], log: Path, ready: str) -> Iterator[subprocess.Po
         yield process
 
 
-def _first_line(process: subprocess.Popen) -> str:
+def _first_line(process: subprocess.Popen[str]) -> str:
     """Return its first line on standard output, or its failure within START_SECONDS."""
     found: list[str] = []
     assert process.stdout is not None
@@ -193,7 +177,7 @@ def _first_line(process: subprocess.Popen) -> str:
     return found[0] if found else ""
 
 
-def end(process: subprocess.Popen) -> None:
+def end(process: subprocess.Popen[str]) -> None:
     """End a process: SIGTERM first, then kill."""
     process.terminate()
     if process.stdin is not None:
@@ -217,7 +201,7 @@ def serving(archive: Path, budget: int, policy: str | None, log: Path) -> Iterat
 def echoing(reply_bytes: int, log: Path) -> Iterator[str]:
     """Run a bare echo, reachable at the yielded endpoint."""
     endpoint = free_endpoint()
-    with running(script("echo_process", endpoint, str(reply_bytes)), log, "ready"):
+    with running(module_command(echo_process.__name__, endpoint, str(reply_bytes)), log, "ready"):
         yield endpoint
 
 

@@ -3,10 +3,12 @@
 import base64
 import html
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from measurement.bench_results import Part, busy, goal_rows, limit_text, number
+from .....schemas.process.new_file import new_file
+from ...common.bench_results import Part, busy, goal_rows, limit_text, number
 
+RELOAD_SECONDS = 10
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1100px; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
@@ -14,19 +16,42 @@ img { max-width: 100%; } table { border-collapse: collapse; font-size: 13px; }
 td, th { padding: .15rem .6rem; text-align: left; border-bottom: 1px solid #e3e7eb; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; }
 .met { color: #2e8b57; } .missed { color: #c0392b; font-weight: 600; } .not { color: #b8860b; }
-p.note { color: #777; font-size: 13px; } p.warn { color: #c0392b; }
+p.note { color: #777; font-size: 13px; } p.warn { color: #c0392b; } p.run { background: #eef4f9; padding: .4rem .8rem; }
 """
 
 
+class PageState(NamedTuple):
+    """State of a load test. now: what runs, "" at the end.
+
+    done, total: numbers of runs.  seconds: since the beginning.
+    """
+
+    now: str
+    done: int
+    total: int
+    seconds: float
+
+
 def write_page(
-    parts: list[Part], notes: dict[str, str], pictures: list[tuple[str, bytes]], about: str, target: Path
+    parts: list[Part],
+    notes: dict[str, str],
+    pictures: list[tuple[str, bytes]],
+    about: str,
+    target: Path,
+    state: PageState | None = None,
 ) -> None:
-    """Write the page.
+    """Write the page, completely or not at all. A page that is not the last one reloads itself.
 
     pictures: title and PNG of each.
     about: machine and archive, in a sentence.
     """
     body = [f"<h1>solidcloud under load</h1><p>{html.escape(about)}</p>"]
+    running = state is not None and bool(state.now)
+    if state is not None and running:
+        done = f"{state.done} of {state.total} runs, {state.seconds / 60:.0f} min so far"
+        body.append(
+            f'<p class="run">running: {html.escape(state.now)} ({done}); this page reloads itself</p>'
+        )
     if warning := busy(parts):
         body.append(f'<p class="warn">{html.escape(warning)}: not figures to quote</p>')
     for part in parts:
@@ -44,7 +69,10 @@ def write_page(
             body.append(f'<p class="note">{html.escape(f"{part.section}: {line}")}</p>')
     target.parent.mkdir(parents=True, exist_ok=True)
     page = '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>solidcloud under load</title>'
-    target.write_text(f"{page}<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n")
+    if running:
+        page += f'<meta http-equiv="refresh" content="{RELOAD_SECONDS}">'
+    with new_file(target) as file:
+        file.write(f"{page}<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n".encode())
 
 
 def _goals(rows: list[dict[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""Machine under measurement: one core or all, other load, and the time limits of sections."""
+"""Machine under measurement: its cores, other load, memory of processes, and the time limits of sections."""
 
 import os
 import platform
@@ -72,6 +72,26 @@ def others_running() -> int | None:
     except OSError:
         return None
     return int(running.split("/")[0]) - 1
+
+
+def parse_rollup(text: str) -> tuple[int, int]:
+    """Return PSS and anonymous memory [bytes] from a process's smaps_rollup."""
+    found = {"Pss": 0, "Anonymous": 0}
+    for line in text.splitlines():
+        name, _, rest = line.partition(":")
+        if name in found:
+            found[name] = int(rest.split()[0]) * 1024
+    return found["Pss"], found["Anonymous"]
+
+
+def drop_from_page_cache(path: Path) -> bool:
+    """Drop a file from the page cache to force reading from disk; return whether this is possible."""
+    if not hasattr(os, "posix_fadvise"):
+        return False
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())  # only clean pages can be dropped
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+    return True
 
 
 class Clock:

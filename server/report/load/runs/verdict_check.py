@@ -3,29 +3,29 @@
 from pathlib import Path
 
 import numpy as np
-from solidcloud.builder.synthetic.figure import figure_points
-from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.report.walk.walkthrough import open_whole
-from solidcloud.server.scene import Scene
+from numpy.typing import NDArray
 
-from .frame_outcomes import ANSWERED, Frames
-from .user_process import AVATAR
-from .user_traces import Trace
+from .....schemas.wire.answers import Verdict
+from ....scene import Scene
+from ...common.whole_scene import open_whole
+from ..users.frame_outcomes import ANSWERED, Frames
+from ..users.user_process import AVATAR
+from ..users.user_traces import Trace
 
 
 class Judge:
     """Undisturbed scene, opened at the first query, closed by `close`."""
 
-    def __init__(self, archive: Path, points: int) -> None:
-        """Create the judge. points: of the avatar."""
-        self._archive, self._points = archive, points
+    def __init__(self, archive: Path, avatar: NDArray[np.float64]) -> None:
+        """Create the judge. avatar: (n, 3) points [m]."""
+        self._archive, self._avatar = archive, avatar
         self._scene: Scene | None = None
 
-    def verdicts(self, trace: Trace) -> np.ndarray:
+    def verdicts(self, trace: Trace) -> NDArray[np.int64]:
         """Return the true verdict of each pose (n,), in one call per user."""
         if self._scene is None:
             self._scene = open_whole(self._archive)
-            self._scene.add_avatar(AVATAR, figure_points(self._points))
+            self._scene.add_avatar(AVATAR, self._avatar)
         found = np.full(len(trace.user), -1)
         for user in np.unique(trace.user):
             own = trace.user == user
@@ -39,7 +39,7 @@ class Judge:
             scene.close()
 
 
-def wrong(frames: Frames, truth: np.ndarray) -> np.ndarray:
+def wrong(frames: Frames, truth: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the numbers of frames whose verdict is neither `UNKNOWN` nor the true one.
 
     Unanswered frames are ignored.

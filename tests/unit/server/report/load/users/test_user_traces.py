@@ -1,16 +1,16 @@
-"""Test the traces of scripts/loadtest: speeds, floors, bounds, smooth turns, reproducible bits."""
+"""Test the traces of a load test: speeds, floors, bounds, smooth turns, reproducible bits."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from loadtest_cases import town_paths, user_traces, walking_motion
-from loadtest_cases.user_traces import KINDS, Trace
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.town import POINTS_PER_FACADE, town_lots
 from solidcloud.builder.synthetic.truth import SceneTruth
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.report.load.users import town_paths, user_traces, walking_motion
+from solidcloud.server.report.load.users.user_traces import KINDS, Trace
 
 MOVING = ("stroll", "run", "tour", "crowd")
 SECONDS, USERS = 40.0, 4

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.avatars.avatar_model import AvatarModel
 
+from ....avatars.avatar_model import AvatarModel
 from .archive_voxels import read_voxels
 
 Floats = NDArray[np.float64]

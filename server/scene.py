@@ -199,11 +199,14 @@ class Scene(SceneQuestions):
         """Return the voxel cache of the first archive, for counters and checks."""
         return self.archives[0].residency
 
-    def warm(self) -> None:
-        """Run every query on each archive, to compile before the first request; start threads."""
+    def warm(self, *, last_first: bool = False) -> None:
+        """Run every query on each archive, to compile before the first request; start threads.
+
+        last_first: begin with what is needed last, while another process begins with the first.
+        """
         self._path_threads.start()
         for archive in self.archives:
-            archive.warm()
+            archive.warm(last_first=last_first)
 
     def info(self) -> SceneInfo:
         """Return the description of all archives together, with the effects of the scene file."""

@@ -27,11 +27,16 @@ class CompileProgress:
         """Begin without a burst. clock: returns the time [s]."""
         self._clock = clock
         self._lock = threading.Lock()
+        self.on_first: Callable[[], object] | None = None  # called once, before a compilation begins
         self._begun = self._last = self._due = 0.0
         self._count = 0
 
     def begin(self) -> None:
         """Record that the compilation of a function begins; functions may be nested."""
+        with self._lock:
+            first, self.on_first = self.on_first, None
+        if first is not None:
+            first()
         with self._lock:
             now = self._clock()
             if not self._count or now >= self._last + PAUSE:

@@ -31,7 +31,7 @@ from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
 
-__all__ = ["config", "intrinsic", "kernel_files", "njit", "types"]
+__all__ = ["config", "intrinsic", "kernel_files", "njit", "on_first_compilation", "types"]
 
 # numba creates its attributes on import, invisible to type checkers.
 config: Any = numba_config
@@ -59,6 +59,11 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
         return kernel
 
     return decorate
+
+
+def on_first_compilation(call: Callable[[], object] | None) -> None:
+    """Set what is called once before this process compiles its next function; None for nothing."""
+    _progress.on_first = call
 
 
 @functools.cache

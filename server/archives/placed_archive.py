@@ -213,7 +213,7 @@ class ArchiveGeneration:
         reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
         return self.prefetcher.record_pose(user, (x, y, z), reach)
 
-    def warm(self) -> None:
+    def warm(self, *, last_first: bool = False) -> None:
         """Run every query once, with a load, so that no request waits for compilation."""
         archive = self.store.archive
         self.data.bounds.trees()  # made before the first load, which tightens the bounds
@@ -221,7 +221,7 @@ class ArchiveGeneration:
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         x, y, z = place = archive.header.lattice.to_world(corner).tolist()
         self.prefetcher.warm((x, y, z))
-        warm_engines(self.data, place)
+        warm_engines(self.data, place, last_first=last_first)
 
     def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:
         """Load the voxels that are resident in `other`, until `stopped` returns True.
@@ -332,10 +332,10 @@ class PlacedArchive:
         """Return the description of the archive, in its own frame."""
         return self._info
 
-    def warm(self) -> None:
-        """Run every query once, with a load, so that no request waits for compilation."""
+    def warm(self, *, last_first: bool = False) -> None:
+        """Run every query once, with a load; see `warm_engines`."""
         with self.take() as opened:
-            opened.warm()
+            opened.warm(last_first=last_first)
 
     def leave_client(self, client: str) -> None:
         """Stop keeping voxels for a disconnected client. Raise BadRequestError if closed."""

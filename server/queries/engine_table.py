@@ -6,6 +6,7 @@ the request in their order, and `budget`. `objects` takes avatars, poses, groups
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,10 +61,11 @@ ENGINES: dict[str, Callable[..., Any]] = {
 }
 
 
-def warm_engines(data: SceneData, place: Sequence[float]) -> None:
+def warm_engines(data: SceneData, place: Sequence[float], *, last_first: bool = False) -> None:
     """Run every query of an archive once, so that every kernel is compiled or read from its file.
 
-    place: a scan point, world [m]; its voxel is loaded.
+    place: a scan point, world [m]; its voxel is loaded.  last_first: begin with what is needed
+    last, while another process begins with the first.
     """
     pose = np.eye(4)[None]
     pose[0, :3, 3] = place
@@ -76,15 +78,20 @@ def warm_engines(data: SceneData, place: Sequence[float]) -> None:
     }  # fmt: skip
     # Queries with a limit use separate kernels. These limits are too large to be reached here.
     limits = QueryBudget(tolerance=1e-3, visits=1 << 20), QueryBudget(deadline=time.perf_counter() + 3600.0)
+    steps: list[Callable[[], Any]] = []
     for budget in (EXACT, *limits):
-        collide(data, avatar, poses, 0.0, budget)  # several poses use other kernels than one pose
+        # Several poses use other kernels than one pose.
+        steps.append(partial(collide, data, avatar, poses, 0.0, budget))
         for question in (one for one in QUESTIONS.values() if not one.whole):
             arguments = [
                 samples[name] for name in question.arguments if name in question.required or name in samples
             ]
             tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
-            ENGINES[question.name](data, *arguments, budget=budget._replace(tolerance=tolerance))
-        objects(data, [avatar, avatar], poses, groups, groups, budget=budget)
+            limit = budget._replace(tolerance=tolerance)
+            steps.append(partial(ENGINES[question.name], data, *arguments, budget=limit))
+        steps.append(partial(objects, data, [avatar, avatar], poses, groups, groups, budget=budget))
+    for step in reversed(steps) if last_first else steps:
+        step()
     if data.coarse is not None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
         reach = check_request(data, avatar, pose, data.radius_units)

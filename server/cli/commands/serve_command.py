@@ -91,6 +91,7 @@ def serve(
     from ...zenoh_server.server_config import ServerConfig
     from ..output.compile_notice import compile_notices
     from .kernel_rehearsal import rehearse
+    from .parallel_warming import warmed_in_parallel
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     config = ServerConfig(
@@ -115,6 +116,7 @@ def serve(
         start.enter_context(compile_notices())
         if start.enter_context(files.starting()):
             rehearse(what, files)
+        start.enter_context(warmed_in_parallel(what))
         scene = stack.enter_context(Scene.open(what, name, budget_bytes=budget, policy=policy))
         if log is not None:
             stack.enter_context(recorded(scene, what, log))

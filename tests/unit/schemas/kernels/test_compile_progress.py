@@ -57,3 +57,13 @@ def test_who_watches_is_warned(
     with caplog.at_level(logging.INFO, NAME):
         compile_for(3.0)
     assert [record.levelno for record in caplog.records] == [logging.WARNING if watched else logging.INFO]
+
+
+def test_the_first_compilation_is_announced_once() -> None:
+    calls = []
+    progress = CompileProgress()
+    progress.on_first = lambda: calls.append(progress._count)
+    progress.begin()
+    progress.end()
+    progress.begin()
+    assert calls == [0]

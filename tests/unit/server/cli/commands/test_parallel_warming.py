@@ -1,0 +1,78 @@
+"""Test the child process that compiles while a server warms its scene."""
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from solidcloud.schemas.kernels import compiling
+from solidcloud.server.cli.commands import parallel_warming
+from solidcloud.server.cli.commands.parallel_warming import main, warmed_in_parallel
+from solidcloud.server.queries import engine_table
+from solidcloud.server.scene import Scene
+
+ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """Return the processes that the module starts, on a machine with two processors."""
+    started: list[subprocess.Popen[bytes]] = []
+    start = subprocess.Popen
+
+    def noted(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        started.append(start(*arguments, **options))
+        return started[-1]
+
+    monkeypatch.setattr(parallel_warming.subprocess, "Popen", noted)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    return started
+
+
+def test_nothing_is_started_where_nothing_is_compiled(started: list[subprocess.Popen[bytes]]) -> None:
+    with warmed_in_parallel(ARCHIVE):
+        pass
+    compiling._progress.begin()  # after the block nobody is helped
+    assert not started
+
+
+def test_one_child_compiles_and_is_gone_at_the_end(started: list[subprocess.Popen[bytes]]) -> None:
+    with warmed_in_parallel(ARCHIVE):
+        compiling._progress.begin()
+        compiling._progress.begin()
+        assert len(started) == 1 and started[0].returncode is None
+    assert started[0].returncode is not None
+    assert str(ARCHIVE) in started[0].args  # type: ignore[operator]
+
+
+def test_one_processor_compiles_alone(
+    started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    with warmed_in_parallel(ARCHIVE):
+        compiling._progress.begin()
+    assert not started
+
+
+@pytest.mark.interpreted
+def test_the_child_runs_the_same_queries_in_the_other_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[str] = []
+
+    def noted(name: str, engine: Any) -> Any:
+        def run(*arguments: Any, **options: Any) -> Any:
+            ran.append(name)
+            return engine(*arguments, **options)
+
+        return run
+
+    for name, engine in engine_table.ENGINES.items():
+        monkeypatch.setitem(engine_table.ENGINES, name, noted(name, engine))
+    with Scene.open(ARCHIVE) as scene:
+        scene.warm()
+    forward, ran = ran, []
+    main(str(ARCHIVE))
+    after_frames = ran[-len(forward) :]
+    assert after_frames == forward[::-1] and len(set(forward)) == len(engine_table.ENGINES) - 1
+    assert np.all([name in engine_table.ENGINES for name in ran])

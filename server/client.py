@@ -5,6 +5,7 @@ requests; zenoh_client/server_connection.py sends them and reads the replies.
 """
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -13,6 +14,7 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..schemas.archive.pose_arrays import make_poses, one_pose
 from ..schemas.errors import BadRequestError, BusyError, InternalError, SolidcloudError, TooLargeError
@@ -27,6 +29,7 @@ from ..schemas.wire.request_limits import MAX_POSES
 from ..schemas.wire.requests import QuestionOptions, has_tolerance_or_budget, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
+from .avatars.avatar_shape import MeshLike, avatar_shape
 from .scene_interface import QueryMethods
 from .zenoh_client.client_identity import AddedAvatar
 from .zenoh_client.client_session import ClientSession, CommandNumbers
@@ -124,15 +127,23 @@ class Client(QueryMethods):
         """Return a message on why no server answered an operation, and what to do."""
         return self._connection.explain_silence(operation)
 
-    def add_avatar(self, name: str, points: Any, radius: float | None = None) -> AvatarInfo:
-        """Add an avatar of this client.
+    def add_avatar(
+        self,
+        name: str,
+        points: "ArrayLike | str | os.PathLike[str] | MeshLike",
+        radius: float | None = None,
+    ) -> AvatarInfo:
+        """Add an avatar of this client: points (n, 3), the path of a file, or a mesh object.
 
-        points: (n, 3) float64, the avatar's frame [m].  radius: see AddAvatarRequest [m].
+        name, points, radius: as in `Scene.add_avatar`. This process reads the file, and needs the
+        extra `readers` for some formats.
         If no server answers, the avatar is remembered and added later; the answer then has `radius`
         as given here and no `bounding_radius`. Raise BadRequestError if another avatar has the name
-        or this one is invalid, TooLargeError beyond the server's limits.
+        or this one is invalid or without points, ScanError if the file cannot be read,
+        TooLargeError beyond the server's limits.
         """
-        avatar = AddedAvatar(make_positions(points).copy(), None if radius is None else float(radius))
+        shape = avatar_shape(points, radius)
+        avatar = AddedAvatar(make_positions(shape.points).copy(), shape.radius)
         request = avatar.request(name)
         avatars = self._connection.avatars
         new = avatars.add(name, avatar)

@@ -1,5 +1,6 @@
 """Scene: placed archives opened in this process, with the query methods of `Client`."""
 
+import os
 import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -12,11 +13,13 @@ from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
 from ..schemas.wire.key_expressions import User, check_name
 from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved
+from ..schemas.wire.requests import AddAvatarRequest, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
 from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats
+from .avatars.avatar_shape import MeshLike, avatar_shape
 from .avatars.client_avatars import check_owner
 from .observability.request_stats import RequestStats
 from .queries.context.query_context import SceneData
@@ -234,18 +237,29 @@ class Scene(SceneQuestions):
             give_back_freed_memory()
 
     def add_avatar(
-        self, name: str, points: ArrayLike, radius: float | None = None, *, client: str = ""
+        self,
+        name: str,
+        points: "ArrayLike | str | os.PathLike[str] | MeshLike",
+        radius: float | None = None,
+        *,
+        client: str = "",
     ) -> AvatarInfo:
-        """Add an avatar of points (n, 3) float64, avatar frame [m].
+        """Add an avatar: points (n, 3), the path of a scan or mesh file, or a mesh object.
 
+        name: 1 to 64 characters.
+        points: in the avatar's frame [m]. A file has any format that `solidcloud build` reads. A
+        mesh object has `vertices` and `faces`, such as a `trimesh.Trimesh`. The surface of a mesh
+        is covered with points, so that no part of it is farther than the radius from one.
         radius: of each point's sphere [m]; None: half the mean closest-point distance of the
-        points.
+        points, for a mesh a hundredth of the square root of its area.
         client: owner; clients may use the same names for different avatars. Adding the same avatar
         again changes nothing.
-        Raise BadRequestError if the name belongs to a different avatar, TooLargeError beyond the
-        limits.
+        Raise BadRequestError for an avatar without points, or if the name belongs to a different
+        one, ScanError if the file cannot be read, TooLargeError beyond the limits.
         """
-        model = self._avatars.add(name, points, radius, client)
+        shape = avatar_shape(points, radius)
+        request = AddAvatarRequest(name, make_positions(shape.points), shape.radius)
+        model = self._avatars.add(name, request.points, request.radius, client)
         return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
 
     @property

@@ -53,7 +53,7 @@ ALLOWED = {
     "server/zenoh_client": "zenoh_common scene_interface.py",
     "server/zenoh_server": "observability runtime scene_interface.py zenoh_common",
     "server/avatars": "kernels scene_interface.py",
-    "server/client.py": "scene_interface.py zenoh_common zenoh_client",
+    "server/client.py": "scene_interface.py zenoh_common zenoh_client avatars",
     "server/residency": "kernels runtime",
     "server/cli/output": "residency",
     "server/queries/context": "kernels runtime avatars residency",
@@ -97,7 +97,12 @@ ALLOWED = {
 # builder's code.
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
-    "server/avatars": ("builder/voxel/point_hierarchy", "builder/sources/scan_files"),
+    "server/avatars": (
+        "builder/voxel/point_hierarchy",
+        "builder/sources/common/scan",
+        "builder/sources/scan_files",
+        "builder/sources/surface_samples",
+    ),
 }
 # The command line and the reports run builds too.
 COMMANDS = ("server/cli", "server/report")

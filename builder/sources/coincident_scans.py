@@ -6,13 +6,16 @@ it as invalid.
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.index import Source
 from ...schemas.errors import ScanError
 from .common.scan import Scan
+
+if TYPE_CHECKING:  # it would load the kernels, which a client that reads an avatar does not need
+    from ...schemas.archive.index import Source
 
 # A scan with at most this many points whose header declares no bounds is read to check it: some
 # milliseconds.
@@ -35,7 +38,7 @@ def is_one_position(low: NDArray[np.float64], high: NDArray[np.float64], count: 
     return count is not None and count > 1 and bool((low == high).all())
 
 
-def coincident_sources(sources: Iterable[Source]) -> tuple[str, ...]:
+def coincident_sources(sources: "Iterable[Source]") -> tuple[str, ...]:
     """Return a warning for each scan of an archive whose points all lie at one place."""
     return tuple(coincident_text(s.path, s.index, s.count) for s in sources if s.one_place)
 

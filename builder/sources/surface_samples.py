@@ -1,5 +1,6 @@
-"""Points spread over the triangles of a mesh: OBJ, STL and PLY with faces (by trimesh), and GLB."""
+"""Triangles of mesh files, OBJ, STL, PLY and GLB, and points spread over them."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.scan import NOT_FINITE, Scan, ScanBlock, reader_library, scan_error
+from .common.scan import NOT_FINITE, Scan, ScanBlock, library_errors, reader_library, scan_error
+from .common.text_rows import LONGEST_LINE, text_chunks
 from .formats.glb import GlbScan
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
@@ -26,6 +28,10 @@ SAMPLES_ANYWAY = 10**7
 # Maximum file size that trimesh loads [bytes]. It holds a mesh whole: reading an OBJ takes about
 # five times its file size.
 LARGEST_MESH = 512 << 20
+
+# A face in an OBJ file, and in the header of a PLY file.
+_OBJ_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
+_PLY_FACE = re.compile(rb"element[ \t]+face[ \t]+0*[1-9]")
 
 
 class SurfaceSamples(Scan):
@@ -92,11 +98,45 @@ class SurfaceSamples(Scan):
         return corners
 
 
-def _by_trimesh(path: Path) -> NDArray[np.float64]:
-    """Return the corners (n, 3, 3) of all triangles of an OBJ, STL or PLY file.
+def mesh_triangles(vertices: Scan) -> NDArray[np.float64]:
+    """Return the corners (n, 3, 3) of all triangles of a file [m]; none if it holds only points.
 
+    vertices: the file as points. Only an OBJ or PLY file with faces needs the library trimesh.
     Raises ScanError.
     """
+    path = vertices.path
+    suffix = path.suffix.lower()
+    if isinstance(vertices, GlbScan):
+        return vertices.triangles()
+    if suffix == ".stl":
+        _check_size(path)
+        corners = np.concatenate([np.empty((0, 3)), *(block.xyz for block in vertices.blocks())])
+        if len(corners) % 3:
+            raise scan_error(
+                path, f"{len(corners)} corners", "three a triangle", "fetch the file again, it is damaged"
+            )
+        return corners.reshape(-1, 3, 3)
+    if suffix in (".obj", ".ply") and _has_faces(path):
+        with library_errors(path):
+            return _by_trimesh(path)
+    return np.empty((0, 3, 3))
+
+
+def _has_faces(path: Path) -> bool:
+    """Return whether an OBJ or PLY file has faces. Raises ScanError."""
+    with library_errors(path), path.open("rb") as file:
+        if path.suffix.lower() == ".obj":
+            return any(_OBJ_FACE.search(chunk) for _, chunk in text_chunks(file, path))
+        for line in iter(lambda: file.readline(LONGEST_LINE), b""):
+            if _PLY_FACE.match(line.strip()):
+                return True
+            if line.strip() == b"end_header":
+                break
+    return False
+
+
+def _check_size(path: Path) -> None:
+    """Raise ScanError for a mesh file that is too large to hold whole."""
     size = path.stat().st_size
     if size > LARGEST_MESH:
         raise scan_error(
@@ -105,6 +145,14 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
             f"at most {LARGEST_MESH} to sample",
             "split it, or build it without --spacing",
         )
+
+
+def _by_trimesh(path: Path) -> NDArray[np.float64]:
+    """Return the corners (n, 3, 3) of all triangles of an OBJ, STL or PLY file.
+
+    Raises ScanError.
+    """
+    _check_size(path)
     trimesh = reader_library("trimesh", path)
     # With materials, trimesh would open any file that the OBJ names.
     mesh = trimesh.load_mesh(path, process=False, skip_materials=True)

@@ -1,5 +1,11 @@
-"""Unit of the integers with which contact is decided exactly ("exact units")."""
+"""Unit of the integers with which contact is decided exactly ("exact units"), and the largest coordinate.
+
+This module imports nothing, so that readers of points need no kernels.
+"""
 
 # 2^-26 m = 15 nm (NUMERICS.md N5). A power of two, so that metres times UNITS_PER_METRE is exact in
 # float64.
 UNITS_PER_METRE = 2.0**26
+
+# Input with world coordinates beyond this is refused (NUMERICS.md case 16).
+MAX_COORDINATE = 1e9

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import BadRequestError
 from ..kernels.morton import morton_decode, morton_encode
+from .units import MAX_COORDINATE as MAX_COORDINATE
 from .units import UNITS_PER_METRE
 
 # Offset added to voxel coordinates before they are interleaved, 21 bits per axis, into a uint64
@@ -30,9 +31,6 @@ MIN_STEP = 1e-6
 # server/kernels/collide/collide_poses.py: a voxel and its neighbours within reach stay below 2^24
 # steps.
 MAX_VOXEL_STEPS = 1 << 21
-
-# Input with world coordinates beyond this is refused (NUMERICS.md case 16).
-MAX_COORDINATE = 1e9
 
 
 class Lattice(NamedTuple):

@@ -48,7 +48,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class AddAvatarRequest(Request, frozen=True):
     """Add an avatar for this client.
 
-    name: 1 to 64 characters.  points: (n, 3) float64, in the avatar's frame [m].
+    name: 1 to 64 characters.  points: (n, 3) float64, n >= 1, in the avatar's frame [m].
     radius: of every point [m], finite and >= 0; null: half the mean closest-point distance of
     `points`.
     """
@@ -56,6 +56,14 @@ class AddAvatarRequest(Request, frozen=True):
     name: Name
     points: Positions
     radius: Length | None = None
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        if not len(self.points):
+            raise BadRequestError(
+                f"avatar {self.name!r} has no points: expected at least one, because an avatar without points touches "
+                "nothing: check where its points come from"
+            )
 
 
 class QuestionRequest(Request, frozen=True, kw_only=True):

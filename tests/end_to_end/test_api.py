@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
+import trimesh
 from floor import server_process
 
 ASK = """
@@ -10,7 +12,9 @@ import sys
 import numpy as np
 import solidcloud
 with solidcloud.connect(sys.argv[1], scene="floor") as scene:
+    print(scene)
     scene.add_avatar("al", np.zeros((1, 3)), 0.125)
+    assert scene.add_avatar("box", sys.argv[2]).points > 1000
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, 2, 3] = 5.0, -5.0
     verdicts = scene.collide("al", poses).verdict.tolist()
@@ -23,10 +27,12 @@ print(verdicts, [name for name in ("numba", "llvmlite", "h5py") if name in sys.m
 """
 
 
-def test_a_client_at_work_loads_neither_numba_nor_h5py(endpoint: str) -> None:
+def test_a_client_at_work_loads_neither_numba_nor_h5py(endpoint: str, tmp_path: Path) -> None:
+    box = tmp_path / "box.stl"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(box)
     with server_process(endpoint):
         done = subprocess.run(
-            [sys.executable, "-P", "-c", ASK, endpoint],
+            [sys.executable, "-P", "-c", ASK, endpoint, box],
             capture_output=True,
             text=True,
             check=False,

@@ -27,9 +27,9 @@ from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])
 CONTACTS = [Verdict.CONTACT] * 2
-# False avatars "al": without points, with another radius, and shifted high above the floor.
+# False avatars "al": a point far away, with another radius, and shifted high above the floor.
 LIES = {
-    "nothing": (np.empty((0, 3)), 0.125),
+    "far": (np.full((1, 3), 1e6), 0.125),
     "radius": (POINTS, 1e-6),
     "high": (POINTS + np.array([0.0, 0.0, 50.0]), 0.125),
 }

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.archive.voxel_grid import MAX_COORDINATE
+from ....schemas.archive.units import MAX_COORDINATE
 from ....schemas.errors import ScanError, SolidcloudError
 from ....schemas.process.interrupts import check_interrupt
 

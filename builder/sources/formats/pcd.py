@@ -29,7 +29,6 @@ from ..common.scan import (
     scan_error,
 )
 from ..common.text_rows import is_number, number_rows
-from .pcd_lzf import LzfStream
 
 # Maximum bytes of a header. A real one has a few hundred bytes; a file without a DATA line in this
 # range is not a PCD file.
@@ -111,6 +110,8 @@ class CompressedPcd(Scan):
         self._header, self._past = header, past
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
+        from .pcd_lzf import LzfStream  # loads the kernels
+
         header = self._header
         with self.path.open("rb") as file:
             # Decode once to find where the last column begins, then decode all columns side by

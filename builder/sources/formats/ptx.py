@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.archive.voxel_grid import MAX_COORDINATE
+from ....schemas.archive.units import MAX_COORDINATE
 from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
 from ..common.scan import Scan, library_errors, scan_error
 from ..common.text_rows import LONGEST_LINE, is_number

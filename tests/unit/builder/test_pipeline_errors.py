@@ -390,7 +390,7 @@ def test_an_empty_avatar_is_clear_though_all_is_unknown(tmp_path: Path) -> None:
     (tmp_path / "bad.xyz").write_text("1 2 3\nbroken\n")
     build([tmp_path / "good.xyz", tmp_path / "bad.xyz"], tmp_path / "hall", skip_bad=True)
     with Scene.open(tmp_path / "hall") as scene:
-        scene.add_avatar("nobody", np.empty((0, 3)))
+        scene._avatars.add("nobody", np.empty((0, 3)), None, "")
         scene.add_avatar("ball", [[0.0, 0, 0]], 0.01)
         far = np.tile(np.eye(4), (3, 1, 1))
         far[:, 0, 3] = 1000.0

@@ -125,7 +125,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     case = archive_cases.build(tmp_path_factory.mktemp("scene"), synthetic_scans.make_scan("plane", 1, 100))
     opened = Scene.open(case.archive)
     opened.add_avatar("ball", [[0.0, 0, 0]], 0.1)
-    opened.add_avatar("nobody", np.empty((0, 3)))
+    opened._avatars.add(
+        "nobody", np.empty((0, 3)), None, ""
+    )  # the engine answers it, `add_avatar` refuses it
     return opened
 
 
@@ -206,7 +208,7 @@ def test_a_tolerance_alone_is_answered_exactly_and_with_bounds(tmp_path: Path) -
     poses = np.array([archive_cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in away])
     with Scene.open(case.archive) as scene:
         scene.add_avatar("ball", np.zeros((1, 3)), 0.25)
-        scene.add_avatar("nothing", np.zeros((0, 3)), 0.25)
+        scene._avatars.add("nothing", np.zeros((0, 3)), 0.25, "")
         for asked in (poses, *poses[:, None]):
             exact = scene.collide("ball", asked, 0.125)
             answers = scene.collide("ball", asked, 0.125, tolerance=0.5)

@@ -1,0 +1,188 @@
+"""What `add_avatar` takes: arrays, files and meshes, in Scene and Client alike."""
+
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import archive_cases
+import numpy as np
+import pytest
+import synthetic_scans
+import trimesh
+from solidcloud.builder.synthetic.figure import figure_points, write_figure
+from solidcloud.schemas.errors import BadRequestError, ScanError, TooLargeError
+from solidcloud.server.avatars.avatar_shape import avatar_shape
+from solidcloud.server.client import Client
+from solidcloud.server.scene import Scene
+
+BOX = trimesh.creation.box((0.5, 0.5, 0.5))
+POINTS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.0, 0.2, 0]])
+
+
+class Mesh:
+    """A mesh of any library."""
+
+    def __init__(self, vertices: Any, faces: Any = None) -> None:
+        self.vertices = vertices
+        if faces is not None:
+            self.faces = faces
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """A scene of one point at the origin."""
+    return Scene.open(archive_cases.build(tmp_path, np.zeros((1, 3)), radius=0.01).archive, "dot")
+
+
+def at(x: float) -> np.ndarray:
+    """A pose (1, 4, 4) at x."""
+    pose = np.eye(4)[None].copy()
+    pose[0, 0, 3] = x
+    return pose
+
+
+def test_an_array_is_taken_as_it_is() -> None:
+    assert avatar_shape(POINTS, 0.1).points is POINTS
+    assert avatar_shape(POINTS.tolist()) == (POINTS.tolist(), None)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ascii.stl", "obj", "ply", "glb"])
+def test_a_mesh_file_is_solid(scene: Scene, tmp_path: Path, kind: str) -> None:
+    file = tmp_path / f"box.{kind}"
+    file_type = "stl_ascii" if kind == "ascii.stl" else kind
+    file.write_bytes(data if isinstance(data := BOX.export(file_type=file_type), bytes) else data.encode())
+    for name, given in (("text", str(file)), ("path", file)):
+        info = scene.add_avatar(name, given)
+        assert info.points > 5_000 and info.radius == pytest.approx(np.sqrt(1.5) / 100, abs=1e-6)
+        # The scan's point lies on the middle of a side, far from any corner of the box.
+        verdicts = scene.collide(name, np.concatenate([at(0.25), at(0.25 + 0.03), at(0.0)])).verdict
+        assert verdicts.tolist() == [1, 0, 0], "a surface, and nothing inside"
+    assert np.array_equal(avatar_shape(file, 0.1).points, avatar_shape(BOX, 0.1).points)
+
+
+def test_points_of_a_file_are_taken_as_they_are(tmp_path: Path) -> None:
+    figure = figure_points(200)
+    for name in ("figure.obj", "figure.ply"):
+        write_figure(tmp_path / name, figure)
+        assert np.array_equal(avatar_shape(tmp_path / name).points, figure), "vertices without faces"
+        assert avatar_shape(tmp_path / name, 0.1).radius == 0.1
+    synthetic_scans.write_las(tmp_path / "body.laz", np.rint(POINTS * 1000).astype(np.int32))
+    assert np.allclose(avatar_shape(tmp_path / "body.laz").points, POINTS, atol=1e-3)
+    (tmp_path / "body.xyz").write_text("0 0 0\n1 2 3\n")
+    assert np.array_equal(avatar_shape(tmp_path / "body.xyz").points, [[0, 0, 0], [1, 2, 3]])
+
+
+def test_a_trimesh_object_or_anything_like_it_is_solid(scene: Scene) -> None:
+    info = scene.add_avatar("box", BOX, 0.02)
+    assert info.radius == 0.02 and info.points > 1_000
+    assert scene.add_avatar("box", Mesh(BOX.vertices.tolist(), BOX.faces.tolist()), 0.02) == info
+    assert scene.add_avatar("box", trimesh.Scene(BOX), 0.02) == info
+    both = trimesh.Scene([BOX, BOX.copy().apply_translation([3.0, 0, 0])])
+    assert scene.add_avatar("two", both, 0.02).points == 2 * info.points
+    assert scene.add_avatar("cloud", trimesh.PointCloud(POINTS), 0.02).points == len(POINTS)
+    assert scene.add_avatar("vertices", Mesh(POINTS), 0.02).points == len(POINTS)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        (Mesh(POINTS, [[0, 1, 3]]), "mesh with a face of vertex 3: expected rows of its 3 vertices"),
+        (Mesh(POINTS, [[0, 1, -1]]), "mesh with a face of vertex -1"),
+        (
+            Mesh(POINTS, [[0, 1, 2, 0]]),
+            r"faces of shape \(1, 4\) .*: expected \(n, 3\) integers: triangulate it",
+        ),
+        (Mesh(POINTS, [[0.0, 1.0, 2.0]]), "type float64: expected"),
+        (Mesh(POINTS * np.nan, [[0, 1, 2]]), "vertices of the mesh.* is nan, expected finite numbers"),
+        (Mesh(POINTS[:, :2], [[0, 1, 2]]), r"vertices of the mesh of shape \(3, 2\): expected \(n, 3\)"),
+    ],
+)
+def test_a_mesh_that_is_none_is_refused(scene: Scene, mesh: Mesh, message: str) -> None:
+    with pytest.raises(BadRequestError, match=message):
+        scene.add_avatar("al", mesh)
+
+
+def test_a_file_that_is_none_is_refused(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "empty.obj").write_text("# nothing\n")
+    (tmp_path / "box.step").write_text("ISO-10303-21;\n")
+    broken = BOX.export(file_type="stl")[:-40]
+    (tmp_path / "cut.stl").write_bytes(broken)
+    (tmp_path / "wild.stl").write_bytes(
+        bytes(80) + struct.pack("<I12fH", 1, *[0.0] * 3, *[0.0, 0, 0, 1, 0, 0, 0, float("nan"), 0], 0)
+    )
+    for name, error, message in (
+        ("nowhere.obj", ScanError, "no such file or folder"),
+        ("empty.obj", ScanError, "contains no point: expected at least one: choose another file"),
+        ("box.step", ScanError, "the suffix '.step', expected one of .las"),
+        ("cut.stl", ScanError, "the 12 its header declares"),
+        ("wild.stl", BadRequestError, "wild.stl: a vertex that is not finite"),
+    ):
+        with pytest.raises(error, match=message):
+            scene.add_avatar("al", tmp_path / name)
+
+
+@pytest.mark.parametrize(("kind", "library"), [("obj", "trimesh"), ("ply", "plyfile"), ("laz", "lazrs")])
+def test_a_missing_reader_is_named_with_the_extra_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, library: str
+) -> None:
+    file = tmp_path / f"body.{kind}"
+    if kind == "laz":
+        synthetic_scans.write_las(file, np.rint(POINTS * 1000).astype(np.int32))
+    else:
+        BOX.export(file)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ScanError, match=rf"library '{library}'.* pip install 'solidcloud\[readers\]'"):
+        avatar_shape(file)
+
+
+def test_stl_glb_and_points_need_no_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in ("stl", "glb"):
+        (tmp_path / f"box.{kind}").write_bytes(BOX.export(file_type=kind))
+    write_figure(tmp_path / "figure.obj", POINTS)
+    for library in ("trimesh", "plyfile", "laspy", "lazrs", "pye57"):
+        monkeypatch.setitem(sys.modules, library, None)
+    assert len(np.asarray(avatar_shape(tmp_path / "box.stl").points)) > 5_000
+    assert len(np.asarray(avatar_shape(tmp_path / "box.glb").points)) > 5_000
+    assert len(np.asarray(avatar_shape(tmp_path / "figure.obj").points)) == 3
+
+
+def refusals(add: Any) -> list[str]:
+    """The messages with which invalid avatars are refused."""
+    found = []
+    for name, points, radius in (
+        ("al", np.empty((0, 3)), None),
+        ("al", np.empty((0, 3)), 0.1),
+        ("", POINTS, 0.1),
+        ("a" * 65, POINTS, 0.1),
+        (7, POINTS, 0.1),
+        ("al", POINTS, -1.0),
+        ("al", POINTS, float("nan")),
+        ("al", POINTS[:, :2], 0.1),
+        ("al", "nowhere.obj", 0.1),
+        ("al", np.zeros((1_000_001, 3)), 0.1),
+    ):
+        with pytest.raises((BadRequestError, ScanError, TooLargeError)) as caught:
+            add(name, points, radius)
+        found.append(str(caught.value))
+    return found
+
+
+def test_scene_and_client_refuse_the_same_avatars_with_the_same_words(scene: Scene) -> None:
+    found = refusals(scene.add_avatar)
+    assert found == refusals(Client(scene="dot").add_avatar), "before anything is sent"
+    assert found[0].startswith("avatar 'al' has no points: expected at least one")
+    assert "of 0 characters: expected 1 to 64" in found[2] and "avatar name 7: expected text" in found[4]
+
+
+def test_a_file_of_a_scene_without_points_is_refused_with_its_place(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "empty.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    file = tmp_path / "hall.toml"
+    archive = next(path.parent for path in tmp_path.rglob("index.h5"))
+    file.write_text(
+        f'format = 1\n[[archives]]\npath = "{archive}"\n[[avatars]]\nname = "al"\nfile = "empty.ply"\n'
+    )
+    with pytest.raises(ScanError, match=r"hall.toml: \$.avatars\[0\].file: .*empty.ply: contains no point"):
+        Scene.open(file)

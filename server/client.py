@@ -30,7 +30,7 @@ from ..schemas.wire.requests import QuestionOptions, has_tolerance_or_budget, ma
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
 from .avatars.avatar_shape import MeshLike, avatar_shape
-from .scene_interface import QueryMethods
+from .scene_interface import QueryMethods, list_avatars
 from .zenoh_client.client_identity import AddedAvatar
 from .zenoh_client.client_session import ClientSession, CommandNumbers
 from .zenoh_client.server_connection import ServerConnection
@@ -98,6 +98,14 @@ class Client(QueryMethods):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def __repr__(self) -> str:
+        """Return the scene, the server's endpoint, the state and the avatars in one line."""
+        lost = f", {self.unanswered:,} items unanswered" if self.unanswered else ""
+        connection = self._connection
+        return (
+            f"<Client of {self.name!r} at {connection!r}, {list_avatars(connection.avatars.names())}{lost}>"
+        )
 
     def close(self) -> None:
         """Disconnect; the server then drops this client's avatars. Closing twice is allowed."""

@@ -27,7 +27,7 @@ from .residency.voxel_cache import VoxelCache
 from .residency.voxel_store import OpenStore, VoxelStore
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag
-from .scene_interface import EVERYBODY, AvatarLimits
+from .scene_interface import EVERYBODY, AvatarLimits, list_avatars
 from .scenes.scene_archives import (
     ReadPoints,
     error_location,
@@ -152,6 +152,20 @@ class Scene(SceneQuestions):
     def __exit__(self, *_: object) -> None:
         """Close the archives."""
         self.close()
+
+    def __repr__(self) -> str:
+        """Return the name, the size and the avatars in one line."""
+        try:
+            with ExitStack() as stack:
+                each = [stack.enter_context(archive.take()).store.archive for archive in self.archives]
+                points = sum(archive.header.points for archive in each)
+                voxels = sum(len(archive.voxels) for archive in each)
+        except BadRequestError:
+            return f"<Scene {self.name!r}: closed>"
+        size = f"{points:,} points in {voxels:,} voxels" + (
+            f" of {len(each)} archives" if len(each) > 1 else ""
+        )
+        return f"<Scene {self.name!r}: {size}, {list_avatars(self._avatars.names())}>"
 
     def close(self) -> None:
         """Wait for parts of paths and reloads in progress, then close the archives' files."""

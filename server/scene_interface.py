@@ -149,6 +149,14 @@ class QueryMethods:
         return self.ask(OBJECTS, objects, margin, **options)
 
 
+def list_avatars(names: Sequence[str]) -> str:
+    """Return a few names of avatars for the `repr` of a scene."""
+    if not names:
+        return "no avatars"
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"avatar{'s' * (len(names) > 1)} {', '.join(names[:3])}{more}"
+
+
 class AvatarLimits(NamedTuple):
     """Limits on avatars, for all clients together and for each one.
 

@@ -13,8 +13,10 @@ import numpy as np
 
 from ..archive.pose_arrays import make_poses, one_pose
 from ..errors import BadRequestError
+from .answer_forms import VERDICT_NAMES
 from .answers import Verdict
 from .arrays import Poses
+from .encoding import JSON, encode
 from .request_limits import MAX_FRAME_SECONDS
 from .requests import Count, Length, Name, Request, check_one_pose
 
@@ -216,6 +218,7 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     ground, proximity, contacts, uncertainty, objects, crowd: the report of each effect.
     unknown: whether the frame needed data that could not be examined. With it, any of these fields
     might differ.
+    `repr` and `str` are one line, such as "at (1.25, 0.5, 0): clear, 0.1 m left".
     """
 
     pose: Poses
@@ -233,6 +236,26 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     crowd: CrowdReport | None = None
     unknown: bool = False
 
+    def __repr__(self) -> str:
+        """Return the position reached, its verdict and what stopped the motion."""
+        at = ", ".join(f"{value:.4g}" for value in self.pose[0, :3, 3])
+        parts = [f"at ({at}): {VERDICT_NAMES.get(self.verdict, self.verdict)}"]
+        if self.left:
+            parts.append(f"{self.left:.4g} m left")
+        if self.touched:
+            parts.append(f"{len(self.touched)} obstacle{'s' * (len(self.touched) != 1)}")
+        if self.skipped:
+            parts.append(f"without {', '.join(self.skipped)}")
+        return ", ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as dicts, lists, numbers and strings, ready for `json.dumps`.
+
+        Fields with their default value are omitted, as on the wire and by `solidcloud query --json`.
+        """
+        found: dict[str, Any] = msgspec.json.decode(encode(self, JSON))
+        return found
+
 
 class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):
     """Result of one frame (`Moved`) as sent to the user of the motion command.
@@ -247,3 +270,7 @@ class State(Moved, frozen=True, eq=False, kw_only=True, omit_defaults=True):
     frame: int
     late: int = 0
     seconds: float = 0.0
+
+    def __repr__(self) -> str:
+        """Return the number of the motion command, and the result as `Moved` does."""
+        return f"command {self.seq}: {Moved.__repr__(self)}"

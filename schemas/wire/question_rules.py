@@ -78,6 +78,28 @@ class ColumnRules(NamedTuple):
     unknown: float = 0
 
 
+class Summary(Enum):
+    """Reduction of a column to the one number that a line about all answers states."""
+
+    LEAST = auto()  # of the finite values
+    SUM = auto()
+    ROWS = auto()  # number of rows
+    CONTACTS = auto()  # number of rows with the verdict CONTACT
+
+
+class Fact(NamedTuple):
+    """Fact in the line that describes the answers of a question.
+
+    column: name.  summary: see the class; the fact is omitted without a value, and for a count of 0.
+    text: format of the number, such as "nearest {:.4g} m".  one: of a count of 1.
+    """
+
+    column: str
+    summary: Summary
+    text: str
+    one: str = ""
+
+
 # Columns that every answer has.
 COMMON: dict[str, ColumnRules] = {
     "verdict": ColumnRules(Merge.VERDICT, unknown=Verdict.UNKNOWN),
@@ -86,6 +108,10 @@ COMMON: dict[str, ColumnRules] = {
     "node_visits": ColumnRules(Merge.SUM),
     "point_tests": ColumnRules(Merge.SUM),
 }
+
+
+# The question that each type of answers, or of their parts along a path, belongs to.
+DECLARED: "dict[type[Cost], Question[Any]]" = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +130,7 @@ class Question(Generic[A]):
     directions: array fields of the request whose vectors are directions, and not points.
     listed: the request's field that limits the rows listed per item, and the bytes of one row; None
     if no rows are listed.
+    facts: facts in the line that describes the answers, besides the number of each verdict.
     """
 
     name: str
@@ -117,6 +144,7 @@ class Question(Generic[A]):
     whole: bool = False
     directions: tuple[str, ...] = ()
     listed: tuple[str, int] | None = None
+    facts: tuple[Fact, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", COMMON | dict(self.columns))
@@ -124,6 +152,7 @@ class Question(Generic[A]):
         if set(self.columns) != expected:
             odd = ", ".join(sorted(expected ^ set(self.columns)))
             raise TypeError(f"{self.name}: {odd}: expected one rule for each array field")
+        DECLARED.update({kind: self for kind in (self.answers, self.part) if kind is not None})
 
     @cached_property
     def arrays(self) -> dict[str, ArrayType]:

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from math import inf
 from typing import Any, TypeVar
 
+from .answer_forms import answer_line, answer_values
 from .answers import (
+    AnswerForms,
     CollideAnswers,
     CollidePart,
     ContactsAnswers,
@@ -22,8 +24,9 @@ from .answers import (
     SweepPart,
     Verdict,
     WithinAnswers,
+    use_forms,
 )
-from .question_rules import ColumnFrame, ColumnRules, Merge, Question, Rows
+from .question_rules import ColumnFrame, ColumnRules, Fact, Merge, Question, Rows, Summary
 from .requests import (
     CollideRequest,
     ContactsRequest,
@@ -48,6 +51,8 @@ _NEAREST = {
 }
 _PAIR = ColumnRules(Merge.LISTED, rows=Rows.LISTED, of="pair_starts")
 _CLUSTER = ColumnRules(Merge.LISTED, rows=Rows.LISTED, of="cluster_starts")
+
+use_forms(AnswerForms(answer_line, answer_values))
 
 COLLIDE = Question(
     "collide",
@@ -77,6 +82,7 @@ DISTANCE = Question(
     },
     nearest=("signed_distance", ("witness_cloud", "witness_avatar")),
     part=DistancePart,
+    facts=(Fact("signed_distance", Summary.LEAST, "nearest {:.4g} m"),),
 )
 CONTACTS = Question(
     "contacts",
@@ -106,6 +112,11 @@ CONTACTS = Question(
     slow=True,
     # A pair takes 68 bytes, and its cluster up to 116.
     listed=("limit", 184),
+    facts=(
+        Fact("pairs_found", Summary.SUM, "{} pairs", "1 pair"),
+        Fact("cluster_count", Summary.ROWS, "{} clusters", "1 cluster"),
+        Fact("cluster_deepest", Summary.LEAST, "deepest {:.4g} m"),
+    ),
 )
 SWEEP = Question(
     "sweep",
@@ -123,6 +134,7 @@ SWEEP = Question(
     nearest=("upper", ("witness_cloud", "witness_avatar")),
     part=SweepPart,
     slow=True,
+    facts=(Fact("upper", Summary.LEAST, "earliest contact at {:.4g} of a motion"),),
 )
 RAYCAST = Question(
     "raycast",
@@ -132,6 +144,7 @@ RAYCAST = Question(
     _NEAREST | {"hit": _POINT, "normal": _DIRECTION},
     nearest=("distance", ("cloud_point",)),
     directions=("directions",),
+    facts=(Fact("distance", Summary.LEAST, "nearest hit at {:.4g} m"),),
 )
 WITHIN = Question(
     "within",
@@ -140,6 +153,7 @@ WITHIN = Question(
     "points",
     _NEAREST,
     nearest=("distance", ("cloud_point",)),
+    facts=(Fact("distance", Summary.LEAST, "nearest scan point at {:.4g} m"),),
 )
 OBJECTS = Question(
     "objects",
@@ -151,6 +165,7 @@ OBJECTS = Question(
         "pair_verdict": ColumnRules(Merge.FIRST, rows=Rows.PAIRS, unknown=Verdict.UNKNOWN),
     },
     whole=True,
+    facts=(Fact("pair_verdict", Summary.CONTACTS, "{} pairs touch", "1 pair touches"),),
 )
 
 # All questions by name.

@@ -144,6 +144,11 @@ class Avatars:
                 f"avatar {name!r} exists with other points or another radius: use another name"
             )
 
+    def names(self) -> list[str]:
+        """Return the names of the scene's avatars and of those added in this process, sorted."""
+        with self._changed:
+            return sorted({name for owner in _OWN for name in self._clients.get(owner, {})})
+
     def drop_client(self, client: str) -> None:
         """Drop the avatars of a client."""
         with self._changed:

@@ -104,6 +104,11 @@ class AddedAvatars:
             )
         return known is avatar
 
+    def names(self) -> list[str]:
+        """Return the names of the avatars, sorted."""
+        with self._lock:
+            return sorted(self._avatars)
+
     def remove(self, name: str) -> None:
         """Remove an avatar."""
         with self._lock:

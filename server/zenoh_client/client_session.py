@@ -108,6 +108,12 @@ class ClientSession:
         self._refusals = 0
         self._stack: ExitStack | None = None
 
+    def __repr__(self) -> str:
+        """Return the avatar, the scene, and whether the session is open, in one line."""
+        latest, begun = self._latest, "closed" if self._stack is None else "open"
+        state = "no state yet" if latest is None else f"{monotonic() - self._received:.2g} s ago {latest!r}"
+        return f"<Session of {self._avatar!r} in {self._scene!r}: {begun}, {state}>"
+
     def _present_user(self) -> key_expressions.User:
         """Return the user of this session under the client's present id."""
         return key_expressions.User(self._connection.client_id, self._avatar)

@@ -86,6 +86,10 @@ class ServerConnection:
         if self._stack is None:
             raise BadRequestError("this client is closed: send requests inside `with Client(...) as scene`")
 
+    def __repr__(self) -> str:
+        """Return the endpoint, and whether the connection is open."""
+        return f"{self._endpoint}: {'closed' if self._stack is None else 'open'}"
+
     @property
     def client_id(self) -> str:
         """Return the client's present id."""

@@ -12,9 +12,9 @@ import sys
 import numpy as np
 import solidcloud
 with solidcloud.connect(sys.argv[1], scene="floor") as scene:
-    print(scene)
     scene.add_avatar("al", np.zeros((1, 3)), 0.125)
     assert scene.add_avatar("box", sys.argv[2]).points > 1000
+    assert repr(scene) == f"<Client of 'floor' at {sys.argv[1]}: open, avatars al, box>", repr(scene)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, 2, 3] = 5.0, -5.0
     verdicts = scene.collide("al", poses).verdict.tolist()
@@ -22,6 +22,8 @@ with solidcloud.connect(sys.argv[1], scene="floor") as scene:
     distances = scene.distance("al", poses, 1.0).verdict.tolist()
     with scene.session("al") as session:
         session.wish(poses[:1])
+        assert repr(session).startswith("<Session of 'al' in 'floor': open, "), repr(session)
+    assert scene.collide("al", poses).to_dict()["answers"][1]["verdict"] in ("clear", "contact")
     scene.stats()
 print(verdicts, [name for name in ("numba", "llvmlite", "h5py") if name in sys.modules])
 """

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.wire.answer_forms import VERDICT_NAMES, verdict_counts
 from ....schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
@@ -19,14 +20,9 @@ from ....schemas.wire.answers import (
     Verdict,
     WithinAnswers,
 )
-from ....schemas.wire.arrays import array_fields
 from ....schemas.wire.motion_messages import Moved
 from ....schemas.wire.question_rules import COMMON, Question, Rows
-from ....schemas.wire.question_table import CONTACTS, question_of
-
-_NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
-_COST = Cost.__struct_fields__
-_TOTALS = ("engine_seconds", "hits", "misses", "resident", "resident_bytes", "faults", "wait_seconds", "late")
+from ....schemas.wire.question_table import question_of
 
 
 def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterator[str]:
@@ -39,12 +35,12 @@ def answer_lines(labels: list[str], times: list[float], answers: Any) -> Iterato
         yield from _verdict_runs(times, answers)
         return
     for i, label in enumerate(labels):
-        yield f"{label}  {_NAMES[int(answers.verdict[i])]:<8}{_result_text(answers, i)}".rstrip()
+        yield f"{label}  {VERDICT_NAMES[int(answers.verdict[i])]:<8}{_result_text(answers, i)}".rstrip()
     if isinstance(answers, ObjectsAnswers):
         for (first, second), verdict in zip(
             answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True
         ):
-            yield f"objects {first} and {second}  {_NAMES[verdict]}"
+            yield f"objects {first} and {second}  {VERDICT_NAMES[verdict]}"
 
 
 def word_of(answers: Any) -> str:
@@ -54,7 +50,7 @@ def word_of(answers: Any) -> str:
 
 def summary_line(answers: Any, outside: NDArray[np.bool_] | None = None) -> str:
     """Return the count of each verdict, the count outside the scan if any, and the engine time."""
-    counts = ", ".join(f"{(answers.verdict == verdict).sum()} {verdict.name.lower()}" for verdict in Verdict)
+    counts = verdict_counts(answers.verdict)
     if outside is not None and outside.any():
         counts += f", {outside.sum()} outside the scan"
     return f"{len(answers)} {word_of(answers)}: {counts}; {answers.engine_seconds * 1e3:.2f} ms in the engine"
@@ -86,7 +82,7 @@ def move_line(label: str, moved: Moved) -> str:
 
     The line has the verdict, final position, remaining motion, first obstacle and skipped effects.
     """
-    line = f"{label}  {_NAMES[moved.verdict]:<8}at {_point_text(moved.pose[0, :3, 3])}"
+    line = f"{label}  {VERDICT_NAMES[moved.verdict]:<8}at {_point_text(moved.pose[0, :3, 3])}"
     if moved.left:
         line += f", {moved.left:.4f} m left"
     if moved.touched:
@@ -104,32 +100,15 @@ def answers_json(
     times: (k,) [s], or empty.  outside: (k,), mask of the items outside the scan; None if not
     known.
     """
-    k = len(answers)  # type: ignore[arg-type]
-    rows: list[dict[str, Any]] = [{"t": t} for t in times] or [{} for _ in range(k)]
-    kind: type[Cost] = type(answers)
-    question = question_of(kind)
-    for name, of in array_fields(kind).items():
-        column = getattr(answers, name)
-        if len(column) == k and question.columns[name].rows in (Rows.ITEMS, Rows.BOUNDED):
-            values = _json_column(column, vectors=bool(of.tail))
-            for row, value in zip(rows, values, strict=True):
-                row[name] = _NAMES[value] if name == "verdict" else value
-    totals = {name: getattr(answers, name) for name in _TOTALS}
-    totals["outside_scan"] = None if outside is None else int(outside.sum())
-    for row, lies in zip(rows, [] if outside is None else outside.tolist(), strict=outside is not None):
-        row["outside_scan"] = lies
-    if isinstance(answers, ContactsAnswers):
-        for i, row in enumerate(rows):
-            row |= {
-                "contacts": _contact_rows(answers, "pair", i),
-                "clusters": _contact_rows(answers, "cluster", i),
-            }
-    if isinstance(answers, ObjectsAnswers):
-        found = zip(answers.pairs.tolist(), answers.pair_verdict.tolist(), strict=True)
-        totals["pairs"] = [{"objects": pair, "verdict": _NAMES[verdict]} for pair, verdict in found]
-    others = [name for name in kind.__struct_fields__ if name not in (*question.columns, *_COST)]
-    totals |= {name: getattr(answers, name) for name in others}
-    return {"answers": rows, **totals}
+    values: dict[str, Any] = answers.to_dict()
+    lies = (
+        [{}] * len(values["answers"]) if outside is None else [{"outside_scan": x} for x in outside.tolist()]
+    )
+    when = [{"t": t} for t in times] or [{}] * len(lies)
+    values["answers"] = [
+        {**at, **row, **lie} for at, row, lie in zip(when, values["answers"], lies, strict=True)
+    ]
+    return {**values, "outside_scan": None if outside is None else int(outside.sum())}
 
 
 def _verdict_runs(times: list[float], answers: CollideAnswers) -> Iterator[str]:
@@ -138,7 +117,7 @@ def _verdict_runs(times: list[float], answers: CollideAnswers) -> Iterator[str]:
     for verdict, group in groupby(found, key=lambda pair: pair[1]):
         stretch = [t for t, _ in group]
         span = f"{stretch[0]:10.3f} .. {stretch[-1]:10.3f} s"
-        yield f"{span}  {_NAMES[verdict]}, {len(stretch)} poses"
+        yield f"{span}  {VERDICT_NAMES[verdict]}, {len(stretch)} poses"
 
 
 def _result_text(answers: Cost, i: int) -> str:
@@ -208,24 +187,6 @@ def _point_text(point: Any) -> str:
     return " ".join(f"{value:.4f}" for value in point)
 
 
-def _contact_rows(answers: ContactsAnswers, what: str, i: int) -> list[dict[str, Any]]:
-    """Return the contacts ("pair") or clusters ("cluster") of one pose."""
-    names = {name: name.removeprefix("cluster_") for name in CONTACTS.rows_of(f"{what}_starts")}
-    which = _rows_of_pose(getattr(answers, f"{what}_starts"), i)
-    columns = [_json_column(getattr(answers, name)[which], vectors=False) for name in names]
-    return [dict(zip(names.values(), row, strict=True)) for row in zip(*columns, strict=True)]
-
-
 def _rows_of_pose(starts: Any, i: int) -> slice:
     """Return the rows of pose i."""
     return slice(int(starts[i]), int(starts[i + 1]))
-
-
-def _json_column(column: Any, *, vectors: bool) -> list[Any]:
-    """Convert a column to JSON values; elements that are not finite become None."""
-    values: list[Any] = column.tolist()
-    if column.dtype.kind != "f" or np.isfinite(column).all():
-        return values
-    if vectors:
-        return [value if all(map(math.isfinite, value)) else None for value in values]
-    return [value if math.isfinite(value) else None for value in values]

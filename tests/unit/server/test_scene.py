@@ -1,5 +1,6 @@
 """A scene: avatars belong to clients, budgets are checked, what is closed stays closed."""
 
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -31,6 +32,40 @@ def test_info_says_what_was_built(scene: Scene) -> None:
     assert np.abs(np.array(info.bounds) - [points.min(axis=0), points.max(axis=0)]).max() <= 0.5001e-4
     assert info.sources[0].count == 300 and info.skipped == []
     assert 0 < info.record_bytes < info.resident_bytes
+
+
+def test_repr_is_one_helpful_line(scene: Scene) -> None:
+    voxels = scene.info().voxels
+    assert repr(scene) == f"<Scene 'hall': 300 points in {voxels} voxels, no avatars>"
+    for name in "edcba":
+        scene.add_avatar(name, BODY, 0.01)
+    scene.add_avatar("of a client", BODY, 0.01, client="one")
+    assert repr(scene).endswith("voxels, avatars a, b, c and 2 more>")
+    session = scene.session("a")
+    assert repr(session) == "<Session of 'a' in 'hall': closed, no state yet>"
+    with session:
+        session.wish(HERE + np.diag([0, 0, 0, 0.0]))
+        assert repr(session).startswith("<Session of 'a' in 'hall': open, ")
+        assert " s ago command 1: at (0, 0, 0): " in repr(session)
+    scene.close()
+    assert repr(scene) == "<Scene 'hall': closed>"
+
+
+def test_answers_of_a_scene_are_one_line_and_become_json(scene: Scene) -> None:
+    scene.add_avatar("al", BODY, 0.01)
+    for answers in (
+        scene.collide("al", HERE),
+        scene.distance("al", HERE, 0.5),
+        scene.contacts("al", HERE),
+        scene.sweep("al", HERE, HERE),
+        scene.raycast([[0.0, 0, 9]], [[0.0, 0, -1]], 20.0),
+        scene.within([[0.0, 0, 0]], 1.0),
+        scene.objects([("al", HERE[0])]),
+        next(iter(scene.path("al", HERE))),
+        scene.move("al", HERE, HERE),
+    ):
+        assert "\n" not in repr(answers) and len(repr(answers)) < 160
+        assert json.loads(json.dumps(answers.to_dict(), allow_nan=False)) == answers.to_dict()
 
 
 def test_the_folder_names_the_scene(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -309,6 +310,38 @@ class Scene(SceneQuestions):
         """
         check_owner(client)
         return LocalSession(self.simulation, User(client, check_name(avatar, "avatar of a session")))
+
+    def plot(
+        self,
+        avatar: str | None = None,
+        poses: ArrayLike | None = None,
+        answers: Any = None,
+        *,
+        path: str | os.PathLike[str] | None = None,
+        heights: tuple[float, float] | None = None,
+        axes: Any = None,
+        points: int = 2_000_000,
+        client: str = "",
+    ) -> Any:
+        """Draw a floor plan with poses marked by verdict; return the figure of matplotlib.
+
+        avatar: its name.  poses: (k, 4, 4), avatar to world; None: the whole scene is drawn.
+        answers: of any query about these poses; None: those of `collide`.
+        path: file to write too, PNG, SVG or PDF by its suffix.
+        heights: range of heights to draw [m]; None: those of the avatar at its median pose, above
+        the floor, or without an avatar all.
+        axes: matplotlib's axes to draw into; None: a new figure.
+        points: number of points to read, those near the poses first. Other voxels are drawn as
+        boxes.  client: owner of the avatar.
+        Raise BadRequestError for poses without an avatar or answers, SolidcloudError if matplotlib
+        is not installed (extra `report`), and the errors of `collide`.
+        """
+        from .pictures.floor_plan import plot_scene, write_figure
+
+        figure = plot_scene(self, avatar, poses, answers, heights, axes, points, client)
+        if path is not None:
+            write_figure(figure, Path(path))
+        return figure
 
     def drop_client(self, client: str) -> None:
         """Drop the bodies and avatars of a disconnected client, and stop keeping voxels for it."""

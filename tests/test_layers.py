@@ -70,8 +70,10 @@ ALLOWED = {
         "kernels observability runtime scene_interface.py avatars residency queries/context queries archives "
         "simulation/effects"
     ),
+    "server/pictures": "avatars archives",
     "server/scene.py": (
-        "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes"
+        "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes "
+        "pictures"
     ),
     "server/report/common": "cli/input avatars residency scene.py",
     "server/cli/scene_files": "residency archives scenes scene.py",
@@ -93,10 +95,11 @@ ALLOWED = {
     "server/api": "client.py scene.py",
 }
 
-# From server to builder: an avatar is read and its tree built, and an archive without some of its points built, by the
-# builder's code.
+# From server to builder: an avatar is read and its tree built, an archive without some of its points built, and the
+# points of a record listed, by the builder's code.
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
+    "server/pictures": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
         "builder/sources/common/scan",
@@ -135,7 +138,7 @@ DOORS = {
     "prometheus_client": ("server/observability/prometheus_export.py",),
     "distributed": ("builder/run/dask_cluster.py",),
     "dask": ("builder/run/dask_cluster.py",),
-    "matplotlib": ("server/report/",),
+    "matplotlib": ("server/pictures/", "server/report/"),
     "PIL": ("server/report/",),
     "typer": ("server/cli/main.py", "server/cli/commands/"),
     "rich": ("server/cli/output/", "server/report/"),

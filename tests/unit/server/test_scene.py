@@ -44,7 +44,7 @@ def test_repr_is_one_helpful_line(scene: Scene) -> None:
     session = scene.session("a")
     assert repr(session) == "<Session of 'a' in 'hall': closed, no state yet>"
     with session:
-        session.wish(HERE + np.diag([0, 0, 0, 0.0]))
+        session.wish(HERE)
         assert repr(session).startswith("<Session of 'a' in 'hall': open, ")
         assert " s ago command 1: at (0, 0, 0): " in repr(session)
     scene.close()

@@ -99,8 +99,8 @@ class Scene(SceneQuestions):
         radius_model: default radius model, see schemas/archive/radius_model.py; None: the archive's
         single radius. `open_store` and `radius_model` are refused for a scene file, which declares
         them itself.
-        read_points: returns the points (n, 3) of an avatar's file [m]; None: `read_avatar`, which
-        reads scans and meshes.
+        read_points: returns the points (n, 3) of an avatar's file [m]; None: files are read as by
+        `add_avatar`.
         Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
         invalid scene file or a budget that is too small.
         """
@@ -126,10 +126,6 @@ class Scene(SceneQuestions):
         cls, path: Path, name: str | None, budget_bytes: int, policy: str, read_points: ReadPoints | None
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
-        if read_points is None:
-            from .avatars.avatar_file import read_avatar  # needs the readers of all formats
-
-            read_points = read_avatar
         file = read_scene(path)
         name = name or scene_name(file, path)
         found = find_archives(file, path)

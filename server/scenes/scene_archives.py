@@ -20,10 +20,12 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.scene.effect_table import Crowd, Ground, Objects, Slide, Through, Uncertainty
 from ...schemas.scene.scene_file import SUFFIX, SceneFile
+from ...schemas.wire.requests import make_positions
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.archive_info import describe
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import make_avatar
+from ..avatars.avatar_shape import avatar_shape
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..residency.arena import ArenaBuffer
 from ..residency.voxel_store import OpenStore, VoxelStore
@@ -89,19 +91,22 @@ def find_archives(file: SceneFile, path: Path) -> list[FoundArchive]:
     return found
 
 
-def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints) -> list[FoundAvatar]:
+def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints | None) -> list[FoundAvatar]:
     """Return the avatars that a scene file names.
 
-    Raises BadRequestError and the errors of `read_points`.
+    read_points: reads the points of a file; None: files are read as by `Scene.add_avatar`.
+    Raises BadRequestError and the errors of `read_points` or `avatar_shape`.
     """
     found = []
     meet = any(isinstance(effect, Objects | Crowd) for effect in file.effects)
     for number, item in enumerate(file.avatars):
         avatar_file = _resolve_relative(path, item.file)
         with error_location(path, f"$.avatars[{number}].file"):
-            points = read_points(avatar_file)
+            source = avatar_file if read_points is None else read_points(avatar_file)
+            shape = avatar_shape(source, item.radius)
+            points = make_positions(shape.points)
         with error_location(path, f"$.avatars[{number}]"):
-            model = make_avatar(points, item.radius)
+            model = make_avatar(points, shape.radius)
             if meet and model.radius > MAX_BODY_RADIUS:
                 raise BadRequestError(
                     f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "

@@ -29,7 +29,7 @@ def query(
         ),
     ] = "collide",
     avatar: Annotated[
-        Path | None, typer.Option(help="Points of the avatar: a file in any format that build reads.")
+        Path | None, typer.Option(help="The avatar: points or a mesh, in any format that build reads.")
     ] = None,
     poses: Annotated[
         Path | None,
@@ -66,7 +66,10 @@ def query(
     ] = None,
     radius: Annotated[
         float | None,
-        typer.Option(help="Radius of an avatar point [m]; default: half the mean closest-point distance."),
+        typer.Option(
+            help="Radius of an avatar point [m]; default: half the mean closest-point distance; of a mesh a hundredth "
+            "of the square root of its area."
+        ),
     ] = None,
     tolerance: Annotated[
         float | None,
@@ -100,6 +103,7 @@ def query(
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
     from ...avatars.avatar_file import read_avatar
+    from ...avatars.avatar_shape import avatar_shape
     from ...client import Client
     from ..input.query_input import ask, check_query, joined
     from ..output.answer_text import answer_lines, answers_json, summary_line, unknown_line, word_of
@@ -109,7 +113,7 @@ def query(
         return _ask_moves(connect, scene, question, as_json, key_file)
     found, asked, printed = [], 0, 0
     with Client(connect, scene=scene, key_file=key_file) as client:
-        for part in ask(client, question, read_avatar):
+        for part in ask(client, question, read_avatar, avatar_shape):
             found.append(part)
             asked += len(part.labels)
             if as_json or client.unanswered == asked:
@@ -178,7 +182,7 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
 
     from ....schemas.wire.answers import Verdict
     from ....schemas.wire.encoding import JSON, encode
-    from ...avatars.avatar_file import read_avatar
+    from ...avatars.avatar_shape import avatar_shape
     from ...client import Client
     from ..input.query_input import ask_moves
     from ..output.answer_text import move_line
@@ -186,7 +190,7 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
     found: list[dict[str, Any]] = []
     waiting: list[str] = []
     with Client(connect, scene=scene, key_file=key_file) as client:
-        places, frames = ask_moves(client, question, read_avatar)
+        places, frames = ask_moves(client, question, avatar_shape)
         for label, moved in frames:
             found.append(json.decode(encode(moved, JSON)))
             waiting.append(move_line(label, moved))

@@ -33,7 +33,6 @@ def new(
     import sys
 
     from ....schemas.process.own_command import own_command
-    from ...avatars.avatar_file import read_avatar
     from ..scene_files.scene_new import new_scene
 
     wanted = [effect.strip() for effect in effects.split(",") if effect.strip()]
@@ -44,7 +43,6 @@ def new(
         effects=wanted,
         name=name,
         overwrite=overwrite,
-        read_points=read_avatar,
     )
     if spawn is None:
         print(f"{output}: no place to stand was found: see [spawn] in it", file=sys.stderr)
@@ -60,11 +58,10 @@ def check(
     The effects are listed in their order. Exit code 2: the file is invalid. Exit code 3: an archive
     or avatar it names is invalid.
     """
-    from ...avatars.avatar_file import read_avatar
     from ..output.console import print_facts
     from ..scene_files.scene_check import check_scene_file, scene_facts, scene_json
 
-    checked = check_scene_file(file, read_avatar)
+    checked = check_scene_file(file)
     if as_json:
         print_json(scene_json(checked))
     else:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
@@ -15,7 +15,7 @@ from ....schemas.wire.path_messages import part_to_answers
 from ....schemas.wire.question_rules import Question
 from ....schemas.wire.question_table import OBJECTS, QUESTIONS, join_answers, path_questions
 from ....schemas.wire.request_limits import MAX_FRAME_SECONDS
-from ....schemas.wire.requests import QuestionRequest
+from ....schemas.wire.requests import QuestionRequest, make_positions
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import BodyPlaces, Places, PointPlaces, RayPlaces, box_of
 
@@ -35,6 +35,8 @@ _NOT_SENT = frozenset({*_FILES.values(), "radius", "along"})
 _COMMON_OPTIONS = QuestionRequest.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
+# Returns the points and the radius of an avatar's file for the radius that was given.
+ReadAvatar = Callable[[Path, float | None], tuple[ArrayLike, float | None]]
 
 
 class QueryTarget(Protocol):
@@ -114,7 +116,9 @@ def _options(question: Question[Any]) -> tuple[tuple[str, ...], tuple[str, ...]]
     return needed, (*radius, *(name for name in parameters if name not in question.required))
 
 
-def ask(scene: QueryTarget, query: Query, read_points: ReadPoints) -> Iterator[AnswerPart]:
+def ask(
+    scene: QueryTarget, query: Query, read_points: ReadPoints, read_avatar: ReadAvatar
+) -> Iterator[AnswerPart]:
     """Make a query and yield its answers at once, or in parts for a path.
 
     read_points: returns the points (n, 3) of a file [m].
@@ -123,7 +127,7 @@ def ask(scene: QueryTarget, query: Query, read_points: ReadPoints) -> Iterator[A
     parameters = {name: value for name, value in given.items() if name not in _NOT_SENT}
     question = QUESTIONS[query.along if query.op == "path" else query.op]
     if "objects" in question.arguments:
-        yield _ask_objects(scene, given["objects"], read_points, parameters, given.get("radius"))
+        yield _ask_objects(scene, given["objects"], read_avatar, parameters, given.get("radius"))
         return
     if "avatar" not in question.arguments:
         rays = "directions" in question.arguments
@@ -136,7 +140,7 @@ def ask(scene: QueryTarget, query: Query, read_points: ReadPoints) -> Iterator[A
     moving = question.moving
     times, poses = read_poses(given["poses"])
     labels, begins = _labels(times.tolist(), moving=moving)
-    places = _add_body(scene, query, read_points, poses, moving=moving)
+    places = _add_body(scene, query, read_avatar, poses, moving=moving)
     if query.op == "path":
         for part in scene.path("avatar", poses, question.name, **parameters):
             which = slice(part.first, part.first + len(part))
@@ -147,7 +151,7 @@ def ask(scene: QueryTarget, query: Query, read_points: ReadPoints) -> Iterator[A
 
 
 def ask_moves(
-    scene: QueryTarget, query: Query, read_points: ReadPoints
+    scene: QueryTarget, query: Query, read_avatar: ReadAvatar
 ) -> tuple[Places, Iterator[tuple[str, Moved]]]:
     """Simulate one frame from each pose towards the next; frames do not depend on one another.
 
@@ -155,7 +159,7 @@ def ask_moves(
     motions, and an iterator over the frames: a label and the result of each.
     """
     times, poses = read_poses(query.given["poses"])
-    places = _add_body(scene, query, read_points, poses, moving=True)
+    places = _add_body(scene, query, read_avatar, poses, moving=True)
     labels, _ = _labels(times.tolist(), moving=True)
 
     def frames() -> Iterator[tuple[str, Moved]]:
@@ -174,11 +178,12 @@ def joined(found: list[AnswerPart]) -> AnswerPart:
 
 
 def _add_body(
-    scene: QueryTarget, query: Query, read_points: ReadPoints, poses: NDArray[np.float64], *, moving: bool
+    scene: QueryTarget, query: Query, read_avatar: ReadAvatar, poses: NDArray[np.float64], *, moving: bool
 ) -> BodyPlaces:
     """Add the avatar of a query; return its positions at the poses, or on motions between them."""
-    points = read_points(query.given["avatar"])
-    radius = scene.add_avatar("avatar", points, query.given.get("radius")).radius
+    found, radius = read_avatar(query.given["avatar"], query.given.get("radius"))
+    points = make_positions(found)
+    radius = scene.add_avatar("avatar", points, radius).radius
     ends = (poses[:-1], poses[1:]) if moving else (poses, poses)
     return BodyPlaces(box_of(points)[None], np.array([radius or 0.0]), _around(query), *ends)
 
@@ -194,7 +199,7 @@ def _around(query: Query) -> float:
 
 
 def _ask_objects(
-    scene: QueryTarget, path: Path, read_points: ReadPoints, parameters: dict[str, Any], radius: float | None
+    scene: QueryTarget, path: Path, read_avatar: ReadAvatar, parameters: dict[str, Any], radius: float | None
 ) -> AnswerPart:
     """Query the objects of a file."""
     rows = read_objects(path)
@@ -203,8 +208,9 @@ def _ask_objects(
     }
     bodies = {}
     for avatar, name in names.items():
-        points = read_points(avatar)
-        bodies[avatar] = box_of(points), scene.add_avatar(name, points, radius).radius or 0.0
+        found, own = read_avatar(avatar, radius)
+        points = make_positions(found)
+        bodies[avatar] = box_of(points), scene.add_avatar(name, points, own).radius or 0.0
     listed = [(names[row.avatar], row.pose, row.group, row.mask) for row in rows]
     answers = scene.ask(OBJECTS, listed, **parameters)
     boxes = np.array([bodies[row.avatar][0] for row in rows]).reshape(-1, 2, 3)

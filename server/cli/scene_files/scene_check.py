@@ -42,7 +42,7 @@ class Checked(NamedTuple):
     notes: list[str]
 
 
-def check_scene_file(path: Path, read_points: ReadPoints) -> Checked:
+def check_scene_file(path: Path, read_points: ReadPoints | None = None) -> Checked:
     """Read a scene file and everything it names.
 
     Raises the same errors as `Scene.open`, except those about budgets.

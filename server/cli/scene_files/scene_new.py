@@ -40,12 +40,12 @@ def new_scene(
     effects: Sequence[str],
     name: str | None = None,
     overwrite: bool = False,
-    read_points: ReadPoints,
+    read_points: ReadPoints | None = None,
 ) -> Sequence[float] | None:
     """Write a scene file with archives, avatars named after their files, effects, and a spawn.
 
     Returns the position of the spawn, None if no place for it was found.
-    overwrite: replace an existing file.  read_points: returns the points of an avatar's file.
+    overwrite: replace an existing file.  read_points: as for `Scene.open`.
     Raises BadRequestError for content that a scene file must not have and for an existing file,
     FormatError or CorruptError for an invalid archive, ScanError for an invalid avatar.
     """
@@ -90,7 +90,7 @@ def new_scene(
 
 
 def _find_spawn(
-    file: SceneFile, out: Path, name: str, read_points: ReadPoints
+    file: SceneFile, out: Path, name: str, read_points: ReadPoints | None
 ) -> tuple[Sequence[float] | None, str]:
     """Return a position where the avatars of a scene file stand, if one is found, and a note on it.
 

@@ -175,6 +175,19 @@ def test_scene_and_client_refuse_the_same_avatars_with_the_same_words(scene: Sce
     assert "of 0 characters: expected 1 to 64" in found[2] and "avatar name 7: expected text" in found[4]
 
 
+def test_a_mesh_of_a_scene_file_is_solid(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "box.stl").write_bytes(BOX.export(file_type="stl"))
+    archive = next(path.parent for path in tmp_path.rglob("index.h5"))
+    file = tmp_path / "hall.toml"
+    top = f'format = 1\n[[archives]]\npath = "{archive}"\n'
+    file.write_text(top + '[[avatars]]\nname = "al"\nfile = "box.stl"\nradius = 0.02\n')
+    with Scene.open(file) as opened:
+        assert opened.info().avatars[0] == scene.add_avatar("al", BOX, 0.02)
+        assert opened.collide("al", np.concatenate([at(0.25), at(0.0)])).verdict.tolist() == [1, 0]
+    with Scene.open(file, read_points=lambda _: POINTS) as opened:
+        assert opened.info().avatars[0].points == len(POINTS)
+
+
 def test_a_file_of_a_scene_without_points_is_refused_with_its_place(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "empty.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"

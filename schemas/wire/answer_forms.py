@@ -44,6 +44,8 @@ def answer_line(answers: Any) -> str:
         parts.append("stopped early")
     if answers.engine_seconds > 0:
         parts.append(seconds_text(answers.engine_seconds))
+    elif k and not answers.stopped and (answers.verdict == Verdict.UNKNOWN).all():
+        parts.append("not answered")
     return "; ".join(parts)
 
 

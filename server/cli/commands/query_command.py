@@ -178,10 +178,8 @@ def _warn_outside(client: "Client", places: Any, leaves: Any, verdicts: Any, wor
 def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file: Path | None) -> int:
     """Send one move per frame and print one line each, or all as JSON; return the exit code."""
     import numpy as np
-    from msgspec import json
 
     from ....schemas.wire.answers import Verdict
-    from ....schemas.wire.encoding import JSON, encode
     from ...avatars.avatar_shape import avatar_shape
     from ...client import Client
     from ..input.query_input import ask_moves
@@ -192,7 +190,7 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
     with Client(connect, scene=scene, key_file=key_file) as client:
         places, frames = ask_moves(client, question, avatar_shape)
         for label, moved in frames:
-            found.append(json.decode(encode(moved, JSON)))
+            found.append(moved.to_dict())
             waiting.append(move_line(label, moved))
             if not as_json and client.unanswered < len(found):
                 print("\n".join(waiting))

@@ -87,7 +87,7 @@ CONTACT_COLUMNS = {
             "2 objects: 2 clear, 0 contact, 0 unknown; 1 pair touches; 0.31 ms",
         ),
         (COLLIDE.unknown(0), "0 poses: 0 clear, 0 contact, 0 unknown"),
-        (COUNT_WITHIN.unknown(2), "2 points: 0 clear, 0 contact, 2 unknown"),
+        (COUNT_WITHIN.unknown(2), "2 points: 0 clear, 0 contact, 2 unknown; not answered"),
         (
             answers_to_part(answered(COLLIDE, [CLEAR] * 2), 5, 100),
             "2 poses from 5 of 100: 2 clear, 0 contact, 0 unknown; 0.31 ms",

@@ -106,6 +106,8 @@ def plot_scene(
 ) -> Any:
     """Draw a plan of a scene for `Scene.plot`, and return the figure. most: number of points to read."""
     array = make_poses(np.empty((0, 4, 4)) if poses is None else poses)
+    if not np.isfinite(array).all():
+        raise BadRequestError("a pose that is not finite: expected finite numbers")
     if answers is None and len(array):
         if avatar is None:
             raise BadRequestError(
@@ -142,12 +144,12 @@ def draw_plan(
     """
     figure_type = _figure_type()
     positions = marks.poses[:, :3, 3]
-    low, high = _region(bounds, positions)
+    shown = [plan.right, plan.ahead]
+    low, high = _region(bounds, positions, shown)
     if heights is not None:
         low[plan.height], high[plan.height] = sorted(plan.sign * height for height in heights)
     near = positions if len(positions) else (low + high)[None] / 2
     found = read_plan_points(archives, low, high, near, most)
-    shown = [plan.right, plan.ahead]
     if axes is None:
         across, along = (high - low)[shown]
         height = float(np.clip(_WIDTH * along / max(across, 1e-9), _LEAST_HEIGHT, _MOST_HEIGHT))
@@ -189,17 +191,18 @@ def _figure_type() -> Any:
     return Figure
 
 
-def _region(bounds: _Floats, positions: _Floats) -> tuple[_Floats, _Floats]:
+def _region(bounds: _Floats, positions: _Floats, shown: list[int]) -> tuple[_Floats, _Floats]:
     """Return the low and high corner (3,) of the region to draw [m].
 
-    That is the surroundings of the positions (k, 3), or the whole scene without any.
+    That is the surroundings of the positions (k, 3) at all heights, or the whole scene without any.
+    shown: the axes of the plan.
     """
     low, high = bounds[0].copy(), bounds[1].copy()
     if len(positions):
-        first, last = positions.min(axis=0), positions.max(axis=0)
+        first, last = positions[:, shown].min(axis=0), positions[:, shown].max(axis=0)
         around = max(_LEAST_MARGIN, _MARGIN * float((last - first).max()))
-        low = np.minimum(np.maximum(low, first - around), first - _LEAST_MARGIN / 4)
-        high = np.maximum(np.minimum(high, last + around), last + _LEAST_MARGIN / 4)
+        low[shown] = np.minimum(np.maximum(low[shown], first - around), first - _LEAST_MARGIN / 4)
+        high[shown] = np.maximum(np.minimum(high[shown], last + around), last + _LEAST_MARGIN / 4)
     edge = 0.02 * float((high - low).max()) + 1e-3
     return low - edge, high + edge
 

@@ -212,6 +212,11 @@ def test_axes_of_the_caller_are_drawn_into(scene: Scene) -> None:
         ({"poses": POSES}, BadRequestError, "poses without an avatar: expected its name, or the answers"),
         ({"poses": POSES, "answers": COLLIDE.unknown(2)}, BadRequestError, "2 answers about 5 poses"),
         ({"poses": np.eye(3), "avatar": "post"}, BadRequestError, "expected"),
+        (
+            {"poses": POSES * np.nan, "answers": COLLIDE.unknown(5)},
+            BadRequestError,
+            "a pose that is not finite",
+        ),
         ({"path": "plan.docx"}, SolidcloudError, "plan.docx: cannot write the plan .*: choose another path"),
         ({"path": "no/such/folder/plan.png"}, SolidcloudError, "cannot write the plan"),
     ],

@@ -66,6 +66,9 @@ def cover_surface(
     corners = [triangles.reshape(-1, 3)]
     count = 0
     while len(triangles):
+        # Of equally long edges, that of the least corners is halved, whatever the order of the corners.
+        order = np.lexsort(triangles.transpose(2, 0, 1)[::-1], axis=-1)
+        triangles = np.take_along_axis(triangles, order[:, :, None], axis=1)
         edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
         begin = edges.argmax(axis=1)
         long = edges.max(axis=1) > longest

@@ -60,7 +60,8 @@ def answer_values(answers: Any) -> dict[str, Any]:
     """Return answers as dicts, lists, numbers and strings; see `Cost.to_dict`."""
     question, k = _question(answers), len(answers)
     rows: list[dict[str, Any]] = [{} for _ in range(k)]
-    for name, of in array_fields(type(answers)).items():
+    kind: type[Cost] = type(answers)
+    for name, of in array_fields(kind).items():
         column = getattr(answers, name)
         if len(column) == k and question.columns[name].rows in (Rows.ITEMS, Rows.BOUNDED):
             values = _json_column(column, vectors=bool(of.tail))

@@ -23,13 +23,14 @@ _Floats = NDArray[np.float64]
 # Marker, face and edge of each verdict. Shape and lightness differ, so that a print in grey can be
 # read, and so can those who do not tell red from green.
 _MARKERS = {
-    Verdict.CLEAR: ("o", "#9ad1ea", "#17465c"),
-    Verdict.CONTACT: ("X", "#a50f26", "#ffffff"),
-    Verdict.UNKNOWN: ("^", "#ffd24d", "#3d3000"),
+    Verdict.CLEAR: ("o", "#9ad1ea", "#2f7391"),
+    Verdict.CONTACT: ("X", "#a50f26", "#4d0410"),
+    Verdict.UNKNOWN: ("^", "#ffe08a", "#6b5200"),
 }
-_PAPER, _STONES, _BOX = "#fdfcfa", ("#e4ddd2", "#b5a68f", "#7d6d58"), "#ece7df"
-# Pixels along the longer side of the scan's image.
-_PIXELS = 700
+_PAPER, _STONES, _BOX = "#fdfcfa", ("#c4b8a4", "#978770", "#5f5140"), "#ece7df"
+# Pixels along the longer side of the scan's image: at most, and at least. Between these, a pixel is as
+# wide as the scan's spheres, so that a wall is a line.
+_MOST_PIXELS, _LEAST_PIXELS = 500, 100
 # Margin around the poses: the share of their extent, and the least [m].
 _MARGIN, _LEAST_MARGIN = 0.25, 2.0
 # Height above the feet at which the slice begins, so that the floor is left out: the share of the
@@ -121,14 +122,12 @@ def plot_scene(
     plan = plan_axes(info.up)
     if heights is None and avatar is not None:
         heights = standing_heights(scene.avatar(avatar, client).points, array, plan)
-    bounds, marks = np.array(info.bounds), Marks(array, verdict)
-    return draw_plan(scene.archives, scene.name, bounds, plan, marks, heights, most, axes)
+    return draw_plan(scene.archives, info, plan, Marks(array, verdict), heights, most, axes)
 
 
 def draw_plan(
     archives: Sequence[PlacedArchive],
-    title: str,
-    bounds: _Floats,
+    info: SceneInfo,
     plan: PlanAxes,
     marks: Marks,
     heights: tuple[float, float] | None,
@@ -137,7 +136,7 @@ def draw_plan(
 ) -> Any:
     """Draw a floor plan, and return matplotlib's figure.
 
-    bounds: (2, 3) of the scene, world [m].  marks: poses to mark, perhaps none.
+    info: description of the scene.  marks: poses to mark, perhaps none.
     heights: range of heights to draw [m]; None: all.  most: points to read, see plan_points.py.
     axes: matplotlib's axes to draw into; None: those of a new figure.
     Raise SolidcloudError if matplotlib is not installed.
@@ -145,19 +144,20 @@ def draw_plan(
     figure_type = _figure_type()
     positions = marks.poses[:, :3, 3]
     shown = [plan.right, plan.ahead]
-    low, high = _region(bounds, positions, shown)
+    low, high = _region(np.array(info.bounds), positions, shown)
     if heights is not None:
         low[plan.height], high[plan.height] = sorted(plan.sign * height for height in heights)
     near = positions if len(positions) else (low + high)[None] / 2
     found = read_plan_points(archives, low, high, near, most)
-    if axes is None:
+    own = axes is None
+    if own:
         across, along = (high - low)[shown]
         height = float(np.clip(_WIDTH * along / max(across, 1e-9), _LEAST_HEIGHT, _MOST_HEIGHT))
         figure = figure_type(
             figsize=(_WIDTH, height + 1.0), dpi=_DPI, facecolor="white", layout="constrained"
         )
         axes = figure.subplots()
-    _draw_scan(axes, found, low[shown], high[shown], shown)
+    _draw_scan(axes, found, low[shown], high[shown], shown, info.radius)
     _draw_marks(axes, marks, shown)
     axes.set_xlim(low[shown[0]], high[shown[0]])
     ends = low[plan.ahead], high[plan.ahead]
@@ -167,8 +167,13 @@ def draw_plan(
     axes.set_ylabel(f"{'xyz'[plan.ahead]} [m]")
     name = "xyz"[plan.height]
     where = "" if heights is None else f", {name} from {low[plan.height]:.2f} to {high[plan.height]:.2f} m"
-    axes.set_title(f"{title}: plan{where}")
-    return axes.figure
+    axes.set_title(f"{info.scene}: plan{where}")
+    figure = axes.figure
+    if len(positions) and own:
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    elif len(positions):
+        axes.legend()
+    return figure
 
 
 def write_figure(figure: Any, path: Path) -> None:
@@ -207,21 +212,30 @@ def _region(bounds: _Floats, positions: _Floats, shown: list[int]) -> tuple[_Flo
     return low - edge, high + edge
 
 
-def _draw_scan(axes: Any, found: PlanPoints, low: _Floats, high: _Floats, shown: list[int]) -> None:
-    """Draw the points as an image of their density, and boxes where points were not read."""
+def _draw_scan(
+    axes: Any, found: PlanPoints, low: _Floats, high: _Floats, shown: list[int], radius: float
+) -> None:
+    """Draw the points as an image of their density, and boxes where points were not read.
+
+    low, high: (2,) of the plan [m].  radius: of the scan's spheres [m].
+    """
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import LinearSegmentedColormap
 
     axes.set_facecolor(_PAPER)
     if len(found.boxes):
         (x0, y0), (x1, y1) = found.boxes[:, 0][:, shown].T, found.boxes[:, 1][:, shown].T
-        corners = np.stack([np.stack(xy, axis=1) for xy in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1)
+        corners: Any = np.stack(
+            [np.stack(xy, axis=1) for xy in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1
+        )
         axes.add_collection(
             PolyCollection(corners, facecolor=_BOX, edgecolor="#d8d0c4", linewidth=0.4, zorder=1)
         )
-    pixel = float((high - low).max()) / _PIXELS
-    edges = [np.arange(a, b + pixel, pixel) for a, b in zip(low, high, strict=True)]
-    counts, _, _ = np.histogram2d(*found.points[:, shown].T, bins=edges)
+    extent = float((high - low).max())
+    pixel = min(max(2 * radius, extent / _MOST_PIXELS), extent / _LEAST_PIXELS)
+    edges: Any = [np.arange(a, b + pixel, pixel) for a, b in zip(low, high, strict=True)]
+    x, y = found.points[:, shown[0]], found.points[:, shown[1]]
+    counts, _, _ = np.histogram2d(x, y, bins=edges)
     image = np.ma.masked_equal(np.log1p(counts.T), 0.0)
     if image.count():
         axes.imshow(
@@ -229,6 +243,7 @@ def _draw_scan(axes: Any, found: PlanPoints, low: _Floats, high: _Floats, shown:
             origin="lower",
             extent=(edges[0][0], edges[0][-1], edges[1][0], edges[1][-1]),
             cmap=LinearSegmentedColormap.from_list("stone", _STONES),
+            vmin=0.0,
             vmax=float(np.quantile(image.compressed(), 0.95)),
             interpolation="nearest",
             zorder=2,
@@ -236,7 +251,7 @@ def _draw_scan(axes: Any, found: PlanPoints, low: _Floats, high: _Floats, shown:
 
 
 def _draw_marks(axes: Any, marks: Marks, shown: list[int]) -> None:
-    """Mark the poses by verdict, contacts on top, and add a legend with their numbers."""
+    """Mark the poses by verdict, contacts on top, and label each kind with its number."""
     k = len(marks.poses)
     if not k:
         return
@@ -253,9 +268,7 @@ def _draw_marks(axes: Any, marks: Marks, shown: list[int]) -> None:
             marker=marker,
             facecolor=face,
             edgecolor=edge,
-            linewidth=0.6,
+            linewidth=size / 100,
             zorder=4 + order,
             label=f"{verdict.name.lower()}: {int(chosen.sum()):,}",
         )
-    # Below the axes, where it covers nothing.
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)

@@ -321,7 +321,7 @@ class Scene(SceneQuestions):
     ) -> Any:
         """Draw a floor plan with poses marked by verdict; return the figure of matplotlib.
 
-        avatar: its name.  poses: (k, 4, 4), avatar to world; None: the whole scene is drawn.
+        avatar: its name.  poses: (4, 4) or (k, 4, 4), avatar to world; None: the whole scene is drawn.
         answers: of any query about these poses; None: those of `collide`.
         path: file to write too, PNG, SVG or PDF by its suffix.
         heights: range of heights to draw [m]; None: those of the avatar at its median pose, above

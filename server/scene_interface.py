@@ -226,6 +226,10 @@ class LatestState(State, frozen=True, eq=False, kw_only=True):
         """Return a state with its age."""
         return cls(**structs.asdict(state), age=age)
 
+    def __repr__(self) -> str:
+        """Return the state in one line, with its age."""
+        return f"{State.__repr__(self)}, {self.age:.2g} s ago"
+
 
 class ServedSimulation(Protocol):
     """Simulation of the frames of users that move in a scene; thread-safe."""

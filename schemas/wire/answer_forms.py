@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .answer_facts import Fact, Summary
 from .answers import Cost, Verdict
 from .arrays import array_fields
-from .question_rules import DECLARED, Fact, Question, Rows, Summary
+from .question_rules import DECLARED, Question, Rows
 
 VERDICT_NAMES = {int(verdict): verdict.name.lower() for verdict in Verdict}
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..archive.pose_arrays import make_poses
 from ..errors import BadRequestError, InternalError
+from .answer_facts import Fact
 from .answers import Cost, Verdict
 from .arrays import ArrayType, Poses, array_fields
 from .requests import Length, QuestionRequest, make_objects, make_vectors
@@ -76,28 +77,6 @@ class ColumnRules(NamedTuple):
     rows: Rows = Rows.ITEMS
     of: str = ""
     unknown: float = 0
-
-
-class Summary(Enum):
-    """Reduction of a column to the one number that a line about all answers states."""
-
-    LEAST = auto()  # of the finite values
-    SUM = auto()
-    ROWS = auto()  # number of rows
-    CONTACTS = auto()  # number of rows with the verdict CONTACT
-
-
-class Fact(NamedTuple):
-    """Fact in the line that describes the answers of a question.
-
-    column: name.  summary: see the class; the fact is omitted without a value, and for a count of 0.
-    text: format of the number, such as "nearest {:.4g} m".  one: of a count of 1.
-    """
-
-    column: str
-    summary: Summary
-    text: str
-    one: str = ""
 
 
 # Columns that every answer has.

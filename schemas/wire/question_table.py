@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from math import inf
 from typing import Any, TypeVar
 
+from .answer_facts import Fact, Summary
 from .answer_forms import answer_line, answer_values
 from .answers import (
     AnswerForms,
@@ -26,7 +27,7 @@ from .answers import (
     WithinAnswers,
     use_forms,
 )
-from .question_rules import ColumnFrame, ColumnRules, Fact, Merge, Question, Rows, Summary
+from .question_rules import ColumnFrame, ColumnRules, Merge, Question, Rows
 from .requests import (
     CollideRequest,
     ContactsRequest,

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.archive.pose_arrays import make_poses
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire.answers import CollideAnswers, Verdict
-from ...schemas.wire.requests import make_poses
 from ...schemas.wire.scene_messages import SceneInfo
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel

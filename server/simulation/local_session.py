@@ -47,7 +47,7 @@ class LocalSession:
     def __repr__(self) -> str:
         """Return the avatar, the scene, and whether the session is open, in one line."""
         latest, begun = self._latest, "open" if self._open else "closed"
-        state = "no state yet" if latest is None else f"{monotonic() - self._when:.2g} s ago {latest!r}"
+        state = "no state yet" if latest is None else f"{latest!r}, {monotonic() - self._when:.2g} s ago"
         return f"<Session of {self._user.avatar!r} in {self._simulation.scene.name!r}: {begun}, {state}>"
 
     def close(self) -> None:

@@ -111,7 +111,7 @@ class ClientSession:
     def __repr__(self) -> str:
         """Return the avatar, the scene, and whether the session is open, in one line."""
         latest, begun = self._latest, "closed" if self._stack is None else "open"
-        state = "no state yet" if latest is None else f"{monotonic() - self._received:.2g} s ago {latest!r}"
+        state = "no state yet" if latest is None else f"{latest!r}, {monotonic() - self._received:.2g} s ago"
         return f"<Session of {self._avatar!r} in {self._scene!r}: {begun}, {state}>"
 
     def _present_user(self) -> key_expressions.User:

@@ -172,7 +172,10 @@ def test_scene_and_client_refuse_the_same_avatars_with_the_same_words(scene: Sce
     found = refusals(scene.add_avatar)
     assert found == refusals(Client(scene="dot").add_avatar), "before anything is sent"
     assert found[0].startswith("avatar 'al' has no points: expected at least one")
-    assert "of 0 characters: expected 1 to 64" in found[2] and "avatar name 7: expected text" in found[4]
+    assert (
+        "of 0 characters: expected 1 to 64" in found[2]
+        and "avatar named by a int: expected a string" in found[4]
+    )
 
 
 def test_a_mesh_of_a_scene_file_is_solid(scene: Scene, tmp_path: Path) -> None:

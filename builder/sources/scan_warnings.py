@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.voxel_grid import MAX_COORDINATE
+from ...schemas.archive.units import MAX_COORDINATE
 from ...schemas.errors import ScanError
 from .common.scan import Scan
 

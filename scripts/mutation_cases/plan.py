@@ -241,6 +241,7 @@ LOWER_GOALS = {
 # Files without a mutant, with the reason.
 NONE = {
     "schemas/kernels/compiling.py": "no kernel: how kernels are compiled",
+    "schemas/kernels/compile_progress.py": "no kernel: messages about compilation",
     "schemas/kernels/kernel_dispatcher.py": "no kernel: for which uses kernels are compiled",
     "schemas/kernels/kernel_files.py": "no kernel: how compiled kernels are kept",
     "schemas/kernels/kernel_sources.py": "no kernel: what compiled kernels depend on",

@@ -20,7 +20,7 @@ _MARK, _KERNEL = ".compiling", ".kernel"
 # Time between two looks at the folder, and the longest gap between two compilations [s].
 _LOOK_SECONDS, _GAP_SECONDS = 0.3, 2.0
 # A compilation is reported after _QUIET_SECONDS, then every _LINE_SECONDS.
-_QUIET_SECONDS, _LINE_SECONDS = 1.0, 5.0
+_QUIET_SECONDS, _LINE_SECONDS = 1.0, 10.0
 
 
 class CompileNotice:

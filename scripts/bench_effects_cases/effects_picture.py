@@ -74,10 +74,11 @@ def _means(axes, parts: list[Part]) -> None:  # type: ignore[no-untyped-def]
     company = {f.side: f.value for f in figures if "in company" in f.what}
     at = np.arange(len(names))
     axes.barh(
-        at - 0.2, [alone.get(n, 0) for n in names], 0.38, color=[COLOURS[n] for n in names], label="alone"
-    )
+        at - 0.2, [alone.get(n, 0) for n in names], 0.38, color=[COLOURS[n] for n in names], label="alone",
+        edgecolor=FAINT, linewidth=0.4,
+    )  # fmt: skip
     axes.barh(at + 0.2, [company.get(n, 0) for n in names], 0.38, color=[COLOURS[n] for n in names], alpha=0.45,
-              label="in company")  # fmt: skip
+              edgecolor=FAINT, linewidth=0.4, label="in company")  # fmt: skip
     for k, name in enumerate(names):
         axes.text(
             max(0.0, alone.get(name, 0)),

@@ -25,19 +25,23 @@ def draw(
     machine: str,
     target: Path,
 ) -> None:
-    """Write the picture as PNG.
+    """Write the picture as PNG; without targets, only the stacked frames.
 
     company: effect -> (k,) seconds of each frame.
     limit: of walking [us].
     """
     pyplot = load_pyplot()
     rows = goal_rows(parts, notes)
-    figure = pyplot.figure(figsize=(15, 9 if rows else 7), dpi=110, layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[1.15, 1])
-    _stack(above.subplots(), company, limit)
-    left, right = below.subplots(1, 2, width_ratios=[1, 1.6])
-    _means(left, parts)
-    goals_table(right, rows, 4.0)
+    if rows:
+        figure = pyplot.figure(figsize=(15, 9), dpi=110, layout="constrained")
+        above, below = figure.subfigures(2, 1, height_ratios=[1.15, 1])
+        _stack(above.subplots(), company, limit)
+        left, right = below.subplots(1, 2, width_ratios=[1, 1.6])
+        _means(left, parts)
+        goals_table(right, rows, 4.0)
+    else:
+        figure = pyplot.figure(figsize=(15, 5), dpi=110, layout="constrained")
+        _stack(figure.subplots(), company, limit)
     write_picture(figure, f"solidcloud: what effects cost, frame by frame  ({machine})", parts, target)
 
 

@@ -32,8 +32,8 @@ def test_all_colours_differ_in_grey_and_neighbours_most() -> None:
     assert faint_neighbours(colours, 23.0) == []
 
 
-@pytest.mark.parametrize("objects", [0.0, 1e-5])
-def test_picture_is_legible_and_full(objects: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("objects, goals", [(0.0, True), (1e-5, True), (0.0, False)])
+def test_picture_is_legible_and_full(objects: float, goals: bool, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     company = {name: rng.exponential(5e-5, 1200) for name in SHOWN}
     company["objects"] = np.full(1200, objects)
@@ -44,7 +44,9 @@ def test_picture_is_legible_and_full(objects: float, tmp_path: Path) -> None:
         part.add("an effect", name, "in company", float(rng.uniform(0.1, 80)), "µs")
     part.goal("walking", "stop, sweep, slide, step, ground: mean frame", 147.0, 100.0, "us")
     with drawn_figures() as figures:
-        effects_picture.draw([part], {}, company, 100.0, "a machine", tmp_path / "effects.png")
+        effects_picture.draw(
+            [part] if goals else [], {}, company, 100.0, "a machine", tmp_path / "effects.png"
+        )
     (figure,) = figures
     assert alike_in_grey(figure) == []
     assert overlaps(figure) == []

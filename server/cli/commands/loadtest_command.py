@@ -67,7 +67,7 @@ def loadtest(
         Path | None, typer.Option(help="Section kinds replays FOLDER/KIND.npz, with its users.")
     ] = None,
 ) -> None:
-    """Measure a server of an archive under the load of simulated users.
+    """Load a server with simulated users.
 
     Starts servers of its own. Sections: start (time to the first right answer), kinds (of users),
     budgets (hit rate over the cache's size), speeds (stalls over the users' speed), users (round

@@ -153,10 +153,9 @@ def _notes(file: SceneFile, archives: list[FoundArchive], left_out: int) -> Iter
             )
     if file.spawn is not None:
         low, high = _bounds(file, archives)
-        beyond = _STANDING_HEIGHT
-        if not all(
-            a - beyond <= x <= b + beyond for a, x, b in zip(low, file.spawn.position, high, strict=True)
-        ):
+        standing = _STANDING_HEIGHT * np.array(file.up) / np.linalg.norm(file.up)
+        low_place, high_place = low + np.minimum(standing, 0.0), high + np.maximum(standing, 0.0)
+        if not np.all((low_place <= file.spawn.position) & (file.spawn.position <= high_place)):
             yield f"spawn lies outside the bounds of the archives, {_numbers(low)} .. {_numbers(high)} m"
 
 

@@ -1,5 +1,6 @@
 """Picture of a walk: its path, its contacts, and the time of each answer."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -222,7 +223,7 @@ def _draw_elevation(
 
 
 def _number(
-    axes: Any, places: NDArray[np.float64], shifts: list[tuple[float, float]], verdicts: NDArray[np.uint8]
+    axes: Any, places: NDArray[np.float64], shifts: Sequence[tuple[float, float]], verdicts: NDArray[np.uint8]
 ) -> None:
     """Number places from 1, in the colours of their verdicts; no number covers another.
 

@@ -213,14 +213,14 @@ class Scene(SceneQuestions):
         """Return the voxel cache of the first archive, for counters and checks."""
         return self.archives[0].residency
 
-    def warm(self, *, last_first: bool = False) -> None:
+    def warm(self, *parts: str) -> None:
         """Run every query on each archive, to compile before the first request; start threads.
 
-        last_first: begin with what is needed last, while another process begins with the first.
+        parts: of schemas/wire/warming_parts.py, in their order; none: all.
         """
         self._path_threads.start()
         for archive in self.archives:
-            archive.warm(last_first=last_first)
+            archive.warm(*parts)
 
     def info(self) -> SceneInfo:
         """Return the description of all archives together, with the effects of the scene file."""

@@ -28,13 +28,14 @@ class CompileProgress:
         self._clock = clock
         self._lock = threading.Lock()
         self.on_first: Callable[[], object] | None = None  # called once, before a compilation begins
+        self.any = False  # whether a compilation has begun
         self._begun = self._last = self._due = 0.0
         self._count = 0
 
     def begin(self) -> None:
         """Record that the compilation of a function begins; functions may be nested."""
         with self._lock:
-            first, self.on_first = self.on_first, None
+            first, self.on_first, self.any = self.on_first, None, True
         if first is not None:
             first()
         with self._lock:

@@ -31,7 +31,7 @@ from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
 
-__all__ = ["config", "intrinsic", "kernel_files", "njit", "on_first_compilation", "types"]
+__all__ = ["config", "has_compiled", "intrinsic", "kernel_files", "njit", "on_first_compilation", "types"]
 
 # numba creates its attributes on import, invisible to type checkers.
 config: Any = numba_config
@@ -64,6 +64,11 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
 def on_first_compilation(call: Callable[[], object] | None) -> None:
     """Set what is called once before this process compiles its next function; None for nothing."""
     _progress.on_first = call
+
+
+def has_compiled() -> bool:
+    """Return whether this process has begun to compile a function that no file held."""
+    return _progress.any
 
 
 @functools.cache

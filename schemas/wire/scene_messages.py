@@ -96,6 +96,8 @@ class SceneInfo(msgspec.Struct, frozen=True):
     up: unit vector against gravity.  spawn: where users start; null: each user chooses.
     objects: dynamic objects and their initial poses.
     default_radius_model: model of queries that do not name one; null: `radius` for all points.
+    compiling: what the server refuses as `busy`, because it still compiles the kernels: questions,
+    "motion" (`move` and motion commands) and "budgets" (questions with a budget).
     """
 
     scene: str
@@ -131,6 +133,7 @@ class SceneInfo(msgspec.Struct, frozen=True):
     spawn: SpawnInfo | None = None
     objects: list[ObjectInfo] = []
     default_radius_model: str | None = None
+    compiling: list[str] = []
 
 
 class ReloadAnswer(msgspec.Struct, frozen=True):

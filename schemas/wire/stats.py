@@ -136,6 +136,7 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     users: the most recently active users, the most recent first.
     keys: of the resident voxels, ascending; null: not requested.
     avatars: memory of the clients' avatars.
+    compiling: as in SceneInfo.
     """
 
     scene: str
@@ -157,3 +158,4 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     users: list[UserStats] = []
     keys: list[int] | None = None
     avatars: AvatarStats = AvatarStats()
+    compiling: list[str] = []

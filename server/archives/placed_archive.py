@@ -27,6 +27,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, BusyError
 from ...schemas.wire.scene_messages import ReloadAnswer, SceneInfo
+from ...schemas.wire.warming_parts import MOTION, PARTS
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from ..queries.engine_table import warm_engines
@@ -49,8 +50,7 @@ _Floats = NDArray[np.float64]
 RELOAD_WAIT = 10.0
 # A request of more poses does not update the user's position: its last pose may be anywhere.
 _MAX_USER_POSES = 8
-# Limits of margin or reach [m] and of the avatar's scale, as in kernels/core/voxels_in_reach.py.
-# Requests beyond them will be refused.
+# Limits of margin or reach [m] and of an avatar's scale (voxels_in_reach.py refuses other requests).
 _MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
 _FLOAT64 = np.dtype(np.float64)  # comparing dtypes is faster than comparing with the type
 _NUMBER = (float, int)  # `float | int` would be constructed for each request
@@ -108,13 +108,12 @@ class ArchiveGeneration:
         # If coarse bounds of all voxels do not fit, only those of requested voxels are stored.
         fill = coarse_filler(coarse, store) if coarse is not None and coarse.has_room_for_all else None
         weak = weakref.ref(self)  # the prefetcher's thread must not keep a generation alive
-
-        def running_requests() -> bool:
-            generation = weak()
-            return generation is not None and generation._readers > 1
-
         self.prefetcher = Prefetcher(
-            residency, around, prefetch=ahead, idle=fill, running_requests=running_requests
+            residency,
+            around,
+            prefetch=ahead,
+            idle=fill,
+            running_requests=lambda: (opened := weak()) is not None and opened._readers > 1,
         )
         figure = make_scene_data(store.archive, residency, bounds, coarse)
         data = figure if radius_model is None else with_radius_model(figure, store.archive, radius_model)
@@ -213,15 +212,17 @@ class ArchiveGeneration:
         reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
         return self.prefetcher.record_pose(user, (x, y, z), reach)
 
-    def warm(self, *, last_first: bool = False) -> None:
-        """Run every query once, with a load, so that no request waits for compilation."""
+    def warm(self, *parts: str) -> None:
+        """Run the queries of these parts once, with a load; see `Scene.warm`."""
         archive = self.store.archive
         self.data.bounds.trees()  # made before the first load, which tightens the bounds
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         x, y, z = place = archive.header.lattice.to_world(corner).tolist()
-        self.prefetcher.warm((x, y, z))
-        warm_engines(self.data, place, last_first=last_first)
+        for part in parts or PARTS:
+            if part == MOTION:
+                self.prefetcher.warm((x, y, z))
+            warm_engines(self.data, place, part)
 
     def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:
         """Load the voxels that are resident in `other`, until `stopped` returns True.
@@ -332,10 +333,10 @@ class PlacedArchive:
         """Return the description of the archive, in its own frame."""
         return self._info
 
-    def warm(self, *, last_first: bool = False) -> None:
-        """Run every query once, with a load; see `warm_engines`."""
+    def warm(self, *parts: str) -> None:
+        """Run the queries of these parts once, with a load; see `Scene.warm`."""
         with self.take() as opened:
-            opened.warm(last_first=last_first)
+            opened.warm(*parts)
 
     def leave_client(self, client: str) -> None:
         """Stop keeping voxels for a disconnected client. Raise BadRequestError if closed."""

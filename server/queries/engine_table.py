@@ -6,13 +6,13 @@ the request in their order, and `budget`. `objects` takes avatars, poses, groups
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...schemas.wire.answers import SweepAnswers
+from ...schemas.wire.question_rules import Question
 from ...schemas.wire.question_table import (
     COLLIDE,
     CONTACTS,
@@ -23,6 +23,7 @@ from ...schemas.wire.question_table import (
     SWEEP,
     WITHIN,
 )
+from ...schemas.wire.warming_parts import BUDGETS
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..residency.coarse_bounds import drop_clear_pairs
 from .collide import collide
@@ -61,11 +62,10 @@ ENGINES: dict[str, Callable[..., Any]] = {
 }
 
 
-def warm_engines(data: SceneData, place: Sequence[float], *, last_first: bool = False) -> None:
-    """Run every query of an archive once, so that every kernel is compiled or read from its file.
+def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
+    """Run the queries of a part once, so that their kernels are compiled or read from their files.
 
-    place: a scan point, world [m]; its voxel is loaded.  last_first: begin with what is needed
-    last, while another process begins with the first.
+    place: a scan point, world [m]; its voxel is loaded.  part: one of warming_parts.py.
     """
     pose = np.eye(4)[None]
     pose[0, :3, 3] = place
@@ -76,23 +76,30 @@ def warm_engines(data: SceneData, place: Sequence[float], *, last_first: bool = 
         "avatar": avatar, "poses": pose, "pose_from": pose, "pose_to": pose, "points": points, "origins": points,
         "directions": np.array([[0.0, 0.0, 1.0]]), "reach": 0.01,
     }  # fmt: skip
-    # Queries with a limit use separate kernels. These limits are too large to be reached here.
-    limits = QueryBudget(tolerance=1e-3, visits=1 << 20), QueryBudget(deadline=time.perf_counter() + 3600.0)
-    steps: list[Callable[[], Any]] = []
-    for budget in (EXACT, *limits):
-        # Several poses use other kernels than one pose.
-        steps.append(partial(collide, data, avatar, poses, 0.0, budget))
-        for question in (one for one in QUESTIONS.values() if not one.whole):
-            arguments = [
-                samples[name] for name in question.arguments if name in question.required or name in samples
-            ]
-            tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
-            limit = budget._replace(tolerance=tolerance)
-            steps.append(partial(ENGINES[question.name], data, *arguments, budget=limit))
-        steps.append(partial(objects, data, [avatar, avatar], poses, groups, groups, budget=budget))
-    for step in reversed(steps) if last_first else steps:
-        step()
-    if data.coarse is not None:
+
+    def run(question: Question[Any], budget: QueryBudget) -> None:
+        if question.name == OBJECTS.name:
+            objects(data, [avatar, avatar], poses, groups, groups, budget=budget)
+            return
+        if question.name == COLLIDE.name:  # several poses use other kernels than one pose
+            collide(data, avatar, poses, 0.0, budget)
+        arguments = [
+            samples[name] for name in question.arguments if name in question.required or name in samples
+        ]
+        tolerance = max(budget.tolerance, question.other_defaults.get("tolerance", 0.0))
+        ENGINES[question.name](data, *arguments, budget=budget._replace(tolerance=tolerance))
+
+    if part in QUESTIONS:
+        run(QUESTIONS[part], EXACT)
+    if part == BUDGETS:
+        # These limits are too large to be reached here.
+        for budget in (
+            QueryBudget(tolerance=1e-3, visits=1 << 20),
+            QueryBudget(deadline=time.perf_counter() + 3600.0),
+        ):
+            for question in QUESTIONS.values():
+                run(question, budget)
+    if part == COLLIDE.name and data.coarse is not None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
         reach = check_request(data, avatar, pose, data.radius_units)
         nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))

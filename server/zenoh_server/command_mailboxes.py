@@ -228,25 +228,28 @@ class FrameLoop:
         publish: Callable[[User, EncodedReply], None],
         max_seconds: float = math.inf,
         turn: Callable[[str], str] = str,
+        check: Callable[[], None] = lambda: None,
     ) -> None:
         """Make mailboxes for the users of a simulation.
 
         publish: sends a user's state, or the reason why there is none; must not block.
         max_seconds: time limit of one frame of all users; users not yet simulated by then keep
         their poses.  turn: as in `Mailboxes`.
+        check: raises SolidcloudError while no motion commands are accepted.
         """
         self._simulation, self._publish, self._max_seconds = simulation, publish, max_seconds
         self._at_work: tuple[float, StopFlag] | None = None  # start and stop flag of the running frame
         self._watchdog = Watchdog(self._look, period=_LOOK_SECONDS)
         self.most_users = simulation.most_users
         self._boxes = Mailboxes(_BOXES_A_USER * simulation.most_users, turn)
-        self._given_up = False
+        self._check, self._given_up = check, False
 
     def wish(self, user: User, payload: bytes, encoding: str | None) -> bool:
         """Store a motion command or refuse it; return whether it repeats the user's latest one."""
         try:
             if not self.fits(user, len(payload), encoding):
                 return False
+            self._check()
             stated = wire_encoding(encoding)
             return self._boxes.put(user, decode_request(Wish, payload, stated), stated)
         except SolidcloudError as error:

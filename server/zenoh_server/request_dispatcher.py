@@ -6,6 +6,8 @@ from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
+from msgspec import structs
+
 from ...schemas.errors import (
     BadRequestError,
     ErrorCode,
@@ -24,10 +26,12 @@ from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from ...schemas.wire.requests import AddAvatarRequest, QuestionRequest
 from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ReloadAnswer, ScenesAnswer
 from ...schemas.wire.stats import StatsRequest
-from ..runtime.stop_flag import NO_STOP, StopFlag, start_deadlines
+from ...schemas.wire.warming_parts import MOTION, needed_parts
+from ..runtime.stop_flag import NO_STOP, StopFlag
 from ..scene_interface import EncodedReply, LimitReached, ServedScene, recording_avatars
 from .command_mailboxes import FrameLoop
 from .server_config import ServerConfig
+from .warming import Warming
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +93,7 @@ class RequestDispatcher:
         self._scenes = {scene.name: scene for scene in scenes}
         self._config = config
         self._frames: dict[str, FrameLoop] = {}
+        self.warming = Warming(scenes)
         self.left_at_work = False  # set at the end of serving if a request did not end in time
         for scene in scenes:
             scene.limit_avatars(config.avatar_limits)
@@ -196,17 +201,9 @@ class RequestDispatcher:
         """
         if (simulation := self._scenes[scene].simulation) is None:
             return None
-        frames = FrameLoop(simulation, publish, self._config.max_request_seconds, turn)
+        limit = self._config.max_request_seconds
+        frames = FrameLoop(simulation, publish, limit, turn, lambda: self.warming.check(MOTION))
         return self._frames.setdefault(scene, frames)
-
-    def warm(self) -> None:
-        """Warm every scene, so that the first client does not wait for compilation."""
-        start_deadlines()
-        for scene in self._scenes.values():
-            log.info("warming %s", scene.name)
-            scene.warm()
-            if scene.simulation is not None:
-                scene.simulation.warm()
 
     def _ask(self, key: str, payload: bytes, encoding: str, stop: StopFlag) -> Any:
         """Send one request to the scene that its key names."""
@@ -219,16 +216,20 @@ class RequestDispatcher:
         if operation is None:
             if route.operation == "stats":
                 asked = decode_request(StatsRequest, payload, encoding) if payload else StatsRequest()
-                return scene.stats(asked.keys)
+                return structs.replace(scene.stats(asked.keys), compiling=self.warming.compiling)
             if payload:
                 raise BadRequestError(
                     f"{route.operation} with a payload of {len(payload)} bytes: expected none"
                 )
             # `reload` answers as a path of one part, because a separate thread sends parts and no
             # worker has to wait.
-            return self._reload(scene) if route.operation == "reload" else scene.info()
+            if route.operation == "reload":
+                return self._reload(scene)
+            return structs.replace(scene.info(), compiling=self.warming.compiling)
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
+        asked_for = request.op if isinstance(request, PathRequest) else route.operation
+        self.warming.check(*needed_parts(asked_for, structs.asdict(request)))
         return operation.ask(scene, request, route.client, stop)
 
     def _reload(self, scene: ServedScene) -> Iterator[ReloadAnswer]:

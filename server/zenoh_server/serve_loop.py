@@ -9,8 +9,9 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
+from ...schemas.wire.warming_parts import READY_LINE
 from ..runtime.process_heap import give_back_large_blocks
 from ..runtime.threads import start_thread
 from ..scene_interface import ServedScene
@@ -29,11 +30,20 @@ def serving(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[Req
     not usable.
     """
     dispatcher = RequestDispatcher(scenes, config)
-    dispatcher.warm()
+    dispatcher.warming.run()
+    with _listening(scenes, dispatcher, config):
+        yield dispatcher
+
+
+@contextmanager
+def _listening(
+    scenes: Sequence[ServedScene], dispatcher: RequestDispatcher, config: ServerConfig
+) -> Iterator[None]:
+    """Answer requests in a block, and those accepted at its end."""
     transport = Transport([scene.name for scene in scenes], dispatcher, config)
     try:
         with transport:
-            yield dispatcher
+            yield
     finally:
         dispatcher.left_at_work = transport.left_at_work
 
@@ -43,8 +53,9 @@ def serve(
 ) -> bool:
     """Serve scenes until SIGTERM or SIGINT, then answer accepted requests. Main thread only.
 
-    Return whether all requests have ended; if not, closing their scene waits for them.
-    ready: called once all is warm and reachable.  SIGHUP: reload all scenes, see `Scene.reload`.
+    Return whether all work has ended; if not, closing the scenes waits for it.
+    ready: called once everything is warm, in any thread, unless a signal comes first.
+    SIGHUP: reload all scenes, see `Scene.reload`.
     """
     give_back_large_blocks()
     # By default, a thread in Python code may keep the interpreter's lock for 5 ms while a reply
@@ -52,17 +63,25 @@ def serve(
     sys.setswitchinterval(0.0005)
     if config.insecure:
         log.warning("--insecure: every client that reaches %s may send requests", config.listen)
-    with (
-        _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals,
-        _metrics(scenes, config),
-        serving(scenes, config) as dispatcher,
-        _reloader(dispatcher) as wanted,
-    ):
-        ready()
-        print(f"serving {', '.join(scene.name for scene in scenes)} at {config.listen}", flush=True)
-        while signals.recv(1)[0] == signal.SIGHUP:
-            wanted.set()
-    return not dispatcher.left_at_work
+    dispatcher = RequestDispatcher(scenes, config)
+    warming = dispatcher.warming
+    with _signalled(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as signals, _metrics(scenes, config):
+        # In a thread, because a signal must be answered while kernels are compiled for many seconds.
+        if not signals.come_after(warming.run_first):
+            return False
+
+        def warm_rest() -> None:
+            if warming.run_rest():
+                ready()
+                print(READY_LINE, flush=True)
+
+        with _listening(scenes, dispatcher, config), _reloader(dispatcher) as wanted:
+            print(f"serving {', '.join(scene.name for scene in scenes)} at {config.listen}", flush=True)
+            rest = start_thread("warm", warm_rest)
+            while signals.next() == signal.SIGHUP:
+                wanted.set()
+            warming.end()
+        return not (dispatcher.left_at_work or rest.is_alive())
 
 
 @contextmanager
@@ -97,20 +116,60 @@ def _reloader(dispatcher: RequestDispatcher) -> Iterator[threading.Event]:
         wanted.set()
 
 
-@contextmanager
-def _signalled(*numbers: signal.Signals) -> Iterator[socket.socket]:
-    """Replace the signals' handlers and yield a socket that becomes readable when a signal arrives.
+class _Signals:
+    """Signals that this process receives.
 
     An event set by a handler does not suffice: the system may deliver the signal to one of zenoh's
-    threads, and a main thread that waits for a lock is then not woken to run the handler.
+    threads, and a main thread that waits for a lock is then not woken to run the handler. Python
+    writes the number of each signal to a socket instead.
     """
+
+    def __init__(self, reader: socket.socket, writer: socket.socket) -> None:
+        self._reader, self._writer = reader, writer
+
+    def next(self) -> int:
+        """Wait for a signal and return its number."""
+        return self._reader.recv(1)[0]
+
+    def come_after(self, work: Callable[[], object]) -> bool:
+        """Do some work in a thread; return False if a signal to stop comes first.
+
+        The work then goes on. Raise its error. `next` returns a SIGHUP that came meanwhile.
+        """
+        errors: list[BaseException] = []
+        over = 0
+
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+            with suppress(OSError):  # nobody waits any more
+                self._writer.send(bytes([over]))
+
+        start_thread("warm", run)
+        reload = False
+        while (number := self.next()) != over:
+            if number != signal.SIGHUP:
+                return False
+            reload = True
+        if errors:
+            raise errors[0]
+        if reload:
+            self._writer.send(bytes([signal.SIGHUP]))
+        return True
+
+
+@contextmanager
+def _signalled(*numbers: signal.Signals) -> Iterator[_Signals]:
+    """Replace the signals' handlers in a block, and yield the signals that come."""
     reader, writer = socket.socketpair()
     with reader, writer:
         writer.setblocking(False)
         before = {number: signal.signal(number, lambda *_: None) for number in numbers}
         descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
         try:
-            yield reader
+            yield _Signals(reader, writer)
         finally:
             signal.set_wakeup_fd(descriptor)
             for number, handler in before.items():

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
+from solidcloud.schemas.kernels import compiling
 from solidcloud.schemas.scene.scene_file import SceneFile, SceneLimits, scene_of
 from solidcloud.schemas.wire.answers import (
     CollideAnswers,
@@ -105,9 +106,14 @@ class FloorScene:
         self.lock = threading.Lock()
         self.simulation = self.file = None
         self.archives = []
+        self.never_warm = ""  # the part whose warming does not end, as if kernels were compiled
 
-    def warm(self):
+    def warm(self, *parts):
         self.warmed += 1
+        if self.never_warm in parts:
+            compiling._progress.begin()
+            print(f"warming {self.never_warm}", flush=True)
+            threading.Event().wait()
 
     def info(self):
         source = SourceInfo("floor.las", 0, "0" * 64, 4, "las", np.eye(4).tolist(), {"nan": 1})
@@ -296,10 +302,12 @@ if __name__ == "__main__":
     parser.add_argument("--delay", type=float, default=0.0)
     parser.add_argument("--walked", action="store_true", help="users may walk it")
     parser.add_argument("--log")
+    parser.add_argument("--never-warm", default="", metavar="PART")
     arguments = parser.parse_args()
     scene = FloorScene(arguments.name, arguments.delay)
     if arguments.walked:
         scene = floor_simulation(arguments.name).scene
+    scene.never_warm = arguments.never_warm
     if arguments.log:
         scene.simulation.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [])))
     serve([scene], ServerConfig(listen=arguments.listen))

@@ -9,21 +9,23 @@ from pathlib import Path
 
 import numpy as np
 from fake_server import floor_verdicts
+from solidcloud.schemas.wire.warming_parts import READY_LINE
 
 POINTS = np.array([[0.0, 0.0, 0.5], [0.25, 0.0, 1.0], [0.0, 0.25, 1.5]])
 DEADLINE = 20.0
 
 
 @contextmanager
-def server_process(endpoint, *arguments):
+def server_process(endpoint, *arguments, last_line=READY_LINE):
     """Run a server in a separate process until the block ends; yield when it is ready.
 
-    The server is killed if it still runs at the end.
+    The server is killed if it still runs at the end.  last_line: printed when it is ready.
     """
     command = [sys.executable, str(Path(__file__).parent / "fake_server.py"), endpoint, *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout.readline().startswith("serving ")
+            assert process.stdout.readline().strip() == last_line
             yield process
         finally:
             process.kill()

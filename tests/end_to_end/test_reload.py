@@ -22,6 +22,7 @@ from solidcloud.schemas.errors import BusyError, FormatError, UnknownSceneError
 from solidcloud.schemas.process.own_command import own_command
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.scene_messages import ReloadAnswer
+from solidcloud.schemas.wire.warming_parts import READY_LINE
 from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
@@ -231,6 +232,7 @@ def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[
         try:
             assert process.stdout is not None
             assert process.stdout.readline().startswith("serving hall")
+            assert process.stdout.readline().strip() == READY_LINE
             yield process
         finally:
             process.kill()

@@ -25,6 +25,7 @@ from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encod
 from solidcloud.schemas.wire.key_expressions import public_id, query_key
 from solidcloud.schemas.wire.scene_messages import ErrorReply
 from solidcloud.schemas.wire.stats import StatsAnswer, StatsRequest
+from solidcloud.schemas.wire.warming_parts import READY_LINE
 from solidcloud.server.cli.main import run
 from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import free_port
@@ -161,6 +162,7 @@ def server(archive: Path, endpoint: str, *options: str) -> Iterator[subprocess.P
         try:
             assert process.stdout is not None
             assert process.stdout.readline().startswith("serving hall"), process.communicate()[1]
+            assert process.stdout.readline().strip() == READY_LINE
             yield process
         finally:
             process.kill()

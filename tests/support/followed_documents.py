@@ -11,6 +11,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from solidcloud.schemas.wire.warming_parts import READY_LINE
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTED_ENDPOINT = "tcp/127.0.0.1:7447"
 # Option by which each command is told the endpoint of this reader's server, since the documented one may be in use.
@@ -137,8 +139,9 @@ class Reader:
                 text=True,
             )
         assert self._server.stdout is not None
-        ready = _first_line(self._server)
-        assert ready.startswith("serving "), f"{place}: {line}: found {ready!r}\n{log.read_text()}"
+        first, second = _first_lines(self._server)
+        assert first.startswith("serving "), f"{place}: {line}: found {first!r}\n{log.read_text()}"
+        assert second.strip() == READY_LINE, f"{place}: {line}: found {second!r}\n{log.read_text()}"
 
     def _stop_server(self) -> None:
         """Stop the server, as Ctrl-C would."""
@@ -161,14 +164,14 @@ def _lines(text: str) -> Iterator[str]:
             yield command
 
 
-def _first_line(process: "subprocess.Popen[str]") -> str:
-    """Return the first line that a process prints; "" if it prints none in time."""
+def _first_lines(process: "subprocess.Popen[str]") -> tuple[str, str]:
+    """Return the first two lines that a process prints; "" for each that it does not print in time."""
     import threading
 
     timer = threading.Timer(READY_SECONDS, process.kill)
     timer.start()
     try:
         assert process.stdout is not None
-        return process.stdout.readline()
+        return process.stdout.readline(), process.stdout.readline()
     finally:
         timer.cancel()

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ....schemas.errors import CorruptError, SolidcloudError
 from ....schemas.kernels.kernel_files import KernelFiles
 from ....schemas.wire.answers import Verdict
+from .child_processes import end_with_parent, lifeline
 
 if TYPE_CHECKING:
     from ...scene import Scene
@@ -72,7 +73,8 @@ def _run_trial(what: Path, seconds: float, environment: Mapping[str, str]) -> tu
     """
     command = [sys.executable, "-P", "-m", __name__, str(what)]
     try:
-        done = subprocess.run(command, capture_output=True, timeout=seconds, env=environment)
+        with lifeline() as stdin:
+            done = subprocess.run(command, stdin=stdin, capture_output=True, timeout=seconds, env=environment)
     except subprocess.TimeoutExpired:
         return f"did not finish within {seconds:g} s", ""
     code = done.returncode
@@ -141,4 +143,5 @@ def main(path: str) -> int:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     sys.exit(main(sys.argv[1]))

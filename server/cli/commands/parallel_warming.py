@@ -1,4 +1,4 @@
-"""A child process that warms a scene from the other end, while this process warms it.
+"""A child process that warms a scene, last parts first, while this process warms it.
 
 The two share the folder of compiled kernels: one compiles a kernel and the other waits for it
 (schemas/kernels/kernel_files.py). Two processes therefore compile everything in about half the time.
@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from .child_processes import end_with_parent, lifeline
+
 
 @contextmanager
 def warmed_in_parallel(what: Path) -> Iterator[None]:
@@ -24,30 +26,36 @@ def warmed_in_parallel(what: Path) -> Iterator[None]:
 
     children: list[subprocess.Popen[bytes]] = []
 
-    def start() -> None:
-        command = [sys.executable, "-P", "-m", __name__, str(what)]
-        nothing = subprocess.DEVNULL
-        children.append(subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing))
+    with lifeline() as stdin:
 
-    if len(os.sched_getaffinity(0)) > 1:
-        on_first_compilation(start)
-    try:
-        yield
-    finally:
-        on_first_compilation(None)
-        for child in children:
-            child.kill()  # what it has not finished, nobody reads
-            child.wait()
+        def start() -> None:
+            command = [sys.executable, "-P", "-m", __name__, str(what)]
+            nothing = subprocess.DEVNULL
+            children.append(subprocess.Popen(command, stdin=stdin, stdout=nothing, stderr=nothing))
+
+        if len(os.sched_getaffinity(0)) > 1:
+            on_first_compilation(start)
+        try:
+            yield
+        finally:
+            on_first_compilation(None)
+            for child in children:
+                child.kill()  # what it has not finished, nobody reads
+                child.wait()
 
 
 def main(path: str) -> None:
-    """Warm a scene, last things first. Errors are reported by the process that serves it."""
+    """Warm a scene. Errors are reported by the process that serves it."""
+    from ....schemas.wire.warming_parts import MOTION, PARTS
     from ...scene import Scene
 
     with Scene.open(path) as scene:
-        scene.simulation.warm()
-        scene.warm(last_first=True)
+        for part in reversed(PARTS):
+            if part == MOTION:
+                scene.simulation.warm()
+            scene.warm(part)
 
 
 if __name__ == "__main__":
+    end_with_parent()
     main(sys.argv[1])

@@ -121,7 +121,8 @@ def serve(
         if log is not None:
             stack.enter_context(recorded(scene, what, log))
         if not serve_scenes([scene], config, ready=start.close):
-            # A request is still running. Nothing is left to write, and closing the archive would
-            # wait for that request.
+            # A request or a compilation is still running. Nothing is left to write, and closing the
+            # archive would wait for it.
+            start.close()
             logging.shutdown()
             os._exit(0)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ....schemas.errors import SolidcloudError
+from ....schemas.wire.warming_parts import READY_LINE
 
 # Enough to load the libraries and compile every kernel on two slow cores. A server that takes
 # longer is considered hung.
@@ -54,16 +55,16 @@ def free_port() -> int:
 
 
 def _wait_ready(process: "subprocess.Popen[str]", archive: Path) -> None:
-    """Wait until the server reports that it serves."""
+    """Wait until the server reports that everything is ready."""
     # The timer kills the server, which closes its output and ends readline(): the only way to wait
     # for a line with a deadline on every system.
     timer = threading.Timer(READY_SECONDS, process.kill)
     timer.start()
     try:
-        line = process.stdout.readline() if process.stdout else ""
+        ready = READY_LINE in map(str.strip, process.stdout or ())
     finally:
         timer.cancel()
-    if not line:
+    if not ready:
         process.wait()
         raise SolidcloudError(
             f"the server of {archive} ended with exit code {process.returncode}, expected it to serve within "

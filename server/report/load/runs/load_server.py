@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .....schemas.errors import SolidcloudError
+from .....schemas.wire.warming_parts import READY_LINE
 from ...common.machine import parse_rollup
 from ..users import echo_process
 
@@ -158,23 +159,30 @@ def running(command: list[str], log: Path, ready: str) -> Iterator[subprocess.Po
     Raises ServerError where it ended before, or was too slow.
     """
     with started(command, log) as process:
-        first = _first_line(process)
-        if not first.startswith(ready):
+        lines = _lines_until(ready, process)
+        if not lines or not lines[-1].startswith(ready):
             said = log.read_text(errors="replace").strip()[-2000:]
-            raise ServerError(f"{' '.join(command[:4])}: not ready ({first.strip()!r}): {said}")
+            raise ServerError(f"{' '.join(command[:4])}: not ready (printed {lines}): {said}")
         yield process
 
 
-def _first_line(process: subprocess.Popen[str]) -> str:
-    """Return its first line on standard output, or its failure within START_SECONDS."""
+def _lines_until(ready: str, process: subprocess.Popen[str]) -> list[str]:
+    """Return its lines on standard output up to one that begins with `ready`.
+
+    The last one is another if it ended before, or was too slow.
+    """
     found: list[str] = []
-    assert process.stdout is not None
-    reader = threading.Thread(
-        target=lambda out: found.append(out.readline()), args=(process.stdout,), daemon=True
-    )
+
+    def read() -> None:
+        for line in process.stdout or ():
+            found.append(line.strip())
+            if line.startswith(ready):
+                return
+
+    reader = threading.Thread(target=read, daemon=True)
     reader.start()
     reader.join(START_SECONDS)
-    return found[0] if found else ""
+    return found
 
 
 def end(process: subprocess.Popen[str]) -> None:
@@ -193,7 +201,7 @@ def end(process: subprocess.Popen[str]) -> None:
 def serving(archive: Path, budget: int, policy: str | None, log: Path) -> Iterator[Served]:
     """Run `solidcloud serve` on an archive, warm and reachable, with an empty cache of `budget` bytes."""
     endpoint, begin = free_endpoint(), time.monotonic()
-    with running(serve_command(archive, endpoint, budget, policy), log, "serving") as process:
+    with running(serve_command(archive, endpoint, budget, policy), log, READY_LINE) as process:
         yield Served(endpoint, process.pid, time.monotonic() - begin)
 
 

@@ -31,9 +31,11 @@ from solidcloud.schemas.wire.scene_messages import (
     SceneInfo,
     ScenesAnswer,
 )
+from solidcloud.schemas.wire.warming_parts import PARTS
 from solidcloud.server.runtime.stop_flag import StopFlag
 from solidcloud.server.scene_interface import LimitReached
 from solidcloud.server.zenoh_server import request_dispatcher as dispatcher_module
+from solidcloud.server.zenoh_server import warming
 from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
@@ -165,8 +167,8 @@ def test_the_sessions_of_a_client_that_is_gone_end():
 
 def test_warming_warms_the_frames_too(scene):
     simulation = floor_simulation()
-    RequestDispatcher([simulation.scene], ServerConfig()).warm()
-    assert simulation.scene.warmed == 1 and simulation._pipeline.frames > 0
+    RequestDispatcher([simulation.scene], ServerConfig()).warming.run()
+    assert simulation.scene.warmed == len(PARTS) and simulation._pipeline.frames > 0
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
@@ -281,9 +283,9 @@ def test_avatars_are_their_clients(service, scene):
 def test_warming_warms_every_scene(service, scene, monkeypatch):
     """It starts the deadlines' thread too: a slow request that started it would give it its low priority."""
     started = []
-    monkeypatch.setattr(dispatcher_module, "start_deadlines", lambda: started.append(1))
-    service.warm()
-    assert scene.warmed == 1 and not scene.avatars and started == [1]
+    monkeypatch.setattr(warming, "start_deadlines", lambda: started.append(1))
+    service.warming.run()
+    assert scene.warmed == len(PARTS) and not scene.avatars and started == [1]
 
 
 def test_busy_says_how_many(service):

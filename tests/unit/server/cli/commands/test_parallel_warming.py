@@ -5,13 +5,13 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from solidcloud.schemas.kernels import compiling
+from solidcloud.schemas.wire.warming_parts import PARTS
 from solidcloud.server.cli.commands import parallel_warming
 from solidcloud.server.cli.commands.parallel_warming import main, warmed_in_parallel
-from solidcloud.server.queries import engine_table
 from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.simulation import Simulation
 
 ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
 
@@ -56,23 +56,10 @@ def test_one_processor_compiles_alone(
     assert not started
 
 
-@pytest.mark.interpreted
-def test_the_child_runs_the_same_queries_in_the_other_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[str] = []
-
-    def noted(name: str, engine: Any) -> Any:
-        def run(*arguments: Any, **options: Any) -> Any:
-            ran.append(name)
-            return engine(*arguments, **options)
-
-        return run
-
-    for name, engine in engine_table.ENGINES.items():
-        monkeypatch.setitem(engine_table.ENGINES, name, noted(name, engine))
-    with Scene.open(ARCHIVE) as scene:
-        scene.warm()
-    forward, ran = ran, []
+def test_the_child_warms_all_parts_last_ones_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    warmed: list[str] = []
+    monkeypatch.setattr(Scene, "warm", lambda scene, *parts: warmed.extend(parts))
+    monkeypatch.setattr(Simulation, "warm", lambda simulation: warmed.append("frames"))
     main(str(ARCHIVE))
-    after_frames = ran[-len(forward) :]
-    assert after_frames == forward[::-1] and len(set(forward)) == len(engine_table.ENGINES) - 1
-    assert np.all([name in engine_table.ENGINES for name in ran])
+    assert [part for part in warmed if part != "frames"] == list(reversed(PARTS))
+    assert warmed.count("frames") == 1

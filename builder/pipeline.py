@@ -36,7 +36,7 @@ from .passes.dataset_header import archive_id, make_header
 from .passes.point_spacing import archive_mean
 from .passes.preview import write_preview
 from .passes.spool_pass import spool_scans
-from .passes.survey import Survey, choose_lattice, survey_scans
+from .passes.survey_pass import Survey, choose_lattice, survey_scans
 from .passes.verify import verify_archive
 from .resume.build_identity import changed_inputs, describe_build, is_up_to_date
 from .resume.kept_work import BuildDirectory, build_directory, building_folder, remove_finished_work
@@ -206,7 +206,7 @@ def filter_points(
     config = build.config
     if not config.filter_passes:
         return spool, {}
-    from .passes.filter import filtered_spool  # most builds do not need its kernels, which this loads
+    from .passes.filter_pass import filtered_spool  # most builds do not need its kernels, which this loads
 
     with build.stage("filter", config.filter_passes * int(spool.counts.sum()), "points"):
         return filtered_spool(

@@ -86,9 +86,10 @@ ALLOWED = {
     "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/cli/doctor": "cli/output scene.py",
+    "server/cli/warming": "scene.py",
     "server/cli/commands": (
-        "cli/doctor cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency cli/output "
-        "archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
+        "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency "
+        "cli/output archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
         "report/accuracy report/common report/load/runs report/load"
     ),
     "server/cli": "cli/commands cli/output",

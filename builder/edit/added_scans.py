@@ -16,7 +16,7 @@ from ...schemas.errors import BadRequestError, ScanError
 from ..build_limits import ARCHIVE_BYTES_A_POINT, MAX_SCANS
 from ..passes.radius_classes import ALL_CODES
 from ..passes.spool_pass import SpoolUnit, run_points, spool_range
-from ..passes.survey import Survey, hash_file, join_ranges, ranges, survey_range, unopened_survey
+from ..passes.survey_pass import Survey, hash_file, join_ranges, ranges, survey_range, unopened_survey
 from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
 from ..sources.scan_files import InputFile

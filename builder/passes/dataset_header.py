@@ -16,7 +16,7 @@ from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
 from .build_shards import Shard
 from .spool_pass import Spooled
-from .survey import Survey
+from .survey_pass import Survey
 
 
 def archive_id(spooled: Sequence[Spooled], lattice: Lattice, config: BuildConfig) -> bytes:

@@ -31,7 +31,7 @@ from ..resume.kept_work import BuildDirectory, RunsIntact, Work, discard_damaged
 from ..resume.transaction import Transaction
 from ..sources.common.scan import Scan, ScanBlock
 from ..spool.run_files import KEYS_SUFFIX, RUN_SUFFIX, RunSums, new_run, ranks, write_directory
-from .survey import Survey
+from .survey_pass import Survey
 
 # Bytes per point in a spooling worker: voxel number, code, and a copy of the code in sorted order.
 # With intensity also its bits, a copy of them, and, for a run in one voxel, order, sorted codes and

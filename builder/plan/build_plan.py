@@ -230,7 +230,7 @@ def _voxels(scene: SceneStats, edge: float, rates: Rates) -> int:
 def _runs(scene: SceneStats, config: BuildConfig, jobs: int) -> int:
     """Return the number of runs.
 
-    survey.py cuts scans into ranges, spool_pass.py ranges into runs.
+    survey_pass.py cuts scans into ranges, spool_pass.py ranges into runs.
     """
     mean = scene.points / scene.scans
     a_range = _range_points(mean)
@@ -239,7 +239,7 @@ def _runs(scene: SceneStats, config: BuildConfig, jobs: int) -> int:
 
 
 def _range_points(points: float) -> float:
-    """Return the points of a range, as survey.py cuts a scan of `points` points."""
+    """Return the points of a range, as survey_pass.py cuts a scan of `points` points."""
     return min(max(points / RANGES, RANGE_POINTS[0]), RANGE_POINTS[1], points)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, make_lattice
 from ...schemas.errors import ScanError
 from ..config import DEFAULT_STEP, BuildConfig
-from ..passes.survey import shared_step
+from ..passes.survey_pass import shared_step
 from ..sources.common.scan import Scan
 from ..sources.scan_files import InputFile, open_input_files
 from ..sources.scan_warnings import ScanFacts, find_warnings
@@ -280,7 +280,7 @@ def _total(seen: Sequence[_ScanSample], edge: float) -> float:
 def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:
     """Return the lattice step that all scans share by their headers, or None.
 
-    survey.py makes the same choice.
+    survey_pass.py makes the same choice.
     """
     step = shared_step([scan.lattice for scan in scans])
     return step if step and max(MIN_STEP, voxel / MAX_VOXEL_STEPS) <= step <= voxel else None

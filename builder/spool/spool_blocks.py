@@ -1,6 +1,6 @@
 """Blocks of points that fit in memory, and the points around a block in all voxels.
 
-The filter rules that examine the neighbourhood of a point use them (filter.py). A voxel may have
+The filter rules that examine the neighbourhood of a point use them (filter_pass.py). A voxel may have
 any number of points, so neighbours are delivered in pieces. Positions are int32 lattice steps from
 a corner of a box around the block.
 """

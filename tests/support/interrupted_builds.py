@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.build_limits as build_limits
-import solidcloud.builder.passes.survey as survey
+import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import BuildSummary, build_archive

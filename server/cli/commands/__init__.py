@@ -1,7 +1,7 @@
 """Commands of `solidcloud`, one file each; a command imports its dependencies when it runs.
 
 May import server.archives, server.avatars, server.cli.doctor, server.cli.input, server.cli.output,
-server.cli.scene_files, server/client.py, server.report.accuracy,
+server.cli.scene_files, server.cli.warming, server/client.py, server.report.accuracy,
 server.report.accuracy.measurement, server.report.accuracy.page, server.report.common,
 server.report.load, server.report.load.runs, server.residency, server/scene.py, server.simulation,
 server.zenoh_client, server.zenoh_common, server.zenoh_server, builder, schemas.

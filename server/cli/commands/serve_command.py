@@ -90,8 +90,8 @@ def serve(
     from ...zenoh_server.serve_loop import serve as serve_scenes
     from ...zenoh_server.server_config import ServerConfig
     from ..output.compile_notice import compile_notices
-    from .kernel_rehearsal import rehearse
-    from .parallel_warming import warmed_in_parallel
+    from ..warming.kernel_rehearsal import rehearse
+    from ..warming.parallel_warming import warmed_in_parallel
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     config = ServerConfig(

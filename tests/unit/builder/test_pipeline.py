@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.build_limits as build_limits
 import solidcloud.builder.passes.spool_pass as partition
-import solidcloud.builder.passes.survey as survey
+import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
 from small_builds import build, content, six_files
 from solidcloud.builder.passes.verify import verify_archive

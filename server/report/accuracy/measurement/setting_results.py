@@ -40,7 +40,7 @@ class Row:
     distance_missing: poses where no pair was found although one is in reach.
     doorway_mm: see doorway.py; inf: the figure cannot even stand in the door.
     made_doorway_mm: doorway error measured on generated doors, see measured_doorway.py.
-    leak_p50_mm, leak_p99_mm, leak_worst_mm, leak_share: see leak.py.
+    leak_p50_mm, leak_p99_mm, leak_worst_mm, leak_share: see wall_leak.py.
     archive_bytes, decode_ms: of a build.  node_tests, pair_tests: means over poses.
     front: the errors for which this row is on the Pareto front of the settings in the charts.
     note: remark in words.

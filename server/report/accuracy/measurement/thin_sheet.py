@@ -11,7 +11,7 @@ from .....builder.pipeline import build_archive
 from .....builder.synthetic.sheet import make_sheet
 from ....scene import Scene
 from ...common.doorway import doorway_error
-from ...common.leak import leak
+from ...common.wall_leak import leak
 from .measured_scene import AVATAR
 from .setting_results import SHEET, Row
 

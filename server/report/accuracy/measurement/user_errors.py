@@ -5,8 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...common.doorway import doorway_error
-from ...common.leak import leak, leak_places
 from ...common.measured_doorway import measure_doorways
+from ...common.wall_leak import leak, leak_places
 from .engine_settings import Archives, Setting
 from .measured_scene import AVATAR, SEED, MeasuredScene
 from .measurement_plan import MeasurementPlan

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.build_limits as memory
 import solidcloud.builder.passes.spool_pass as spool_pass
-import solidcloud.builder.passes.survey as survey
+import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import solidcloud.builder.passes.build_shards as build_shards
 import solidcloud.builder.passes.spool_pass as spool_pass
-import solidcloud.builder.passes.survey as survey
+import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
 from solidcloud.builder.config import BuildConfig

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import solidcloud.builder.passes.build_shards as build_shards
 import solidcloud.builder.passes.spool_pass as spool_pass
-import solidcloud.builder.passes.survey as survey
+import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.resume.transaction as transaction
 from interrupted_builds import build, content, done_folder, interrupted, two_scans

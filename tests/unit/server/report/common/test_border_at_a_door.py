@@ -7,7 +7,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.synthetic.sheet import Sheet, make_sheet
 from solidcloud.server.report.common.doorway import doorway_error
-from solidcloud.server.report.common.leak import leak
+from solidcloud.server.report.common.wall_leak import leak
 from solidcloud.server.scene import Scene
 
 

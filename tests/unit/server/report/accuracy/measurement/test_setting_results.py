@@ -40,7 +40,7 @@ from solidcloud.server.report.accuracy.measurement.user_errors import (
     measure_user_errors,
 )
 from solidcloud.server.report.common.doorway import Doorway
-from solidcloud.server.report.common.leak import Leak
+from solidcloud.server.report.common.wall_leak import Leak
 
 
 def test_early_late_and_unknown_are_told_apart() -> None:

@@ -21,7 +21,7 @@ from solidcloud.schemas.kernels.compiling import kernel_files
 from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.schemas.kernels.morton import morton_decode
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.cli.commands.kernel_rehearsal import check_answers, rehearse
+from solidcloud.server.cli.warming.kernel_rehearsal import check_answers, rehearse
 from solidcloud.server.scene import Scene
 
 ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"

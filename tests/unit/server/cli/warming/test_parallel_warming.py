@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from solidcloud.schemas.kernels import compiling
 from solidcloud.schemas.wire.warming_parts import PARTS
-from solidcloud.server.cli.commands import parallel_warming
-from solidcloud.server.cli.commands.parallel_warming import main, warmed_in_parallel
+from solidcloud.server.cli.warming import parallel_warming
+from solidcloud.server.cli.warming.parallel_warming import main, warmed_in_parallel
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.simulation import Simulation
 

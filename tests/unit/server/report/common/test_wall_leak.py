@@ -9,8 +9,8 @@ import pytest
 import radius_class_archives
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.places import WallPlaces
-from solidcloud.server.report.common import leak as report
-from solidcloud.server.report.common.leak import leak, leak_depths
+from solidcloud.server.report.common import wall_leak as report
+from solidcloud.server.report.common.wall_leak import leak, leak_depths
 from solidcloud.server.scene import Scene
 
 PROBE = 0.05

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solidcloud.builder.passes.survey as survey_module
+import solidcloud.builder.passes.survey_pass as survey_module
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.passes.survey import (
+from solidcloud.builder.passes.survey_pass import (
     Survey,
     choose_lattice,
     dump_part,

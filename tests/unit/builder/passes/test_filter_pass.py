@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.passes import filter as filters
-from solidcloud.builder.passes.filter import filtered_spool
+from solidcloud.builder.passes import filter_pass as filters
+from solidcloud.builder.passes.filter_pass import filtered_spool
 from solidcloud.builder.passes.filter_rules import MOVING, OUTLIER, THINNED
 from solidcloud.builder.resume.kept_work import Journal
 from solidcloud.builder.resume.transaction import make_executor

@@ -1,0 +1,5 @@
+"""Child processes of a server's start: one compiles too, one tries kernels that may be wrong.
+
+May import server/scene.py, builder, schemas.
+Begin with parallel_warming.py.
+"""

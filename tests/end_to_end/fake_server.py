@@ -303,6 +303,7 @@ if __name__ == "__main__":
     parser.add_argument("--walked", action="store_true", help="users may walk it")
     parser.add_argument("--log")
     parser.add_argument("--never-warm", default="", metavar="PART")
+    parser.add_argument("--stop-seconds", type=float, default=1.0)
     arguments = parser.parse_args()
     scene = FloorScene(arguments.name, arguments.delay)
     if arguments.walked:
@@ -310,4 +311,4 @@ if __name__ == "__main__":
     scene.never_warm = arguments.never_warm
     if arguments.log:
         scene.simulation.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [])))
-    serve([scene], ServerConfig(listen=arguments.listen))
+    serve([scene], ServerConfig(listen=arguments.listen, stop_seconds=arguments.stop_seconds))

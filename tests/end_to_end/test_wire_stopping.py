@@ -55,7 +55,7 @@ def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
 @pytest.mark.parametrize("delay, count", [(0.005, 60), (0.015, 50)])
 def test_terminated_server_answers_what_it_accepted_and_exits_0(endpoint, delay, count):
     """Test requests of more than 10 ms, each of which is handed to a separate thread."""
-    with server_process(endpoint, "--delay", str(delay)) as process:
+    with server_process(endpoint, "--delay", str(delay), "--stop-seconds", str(DEADLINE)) as process:
         with (
             Client(endpoint, scene="floor") as client,
             zenoh.open(session_config(connect=endpoint)) as session,

@@ -11,6 +11,7 @@ content.
 
 import functools
 import hashlib
+import importlib
 import pickle
 import sys
 from collections.abc import Callable
@@ -31,7 +32,16 @@ from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
 from .kernel_files import KernelFiles, default_folder
 from .kernel_sources import source_digest
 
-__all__ = ["config", "has_compiled", "intrinsic", "kernel_files", "njit", "on_first_compilation", "types"]
+__all__ = [
+    "config",
+    "has_compiled",
+    "intrinsic",
+    "kernel_files",
+    "njit",
+    "on_first_compilation",
+    "types",
+    "without_linear_algebra",
+]
 
 # numba creates its attributes on import, invisible to type checkers.
 config: Any = numba_config
@@ -64,6 +74,20 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
 def on_first_compilation(call: Callable[[], object] | None) -> None:
     """Set what is called once before this process compiles its next function; None for nothing."""
     _progress.on_first = call
+
+
+def without_linear_algebra() -> None:
+    """Make numba load its array functions without linear algebra, which no kernel uses.
+
+    numba otherwise imports scipy, if it is installed, before the first kernel: 0.1 s of a server's
+    start. Only for a process in which nobody else uses numba.
+    """
+    if "scipy" not in sys.modules:
+        sys.modules["scipy"] = None  # type: ignore[assignment]  # an import of it fails
+        try:
+            importlib.import_module("numba.np.arraymath")
+        finally:
+            del sys.modules["scipy"]
 
 
 def has_compiled() -> bool:

@@ -83,7 +83,7 @@ def serve(
     import os
     from contextlib import ExitStack
 
-    from ....schemas.kernels.compiling import kernel_files
+    from ....schemas.kernels.compiling import kernel_files, without_linear_algebra
     from ...scene import Scene
     from ...simulation.replay import recorded
     from ...zenoh_common.key_files import read_given_key
@@ -111,6 +111,7 @@ def serve(
     budget = parse_bytes(cache, "--cache")
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
+    without_linear_algebra()
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
         start.enter_context(compile_notices())

@@ -1,6 +1,7 @@
-"""Settings and calls that make the process's memory allocator return memory to the system."""
+"""Memory of the process: what the allocator returns to the system, what garbage collection examines."""
 
 import ctypes
+import gc
 import sys
 from contextlib import suppress
 
@@ -30,3 +31,15 @@ def give_back_large_blocks() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
         mallopt(_ARENA_MAX, _ARENAS)
+
+
+def exempt_present_objects(*, collect: bool) -> None:
+    """Exempt all present objects from garbage collection. collect: after one last collection.
+
+    A full collection holds the interpreter's lock. Over the 150,000 objects of a warm server, most of
+    them numba's, it takes 65 ms, during which no request is answered.
+    """
+    if collect:
+        gc.unfreeze()
+        gc.collect()
+    gc.freeze()

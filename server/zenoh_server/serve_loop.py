@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from ...schemas.wire.warming_parts import READY_LINE
-from ..runtime.process_heap import give_back_large_blocks
+from ..runtime.process_heap import exempt_present_objects, give_back_large_blocks
 from ..runtime.threads import start_thread
 from ..scene_interface import ServedScene
 from .request_dispatcher import RequestDispatcher
@@ -69,9 +69,11 @@ def serve(
         # In a thread, because a signal must be answered while kernels are compiled for many seconds.
         if not signals.come_after(warming.run_first):
             return False
+        exempt_present_objects(collect=False)
 
         def warm_rest() -> None:
             if warming.run_rest():
+                exempt_present_objects(collect=True)
                 ready()
                 print(READY_LINE, flush=True)
 

@@ -228,8 +228,9 @@ class RequestDispatcher:
             return structs.replace(scene.info(), compiling=self.warming.compiling)
         request: Any = decode_request(operation.request, payload, encoding)
         self._check_size(operation, request)
-        asked_for = request.op if isinstance(request, PathRequest) else route.operation
-        self.warming.check(*needed_parts(asked_for, structs.asdict(request)))
+        if not self.warming.complete:
+            asked_for = request.op if isinstance(request, PathRequest) else route.operation
+            self.warming.check(*needed_parts(asked_for, structs.asdict(request)))
         return operation.ask(scene, request, route.client, stop)
 
     def _reload(self, scene: ServedScene) -> Iterator[ReloadAnswer]:

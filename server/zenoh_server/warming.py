@@ -57,11 +57,16 @@ class Warming:
             except Exception:
                 log.exception("cannot warm %s", part)
                 self._done(part)
-        return not self._left
+        return self.complete
 
     def end(self) -> None:
         """End `run_rest` after the part in work."""
         self._ended = True
+
+    @property
+    def complete(self) -> bool:
+        """Return whether no part is left."""
+        return not self._left
 
     @property
     def compiling(self) -> list[str]:
@@ -70,7 +75,7 @@ class Warming:
 
     def check(self, *parts: str) -> None:
         """Raise BusyError if a part is not ready, and let it be the next one."""
-        if not self._left or not self._compiles():
+        if self.complete or not self._compiles():
             return
         with self._lock:
             missing = [part for part in parts if part in self._left]

@@ -17,6 +17,7 @@ from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved
 from ..schemas.wire.requests import AddAvatarRequest, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
+from ..schemas.wire.warming_parts import MOTION, PARTS
 from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats
@@ -214,13 +215,16 @@ class Scene(SceneQuestions):
         return self.archives[0].residency
 
     def warm(self, *parts: str) -> None:
-        """Run every query on each archive, to compile before the first request; start threads.
+        """Run every query and some frames, to compile before the first request; start threads.
 
-        parts: of schemas/wire/warming_parts.py, in their order; none: all.
+        parts: of schemas/wire/warming_parts.py, in their order; none: all. Users that are present do
+        not notice: the frames are those of another simulation.
         """
         self._path_threads.start()
         for archive in self.archives:
             archive.warm(*parts)
+        if MOTION in (parts or PARTS):
+            make_simulation(self, self._file).warm()
 
     def info(self) -> SceneInfo:
         """Return the description of all archives together, with the effects of the scene file."""

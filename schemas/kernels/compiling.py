@@ -79,20 +79,20 @@ def on_first_compilation(call: Callable[[], object] | None) -> None:
 def without_linear_algebra() -> None:
     """Make numba load its array functions without linear algebra, which no kernel uses.
 
-    numba otherwise imports scipy, if it is installed, before the first kernel: 0.1 s of a server's
-    start. Only for a process in which nobody else uses numba.
+    numba otherwise imports scipy.linalg, if it is installed, before the first kernel: 0.1 s of a
+    server's start. Only for a process in which nobody else uses numba.
     """
-    if "scipy" not in sys.modules:
-        sys.modules["scipy"] = None  # type: ignore[assignment]  # an import of it fails
+    if "scipy.linalg" not in sys.modules:
+        sys.modules["scipy.linalg"] = None  # type: ignore[assignment]  # an import of it fails
         try:
             importlib.import_module("numba.np.arraymath")
         finally:
-            del sys.modules["scipy"]
+            del sys.modules["scipy.linalg"]
 
 
 def has_compiled() -> bool:
-    """Return whether this process has begun to compile a function that no file held."""
-    return _progress.any
+    """Return whether no file held some function, so that this or another process compiles it."""
+    return _progress.any or kernel_files().has_waited
 
 
 @functools.cache

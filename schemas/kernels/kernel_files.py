@@ -56,6 +56,7 @@ class KernelFiles:
         self.folder = folder
         self._warned: set[str] = set()
         self._pruned = False
+        self.has_waited = False  # whether another process was found compiling
         self._claims: dict[str, int] = {}
         self._descriptor = self._open()
 
@@ -185,7 +186,7 @@ class KernelFiles:
             try:
                 fcntl.lockf(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)  # of this process, not of its children
             except OSError:
-                waited = True
+                waited = self.has_waited = True
                 time.sleep(0.02)
                 continue
             if not waited:
@@ -278,7 +279,7 @@ class KernelFiles:
     def _warn_not_stored(self, fault: str) -> None:
         self._warn_once(
             "not kept",
-            f"compiled kernels are not kept in {self.folder} ({fault}), so each start compiles for a minute or more: "
+            f"compiled kernels are not kept in {self.folder} ({fault}), so each start compiles for about a minute: "
             "set NUMBA_CACHE_DIR to a folder that you alone may write",
         )
 

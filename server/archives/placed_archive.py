@@ -220,8 +220,7 @@ class ArchiveGeneration:
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         x, y, z = place = archive.header.lattice.to_world(corner).tolist()
         for part in parts or PARTS:
-            if part == MOTION:
-                self.prefetcher.warm((x, y, z))
+            self.prefetcher.warm((x, y, z), predict=part == MOTION)
             warm_engines(self.data, place, part)
 
     def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:

@@ -127,6 +127,12 @@ class UserTracks:
         self._planned_paths = np.empty((0, PIECES + 1, 3)), 1
         self._distance_plan, self._distances = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
 
+    def without_users(self) -> "UserTracks":
+        """Return tracks with the same options and no users."""
+        return UserTracks(
+            self._index, self._options.voxel_steps, self._options.origin, self._step, self.ahead
+        )
+
     @property
     def users(self) -> list[User]:
         """Return the known users, in order of arrival."""

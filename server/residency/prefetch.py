@@ -114,16 +114,21 @@ class Prefetcher:
         self._wake()
         return jumped
 
-    def warm(self, center: tuple[float, float, float]) -> None:
-        """Make a plan for a dummy user, so that all kernels are compiled before the first user."""
-        user = ("", "")
-        self._running_requests = None
-        self._tracks.record_pose(user, self._clock(), center, 1.0)
-        self._tracks.plan(self._clock(), 0.0)
-        self._tracks.kept(self._clock())
-        self._tracks.path_distances([0])
-        self._tracks.leave(user)
-        self._tracks.plan(self._clock(), 0.0)
+    def warm(self, center: tuple[float, float, float], *, predict: bool) -> None:
+        """Record a pose of a dummy user, so that the kernels are compiled before the first user.
+
+        predict: also make a plan, and let the first plan wait for no request. The tracks of users
+        are not touched.
+        """
+        user, tracks = ("", ""), self._tracks.without_users()
+        tracks.record_pose(user, self._clock(), center, 1.0)
+        if predict:
+            self._running_requests = None
+            tracks.plan(self._clock(), 0.0)
+            tracks.kept(self._clock())
+            tracks.path_distances([0])
+            tracks.leave(user)
+            tracks.plan(self._clock(), 0.0)
 
     def leave_client(self, client: str) -> None:
         """Stop keeping and prefetching voxels for a client's avatars."""
@@ -183,10 +188,11 @@ class Prefetcher:
 
     def _waits_for_first_answer(self, now: float) -> bool:
         """Return whether the first plan is still to wait for running requests."""
-        if self._running_requests is None:
+        running = self._running_requests  # read once: `warm` may set it
+        if running is None:
             return False
         self._first_seen = min(self._first_seen, now)
-        if now < self._first_seen + FIRST_ANSWER_SECONDS and self._running_requests():
+        if now < self._first_seen + FIRST_ANSWER_SECONDS and running():
             return True
         self._running_requests = None
         return False

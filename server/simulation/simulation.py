@@ -295,7 +295,7 @@ class Simulation:
                 self._recorder.dropped(client)
 
     def warm(self) -> None:
-        """Simulate some frames, so that no user waits for compilation.
+        """Simulate some frames, so that no user waits for compilation. Nobody else may use this simulation.
 
         Their motions lead onto a scan point from above, away from it, past it, and into another
         user.

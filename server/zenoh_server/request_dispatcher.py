@@ -10,6 +10,7 @@ from msgspec import structs
 
 from ...schemas.errors import (
     BadRequestError,
+    BusyError,
     ErrorCode,
     SolidcloudError,
     TooLargeError,
@@ -236,6 +237,8 @@ class RequestDispatcher:
     def _reload(self, scene: ServedScene) -> Iterator[ReloadAnswer]:
         """Reload one scene when the answer is requested; log and raise errors."""
         try:
+            if not self.warming.complete:
+                raise BusyError("reload not ready: this server is still warming: ask again in some seconds")
             answer = scene.reload()
         except Exception as error:
             log.error("%s cannot be reloaded and is served as before: %s", scene.name, error)

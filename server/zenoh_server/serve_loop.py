@@ -21,6 +21,12 @@ from .transport import Transport
 
 log = logging.getLogger(__name__)
 
+# How long a stop waits for the part of warming that is in work [s]. Parts that are not compiled take
+# less.
+_END_SECONDS = 0.5
+# Interval at which a reload checks whether warming is complete [s].
+_LOOK_SECONDS = 0.1
+
 
 @contextmanager
 def serving(scenes: Sequence[ServedScene], config: ServerConfig) -> Iterator[RequestDispatcher]:
@@ -83,6 +89,7 @@ def serve(
             while signals.next() == signal.SIGHUP:
                 wanted.set()
             warming.end()
+        rest.join(_END_SECONDS)
         return not (dispatcher.left_at_work or rest.is_alive())
 
 
@@ -107,7 +114,11 @@ def _reloader(dispatcher: RequestDispatcher) -> Iterator[threading.Event]:
     def run() -> None:
         while wanted.wait() and not ended.is_set():
             wanted.clear()
-            dispatcher.reload()
+            # A reload warms too; closing its scene would wait until it has compiled everything.
+            while not (dispatcher.warming.complete or ended.wait(_LOOK_SECONDS)):
+                pass
+            if not ended.is_set():
+                dispatcher.reload()
 
     # A reload that is running at the end is abandoned when its scene closes (`Scene.close` waits).
     start_thread("reload", run)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from ...schemas.errors import BusyError
 from ...schemas.kernels.compiling import has_compiled
-from ...schemas.wire.warming_parts import MOTION, PARTS
+from ...schemas.wire.warming_parts import PARTS
 from ..runtime.stop_flag import start_deadlines
 from ..scene_interface import ServedScene
 
@@ -92,8 +92,6 @@ class Warming:
     def _warm(self, part: str) -> None:
         for scene in self._scenes:
             scene.warm(part)
-            if part == MOTION and scene.simulation is not None:
-                scene.simulation.warm()
         self._done(part)
 
     def _done(self, part: str) -> None:

@@ -34,6 +34,7 @@ from solidcloud.schemas.wire.scene_messages import (
     SourceInfo,
 )
 from solidcloud.schemas.wire.stats import StatsAnswer
+from solidcloud.schemas.wire.warming_parts import MOTION
 from solidcloud.server.archives.archive_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene_interface import record_avatar
@@ -110,6 +111,8 @@ class FloorScene:
 
     def warm(self, *parts):
         self.warmed += 1
+        if MOTION in parts and self.simulation is not None:
+            self.simulation.warm()
         if self.never_warm in parts:
             compiling._progress.begin()
             print(f"warming {self.never_warm}", flush=True)

@@ -81,9 +81,11 @@ def serve(
     """
     import logging
     import os
+    import signal
+    import sys
     from contextlib import ExitStack
 
-    from ....schemas.kernels.compiling import kernel_files, without_linear_algebra
+    from ....schemas.kernels.compiling import has_compiled, kernel_files, without_linear_algebra
     from ...scene import Scene
     from ...simulation.replay import recorded
     from ...zenoh_common.key_files import read_given_key
@@ -111,6 +113,7 @@ def serve(
     budget = parse_bytes(cache, "--cache")
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # until `serve_scenes` waits for signals
     without_linear_algebra()
     files = kernel_files()
     with ExitStack() as stack, ExitStack() as start:
@@ -123,7 +126,9 @@ def serve(
             stack.enter_context(recorded(scene, what, log))
         if not serve_scenes([scene], config, ready=start.close):
             # A request or a compilation is still running. Nothing is left to write, and closing the
-            # archive would wait for it.
-            start.close()
+            # archive would wait for it. If the start has ended without compiling, a kernel may hang:
+            # its mark stays, so that the next start tries the kernels first.
+            if has_compiled():
+                start.close()
             logging.shutdown()
             os._exit(0)

@@ -134,7 +134,6 @@ def main(path: str) -> int:
     try:
         with Scene.open(path) as scene:
             scene.warm()
-            scene.simulation.warm()
             check_answers(scene)
     except SolidcloudError as error:
         sys.stdout.buffer.write(str(error).encode(errors="backslashreplace"))

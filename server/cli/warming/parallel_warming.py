@@ -46,14 +46,11 @@ def warmed_in_parallel(what: Path) -> Iterator[None]:
 
 def main(path: str) -> None:
     """Warm a scene. Errors are reported by the process that serves it."""
-    from ....schemas.wire.warming_parts import MOTION, PARTS
+    from ....schemas.wire.warming_parts import PARTS
     from ...scene import Scene
 
     with Scene.open(path) as scene:
-        for part in reversed(PARTS):
-            if part == MOTION:
-                scene.simulation.warm()
-            scene.warm(part)
+        scene.warm(*reversed(PARTS))
 
 
 if __name__ == "__main__":

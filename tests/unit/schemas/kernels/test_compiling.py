@@ -181,6 +181,20 @@ def test_other_settings_have_kernels_of_their_own(cache: Path) -> None:
     assert start(cache) == (ANSWER | {"compiled": 0}, [])
 
 
+def test_kernels_need_no_linear_algebra_and_scipy_can_be_imported_later(cache: Path) -> None:
+    code = (
+        "from solidcloud.schemas.kernels.compiling import without_linear_algebra\n"
+        f"without_linear_algebra()\n{CODE}\n"
+        "import sys\nassert 'scipy.linalg' not in sys.modules\n"
+        "import scipy.linalg\nwithout_linear_algebra()\nassert 'scipy.linalg' in sys.modules\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+    out = subprocess.run(
+        [sys.executable, "-P", "-c", code], env=environment, capture_output=True, check=True, timeout=240
+    )
+    assert json.loads(out.stdout) == ANSWER | {"compiled": 0}
+
+
 def test_processes_that_start_at_once_share_a_cache(tmp_path: Path) -> None:
     command = [sys.executable, "-P", "-c", CODE]
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}

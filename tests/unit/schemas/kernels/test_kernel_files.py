@@ -314,7 +314,8 @@ def test_nobody_waits_for_ever(
     command = [sys.executable, "-P", "-c", program, str(folder), NAME]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "compiles\n"
-        assert files.read(NAME) is None
+        assert not files.has_waited
+        assert files.read(NAME) is None and files.has_waited
         files.write(NAME, PAYLOAD)
         other.kill()
     assert files.read(NAME) == PAYLOAD and not caplog.records

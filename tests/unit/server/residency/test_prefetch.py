@@ -247,9 +247,11 @@ def test_the_first_plan_waits_for_the_first_answer_and_no_longer_than_its_limit(
 
 def test_a_warm_prefetcher_waits_for_nobody() -> None:
     table = Table([1], 4, running_requests=lambda: True)
-    table.wishes.path_distances = table.wishes.leave = lambda *_: None  # type: ignore[attr-defined]
+    other = Table([2], 4)
+    other.wishes.path_distances = other.wishes.leave = lambda *_: None  # type: ignore[attr-defined]
+    table.wishes.without_users = lambda: other.wishes  # type: ignore[attr-defined]
     with table.prefetcher:
-        table.prefetcher.warm((0.0, 0.0, 0.0))
-        before = table.wishes.plans
+        table.prefetcher.warm((0.0, 0.0, 0.0), predict=True)
+        assert table.wishes.plans == 0 < other.wishes.plans, "nothing is planned for users"
         table.see()
-        assert until(lambda: table.wishes.plans > before)
+        assert until(lambda: table.wishes.plans > 0)

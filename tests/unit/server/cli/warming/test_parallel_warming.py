@@ -11,7 +11,6 @@ from solidcloud.schemas.wire.warming_parts import PARTS
 from solidcloud.server.cli.warming import parallel_warming
 from solidcloud.server.cli.warming.parallel_warming import main, warmed_in_parallel
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.simulation import Simulation
 
 ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
 
@@ -59,7 +58,5 @@ def test_one_processor_compiles_alone(
 def test_the_child_warms_all_parts_last_ones_first(monkeypatch: pytest.MonkeyPatch) -> None:
     warmed: list[str] = []
     monkeypatch.setattr(Scene, "warm", lambda scene, *parts: warmed.extend(parts))
-    monkeypatch.setattr(Simulation, "warm", lambda simulation: warmed.append("frames"))
     main(str(ARCHIVE))
-    assert [part for part in warmed if part != "frames"] == list(reversed(PARTS))
-    assert warmed.count("frames") == 1
+    assert warmed == list(reversed(PARTS))

@@ -165,7 +165,7 @@ def test_an_archive_grows_and_shrinks_while_it_is_served(hall: Path, endpoint: s
     stop, found = threading.Event(), []
 
     def ask() -> None:
-        with Client(endpoint, scene="hall") as client:
+        with Client(endpoint, scene="hall", timeout=60.0) as client:
             client.add_avatar("al", BODY, 0.01)
             while not stop.is_set():
                 found.append(client.collide("al", poses).verdict)
@@ -173,8 +173,8 @@ def test_an_archive_grows_and_shrinks_while_it_is_served(hall: Path, endpoint: s
     chair = hall.parent / "chair.ply"
     with (
         Scene.open(hall) as scene,
-        serving([scene], ServerConfig(listen=endpoint)),
-        Client(endpoint, scene="hall") as client,
+        serving([scene], ServerConfig(listen=endpoint, max_request_seconds=60.0)),
+        Client(endpoint, scene="hall", timeout=60.0) as client,
     ):
         client.add_avatar("al", BODY, 0.01)
         thread = threading.Thread(target=ask)

@@ -4,11 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from floor import DEADLINE, eventually
-from solidcloud.server.cli.warming import kernel_rehearsal
+from solidcloud.server.cli.warming import kernel_rehearsal, parallel_warming
 
 ARCHIVE = Path(__file__).parents[1] / "golden" / "archive-4"
 
@@ -18,11 +19,17 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def children_of(pid):
-    """Return the process ids of the children that any thread of a process has started."""
+def children_of(pid, module):
+    """Return the process ids of the children of a process that run a module.
+
+    Libraries start short-lived children too while they are imported.
+    """
     found = []
     for thread in Path(f"/proc/{pid}/task").iterdir():
-        found += [int(each) for each in (thread / "children").read_text().split()]
+        with suppress(FileNotFoundError):  # thread or child may have ended
+            for child in (thread / "children").read_text().split():
+                if module.__name__.encode() in Path(f"/proc/{child}/cmdline").read_bytes():
+                    found.append(int(child))
     return found
 
 
@@ -52,7 +59,7 @@ def test_the_child_of_a_server_that_compiles_ends_with_it(endpoint, tmp_path, nu
     ) as process:
         try:
             found = []
-            eventually(lambda: found.extend(children_of(process.pid)) or found)
+            eventually(lambda: found.extend(children_of(process.pid, parallel_warming)) or found)
             (child,) = found
             process.send_signal(number)
             code = process.wait(DEADLINE)
@@ -70,7 +77,7 @@ def test_a_trial_ends_with_its_parent(tmp_path):
     with subprocess.Popen([sys.executable, "-P", "-c", program], env=environment) as process:
         try:
             found = []
-            eventually(lambda: found.extend(children_of(process.pid)) or found)
+            eventually(lambda: found.extend(children_of(process.pid, kernel_rehearsal)) or found)
         finally:
             process.kill()
     eventually(lambda: not runs(found[0]))

@@ -27,7 +27,7 @@ HARD = (ADVERSARY, "teleport")
 MEMORY_BEYOND = 150 << 20  # above the budget and the memory of the warm process [bytes]
 ROUND_TRIP = 1.5  # ratio to the echo's, medians
 CROWD = 64
-START_COLD, START_WARM = 3.0, 1.5  # [s]
+START_COLD, START_WARM = 3.0, 1.0  # [s]
 
 
 @dataclass(frozen=True)

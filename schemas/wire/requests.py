@@ -22,6 +22,7 @@ ALL_GROUPS = 0xFFFFFFFF
 
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
 Length = Annotated[float, msgspec.Meta(ge=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, description="1 is the whole")]
 Duration = Annotated[float, msgspec.Meta(ge=0, description="milliseconds")]
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 Bits = Annotated[int, msgspec.Meta(ge=0, le=ALL_GROUPS)]
@@ -71,6 +72,9 @@ class QuestionRequest(Request, frozen=True, kw_only=True):
 
     tolerance: separation up to which contact may be reported, and allowed distance between bounds
     [m]; 0: exact.
+    relative_tolerance: allowed distance between the bounds of a distance, as a share of the distance
+    between the centres; if it is above 0, a millimetre is allowed at any distance. Only `distance`
+    uses it.
     budget_ms: time for loading and computing together [ms]; null: no limit.
     budget_visits: node visits per pose (ray, point, motion); null: no limit.
     radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
@@ -78,6 +82,7 @@ class QuestionRequest(Request, frozen=True, kw_only=True):
     """
 
     tolerance: Length = 0.0
+    relative_tolerance: Share = 0.0
     budget_ms: Duration | None = None
     budget_visits: Count | None = None
     radius_model: ModelName | None = None
@@ -98,6 +103,7 @@ class QuestionOptions(TypedDict, total=False):
     """Fields of `QuestionRequest` as keyword arguments, for this module and every query method."""
 
     tolerance: float
+    relative_tolerance: float
     budget_ms: float | None
     budget_visits: int | None
     radius_model: str | None

@@ -163,7 +163,9 @@ TESTS: dict[str, tuple[str, ...]] = {
         SERVER + "kernels/core/test_separation_order.py",
         *work("distance"),
     ),
-    "server/kernels/nearest/nearest_pair.py": work("distance", "distance deep", "distance bounded"),
+    "server/kernels/nearest/nearest_pair.py": work(
+        "distance", "distance deep", "distance within", "distance bounded"
+    ),
     "server/kernels/collide/coarse_clearance.py": (
         SERVER + "residency/test_coarse_bounds.py::test_the_nodes_of_a_top_enclose_all_points",
         SERVER + "residency/test_coarse_bounds.py::test_filled_and_remembered_are_the_same_rows",
@@ -193,7 +195,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("sweep", "sweep bounded"),
     ),
     "server/kernels/nearest/nearest_by_scan.py": (SERVER + "queries/test_distance_per_scan.py",),
-    "server/kernels/nearest/nearest_search.py": work("distance", "distance deep"),
+    "server/kernels/nearest/nearest_search.py": work("distance", "distance deep", "distance within"),
     "server/kernels/nearest/nearest_resident.py": (
         SERVER + "queries/test_distance_fast.py",
         "tests/property/test_distance_fast_naive.py::test_one_pose_has_the_bits_of_distance",
@@ -202,7 +204,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/bodies/moving_bodies.py": (SERVER + "kernels/bodies/test_body_sweep.py",),
     "server/kernels/rays/stored_normals.py": NORMALS,
     "server/kernels/collide/collide_poses.py": (
-        *work("collide", "collide deep", "collide one"),
+        *work("collide", "collide deep", "collide one", "collide within"),
+        *tangent("collide"),
+    ),
+    "server/kernels/collide/early_contact.py": work("collide within"),
+    "server/kernels/collide/leaf_contact.py": (
+        *work("collide", "collide deep", "collide within"),
         *tangent("collide"),
     ),
     "server/kernels/core/placed_avatar.py": (

@@ -60,6 +60,7 @@ def ask_each(
     k: int,
     prepare: PrepareQuery,
     tolerance: float = 0.0,
+    relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
     radius_model: str | None = None,
@@ -68,11 +69,11 @@ def ask_each(
     """Query every archive for k items (poses, rays, points, motions or objects); merge the answers.
 
     prepare: returns, for an archive and its current generation, the function that queries it.
-    tolerance, budget_ms, budget_visits, stop: as for `make_budget`.
+    tolerance, relative_tolerance, budget_ms, budget_visits, stop: as for `make_budget`.
     radius_model: see schemas/archive/radius_model.py; None: that of each archive.
     Raise BadRequestError, and the errors of the query.
     """
-    budget = make_budget(tolerance, budget_ms, budget_visits, stop)
+    budget = make_budget(tolerance, relative_tolerance, budget_ms, budget_visits, stop)
     if len(archives) == 1 and archives[0].pose is None:
         with archives[0].take() as opened:
             data = opened.data if radius_model is None else opened.radius_model(radius_model)

@@ -1,5 +1,6 @@
 """Query `collide`: whether an avatar touches the scene, one verdict a pose."""
 
+import math
 import time
 from typing import Any
 
@@ -9,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.collide.collide_poses import CLEAR, CONTACT, UNKNOWN, collide_poses
+from ..kernels.collide.collide_poses import collide_poses
+from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
+from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..residency.coarse_bounds import drop_clear_pairs
 from .context.anytime_search import collide_bounded
@@ -32,8 +35,8 @@ def collide(
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
-    budget: a limited one is passed to `collide_bounded`. With a tolerance alone the answer is exact
-    and has bounds.
+    budget: a limited one is passed to `collide_bounded`. With a tolerance, CONTACT means a pair
+    within margin plus tolerance, and CLEAR none within the margin; the answer has bounds.
     The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read or
     a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
@@ -45,6 +48,7 @@ def collide(
     margin_units = to_units(margin, "margin")
     other_units = data.radius_units + margin_units
     k = len(array)
+    early = tolerance_units(budget)
     residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
 
     def settled(reach: VoxelsInReach) -> VoxelsInReach:
@@ -63,19 +67,22 @@ def collide(
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            collide_poses(array, avatar.arrays, seen.arrays, part, which, NO_LIMIT, verdict, counts)
+            collide_poses(array, avatar.arrays, seen.arrays, part, which, early, NO_LIMIT, verdict, counts)
         spent.add(held)
     # A load may have proved the index wrong by now.
     if (data.nothing_clear or len(data.unknown)) and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
-    return CollideAnswers(
-        verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(),
-        **_bounds(verdict, reach.units - margin_units, margin, margin_units, budget),
-    )  # fmt: skip
+    bounds = verdict_bounds(verdict, reach.units - margin_units, margin, margin_units, budget)
+    return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(), **bounds)
 
 
-def _bounds(
+def tolerance_units(budget: QueryBudget) -> int:
+    """Return the tolerance in exact units, rounded down; at most the longest reach."""
+    return math.floor(min(budget.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
+
+
+def verdict_bounds(
     verdict: NDArray[np.uint8],
     radii: NDArray[np.int64],
     margin: float,
@@ -84,14 +91,19 @@ def _bounds(
 ) -> dict[str, Any]:
     """Return the bounds of `CollideAnswers` that follow from verdicts; {} without a tolerance.
 
+    verdict: (k,), in which EARLY becomes CONTACT.
     radii: (k,) sum of the largest radii of avatar and scan, exact units: the depth limit of a pair.
     margin: [m].  margin_units: the margin as rounded, up or down; verdicts are based on it.
     """
     if budget.tolerance == 0:
         return {}
     rounded = margin_units / UNITS_PER_METRE
+    early = verdict == EARLY
+    verdict[early] = CONTACT
+    upper = np.where(verdict == CONTACT, max(margin, rounded), np.inf)
+    upper[early] = np.nextafter(max(margin, rounded) + budget.tolerance, np.inf)
     return {
         "lower": np.where(verdict == CLEAR, min(margin, rounded), -radii / UNITS_PER_METRE),
-        "upper": np.where(verdict == CONTACT, max(margin, rounded), np.inf),
-        "exact": verdict != UNKNOWN,
+        "upper": upper,
+        "exact": (verdict != UNKNOWN) & ~early,
     }

@@ -9,11 +9,12 @@ import time
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import DistanceAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
-from .context.anytime_search import distance_bounded
+from .context.anytime_search import TOLERANCE_SLACK, distance_bounded
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -34,6 +35,8 @@ def distance(
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.
     reach: pairs whose spheres are farther apart than this do not count; reach and largest radii
     together are at most 16 m.
+    budget: with a tolerance, the pair found may be farther than the nearest one by as much as it
+    allows; `lower` and `upper` then bound the distance.
     If a voxel in reach is missing or a scan was left out, the distance is that of the nearest
     examined pair, and exact only if nothing missing can contain a nearer pair.
     Raise BadRequestError, BadTransformError, TooLargeError.
@@ -50,6 +53,7 @@ def distance(
         np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
     )
     counts = np.zeros((3, k), np.uint32)
+    tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
     if len(avatar.points):
         for which, rows, part in pieces(around, residency, budget.share, budget.stop):
             if budget.stop:
@@ -65,6 +69,8 @@ def distance(
                     part,
                     reach_units,
                     which,
+                    budget.relative,
+                    tolerance,
                     NO_LIMIT,
                     nearest,
                     counts,

@@ -69,7 +69,11 @@ def path_question(
     """
     given = {name: value for name, value in parameters.items() if value is not None}
     check_path_parameters(op, given)
-    budgets = {name: given.pop(name) for name in ("budget_ms", "budget_visits") if name in given}
+    budgets = {
+        name: given.pop(name)
+        for name in ("relative_tolerance", "budget_ms", "budget_visits")
+        if name in given
+    }
     question, engine = QUESTIONS[op], ENGINES[op]
     tolerance = given.pop("tolerance", question.other_defaults.get("tolerance", 0.0))
     # The voxels along a path are used once. Half of the cache is left for those at users'

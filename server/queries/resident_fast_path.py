@@ -23,12 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_resident
+from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
 from ..residency.voxel_cache import VoxelCache
-from .collide import collide
+from .collide import collide, tolerance_units
 from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units
 from .distance import distance
@@ -42,8 +43,8 @@ Pose = NDArray[np.float64]
 MAX_FAST_POINTS = 1 << 13
 # With nothing near, the time grows with the number of voxels in reach [voxels], [m].
 MAX_FAST_VOXELS, MAX_FAST_REACH = 64, 2.0
-# Verdicts by value: constructing one from a number would double the Python time of a query.
-_VERDICTS = tuple(Verdict(value) for value in range(3))
+# Verdicts by a kernel's: constructing one from a number would double the Python time of a query.
+_VERDICTS = {CLEAR: Verdict.CLEAR, CONTACT: Verdict.CONTACT, UNKNOWN: Verdict.UNKNOWN, EARLY: Verdict.CONTACT}
 _CLEAR, _CONTACT = int(Verdict.CLEAR), int(Verdict.CONTACT)
 # Columns of the results of `nearest_resident` and `sweep_resident`.
 _SIGNED, _LOWER = slice(_nearest.SIGNED, _nearest.LOWER), slice(_nearest.LOWER, _nearest.NORMAL)
@@ -79,6 +80,7 @@ def collide_fast(
             avatar.arrays,
             avatar.radius,
             other_units,
+            0,
             data.arrays,
             data.broad,
             rows,
@@ -251,14 +253,14 @@ class ResidentQueries:
             counts[:] = 0
             with residency.frozen():
                 fault, at, found, needed = collide_resident(
-                    poses, avatar.arrays, avatar.radius, data.radius_units, data.arrays, data.broad, rows,
-                    self._outside, verdict, counts,
+                    poses, avatar.arrays, avatar.radius, data.radius_units, tolerance_units(budget), data.arrays,
+                    data.broad, rows, self._outside, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
             refuse(fault, at, found)
             if needed >= 0:
-                return _VERDICTS[verdict[0]], int(counts[1, 0])
+                return _VERDICTS[int(verdict[0])], int(counts[1, 0])
         answers = collide(data, self.avatar, pose[None], budget=budget)
         return _VERDICTS[answers.verdict[0]], int(answers.node_visits[0])
 

@@ -253,13 +253,14 @@ class SceneQuestions(QueryMethods):
 def _terms(
     opened: ArchiveGeneration,
     tolerance: float = 0.0,
+    relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
     radius_model: str | None = None,
     stop: StopFlag = NO_STOP,
 ) -> tuple[SceneData, QueryBudget]:
     """Return the scene data and the budget of a request with these options."""
-    budget = make_budget(tolerance, budget_ms, budget_visits, stop)
+    budget = make_budget(tolerance, relative_tolerance, budget_ms, budget_visits, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
     return with_stop(data, budget.stop), budget
 

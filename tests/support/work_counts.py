@@ -189,6 +189,9 @@ BUDGETS = ((0.01, 20), (0.0, 2), (0.0, 7), (0.05, None))  # tolerance [m], visit
 QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
     "collide": lambda s, o: [s.collide(a, poses(), m, **o) for a in AVATARS for m in (0.0, 0.04)],
     "collide one": lambda s, o: [s.collide("large", pose[None], **o) for pose in poses()[:5]],
+    "collide within": lambda s, o: [
+        s.collide(a, poses(), 0.01, tolerance=t, **o) for a in AVATARS for t in (0.003, 0.03, 0.3)
+    ],
     "collide bounded": lambda s, o: [
         s.collide(a, poses(), 0.01, tolerance=t, budget_visits=b, **o)
         for a in AVATARS
@@ -204,6 +207,10 @@ QUESTIONS: dict[str, Callable[[Scene, Options], list[Any]]] = {
     ],
     "contacts deep": lambda s, o: [s.contacts("deep", poses()[:7], 20, m, **o) for m in (0.0, 0.03)],
     "distance": lambda s, o: [s.distance(a, poses(), r, **o) for a in AVATARS for r in (0.1, 3.0)],
+    "distance within": lambda s, o: [
+        *(s.distance(a, poses(), 3.0, tolerance=t, **o) for a in AVATARS for t in (0.003, 0.1)),
+        *(s.distance(a, poses(), 3.0, relative_tolerance=0.3, **o) for a in AVATARS),
+    ],
     "distance bounded": lambda s, o: [
         s.distance("small", poses(), 3.0, budget_ms=0.0, **o),
         *(

@@ -75,6 +75,10 @@ def query(
         float | None,
         typer.Option(help="Distance by which contact may be reported early [m]; default 0, for sweep 1e-6."),
     ] = None,
+    relative_tolerance: Annotated[
+        float | None,
+        typer.Option(help="distance: allowed error as a share of it, 0.3 for 30 %, or 1 mm; default 0."),
+    ] = None,
     budget_ms: Annotated[
         float | None, typer.Option(help="Time limit of the whole query [ms]; default: none.")
     ] = None,

@@ -14,39 +14,36 @@ distances are in lattice steps from a lattice point near the avatar; relative to
 coordinates are integers below 2^24 and therefore exact. The placed avatar carries an error `error`,
 which is added to every bound. Pairs of points below `near` touch; pairs above `far` do not; only
 pairs between them need the integers.
+
+Of the children to descend into, the one of least power distance to the avatar's root comes first,
+and so does the voxel. On the walk, poses in contact then end after 491 node visits instead of 863,
+in 0.8 of the time; other poses must visit all nodes in any order. Sorting all children saves a
+tenth of these visits and no time.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import (
     BROAD,
     FLAT,
-    STACK,
     compact_marked,
     copy_node,
     lanes_meet,
     locate_voxel,
     make_class_thresholds,
     mark_meeting,
-    next_near,
     nodes_meet,
+    power_distance,
     set_class_thresholds,
 )
 from ..core.placed_avatar import (
     make_front,
     make_placed,
-    node_reach,
     pad_list,
-    pair_in_reach,
-    place_block_once,
     place_front,
     place_lanes,
-    place_node,
     place_root,
 )
 from ..core.scene_arrays import (
@@ -55,130 +52,28 @@ from ..core.scene_arrays import (
     FIRST,
     LANES,
     MAX_RESIDENT_PATH_VISITS,
-    NO_LIMIT,
     ROW_WORDS,
     node_class,
-    point_class,
     should_end,
     stopped,
 )
 from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
-
-CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
+from .early_contact import set_early, surely_near
+from .leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN, below_touches, leaves_touch, make_collide_scratch
 
 U = np.uint64  # see placed_avatar.py
-
-
-class CollideScratch(NamedTuple):
-    """Scratch of one call.
-
-    stack: (STACK, 3) int64: scene row, start of its list, length.
-    below: (STACK,) int64: avatar nodes below its front; one element where the front is leaf nodes.
-    keep: (LANES,) bool, marks; keep8: the same memory as uint64, eight marks each.
-    counters: (3,) int64, node visits, point tests, and the largest number of visits of a pose,
-    beyond which its search ends.
-    """
-
-    stack: NDArray[np.int64]
-    below: NDArray[np.int64]
-    keep: NDArray[np.bool_]
-    keep8: NDArray[np.uint64]
-    counters: NDArray[np.int64]
-
-
-@nb.njit(nogil=True, cache=True)
-def make_collide_scratch(avatar):
-    """Allocate scratch for one avatar (not empty)."""
-    below = STACK if avatar.first[avatar.front_first] >= 0 else 1
-    keep = np.zeros(LANES, np.bool_)
-    stack, counters = np.empty((STACK, 3), np.int64), np.zeros(3, np.int64)
-    counters[2] = NO_LIMIT
-    return CollideScratch(stack, np.empty(below, np.int64), keep, keep.view(np.uint64), counters)
-
-
-@njit_no_refcount
-def leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
-    """Return whether a marked point of an avatar's block touches a point of leaf node `row`."""
-    halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
-    number = ~np.int64(ints[U(row + FIRST)])
-    block_at = location.blocks + number * scene.block_words
-    lane_at = location.lanes + number * 3 * LANES
-    low_x = location.x + np.float32(ints[U(block_at)])
-    low_y = location.y + np.float32(ints[U(block_at + 1)])
-    low_z = location.z + np.float32(ints[U(block_at + 2)])
-    far = by_class.far[node_class(ints, row, mask)]  # for the largest sphere in the block
-    begin = 0
-    while begin < LANES:
-        lane, tested = next_near(
-            halves, lane_at, low_x, low_y, low_z, lanes, block, far, scratch.keep, scratch.keep8, begin
-        )
-        scratch.counters[1] += LANES * tested
-        if lane < 0:
-            return False
-        x, y, z = lanes[block, 0, lane] - low_x, lanes[block, 1, lane] - low_y, lanes[block, 2, lane] - low_z
-        for j in range(LANES):
-            i = U(lane_at + j)
-            dx = np.float32(halves[i]) - x
-            dy = np.float32(halves[i + U(LANES)]) - y
-            dz = np.float32(halves[i + U(2 * LANES)]) - z
-            square = dx * dx + dy * dy + dz * dz
-            if square > far:
-                continue
-            c = point_class(ints, block_at, j, mask)
-            if square <= by_class.near[c]:
-                return True
-            if square <= by_class.far[c] and pair_in_reach(
-                avatar, m, block, lane, placed, scene, voxel, lane_at, block_at, j, by_class.units[c]
-            ):
-                return True
-        begin = lane + 1
-    return False
-
-
-@njit_no_refcount
-def _below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch):
-    """Return whether a point of a scene leaf node touches a point below an avatar's front node.
-
-    The avatar's node is descended depth first. This is for avatars whose front is not their leaf
-    nodes.
-    """
-    words, below = scene.words, scratch.below
-    threshold = by_class.threshold[node_class(scene.ints, row, by_class.mask)]
-    steps = scale / scene.step
-    below[0] = a
-    depth = 1
-    while depth > 0 and not should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
-        depth -= 1
-        a = below[depth]
-        a_first = avatar.first[a]
-        scratch.counters[0] += 1
-        if a_first < 0:
-            block = np.int64(~a_first)
-            place_block_once(avatar, m, pose, block, placed, scene)
-            if lanes_meet(
-                words, row, placed.lanes, block, location.x, location.y, location.z, threshold, scratch.keep
-            ) and leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
-                return True
-            continue
-        x, y, z = place_node(avatar, m, a, placed, scene)
-        radius = node_reach(avatar.radius[a], steps, extent)
-        if nodes_meet(words, row, x - location.x, y - location.y, z - location.z, radius, threshold):
-            for i in range(avatar.count[a]):
-                below[depth] = a_first + i
-                depth += 1
-    return False
 
 
 @njit_no_refcount
 def _collide_voxel(
     avatar, m, scale, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch
 ):
-    """Return whether the placed avatar touches one resident voxel, whose root it meets.
+    """Return CONTACT or EARLY if the placed avatar touches a resident voxel whose root it meets.
 
-    The scene's tree is descended depth first, each node with a list of those front nodes that met
-    its parent. The function is long because each of its inner steps takes some ten nanoseconds: a
-    call that passes tuples of arrays, or takes arrays out of them, costs the same again (11 us a
-    pose instead of 4 with each step in a function).
+    Otherwise return CLEAR. The scene's tree is descended depth first, each node with a list of
+    those front nodes that met its parent. The function is long because each of its inner steps
+    takes some ten nanoseconds: a call that passes tuples of arrays, or takes arrays out of them,
+    costs the same again (11 us a pose instead of 4 with each step in a function).
     """
     words, ints, stack, counters = scene.words, scene.ints, scratch.stack, scratch.counters
     bounds, which, nodes, lanes, stamp = front.bounds, front.which, placed.nodes, placed.lanes, placed.stamp
@@ -188,6 +83,8 @@ def _collide_voxel(
     off_x, off_y, off_z = location.x, location.y, location.z
     thresholds, mask = by_class.threshold, by_class.mask
     by_size, threshold, stop, most = mask > U(0), thresholds[0], scene.stop, counters[2]
+    early = scratch.early
+    tolerant = early[1] > np.float32(0.0)
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = location.rows, 0, count
     depth = 1
@@ -217,33 +114,39 @@ def _collide_voxel(
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
+                        if tolerant and first >= 0:
+                            # What is out of this wider reach is out of reach: one test, as without
+                            # a tolerance. The largest sphere may reach farther than the smallest
+                            # with the tolerance.
+                            wide = max(threshold, early[0])
+                            if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, wide, keep):
+                                continue
+                            u = U(i)
+                            x_a, y_a, z_a = bounds[0, u], bounds[1, u], bounds[2, u]
+                            near, tests = surely_near(
+                                words, ints, scene.halves, scene.block_words, location, row, x_a, y_a, z_a,
+                                lanes, block, early, keep, scratch.keep8,
+                            )  # fmt: skip
+                            counters[1] += tests
+                            if near:
+                                return EARLY
                         if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
                             continue
                         if first < 0:
-                            if leaves_touch(
+                            found = leaves_touch(
                                 avatar, m, block, placed, scene, voxel, location, row, by_class, scratch
-                            ):
-                                return True
+                            )
+                            if found != CLEAR:
+                                return found
                             if stopped(stop):  # the blocks of a whole front may take milliseconds
-                                return False
+                                return CLEAR
                             continue
                     elif first < 0:
-                        if _below_touches(
-                            avatar,
-                            m,
-                            scale,
-                            extent,
-                            pose,
-                            placed,
-                            scene,
-                            voxel,
-                            location,
-                            a,
-                            row,
-                            by_class,
-                            scratch,
-                        ):
-                            return True
+                        found = below_touches(
+                            avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch
+                        )  # fmt: skip
+                        if found != CLEAR:
+                            return found
                         continue
                     copy_node(bounds, which, U(i), U(left))
                     left += 1
@@ -254,43 +157,79 @@ def _collide_voxel(
         children = np.int64(ints[U(row + COUNT)] & COUNTED)
         child = location.rows + first * ROW_WORDS
         counters[0] += children
+        nearest, least = depth, np.float32(np.inf)
         for _ in range(children):
             u = U(depth)
             stack[u, 0], stack[u, 1], stack[u, 2] = child, at, count
             if by_size:
                 threshold = thresholds[node_class(ints, child, mask)]
             if nodes_meet(words, child, x, y, z, radius, threshold):
+                power = power_distance(words, child, x, y, z)
+                if power < least:
+                    nearest, least = depth, power
                 depth += 1
             child += ROW_WORDS
-    return False
+        if least < np.float32(np.inf):
+            top, best = U(depth - 1), U(nearest)
+            stack[top, 0], stack[best, 0] = stack[best, 0], stack[top, 0]
+    return CLEAR
+
+
+@njit_no_refcount
+def _nearest_voxel(scene, rows, begin, end, placed):
+    """Return which of rows[begin:end] has the least power distance; `begin` if one is not resident.
+
+    A pose in contact counts the missing voxels before the one that it touches, in stored order.
+    """
+    nodes = placed.nodes
+    nearest, least = begin, np.float32(np.inf)
+    for at in range(begin, end):
+        if scene.where[rows[at], 0] < 0:
+            return begin
+        location = locate_voxel(scene, rows[at], placed)
+        x, y, z = nodes[0, 0] - location.x, nodes[1, 0] - location.y, nodes[2, 0] - location.z
+        power = power_distance(scene.words, location.rows, x, y, z)
+        if power < least:
+            nearest, least = at, power
+    return nearest
 
 
 @nb.njit(nogil=True, cache=True)
-def collide_poses(poses, avatar, scene, reach, which, most, verdict, counts):
+def collide_poses(poses, avatar, scene, reach, which, tolerance, most, verdict, counts):
     """Answer `collide` for the poses numbered in `which`: one call a request, with all voxels.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
-    (voxels_in_reach.py); a voxel in it that is not resident is counted as missing.  most: node
+    (voxels_in_reach.py); a voxel in it that is not resident is counted as missing.  tolerance:
+    exact units by which a pair may exceed the reach and still end the search, as EARLY.  most: node
     visits of a pose, beyond which its search ends.
     Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
     tests), whose initial values are CLEAR and 0. A pose may therefore be answered in pieces: a
-    contact overrides a missing voxel, and a missing voxel overrides CLEAR. Once the scene's stop
+    contact, early or not, overrides a missing voxel, and a missing voxel overrides CLEAR. Once the scene's stop
     flag is set, poses without a contact so far become UNKNOWN; a pose whose search ends early does
     too.
     """
     placed, front, scratch = make_placed(avatar), make_front(avatar), make_collide_scratch(avatar)
     by_class = make_class_thresholds(scene.radius_deficit)
     scratch.counters[2] = most
-    _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, scratch)
+    _collide_poses(
+        poses, avatar, scene, reach, which, tolerance, verdict, counts, placed, front, by_class, scratch
+    )
 
 
 @njit_no_refcount
-def _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, front, by_class, scratch):
+def _collide_poses(
+    poses, avatar, scene, reach, which, tolerance, verdict, counts, placed, front, by_class, scratch
+):
     """Implement `collide_poses` with its scratch passed in."""
     nodes, ints = placed.nodes, scene.ints
+    scratch.early[:] = np.float32(-1.0)
+    smallest = np.int64(0)  # the largest radius minus that of the smallest sphere
+    for c in range(scene.radius_deficit.shape[0]):
+        smallest = max(smallest, scene.radius_deficit[c])
     for number in range(which.shape[0]):
         i = which[number]
-        if verdict[i] == CONTACT or reach.starts[i + 1] == reach.starts[i]:
+        begin, end = reach.starts[i], reach.starts[i + 1]
+        if verdict[i] == CONTACT or verdict[i] == EARLY or begin == end:
             continue
         if stopped(scene.stop):
             verdict[i] = UNKNOWN
@@ -298,7 +237,7 @@ def _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
         m, scale = poses[i], reach.scales[i]
         scratch.counters[0], scratch.counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, scale, placed, scene)
-        set_class_thresholds(
+        error = set_class_thresholds(
             by_class,
             scene.radius_deficit,
             reach.units[i],
@@ -307,8 +246,16 @@ def _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
             farthest,
             scene.voxel_steps,
         )
+        if tolerance > 0:
+            set_early(scratch.early, tolerance, reach.units[i] - smallest, scene.units_per_step, error)
         count = 0  # length of the front; not placed yet, as most far poses never need it
-        for at in range(reach.starts[i], reach.starts[i + 1]):
+        nearest = begin if end == begin + 1 else _nearest_voxel(scene, reach.rows, begin, end, placed)
+        for number_in_reach in range(begin, end):
+            at = number_in_reach
+            if at == begin:
+                at = nearest
+            elif at == nearest:
+                at = begin
             voxel = reach.rows[at]
             if scene.where[voxel, 0] < 0:
                 counts[0, i] += np.uint32(1)
@@ -322,10 +269,11 @@ def _collide_poses(poses, avatar, scene, reach, which, verdict, counts, placed, 
                 continue
             if count == 0:
                 count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
-            if _collide_voxel(
+            found = _collide_voxel(
                 avatar, m, scale, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
-            ):
-                verdict[i] = CONTACT
+            )
+            if found != CLEAR:
+                verdict[i] = found
                 break
             if should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
                 verdict[i] = UNKNOWN
@@ -350,7 +298,9 @@ def rows_or_reset(needed, verdict, counts):
 
 
 @nb.njit(nogil=True, cache=True)
-def collide_resident(poses, avatar, radius, other_units, scene, index, rows, outside, verdict, counts):
+def collide_resident(
+    poses, avatar, radius, other_units, tolerance, scene, index, rows, outside, verdict, counts
+):
     """Answer a whole request in one call, where all voxels in its reach are resident.
 
     This is `find_reach`, then `collide_poses`. Writes rows (capacity,) int64, the voxels in reach,
@@ -371,5 +321,7 @@ def collide_resident(poses, avatar, radius, other_units, scene, index, rows, out
         if scene.where[rows[at], 0] < 0:
             return fault, pose, found, -1
     if avatar.radius.shape[0] > 0:
-        collide_poses(poses, avatar, scene, reach, np.arange(k), MAX_RESIDENT_PATH_VISITS, verdict, counts)
+        collide_poses(
+            poses, avatar, scene, reach, np.arange(k), tolerance, MAX_RESIDENT_PATH_VISITS, verdict, counts
+        )
     return fault, pose, found, rows_or_reset(needed, verdict, counts)

@@ -90,13 +90,16 @@ def make_class_thresholds(deficit):
 def set_class_thresholds(by_class, deficit, units, units_per_step, extent, farthest, voxel_steps):
     """Compute the thresholds of one pose for each radius class.
 
-    Arguments as for `make_thresholds`; `units` is for the largest radius.
+    Arguments as for `make_thresholds`; `units` is for the largest radius. Returns its error.
     """
+    error = np.float32(0.0)
     for c in range(deficit.shape[0]):
         thresholds = make_thresholds(units - deficit[c], units_per_step, extent, farthest, voxel_steps)
         by_class.threshold[c] = thresholds.reach + thresholds.error
         by_class.near[c], by_class.far[c] = thresholds.near, thresholds.far
         by_class.units[c] = thresholds.units
+        error = max(error, thresholds.error)
+    return error
 
 
 @njit_no_refcount
@@ -157,6 +160,18 @@ def nodes_meet(words, row, x, y, z, radius, threshold):
         & (along <= words[w + U(9)] + wide)
         & (along >= words[w + U(8)] - wide)
     )
+
+
+@njit_inlined
+def power_distance(words, row, x, y, z):
+    """Return the power distance of a position from a node's sphere, |x - c|^2 - r^2 [steps^2].
+
+    x, y, z: float32, relative to the voxel's low corner. It only orders nodes, so its rounding does
+    not matter.
+    """
+    w = U(row)
+    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
+    return dx * dx + dy * dy + dz * dz - words[w + U(3)] * words[w + U(3)]
 
 
 @njit_inlined

@@ -111,6 +111,7 @@ class SearchGoal(NamedTuple):
     enough: (k,) float64 [steps], with `first`: a pair whose upper bound is at most this is accepted
     although the pair itself is not known.
     tolerance: without `first`, the difference of the bounds at which the search ends [steps].
+    share: the same, as a share of |a - b|; the larger of both counts.
     visits: node visits a pose.
     """
 
@@ -118,6 +119,7 @@ class SearchGoal(NamedTuple):
     early: int
     enough: NDArray[np.float64]
     tolerance: float
+    share: float
     visits: int
 
 
@@ -185,7 +187,8 @@ def _enough(goal, enough, best, bounds):
     if best.found[0] < 0 or goal.tolerance <= 0.0:
         return False
     found = math.sqrt(np.float64(best.found[0])) + np.float64(best.found[7])
-    return found / best.frame[2] - bounds[0] <= goal.tolerance
+    nearest = max(bounds[0] - best.frame[7] / best.frame[2], 0.0)  # a lower bound of |a - b|
+    return found / best.frame[2] - bounds[0] <= max(goal.tolerance, goal.share * nearest)
 
 
 @njit_no_refcount

@@ -56,8 +56,9 @@ class BestPair(NamedTuple):
     cut, far: (n,) float32, by radius class: no node pair whose `lower_bound` is above cut[c]
     [steps] and no pair of points whose square is above far[c] can be nearer, or tie.
     deficit: (n,) int64, of SceneArrays.  mask: the number of classes minus one, uint64.
-    frame: (5,) float64, extent and farthest of `make_thresholds`, units per step, voxel steps; the
-    error of a distance [steps].
+    frame: (8,) float64, extent and farthest of `make_thresholds`, units per step, voxel steps; the
+    error of a distance [steps]; tolerance as a share of |a - b|, tolerance [exact units]; the
+    largest deficit.
     corner: (3,) int64, low corner of the current voxel [steps].
     keep, squares: (LANES,), a mark and a square for each point of an avatar's block.
     keep8: the memory of keep as uint64, eight marks each.
@@ -91,8 +92,11 @@ class BestPair(NamedTuple):
 def make_best_pair(deficit):
     """Allocate scratch for as many classes as `deficit` has; no pair is found yet."""
     keep, n = np.zeros(LANES, np.bool_), deficit.shape[0]
+    frame = np.zeros(8)
+    for c in range(n):
+        frame[7] = max(frame[7], np.float64(deficit[c]))
     return BestPair(
-        np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), np.empty(5),
+        np.empty(8, np.int64), np.empty(n, np.float32), np.empty(n, np.float32), deficit, np.uint64(n - 1), frame,
         np.empty(3, np.int64), keep, keep.view(np.uint64), np.empty(LANES, np.float32), np.empty(LANES, np.float32),
         np.empty(2, np.int64), np.array([0, 0, 0, NO_LIMIT]), np.empty((MAX_CANDIDATES, 5), np.int64),
         np.empty(MAX_CANDIDATES, np.float32),
@@ -160,6 +164,36 @@ def found_units(found):
     A bound at this value excludes no pair that ties.
     """
     return np.int64(math.sqrt(np.float64(found[0]))) + 2 + found[7]
+
+
+@njit_no_refcount
+def units_to_beat(units, frame):
+    """Return |a - b| + deficit below which a pair is worth finding, if one is known at `units`.
+
+    Exact units, 0 or more; `units` itself without a tolerance. Let u = `units`, and D the largest
+    deficit. If no pair is below the result u - t, the pair known is within t of the nearest one,
+    and t is at most the tolerance, or the share e of the nearest pair's |a - b|: that is at least
+    u - t - D, and t = e (u - D) / (1 + e) is e (u - t - D).
+    """
+    share, tolerance = frame[5], frame[6]
+    if share == 0.0 and tolerance == 0.0:
+        return units
+    near = max(np.float64(units) - frame[7], 0.0)
+    allowed = max(tolerance, share / (1.0 + share) * near * (1.0 - 1e-12))
+    return max(units - np.int64(min(allowed, np.float64(units))), 0)
+
+
+@njit_no_refcount
+def unsearched_bound(best):
+    """Return a lower bound of |a - b| + deficit of pairs that a tolerance left unsearched [steps].
+
+    inf: all nearer pairs were searched.
+    """
+    if best.found[0] < 0:
+        return np.inf
+    known = found_units(best.found)
+    to_beat = units_to_beat(known, best.frame)
+    return np.float64(to_beat) / best.frame[2] if to_beat < known else np.inf
 
 
 @njit_no_refcount
@@ -326,6 +360,8 @@ def take_candidates(least, c, block, block_at, lane_at, off, best, points, m, sh
         candidates[at, 3], candidates[at, 4] = lane_at, np.int64(c)
         candidate_squares[at] = squares[lane]
         counters[2] = at + 1
+    if best.frame[5] > 0.0 or best.frame[6] > 0.0:
+        settle_candidates(best, points, m, shift, ints, halves, lanes, off)
 
 
 @njit_no_refcount
@@ -355,6 +391,7 @@ def settle_candidates(best, points, m, shift, ints, halves, lanes, off):
     best.counters[2] = 0
     if found[0] >= 0:
         nearest = found_units(found)
-        if nearest < units[1]:
-            units[1] = nearest
-            set_cut(best.cut, far, frame, best.deficit, nearest)
+        to_beat = units_to_beat(nearest, frame)
+        if nearest < units[1] or to_beat < nearest:
+            units[1] = min(units[1], nearest)
+            set_cut(best.cut, far, frame, best.deficit, to_beat)

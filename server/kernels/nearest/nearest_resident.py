@@ -76,8 +76,8 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     counts = np.zeros((3, 1), np.uint32)
     if needed > 0:
         nearest_poses(
-            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), MAX_RESIDENT_PATH_VISITS,
-            nearest, counts,
+            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), 0.0, 0.0,
+            MAX_RESIDENT_PATH_VISITS, nearest, counts,
         )  # fmt: skip
         if nearest.missing_bound[0] < np.inf:  # all is resident: the search ended early
             return fault, pose, found, -1, False, 0, 0

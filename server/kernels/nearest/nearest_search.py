@@ -6,12 +6,11 @@ where the reach is the bound. A node is pruned only if its lower bound, minus th
 error, exceeds the best; the radius class of the largest sphere below a node sets its bound.
 nearest_pair.py defines nearest and handles the points.
 
-The first bound is narrow and is widened while nothing is found within it. This costs a tenth more
-node visits than knowing the distance beforehand. Two alternatives are slower. A single descent of
-both trees, taking the nearest child each time, gives a poor first bound: it ended ten times as far
-as the nearest pair, and the search took twice as long. Visiting children in the order of their
-bounds, which are nearly equal over a floor, took a tenth longer than visiting them in stored order.
-(scripts/bench_engine, distance on the walk.)
+The first bound is narrow and is widened while nothing is found within it. Two alternatives are
+slower. A single descent of both trees, taking the nearest child each time, gives a poor first
+bound: it ended ten times as far as the nearest pair, and the search took twice as long. Visiting
+children in the order of their bounds, which are nearly equal over a floor, took a tenth longer than
+visiting them in stored order (scripts/bench_engine, distance on the walk).
 """
 
 import math
@@ -42,6 +41,8 @@ from .nearest_pair import (
     set_cut,
     settle_candidates,
     take_candidates,
+    units_to_beat,
+    unsearched_bound,
 )
 
 U = np.uint64  # see placed_avatar.py
@@ -298,7 +299,7 @@ def _search_widening(
     while True:
         limit = units[0]
         if found[0] >= 0:
-            limit = min(limit, found_units(found))
+            limit = min(limit, units_to_beat(found_units(found), best.frame))
         bound = min(base + near, limit)
         units[1] = bound
         set_cut(cut, best.far, best.frame, deficit, bound)
@@ -323,19 +324,23 @@ def _search_widening(
 
 
 @nb.njit(nogil=True, cache=True)
-def nearest_poses(poses, avatar, scene, index, reach, beyond, which, most_visits, nearest, counts):
+def nearest_poses(
+    poses, avatar, scene, index, reach, beyond, which, share, tolerance, most_visits, nearest, counts
+):
     """Answer `distance` for the poses numbered in `which`: one call a request, with all voxels.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
     (voxels_in_reach.py), to the largest distance requested; a voxel in it that is not resident is
     counted as missing.  beyond: the part of the reach that is not the radii, exact units.
+    share, tolerance: how much farther than the nearest pair the one found may be: this share of
+    the nearest pair's |a - b|, or these exact units, whichever is more.
     Accumulates into `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests),
     whose initial values are -1, inf and 0. A pose may therefore be answered in pieces. Once the
     scene's stop flag is set, or a pose has cost more than `most_visits`, voxels that were not
     searched count in `missing_bound` as though they were missing.
     """
     placed, best = make_placed(avatar), make_best_pair(scene.radius_deficit)
-    best.counters[3] = most_visits
+    best.counters[3], best.frame[5], best.frame[6] = most_visits, share, tolerance
     front, scratch = make_front(avatar), make_nearest_scratch()
     most = 0
     for number in range(which.shape[0]):
@@ -386,6 +391,7 @@ def _nearest_poses(
         if should_end(scene.stop, best.counters[0], best.counters[3]):
             # The gap of no voxel is below 0, and any of them may have been searched only in part.
             nearest.missing_bound[i] = 0.0
+        nearest.missing_bound[i] = min(nearest.missing_bound[i], unsearched_bound(best))
         nearest.square[i] = best.found[0]
         for r in range(6):
             nearest.pair[i, r] = best.found[1 + r]

@@ -185,8 +185,8 @@ def distance_bounded(
     reach_units = to_units(reach, "reach")
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
     around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, budget, spent)
-    tolerance = max(0.0, budget.tolerance - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
-    goal = SearchGoal(False, 0, np.zeros(len(array)), tolerance, budget.visits)
+    tolerance = max(0.0, budget.between_bounds - TOLERANCE_SLACK / UNITS_PER_METRE) / data.arrays.step
+    goal = SearchGoal(False, 0, np.zeros(len(array)), tolerance, budget.relative, budget.visits)
     known, counts, cost = _gather(data, avatar, array, around, goal, budget, spent)
     if len(avatar.points):
         np.minimum(known.missing_bound, unknown_gaps(data, around), out=known.missing_bound)
@@ -217,7 +217,7 @@ def collide_bounded(
     # values.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
     enough = np.asarray((around.units + early - TOLERANCE_SLACK) / data.arrays.units_per_step, np.float64)
-    goal = SearchGoal(True, early, enough, 0.0, budget.visits)
+    goal = SearchGoal(True, early, enough, 0.0, 0.0, budget.visits)
     known, counts, cost = _gather(data, avatar, array, around, goal, budget, spent)
     upper = _upper(data, known, radii)
     found = known.square >= 0

@@ -30,14 +30,18 @@ LOAD_SHARE = 0.5
 # Time after a budget's deadline in which searches that check the clock end by themselves, with the
 # results so far; after it the stop flag ends everything [s].
 GRACE = 0.05
+# Where a share of the distance is allowed, this is allowed at any distance: near contact a share
+# would be less than the lattice resolves [m].
+LEAST_RELATIVE = 1e-3
 
 
 class QueryBudget(NamedTuple):
     """Limits on the cost of one request.
 
     tolerance: separation up to which contact may be reported, and allowed distance between bounds
-    [m]. The default 0 means exact, which is faster than every search that may stop early
-    (`solidcloud accuracy`).
+    [m]. The default 0 means exact.
+    relative: allowed distance between the bounds of a distance, as a share of the distance between
+    the centres; a millimetre is allowed at any distance if it is above 0.
     visits: limit of node visits a pose (ray, point, motion).
     deadline: on time.perf_counter()'s clock [s], inf for none.
     scan: voxels are used in passing, as on a sweep along a path, and should not displace others in
@@ -53,16 +57,17 @@ class QueryBudget(NamedTuple):
     scan: bool = False
     share: float = 1.0
     stop: StopFlag = NO_STOP
+    relative: float = 0.0
 
     @property
     def limited(self) -> bool:
-        """Return whether there is a budget.
-
-        `collide` and `distance` use best-first search only then. With only a tolerance they answer
-        exactly, which takes a fraction of the time of a search that may stop early (`solidcloud
-        accuracy`, knob "tolerance").
-        """
+        """Return whether there is a budget. `collide` and `distance` use best-first search then."""
         return self.visits < NO_LIMIT or self.deadline < math.inf
+
+    @property
+    def between_bounds(self) -> float:
+        """Return the distance that two bounds may lie apart, however small the distance [m]."""
+        return max(self.tolerance, LEAST_RELATIVE if self.relative > 0.0 else 0.0)
 
     @property
     def spent(self) -> bool:
@@ -88,13 +93,14 @@ class EngineOptions(QuestionOptions, total=False):
 
 def make_budget(
     tolerance: float = 0.0,
+    relative_tolerance: float = 0.0,
     budget_ms: float | None = None,
     budget_visits: int | None = None,
     stop: StopFlag = NO_STOP,
 ) -> QueryBudget:
     """Make the budget of a request that starts now.
 
-    tolerance: [m], finite and >= 0.
+    tolerance: [m], finite and >= 0.  relative_tolerance: finite and >= 0.
     budget_ms: time limit including waits for loads; None: no limit.
     budget_visits: limit in node visits a pose, independent of the clock; None: no limit.
     stop: the request's stop flag. A time budget sets it `GRACE` after its end, for kernels that do
@@ -102,6 +108,10 @@ def make_budget(
     """
     if not 0 <= tolerance < math.inf:
         raise BadRequestError(f"tolerance is {tolerance}: expected a finite number of metres, 0 or more")
+    if not 0 <= relative_tolerance < math.inf:
+        raise BadRequestError(
+            f"relative_tolerance is {relative_tolerance}: expected a finite share, 0 or more, as 0.3 for 30 %"
+        )
     if budget_ms is not None and not 0 <= budget_ms < math.inf:
         raise BadRequestError(f"budget_ms is {budget_ms}: expected milliseconds, 0 or more, or none")
     if budget_visits is not None and not 0 <= budget_visits <= NO_LIMIT:
@@ -112,7 +122,7 @@ def make_budget(
         stop = StopFlag() if stop is NO_STOP else stop
         stop_at(stop, deadline + GRACE, f"the request's budget of {budget_ms:g} ms was spent")
     visits = NO_LIMIT if budget_visits is None else int(budget_visits)
-    return QueryBudget(float(tolerance), visits, deadline, stop=stop)
+    return QueryBudget(float(tolerance), visits, deadline, stop=stop, relative=float(relative_tolerance))
 
 
 class CostCounter:

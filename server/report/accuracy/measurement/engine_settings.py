@@ -24,7 +24,6 @@ from .measured_scene import AVATAR, REACH, MeasuredScene
 from .measurement_plan import MeasurementPlan
 from .reference_answers import ReferenceAnswers
 from .setting_results import (
-    ALONE,
     BUDGET,
     DEGREE,
     LEAF,
@@ -45,9 +44,6 @@ DECODE_LOOPS = 3
 # with 200,000 points and 800 poses); and the time of a pose apart from its node and pair tests, in
 # tests. They are for the estimate of the remaining time only.
 BUILD_COST, POSE_COST = 15.0, 60.0
-# A budget of node visits that is never spent. A tolerance without a budget is answered exactly;
-# with a budget, the engine uses the search that may stop within the tolerance.
-UNSPENT = 1 << 40
 
 
 class Setting(NamedTuple):
@@ -84,10 +80,9 @@ def engine_settings(plan: MeasurementPlan, plain: BuildConfig, radius: float) ->
         found.append(Setting(Row(knob, setting, value, default), config, options))
 
     for tolerance in plan.tolerances:
-        options = {"tolerance": tolerance, "budget_visits": UNSPENT} if tolerance else {}
-        name = f"search within {length_name(tolerance)}" if tolerance else "0"
+        options = {"tolerance": tolerance} if tolerance else {}
+        name = f"tolerance {length_name(tolerance)}" if tolerance else "0"
         add(TOLERANCE, name, plain, not tolerance, tolerance, **options)
-    add(TOLERANCE, f"{length_name(plan.alone)}{ALONE}", plain, False, plan.alone, tolerance=plan.alone)
     for budget in plan.budgets:
         add(BUDGET, f"{budget:,} visits", plain, False, budget, budget_visits=budget)
     add(BUDGET, "none", plain, True, math.inf)
@@ -236,7 +231,7 @@ def _check_answers(setting: Setting) -> None:
     """Raise InternalError if a setting changed an answer that it must not change."""
     row = setting.row
     wrong = row.early + row.late + row.unknown + row.tangent_early + row.tangent_late + row.tangent_unknown
-    exact = row.knob == TOLERANCE and "budget_visits" not in setting.options
+    exact = row.knob == TOLERANCE and not setting.options
     if (exact or row.knob in (DEGREE, LEAF, NODES)) and wrong:
         raise InternalError(
             f"{row.knob} {row.setting}: {wrong} verdicts differ from the default's, expected none: this is a bug of "

@@ -20,7 +20,6 @@ class MeasurementPlan:
     tolerances [m].  budgets [node visits].  steps: of the lattice [m].
     factors: on the radii of each radius model.  places: number of places where the leak is
     measured.
-    alone: a tolerance without a budget, which is answered exactly [m].
     made_models: radius models whose doorway error is measured on generated doors, which takes 12 to
     20 façades; empty: none.
     """
@@ -39,7 +38,6 @@ class MeasurementPlan:
     leaves: tuple[int, ...] = (8, 16, 32)
     factors: tuple[float, ...] = (0.5, 1.0, 2.0)
     places: int = 2000
-    alone: float = 1e-2
     made_models: tuple[str, ...] = ()
 
 

@@ -15,8 +15,6 @@ Floats = NDArray[np.float64]
 TOLERANCE, BUDGET, RADIUS = "tolerance", "budget", "radius model"
 SHEET = "radius model, a thin sheet with a door"
 STEP, DEGREE, LEAF, NODES = "lattice step", "degree", "leaf size", "bounding volume"
-# Suffix of a tolerance without a budget, which is answered exactly.
-ALONE = ", alone"
 # Knobs in the charts of time against error. Degree and leaf size change no answer and hardly any
 # time.
 SHOWN = (TOLERANCE, BUDGET, RADIUS, STEP, NODES)

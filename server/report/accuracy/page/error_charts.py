@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from ...common.sphere_pictures import load_pyplot
 from ..measurement.setting_results import (
-    ALONE,
     BUDGET,
     ERRORS,
     NODES,
@@ -102,8 +101,6 @@ def points_of(rows: Sequence[Row], error: str) -> list[Point]:
         if row.default and any(point.row.default for point in found):
             continue
         if row.knob == RADIUS and not row.default and is_scaled(row):
-            continue
-        if row.setting.endswith(ALONE):  # the same as the default
             continue
         shown = float(getattr(row, ERRORS[error][1])) if error == "leak" else size
         found.append(Point(row, row.mean_us, shown, "default" if row.default else label_of(row)))
@@ -318,10 +315,10 @@ def _merged(places: list[tuple[float, float]], labels: list[str], rows: list[Row
 
 
 def _short(names: list[str]) -> list[str]:
-    """Combine labels at one place, one line per knob, such as "search within 1 mm, 2 mm"."""
+    """Combine labels at one place, one line per knob, such as "tolerance 1 mm, 2 mm"."""
     lines: dict[str, list[str]] = {}
     for name in names:
-        knob = next((knob for knob in ("search within", "lattice") if name.startswith(f"{knob} ")), name)
+        knob = next((knob for knob in ("tolerance", "lattice") if name.startswith(f"{knob} ")), name)
         lines.setdefault(knob, []).append(name.removeprefix(knob).strip())
     return [
         f"{knob} {values[0]} to {values[-1]}" if len(values) > 2 else f"{knob} {', '.join(values)}".rstrip()

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 from ..measurement.interleaved_timing import NOISY
 from ..measurement.setting_results import (
-    ALONE,
     BUDGET,
     DEGREE,
     LEAF,
@@ -61,10 +60,9 @@ LEFT = (
 )
 
 KNOBS = {
-    TOLERANCE: "Distance by which contact may be reported early [m]. A tolerance without a budget is answered exactly, "
-    "because that is the fastest: see the row `alone`. The other rows show the search that is used with a budget: it "
-    "maintains bounds, may stop as soon as they are within the tolerance, and reports the bounds if the budget is "
-    "spent. Here the budget is never spent: only the tolerance makes the difference.",
+    TOLERANCE: "Distance by which contact may be reported early [m]. It ends the exact search as soon as a pair of "
+    "points within margin plus tolerance is met, and changes nothing else: poses farther away than that take as long "
+    "as without it.",
     BUDGET: "Maximum number of node visits per pose. When it is spent, the answer is unknown, never a wrong clear.",
     STEP: "Step of the lattice on which points are stored. The radius is that of the default, and only the "
     "displacement of points has an effect. A coarser lattice makes a smaller archive, and moves each point by up to "
@@ -124,19 +122,15 @@ def _exact(rows: Sequence[Row], brute: int) -> str:
 
 def _tolerance(rows: Sequence[Row]) -> str:
     own = [r for r in rows if r.knob == TOLERANCE and not r.default and r.times is not None]
-    searches = [r for r in own if not r.setting.endswith(ALONE)]
-    alone = next((r for r in own if r.setting.endswith(ALONE)), None)
-    if not searches or alone is None:
+    if not own:
         return ""
-    best = min(searches, key=lambda r: r.times or 0.0)
+    best = min(own, key=lambda r: r.times or 0.0)
     said = (
-        f"A tolerance without a budget is answered exactly: {alone.early + alone.late} of {alone.poses:,} verdicts are "
-        f"wrong with {alone.setting.removesuffix(ALONE)}, in {_ratio(alone, 'the exact answer')}. "
-        f"With a budget, the search may stop within the tolerance: at best, {best.setting}, it takes "
-        f"{_ratio(best, 'the exact answer')}, and calls {best.early:,} of {best.poses:,} poses early"
+        f"A tolerance ends the search early where something is near: at best, {best.setting}, a pose takes "
+        f"{_ratio(best, 'the exact answer')}, and {best.early:,} of {best.poses:,} poses are called early"
     )
     faster = not _noisy(best) and (best.times or 0.0) * SAME_TIME < 1.0
-    return f"{said}." if faster else f"{said}: it is not measurably faster, but its work is bounded."
+    return f"{said}." if faster else f"{said}: on these poses it is not measurably faster."
 
 
 def _noisy(row: Row) -> bool:

@@ -201,7 +201,7 @@ def test_poses_of_any_layout_give_the_same_answers(scene: Scene, rng: np.random.
         assert scene.collide("ball", same).verdict.tolist() == expected
 
 
-def test_a_tolerance_alone_is_answered_exactly_and_with_bounds(tmp_path: Path) -> None:
+def test_a_tolerance_makes_contact_early_by_no_more_and_gives_bounds(tmp_path: Path) -> None:
     # One point, one ball of 0.25 m, a margin of 0.125 m: contact begins at 0.375 m.
     case = archive_cases.build(tmp_path, np.zeros((1, 3)), radius=0.0, resolution=archive_cases.BINARY_STEP)
     away = np.array([0.0, 0.375, 0.375 + 2.0**-26, 0.4, 5.0])
@@ -212,16 +212,18 @@ def test_a_tolerance_alone_is_answered_exactly_and_with_bounds(tmp_path: Path) -
         for asked in (poses, *poses[:, None]):
             exact = scene.collide("ball", asked, 0.125)
             answers = scene.collide("ball", asked, 0.125, tolerance=0.5)
-            assert answers.verdict.tolist() == exact.verdict.tolist() and answers.exact.all()
-            assert answers.node_visits.tolist() == exact.node_visits.tolist()
+            assert (answers.verdict >= exact.verdict).all() and (
+                answers.node_visits <= exact.node_visits
+            ).all()
+            assert answers.exact.tolist() == (answers.verdict == exact.verdict).tolist()
             distance = asked[:, 2, 3] - 0.25
             assert (answers.lower <= distance).all() and (distance <= answers.upper).all()
-        assert scene.collide("ball", poses, 0.125, tolerance=0.5).verdict.tolist() == [1, 1, 0, 0, 0]
+        assert scene.collide("ball", poses, 0.125, tolerance=0.5).verdict.tolist() == [1, 1, 1, 0, 0]
         assert scene.collide("nothing", poses, 0.125, tolerance=0.5).lower.tolist() == [0.125] * 5
         # Margins are rounded to whole units, up or down: bounds go by what verdicts go by.
         apart = np.array([0.25 + 2.0**-26, 0.25 + 2 * 2.0**-26])
         poses = np.array([archive_cases.pose_of(np.eye(3), np.array([0.0, 0.0, z])) for z in apart])
         for margin, right in ((0.6, [1, 0]), (1.4, [1, 0]), (1.6, [1, 1])):
-            answers = scene.collide("ball", poses, margin * 2.0**-26, tolerance=0.5)
+            answers = scene.collide("ball", poses, margin * 2.0**-26, tolerance=1e-9)
             assert answers.verdict.tolist() == right
             assert (answers.lower <= apart - 0.25).all() and (apart - 0.25 <= answers.upper).all()

@@ -14,7 +14,8 @@ from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.collide import coarse_clearance
 from solidcloud.server.kernels.collide.coarse_clearance import any_with_coarse_bounds
-from solidcloud.server.kernels.collide.collide_poses import CLEAR, CONTACT, collide_poses
+from solidcloud.server.kernels.collide.collide_poses import collide_poses
+from solidcloud.server.kernels.collide.leaf_contact import CLEAR, CONTACT
 from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach
 from solidcloud.server.queries.context.query_budget import NO_LIMIT
 from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs
@@ -87,7 +88,7 @@ def test_feet_above_a_floor_are_settled_by_their_points(corner: Made) -> None:
     verdict, counts = np.zeros(2, np.uint8), np.zeros((3, 2), np.uint32)
     reach = corner.reach(BODY, poses)
     collide_poses(
-        poses, BODY.arrays, corner.resident(0).arrays, reach, np.arange(2), NO_LIMIT, verdict, counts
+        poses, BODY.arrays, corner.resident(0).arrays, reach, np.arange(2), 0, NO_LIMIT, verdict, counts
     )
     assert verdict.tolist() == [CLEAR, CONTACT]
 
@@ -138,7 +139,7 @@ def test_what_is_settled_of_a_long_avatar_is_clear(made: Made, rng: np.random.Ge
         reach = made.reach(rod, poses)._replace(starts=starts, rows=np.array(list(chain(*gone)), np.int64))
         verdict, counts = np.zeros(count, np.uint8), np.zeros((3, count), np.uint32)
         collide_poses(
-            poses, rod.arrays, everything.arrays, reach, np.arange(count), NO_LIMIT, verdict, counts
+            poses, rod.arrays, everything.arrays, reach, np.arange(count), 0, NO_LIMIT, verdict, counts
         )
         assert (verdict == CLEAR).all()
 

@@ -207,6 +207,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         *work("collide", "collide deep", "collide one", "collide within"),
         *tangent("collide"),
     ),
+    "server/kernels/nearest/missing_voxels.py": (SERVER + "kernels/nearest/test_missing_voxels.py",),
     "server/kernels/collide/early_contact.py": work("collide within"),
     "server/kernels/collide/leaf_contact.py": (
         *work("collide", "collide deep", "collide within"),

@@ -13,9 +13,8 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.core.voxels_in_reach import VoxelsInReach
-from ..residency.coarse_bounds import drop_clear_pairs
 from .context.anytime_search import collide_bounded
+from .context.missing_voxels import drop_clear_voxels
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -50,13 +49,8 @@ def collide(
     k = len(array)
     early = tolerance_units(budget)
     residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
-
-    def settled(reach: VoxelsInReach) -> VoxelsInReach:
-        if data.coarse is None or not len(avatar.points):
-            return reach
-        return drop_clear_pairs(data.arrays, data.coarse.arrays, avatar.arrays, array, reach)[0]
-
-    reach = find_proved_reach(data, avatar, array, other_units, budget, spent, settled)
+    clear = drop_clear_voxels(data, avatar, array)
+    reach = find_proved_reach(data, avatar, array, other_units, budget, spent, clear)
     verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
     # An avatar without points is clear, even if the index is wrong or a scan was left out.
     for which, rows, part in (

@@ -26,8 +26,10 @@ from ...schemas.wire.question_table import (
 from ...schemas.wire.warming_parts import BUDGETS
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..residency.coarse_bounds import drop_clear_pairs
+from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
+from .context.missing_voxels import bound_missing
 from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData, check_request
 from .distance import distance
@@ -99,6 +101,19 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
         ):
             for question in QUESTIONS.values():
                 run(question, budget)
+    if part in (DISTANCE.name, BUDGETS):
+        lacking = HeldVoxels(0, 0, ("not read",))
+        reach = check_request(data, avatar, pose, data.radius_units)
+        bound_missing(
+            data,
+            lacking,
+            avatar,
+            pose,
+            reach,
+            np.zeros(1, np.int64),
+            np.zeros(1),
+            np.zeros((3, 1), np.uint32),
+        )
     if part == COLLIDE.name and data.coarse is not None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
         reach = check_request(data, avatar, pose, data.radius_units)

@@ -29,6 +29,7 @@ from ...kernels.nearest.best_first_search import (
 )
 from ...kernels.nearest.nearest_pair import NearestPairs
 from ...runtime.stop_flag import StopFlag
+from .missing_voxels import bound_missing, drop_clear_voxels
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, as_held, find_proved_reach, in_unknown, kernel_poses, pieces, to_units
 from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
@@ -147,6 +148,7 @@ def _gather(
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
+            part = bound_missing(seen, held, avatar, array, part, which, known.missing_bound, counts)
             if budget.deadline < math.inf:
                 _search_until(seen, avatar, array, part, which, heap, goal, budget, known, counts)
             else:
@@ -210,7 +212,8 @@ def collide_bounded(
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
+    clear = drop_clear_voxels(data, avatar, array)
+    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent, clear)
     radii = around.units - margin_units
     early = math.floor(min(budget.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
     # Both sides of the comparison are float64 sums: some units of slack make it valid for the exact

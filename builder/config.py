@@ -11,6 +11,7 @@ from ..schemas.errors import BadRequestError
 
 DEFAULT_STEP = 1e-4
 DEFAULT_VOXEL = 8.0
+DEFAULT_CELL_POINTS = 1024
 CELL_KINDS = ("octree", "balanced")
 
 
@@ -110,7 +111,7 @@ class BuildConfig:
     resolution: float | None = None
     degree: int = 8
     leaf: int = 32
-    cell_points: int = 1024
+    cell_points: int = DEFAULT_CELL_POINTS
     cells: str = "octree"
     spacing: float | None = None
     radius: float | None = None

@@ -2,7 +2,9 @@
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from ..schemas.archive.normal_reach import MAX_NORMAL_REACH, NORMAL_REACH
 from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
@@ -11,6 +13,9 @@ from ..schemas.errors import BadRequestError
 
 DEFAULT_STEP = 1e-4
 DEFAULT_VOXEL = 8.0
+DEFAULT_CELL_POINTS = 1024
+# A cell is built at once: with more points, one part of a dense voxel would exceed --memory.
+MAX_CELL_POINTS = 1 << 20
 CELL_KINDS = ("octree", "balanced")
 
 
@@ -78,6 +83,8 @@ class BuildConfig:
     for 16 % more memory (scripts/bench_engine --only cells).
     cells: "octree", or "balanced", which also merges cells until all trees have the same height
     (balance_cells.py).
+    leaf_cells: requested number of leaf cells of the archive, [Fig12] section 7 has 4,096. A build
+    then chooses `cell_points` (passes/cell_size.py). None: `cell_points` as given.
     models: stored radius models: always "mean", optionally "local" and "border", which need one
     byte per point. The default is "mean" alone: a ball of 5 cm enters a surface by 14 mm with
     "local" and by 16 mm with "mean", but "local" takes a seventh more time, and makes doors with
@@ -110,8 +117,9 @@ class BuildConfig:
     resolution: float | None = None
     degree: int = 8
     leaf: int = 32
-    cell_points: int = 1024
+    cell_points: int = DEFAULT_CELL_POINTS
     cells: str = "octree"
+    leaf_cells: int | None = None
     spacing: float | None = None
     radius: float | None = None
     models: frozenset[str] = frozenset({"mean"})
@@ -139,7 +147,12 @@ class BuildConfig:
                 f"{MIN_DEGREE} to {MAX_DEGREE}",
             ),
             (1 <= self.leaf <= MAX_LEAF, f"--leaf {self.leaf}", f"1 to {MAX_LEAF}"),
-            (self.cell_points >= 1, f"cell_points {self.cell_points}", "at least 1"),
+            (self.cell_points >= 1, f"--cell-points {self.cell_points}", "at least 1"),
+            (
+                self.leaf_cells is None or self.leaf_cells >= 1,
+                f"--leaf-cells {self.leaf_cells}",
+                "at least 1",
+            ),
             (self.cells in CELL_KINDS, f"--cells {self.cells}", " or ".join(CELL_KINDS)),
             (0 < self.voxel < math.inf, f"--voxel {self.voxel}", "a positive length in metres"),
             (
@@ -219,9 +232,18 @@ class BuildConfig:
             "keep": ",".join(sorted(self.keep)),
             # Named only if not the default: archives without it stay byte for byte unchanged.
             **({} if self.cells == "octree" else {"cells": self.cells}),
+            **({} if self.leaf_cells is None else {"leaf_cells": self.leaf_cells}),
             **({} if self.models == {"mean"} else {"models": ",".join(self.stored_models())}),
             **({"normal_reach": self.normal_reach} if "normal" in self.keep else {}),
             **({} if self.thin is None else {"thin": self.thin}),
             **({} if self.outliers is None else {"outliers": "{!r},{}".format(*self.outliers)}),
             **({} if self.moving is None else {"moving": "{!r},{}".format(*self.moving)}),
         }
+
+    def is_identity(self, options: Mapping[str, Any]) -> bool:
+        """Return whether a build with this configuration gives an archive with these stored options.
+
+        With `leaf_cells`, the stored `cell_points` is the one that the build chose.
+        """
+        chosen = {} if self.leaf_cells is None else {"cell_points": options.get("cell_points")}
+        return {**self.identity(), **chosen} == options

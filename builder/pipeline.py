@@ -172,6 +172,10 @@ def _build(
         dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-build.executor.jobs :]
         build.check_space(final + int(dense.sum()) * SCRATCH_BYTES_A_POINT, build_dir.folder)
         _check_voxels(spool, config)
+        if config.leaf_cells is not None:
+            from .passes.cell_size import choose_cell_points  # most builds do not need its kernel
+
+            build.config = config = replace(config, cell_points=choose_cell_points(spool, build))
         readers = readers_that_fit(spool.counts, build.executor.jobs, config)
         identity = archive_id(spooled, lattice, config)
         shards = build_shards(spool, identity, build_dir, build)

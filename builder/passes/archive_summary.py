@@ -16,6 +16,7 @@ from ...schemas.errors import CorruptError
 from ..config import DEFAULT_VOXEL
 from ..sources.scan_warnings import SPARSE, length_text, radius_warning
 from ..voxel.record_points import iter_points
+from .cell_summary import CellSummary, summarize_cells
 
 # Most voxels, and about the most points, that are read for the area.
 AREA_VOXELS, AREA_POINTS = 16, 2_000_000
@@ -45,6 +46,7 @@ class ArchiveSummary:
     voxel: edge of a voxel [m]; voxel_from: how it was chosen.
     voxels, points_a_voxel, densest: their number, points of one in the mean and at most.
     bytes_a_point: of index and shards.
+    cells: figures of the leaf cells.
     look_at: what to look at if the archive looks wrong, one line each; the most likely first.
     """
 
@@ -61,6 +63,7 @@ class ArchiveSummary:
     points_a_voxel: float
     densest: int
     bytes_a_point: float
+    cells: CellSummary
     look_at: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -69,7 +72,10 @@ class ArchiveSummary:
 
 
 def summarize_archive(archive: Archive) -> ArchiveSummary:
-    """Return the figures of an open archive. Reads at most AREA_VOXELS voxels."""
+    """Return the figures of an open archive.
+
+    Reads at most AREA_VOXELS voxels, and the hierarchies of all voxels if cells are balanced.
+    """
     header = archive.header
     counts = archive.voxels["rows"][:, 2].astype(np.int64)
     files = [path for path in archive.folder.rglob("*") if path.is_file() and path.name != PREVIEW_NAME]
@@ -94,6 +100,7 @@ def summarize_archive(archive: Archive) -> ArchiveSummary:
         points_a_voxel=header.points / max(1, len(counts)),
         densest=int(counts.max(initial=0)),
         bytes_a_point=sum(path.stat().st_size for path in files) / max(1, header.points),
+        cells=summarize_cells(archive),
         look_at=tuple(_look_at(archive, spacing, counts)),
     )
 

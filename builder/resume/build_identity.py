@@ -22,7 +22,7 @@ NAMED = 5
 _PLACED = {"pose": "pose", "crs": "coordinate system", "units": "unit", "up": "direction up"}
 
 # Options whose stored name differs from the command line, or that the command line lacks.
-_OPTION_NAMES = {"models": "--radius", "cell_points": "cell_points", "with_slab": "with_slab"}
+_OPTION_NAMES = {"models": "--radius", "with_slab": "with_slab"}
 
 
 def describe_build(inputs: Sequence[InputFile], config: BuildConfig) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def is_up_to_date(
     sources = header.sources
     lost = any(s.fault for s in sources) and not config.skip_bad
     unclean = any(NOT_FINITE in s.skipped for s in sources) and config.strict
-    if header.options != config.identity() or header.generation or lost or unclean:
+    if not config.is_identity(header.options) or header.generation or lost or unclean:
         return False
     asked = {
         (str(item.path), scan.index if scan else 0): scan

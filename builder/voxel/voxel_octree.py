@@ -16,7 +16,7 @@ from ..kernels.points.octree_cells import is_ascending, merge_order, split_octre
 from ..kernels.trees.bounding_sphere import MOMENTS
 from ..kernels.trees.build_tree import EXTREMES, build_cells, copy_runs, leaf_rows
 from ..kernels.trees.pack_tree import max_nodes
-from .balance_cells import balance_cells, tree_limits
+from .balance_cells import balance_cells, packed_heights, raise_trees, tree_height, tree_limits
 from .top_hierarchy import HIGHEST, pack_top
 
 
@@ -112,6 +112,8 @@ def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildCo
     else:
         starts, log2_size = split_octree(codes, root_log2, CELL_BITS, config.cell_points)
     trees = build_trees(points.local, starts, log2_size, config)
+    if config.cells == "balanced":
+        trees = _raised(trees, config)
     top = None
     if len(starts) > 1:
         top = pack_top(trees.low, log2_size, trees.spreads, trees.extremes, voxel_steps, config)
@@ -131,6 +133,14 @@ def build_voxel(key: int, points: VoxelPoints, voxel_steps: int, config: BuildCo
         block_points(trees, config.leaf),
         *_taken(points, trees.rank)[1:],
     )
+
+
+def _raised(trees: "CellTrees", config: BuildConfig) -> "CellTrees":
+    """Give the trees of cells with too few points the height of all others."""
+    height = tree_height(config.cell_points, config.leaf, config.degree)
+    lacking = height - packed_heights(np.diff(trees.starts), config.leaf, config.degree)
+    nodes, rows = raise_trees(trees.nodes, trees.rows, lacking)
+    return trees._replace(nodes=nodes, rows=rows)
 
 
 class CellTrees(NamedTuple):

@@ -70,6 +70,42 @@ def split_octree(codes, root_log2, largest_log2, capacity):
 
 
 @nb.njit(nogil=True, cache=True)
+def count_capacities(codes, root_log2, largest_log2):
+    """Count the cubes below the root that `split_octree` makes leaf cells, for every capacity at once.
+
+    codes, root_log2, largest_log2: as for `split_octree`.
+    Returns changes (n + 1,) int64: for capacities k of 1 to n, changes[1] + ... + changes[k] is the
+    number of leaf cells below the root while the root itself is split. A cube of c points in a cube
+    of p points is a leaf cell for c <= k < p. A cube of one step is one for every k < p, and a cube
+    of the largest permitted edge for every k >= c.
+    """
+    n = codes.shape[0]
+    changes = np.zeros(n + 1, np.int64)
+    stack = np.empty((8 * (root_log2 + 1) + 1, 3), np.int64)
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, n, root_log2
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        lo, hi, log2 = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+        if log2 == 0 or (hi - lo == 1 and log2 <= largest_log2):
+            continue  # never split
+        shift = np.uint64(3 * (log2 - 1))
+        base = (codes[lo] >> (shift + np.uint64(3))) << np.uint64(3)
+        end = hi
+        for child in range(7, -1, -1):
+            begin = first_at_least(codes, lo, end, (base | np.uint64(child)) << shift)
+            if begin < end:
+                if log2 - 1 <= largest_log2:
+                    changes[1 if log2 == 1 else end - begin] += 1
+                    if log2 <= largest_log2:
+                        changes[hi - lo] -= 1
+                stack[depth, 0], stack[depth, 1], stack[depth, 2] = begin, end, log2 - 1
+                depth += 1
+            end = begin
+    return changes
+
+
+@nb.njit(nogil=True, cache=True)
 def is_ascending(codes):
     """Return whether codes (n,) uint64 ascend; equal codes are allowed."""
     falls = np.uint64(0)

@@ -41,6 +41,14 @@ def build(
             autocompletion=among("octree", "balanced"),
         ),
     ] = "octree",
+    cell_points: Annotated[
+        int | None,
+        typer.Option(min=1, max=1 << 20, help="Maximum number of points of a leaf cell; default: 1024."),
+    ] = None,
+    leaf_cells: Annotated[
+        int | None,
+        typer.Option(help="Choose --cell-points so that the archive has about this many leaf cells."),
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Worker processes; 0: one per core.")] = 0,
     memory: Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")] = "2GB",
     spacing: Annotated[
@@ -108,8 +116,14 @@ def build(
 
     if not dry_run:
         check_free(output)  # before loading numba, which takes a second
-    from ....builder.config import BuildConfig, parse_radius, parse_rule
+    from ....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_radius, parse_rule
+    from ....schemas.errors import BadRequestError
 
+    if cell_points is not None and leaf_cells is not None:
+        raise BadRequestError(
+            f"--cell-points {cell_points} and --leaf-cells {leaf_cells}: expected only one of them: the number of "
+            "cells follows from their size"
+        )
     fixed, models = parse_radius(radius)
     config = BuildConfig(
         voxel=voxel,
@@ -117,6 +131,8 @@ def build(
         degree=degree,
         leaf=leaf,
         cells=cells,
+        cell_points=DEFAULT_CELL_POINTS if cell_points is None else cell_points,
+        leaf_cells=leaf_cells,
         jobs=jobs,
         memory_bytes=parse_bytes(memory, "--memory"),
         spacing=spacing,

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
     from ....builder.export.export_archive import ExportSummary
     from ....builder.passes.archive_summary import ArchiveSummary
+    from ....builder.passes.cell_summary import CellSummary
     from ....schemas.archive.index import Source
     from ...residency.voxel_store import VoxelStore
 
@@ -50,9 +51,33 @@ def summary_facts(summary: "ArchiveSummary") -> Iterator[tuple[str, str]]:
         f"{summary.voxel:g} m ({summary.voxel_from}): {summary.voxels:,} voxels, {summary.points_a_voxel:,.0f} points "
         f"in the mean, {summary.densest:,} in the densest",
     )
+    yield "leaf cells", cells_text(summary.cells)
     yield "bytes a point", f"{summary.bytes_a_point:.2f}"
     for number, line in enumerate(summary.look_at):
         yield "" if number else "if it looks wrong", line
+
+
+def cells_text(cells: "CellSummary") -> str:
+    """Describe leaf cells: their number and size, what was asked for, and the heights of their trees."""
+    asked = "" if cells.asked is None else f" (--leaf-cells {cells.asked:,})"
+    text = f"{cells.cells:,} of at most {cells.most:,} points{asked}"
+    if cells.heights is None:
+        return text
+    if len(cells.heights) == 1:
+        levels = f"all trees have {_levels_text(*cells.heights)}"
+    else:
+        levels = ", ".join(f"{held:,} trees of {_levels_text(each)}" for each, held in cells.heights.items())
+    small = (
+        f"; {cells.small:,} cells of fewer than {cells.fewest:,} points could not be merged within their largest cube"
+        if cells.small
+        else ""
+    )
+    return f"{text}; {levels}{small}"
+
+
+def _levels_text(levels: int) -> str:
+    """Format a number of levels."""
+    return "1 level" if levels == 1 else f"{levels} levels"
 
 
 def _rounded_area(square_metres: float) -> str:

@@ -27,6 +27,7 @@ from ...scene import Scene
 from ..common.paper_case import Case
 from ..common.sphere_pictures import draw_spheres, level_spheres, load_pyplot
 from ..common.whole_scene import open_whole
+from .cell_comparison import AVATAR, WALK_DIVISIONS, Say, cell_row, compare_cells, show_cells, write_cells
 from .paper_figures import PAPER_FPS, PAPER_MACHINE, paper_rows
 from .path_figure import Curve, draw_path
 
@@ -39,7 +40,7 @@ WARM_FRAMES = 30
 NEAR = 1.05
 
 SLAB, PLAIN = "ours", "plain spheres"
-AVATAR, NOBODY = "avatar", "nobody"
+NOBODY = "nobody"
 # Height of the avatar NOBODY above every scan [m]: a call for it tests no voxel.
 FAR_AWAY = 1e5
 
@@ -50,8 +51,6 @@ CAVEATS = (
     "Plain spheres are the paper's bounds in our trees: packed top-down instead of by insertion, with up to 32 points "
     "per leaf node, and in the same memory layout, which reserves the space of a slab.",
 )
-
-Say = Callable[[str], None]
 
 
 @dataclass
@@ -322,7 +321,7 @@ def draw_report(
 
 
 def show(report: dict[str, Any], console: Console) -> None:
-    """Print table 1 and the sentences."""
+    """Print table 1, the sentences and the table of cells."""
     case = report["case"]
     title = (
         f"{case['name']}: {case['points']} points in {case['voxels']} voxel(s) of {case['voxel_size']:g} m, avatar of "
@@ -350,6 +349,7 @@ def show(report: dict[str, Any], console: Console) -> None:
     )
     for sentence in report["caveats"] + report["comparison"]:
         console.print(sentence)
+    show_cells(report["cells"], console)
 
 
 def _cell(name: str, value: Any) -> str:
@@ -383,6 +383,8 @@ def run(
     structures = build_structures(case, degrees, scratch, say)
     without = measure(case, structures, loops, say)
     report = make_report(case, structures, without)
+    report["cells"] = [cell_row(plan) for plan in compare_cells(case, scratch, loops, say, WALK_DIVISIONS)]
+    write_cells(report["cells"], out / "cells.csv")
     say("drawing")
     report["figure8"] = draw_report(case, structures, without, level, out)
     write_report(report, case, structures, without, out)

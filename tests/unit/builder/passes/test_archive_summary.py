@@ -80,6 +80,7 @@ def test_build_and_info_end_with_the_same_lines(tmp_path: Path, capsys: pytest.C
         "spacing",
         "radius",
         "voxel size",
+        "leaf cells",
         "bytes a point",
         "if it looks wrong",
     ]

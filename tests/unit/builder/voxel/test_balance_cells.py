@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import voxel_codes
-from solidcloud.builder.voxel.balance_cells import balance_cells, tree_limits
+from solidcloud.builder.passes.cell_summary import tree_heights
+from solidcloud.builder.voxel.balance_cells import balance_cells, packed_heights, tree_height, tree_limits
+from solidcloud.builder.voxel.exact_enclosure import loose_nodes
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel
 from solidcloud.schemas.archive.codec import encode_voxel
 from solidcloud.schemas.archive.voxel import check_voxel
-from solidcloud.server.report.walk.cell_comparison import tree_heights
 from synthetic_scans import WITH_POINTS, make_steps
 
 pytestmark = pytest.mark.interpreted
@@ -71,12 +72,12 @@ def test_all_trees_of_a_voxel_have_one_height(kind: str, degree: int) -> None:
     points = VoxelPoints(make_steps(kind, 2, 400, STEPS))
     config = BuildConfig(leaf=4, degree=degree, cell_points=4 * degree, cells="balanced")
     voxel = build_voxel(5, points, STEPS, config)
-    heights = tree_heights(voxel, check_voxel(voxel, STEPS))
+    heights = tree_heights(voxel.cells, check_voxel(voxel, STEPS))
     assert len(heights) > 3
     assert set(heights) == {2}
     plain = build_voxel(5, points, STEPS, BuildConfig(leaf=4, degree=degree, cell_points=4 * degree))
     if kind == "noise":
-        assert len(set(tree_heights(plain, check_voxel(plain, STEPS)))) > 1
+        assert len(set(tree_heights(plain.cells, check_voxel(plain, STEPS)))) > 1
 
 
 def test_the_same_voxel_has_the_same_bytes_in_any_order_of_points() -> None:
@@ -88,6 +89,49 @@ def test_the_same_voxel_has_the_same_bytes_in_any_order_of_points() -> None:
     b = build_voxel(5, VoxelPoints(points[order], scan_index[order]), STEPS, config)
     assert encode_voxel(a, bytes(16)) == encode_voxel(b, bytes(16))
     assert len(a.cells.nodes) > 3
+
+
+def scattered() -> np.ndarray:
+    """Return a voxel of 100,000 steps whose largest cubes hold 900, 200, 12, 2 and 1 points."""
+    rng = np.random.default_rng(12)
+    corners = [(0, 0, 0), (65536, 0, 0), (0, 65536, 0), (65536, 65536, 0), (0, 0, 65536)]
+    clusters = [
+        corner + rng.integers(0, 30000, (held, 3))
+        for corner, held in zip(corners, (900, 200, 12, 2, 1), strict=True)
+    ]
+    return np.concatenate(clusters).astype(np.int32)
+
+
+@pytest.mark.parametrize("with_slab", [True, False])
+@pytest.mark.parametrize(("leaf", "degree", "cell_points"), [(4, 4, 64), (32, 8, 1024), (1, 2, 2), (8, 3, 8)])
+def test_cells_alone_in_the_largest_cube_have_trees_of_the_same_height(
+    leaf: int, degree: int, cell_points: int, with_slab: bool
+) -> None:
+    points, steps = scattered(), 100_000
+    config = BuildConfig(
+        leaf=leaf, degree=degree, cell_points=cell_points, cells="balanced", with_slab=with_slab
+    )
+    voxel = build_voxel(5, VoxelPoints(points), steps, config)
+    links = check_voxel(voxel, steps)
+    height = tree_height(cell_points, leaf, degree)
+    assert set(tree_heights(voxel.cells, links)) == {height + 1}
+    fewest, most = tree_limits(cell_points, leaf, degree)
+    held = voxel.cells.points.astype(np.int64)
+    assert held.max() <= most and held.sum() == len(points)
+    assert (held < fewest).any() == (height > 0), "some cells are too small for a packed tree"
+    assert loose_nodes(voxel, links, range(len(voxel.nodes.count))) == []
+
+
+@pytest.mark.parametrize(("leaf", "degree"), [(32, 8), (4, 3), (1, 2)])
+def test_packed_heights_are_those_of_packed_trees(leaf: int, degree: int) -> None:
+    held = np.array([1, 2, leaf, leaf + 1, leaf * degree, leaf * degree + 1, leaf * degree**2 + 1])
+    rng = np.random.default_rng(3)
+    expected = []
+    for n in held.tolist():
+        config = BuildConfig(leaf=leaf, degree=degree, cell_points=10**6)
+        voxel = build_voxel(5, VoxelPoints(rng.integers(0, STEPS, (n, 3)).astype(np.int32)), STEPS, config)
+        expected += tree_heights(voxel.cells, check_voxel(voxel, STEPS))
+    assert (packed_heights(held, leaf, degree) + 1).tolist() == expected
 
 
 def test_only_cells_that_are_not_the_default_are_named_in_the_archive() -> None:

@@ -67,7 +67,41 @@ def test_every_option_arrives(scan: Path, monkeypatch: pytest.MonkeyPatch) -> No
         spacing=0.1,
     )
     assert caught_config("", scan, monkeypatch) == BuildConfig()
+    assert caught_config("--cell-points 300", scan, monkeypatch) == BuildConfig(cell_points=300)
+    assert caught_config("--leaf-cells 4096", scan, monkeypatch) == BuildConfig(leaf_cells=4096)
     assert caught_config("--scheduler tcp://a:1", scan, monkeypatch) == BuildConfig(scheduler="tcp://a:1")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("--cell-points 300 --leaf-cells 40", "--cell-points 300 and --leaf-cells 40: expected only one"),
+        ("--leaf-cells 0", "--leaf-cells 0: expected at least 1"),
+        ("--cell-points 0", "--cell-points"),
+    ],
+)
+def test_a_wrong_size_or_number_of_cells_is_refused(
+    given: str, said: str, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["build", str(scan), "-o", str(tmp_path / "x"), *given.split()]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_summary_says_what_was_asked_and_what_came_out(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = str(tmp_path / "x")
+    given = ["--voxel", "0.5", "--jobs", "1", "--leaf-cells", "40"]
+    assert run(["build", str(scan), "-o", target, *given]) == 0
+    assert "(--leaf-cells 40)" in capsys.readouterr().out
+    assert run(["info", target, "--json"]) == 0
+    cells = json.loads(capsys.readouterr().out)["summary"]["cells"]
+    assert cells["asked"] == 40 and abs(cells["cells"] - 40) <= 4 and cells["kind"] == "octree"
+    assert run(["build", str(scan), "-o", target, *given, "--cells", "balanced", "--overwrite"]) == 0
+    assert "all trees have 1 level" in " ".join(capsys.readouterr().out.split())
+    assert run(["build", str(scan), "-o", target, *given, "--dry-run"]) == 0
+    assert "--leaf-cells" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -88,6 +88,18 @@ def test_whole_experiment_writes_every_file(case: Case, tmp_path: Path) -> None:
         frames = list(csv.DictReader(file))
     assert len(frames) == 12
     assert sum(row["verdict"] == "contact" for row in frames) == stored["case"]["contacts"]
+    octree, many, balanced, many_balanced = stored["cells"]
+    assert [row["kind"] for row in stored["cells"]] == ["octree", "octree", "balanced", "balanced"]
+    assert (many["cells_asked"], octree["cells_asked"]) == (4096, None)
+    assert octree["cells"] < many["cells"] and many["cell_points"] < 10
+    assert octree["equal_heights"] == max(octree["levels"].values()) / octree["cells"]
+    assert balanced["equal_heights"] == many_balanced["equal_heights"] == 1.0
+    assert len(balanced["levels"]) == 1 and balanced["cells"] == sum(balanced["levels"].values())
+    assert all(0 < row["batch_ms_best"] <= row["batch_ms"] for row in stored["cells"])
+    with open(out / "cells.csv", newline="") as file:
+        assert [int(row["cells"]) for row in csv.DictReader(file)] == [
+            row["cells"] for row in stored["cells"]
+        ]
     for name in ("figure7.png", "figure8.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 

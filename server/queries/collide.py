@@ -11,7 +11,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
-from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
+from ..kernels.collide.early_contact import CLEAR, UNKNOWN, write_verdict_bounds
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from .context.anytime_search import collide_bounded
 from .context.missing_voxels import drop_clear_voxels
@@ -91,13 +91,9 @@ def verdict_bounds(
     """
     if budget.tolerance == 0:
         return {}
-    rounded = margin_units / UNITS_PER_METRE
-    early = verdict == EARLY
-    verdict[early] = CONTACT
-    upper = np.where(verdict == CONTACT, max(margin, rounded), np.inf)
-    upper[early] = np.nextafter(max(margin, rounded) + budget.tolerance, np.inf)
-    return {
-        "lower": np.where(verdict == CLEAR, min(margin, rounded), -radii / UNITS_PER_METRE),
-        "upper": upper,
-        "exact": (verdict != UNKNOWN) & ~early,
-    }
+    rounded, k = margin_units / UNITS_PER_METRE, len(verdict)
+    low, high = min(margin, rounded), max(margin, rounded)
+    early = float(np.nextafter(high + budget.tolerance, math.inf))
+    lower, upper, exact = np.empty(k), np.empty(k), np.empty(k, bool)
+    write_verdict_bounds(verdict, radii, low, high, early, lower, upper, exact)
+    return {"lower": lower, "upper": upper, "exact": exact}

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_resident
-from ..kernels.collide.leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN
+from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest

@@ -58,8 +58,8 @@ from ..core.scene_arrays import (
     stopped,
 )
 from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
-from .early_contact import set_early, surely_near
-from .leaf_contact import CLEAR, CONTACT, EARLY, UNKNOWN, below_touches, leaves_touch, make_collide_scratch
+from .early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, set_early, surely_near
+from .leaf_contact import below_touches, leaves_touch, make_collide_scratch
 
 U = np.uint64  # see placed_avatar.py
 

@@ -18,11 +18,16 @@ the exact descent ends at nodes of 0.3 to 0.5 m, and this finds 95 %. It needs n
 
 import numpy as np
 
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import U32, lanes_meet, next_near
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 
 U = np.uint64  # see placed_avatar.py
+# Verdicts of the kernels. EARLY: some pair is within reach plus tolerance, perhaps beyond reach.
+CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
+EARLY = 3
 
 
 @njit_no_refcount
@@ -83,3 +88,22 @@ def surely_near(words, ints, halves, block_words, location, row, x, y, z, lanes,
     low_z = off_z + np.float32(ints[U(block_at + 2)])
     lane, tested = next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, early[1], keep, keep8, 0)
     return lane >= 0, LANES * tested
+
+
+@nb.njit(nogil=True, cache=True)
+def write_verdict_bounds(verdict, radii, low, high, early, lower, upper, exact):
+    """Write what verdicts within a tolerance say about the signed distance, and turn EARLY to CONTACT.
+
+    verdict: (k,) uint8.  radii: (k,) int64, the depth limit of a pair, exact units.  low, high,
+    early: [m], above which distance a pose is CLEAR, and up to which CONTACT and EARLY.
+    Writes lower, upper (k,) float64 [m], and exact (k,) bool.
+
+    No store is conditional: with `if said == EARLY: verdict[i] = CONTACT` LLVM 22.1 vectorised the
+    loop such that it wrote beyond the end of `exact` (test_early_contact.py).
+    """
+    for i in range(verdict.shape[0]):
+        said = verdict[i]
+        lower[i] = low if said == CLEAR else -radii[i] / UNITS_PER_METRE
+        upper[i] = high if said == CONTACT else early if said == EARLY else np.inf
+        exact[i] = (said == CLEAR) | (said == CONTACT)
+        verdict[i] = CONTACT if said == EARLY else said

@@ -13,9 +13,7 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK, lanes_meet, next_near, nodes_meet
 from ..core.placed_avatar import node_reach, pair_in_reach, place_block_once, place_node
 from ..core.scene_arrays import FIRST, LANES, NO_LIMIT, node_class, point_class, should_end
-
-CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
-EARLY = 3  # some pair is within reach plus tolerance, perhaps beyond reach: early_contact.py
+from .early_contact import CLEAR, CONTACT, EARLY
 
 U = np.uint64  # see placed_avatar.py
 

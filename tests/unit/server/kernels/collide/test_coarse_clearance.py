@@ -15,7 +15,7 @@ from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.collide import coarse_clearance
 from solidcloud.server.kernels.collide.coarse_clearance import any_with_coarse_bounds
 from solidcloud.server.kernels.collide.collide_poses import collide_poses
-from solidcloud.server.kernels.collide.leaf_contact import CLEAR, CONTACT
+from solidcloud.server.kernels.collide.early_contact import CLEAR, CONTACT
 from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach
 from solidcloud.server.queries.context.query_budget import NO_LIMIT
 from solidcloud.server.residency.coarse_bounds import CoarseBounds, drop_clear_pairs

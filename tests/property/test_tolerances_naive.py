@@ -73,6 +73,7 @@ def test_bounds_hold_and_a_larger_tolerance_never_takes_longer(
                 judge_distance(near, within, reach, float(allowed[found].max(initial=0.0)), True)
 
 
+@pytest.mark.case(30, "soles above a floor: in contact early, for no more visits with a larger tolerance")
 @pytest.mark.interpreted
 @pytest.mark.parametrize("turned", [False, True])
 def test_soles_above_a_floor_are_in_contact_early(
@@ -110,6 +111,11 @@ def test_soles_above_a_floor_are_in_contact_early(
         assert early.mean() > 0.8 and visits.sum() < exact.node_visits.sum()
 
 
+@pytest.mark.case(
+    30,
+    "100,000 poses with tolerances of 1 mm to 1 m: brute force finds no answer outside its bounds",
+    compiled_only="it judges 1,600,000 answers",
+)
 def test_a_hundred_thousand_poses_by_brute_force() -> None:
     """As scripts/check_tolerances, which judges 10^7."""
     figures = load_script("check_tolerances").run(100_000, 20_000, 1)

@@ -12,9 +12,7 @@ from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, UNKNOWN, write_verdict_bounds
-from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from .context.anytime_search import collide_bounded
-from .context.missing_voxels import drop_clear_voxels
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -25,6 +23,7 @@ from .context.query_context import (
     pieces,
     to_units,
 )
+from .context.unloaded_voxels import drop_clear_voxels
 
 
 def collide(
@@ -45,9 +44,8 @@ def collide(
     begin = time.perf_counter()
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
-    other_units = data.radius_units + margin_units
+    other_units, early = data.radius_units + margin_units, budget.tolerance_units
     k = len(array)
-    early = tolerance_units(budget)
     residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
     clear = drop_clear_voxels(data, avatar, array)
     reach = find_proved_reach(data, avatar, array, other_units, budget, spent, clear)
@@ -71,11 +69,6 @@ def collide(
     return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(), **bounds)
 
 
-def tolerance_units(budget: QueryBudget) -> int:
-    """Return the tolerance in exact units, rounded down; at most the longest reach."""
-    return math.floor(min(budget.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
-
-
 def verdict_bounds(
     verdict: NDArray[np.uint8],
     radii: NDArray[np.int64],
@@ -92,7 +85,7 @@ def verdict_bounds(
     if budget.tolerance == 0:
         return {}
     rounded, k = margin_units / UNITS_PER_METRE, len(verdict)
-    low, high = min(margin, rounded), max(margin, rounded)
+    low, high = min(float(margin), rounded), max(float(margin), rounded)
     early = float(np.nextafter(high + budget.tolerance, math.inf))
     lower, upper, exact = np.empty(k), np.empty(k), np.empty(k, bool)
     write_verdict_bounds(verdict, radii, low, high, early, lower, upper, exact)

@@ -15,7 +15,6 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.anytime_search import TOLERANCE_SLACK, distance_bounded
-from .context.missing_voxels import bound_missing
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -26,6 +25,7 @@ from .context.query_context import (
     to_units,
 )
 from .context.signed_distance import distance_columns, unknown_gaps
+from .context.unloaded_voxels import bound_missing
 
 
 def distance(
@@ -62,7 +62,9 @@ def distance(
                 continue
             with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
-                own = bound_missing(seen, held, avatar, array, part, which, nearest.missing_bound, counts)
+                own = bound_missing(
+                    seen, held, avatar, array, part, which, nearest.missing_bound, counts, budget
+                )
                 nearest_poses(
                     array,
                     avatar.arrays,

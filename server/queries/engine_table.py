@@ -29,9 +29,9 @@ from ..residency.coarse_bounds import drop_clear_pairs
 from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
-from .context.missing_voxels import bound_missing
 from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData, check_request
+from .context.unloaded_voxels import bound_missing
 from .distance import distance
 from .objects import objects
 from .raycast import raycast
@@ -93,6 +93,8 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
 
     if part in QUESTIONS:
         run(QUESTIONS[part], EXACT)
+    if part == COLLIDE.name:
+        run(COLLIDE, QueryBudget(tolerance=1e-3))
     if part == BUDGETS:
         # These limits are too large to be reached here.
         for budget in (
@@ -113,6 +115,7 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             np.zeros(1, np.int64),
             np.zeros(1),
             np.zeros((3, 1), np.uint32),
+            EXACT,
         )
     if part == COLLIDE.name and data.coarse is not None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.

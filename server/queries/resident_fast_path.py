@@ -1,6 +1,7 @@
 """Fast path of queries of one pose whose voxels are all resident: a single kernel call.
 
-The answers equal those of the engines bit for bit, cost counters included, except engine_seconds.
+The answers equal those of the engines bit for bit, cost counters included, except engine_seconds;
+with a tolerance, that of `distance` is the exact one.
 The engine is called instead if
 
 - a voxel in reach has to be loaded, or more than MAX_FAST_VOXELS are in reach,
@@ -29,7 +30,7 @@ from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
 from ..residency.voxel_cache import VoxelCache
-from .collide import collide, tolerance_units
+from .collide import collide
 from .context.query_budget import EXACT, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units
 from .distance import distance
@@ -43,7 +44,7 @@ Pose = NDArray[np.float64]
 MAX_FAST_POINTS = 1 << 13
 # With nothing near, the time grows with the number of voxels in reach [voxels], [m].
 MAX_FAST_VOXELS, MAX_FAST_REACH = 64, 2.0
-# Verdicts by a kernel's: constructing one from a number would double the Python time of a query.
+# Verdict of a kernel -> `Verdict`: making one from a number would double the Python time of a query.
 _VERDICTS = {CLEAR: Verdict.CLEAR, CONTACT: Verdict.CONTACT, UNKNOWN: Verdict.UNKNOWN, EARLY: Verdict.CONTACT}
 _CLEAR, _CONTACT = int(Verdict.CLEAR), int(Verdict.CONTACT)
 # Columns of the results of `nearest_resident` and `sweep_resident`.
@@ -253,7 +254,7 @@ class ResidentQueries:
             counts[:] = 0
             with residency.frozen():
                 fault, at, found, needed = collide_resident(
-                    poses, avatar.arrays, avatar.radius, data.radius_units, tolerance_units(budget), data.arrays,
+                    poses, avatar.arrays, avatar.radius, data.radius_units, budget.tolerance_units, data.arrays,
                     data.broad, rows, self._outside, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:

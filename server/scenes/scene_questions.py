@@ -65,7 +65,8 @@ class SceneQuestions(QueryMethods):
         client: owner of the avatars.
         options: the remaining fields by name, and
 
-        - tolerance [m], budget_ms and budget_visits: see server/queries/context/query_budget.py,
+        - tolerance [m], relative_tolerance, budget_ms and budget_visits: see
+          server/queries/context/query_budget.py,
         - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
           scene's default,
         - stop: stop flag that ends the work early.

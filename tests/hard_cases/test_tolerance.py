@@ -6,6 +6,8 @@ import archive_cases
 import numpy as np
 import pytest
 from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.scene import Scene
 
 # UTM and ECEF, in whole metres.
@@ -39,12 +41,15 @@ def test_case_32_coarse_bounds_are_the_same_everywhere(tmp_path: Path) -> None:
         with Scene.open(case.archive, policy="lru+prefetch", budget_bytes=budget) as scene:
             scene.add_avatar("body", body, 0.01)
             true = scene.distance("body", poses, 2.0).signed_distance
-            again = scene.distance("body", poses, 2.0, budget_ms=0.0)
+            # Without the stop flag of `budget_ms`, which compilation would set off.
+            late = QueryBudget(deadline=0.0)
+            data, model = scene._data, scene.avatar("body", "")
+            again = distance_bounded(data, model, poses, 2.0, late)
             assert (again.lower <= true).all() and (true <= again.upper).all()
             assert again.voxels_missing.sum() > 0, "both do not fit"
             found.append(again.lower)
-            late = scene.collide("body", poses, budget_ms=0.0)
-            assert (late.verdict == Verdict.CLEAR).all() and (late.lower <= true).all()
+            touch = collide_bounded(data, model, poses, 0.0, late)
+            assert (touch.verdict == Verdict.CLEAR).all() and (touch.lower <= true).all()
     assert np.ptp(found, axis=0).max() <= 2.0**-20 and min(found[0]) > 0.3
 
 

@@ -12,7 +12,7 @@ import pytest
 import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from judged_distance import judge_collide, judge_distance
+from judged_distance import ROUNDED, judge_collide, judge_distance
 from point_clouds import KINDS, TREES, cloud
 from project_scripts import load_script
 from solidcloud.schemas.wire.answers import Verdict
@@ -52,9 +52,12 @@ def test_bounds_hold_and_a_larger_tolerance_never_takes_longer(
         judged = naive_distance.distance_by_radii(*scan, poses, 5.0)
         signed = np.array([math.inf if found is None else found.signed for found in judged])
         within = np.where(signed <= reach, signed, np.inf)
+        # Of the centres of the nearest pair.
+        apart = np.array([0.0 if found is None else math.sqrt(found.square) / 2**26 for found in judged])
         with Scene.open(case.archive, **({} if cache is None else {"budget_bytes": cache * most})) as scene:
             scene.add_avatar("avatar", avatar, 0.02)
             last = scene.collide("avatar", poses, margin, radius_model=model).node_visits
+            exact = scene.distance("avatar", poses, reach, radius_model=model).node_visits
             for tolerance in TOLERANCES:
                 options: dict[str, Any] = {"tolerance": tolerance, "radius_model": model}
                 touch = scene.collide("avatar", poses, margin, **options)
@@ -63,14 +66,24 @@ def test_bounds_hold_and_a_larger_tolerance_never_takes_longer(
                     assert (touch.node_visits <= last).all()
                     last = touch.node_visits
                 near = scene.distance("avatar", poses, reach, **options)
+                assert cache is not None or (near.node_visits <= exact).all()
                 judge_distance(near, within, reach, tolerance, True)
             for share in (1e-9, 0.3, 5.0):
                 near = scene.distance("avatar", poses, reach, relative_tolerance=share, radius_model=model)
-                # The nearest pair may be of two spheres of any radius.
-                allowed = np.maximum(1e-3, share * (within + radii.max() / 2**26 + 0.02))
                 found = np.isfinite(within)
-                assert (near.signed_distance[found] <= (within + allowed)[found]).all()
+                allowed = np.maximum(1e-3, share * apart)
+                assert (near.signed_distance[found] <= (within + allowed)[found] + ROUNDED).all()
                 judge_distance(near, within, reach, float(allowed[found].max(initial=0.0)), True)
+                searched = scene.distance(
+                    "avatar",
+                    poses,
+                    reach,
+                    relative_tolerance=share,
+                    budget_visits=1 << 40,
+                    radius_model=model,
+                )
+                assert (searched.signed_distance[found] <= (within + allowed)[found] + ROUNDED).all()
+                judge_distance(searched, within, reach, float(allowed[found].max(initial=0.0)), True)
 
 
 @pytest.mark.case(30, "soles above a floor: in contact early, for no more visits with a larger tolerance")

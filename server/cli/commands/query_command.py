@@ -77,7 +77,9 @@ def query(
     ] = None,
     relative_tolerance: Annotated[
         float | None,
-        typer.Option(help="distance: allowed error as a share of it, 0.3 for 30 %, or 1 mm; default 0."),
+        typer.Option(
+            help="distance: allowed error as a share of the gap between centres, 0.3 for 30 %; default 0."
+        ),
     ] = None,
     budget_ms: Annotated[
         float | None, typer.Option(help="Time limit of the whole query [ms]; default: none.")

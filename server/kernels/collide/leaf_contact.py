@@ -51,9 +51,9 @@ def make_collide_scratch(avatar):
 
 @njit_no_refcount
 def leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class, scratch):
-    """Return CONTACT or EARLY if a marked point of a block touches a point of leaf node `row`.
+    """Return CONTACT if a marked point of a block touches a point of leaf node `row`.
 
-    Otherwise return CLEAR.
+    Return EARLY if a pair within the tolerance is met first, and CLEAR if there is neither.
     """
     halves, lanes, ints, mask = scene.halves, placed.lanes, scene.ints, by_class.mask
     number = ~np.int64(ints[U(row + FIRST)])

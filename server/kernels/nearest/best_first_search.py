@@ -111,7 +111,7 @@ class SearchGoal(NamedTuple):
     enough: (k,) float64 [steps], with `first`: a pair whose upper bound is at most this is accepted
     although the pair itself is not known.
     tolerance: without `first`, the difference of the bounds at which the search ends [steps].
-    share: the same, as a share of |a - b|; the larger of both counts.
+    share: the same, as a share of |a - b|; the larger of both counts, if `tolerance` is above 0.
     visits: node visits a pose.
     """
 

@@ -48,26 +48,32 @@ def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, row
     Writes starts (k + 1,) and rows, as long as those of `reach`: the resident voxels of the poses
     in `which`, in the same order, and none for other poses. For each pose in `which`, adds the
     number of the other voxels to counts[0] (3, k) uint32, and lowers missing_bound (k,) float64
-    [steps] to their distance from the avatar's centres. Once the scene's stop flag is set, voxels
-    that were not examined count as missing, at distance 0.
+    [steps] to their distance from the avatar's centres. Once the scene's stop flag is set, all
+    voxels of the remaining poses count as missing, at distance 0.
     """
     placed, front = make_placed(avatar), make_front(avatar)
     root, off = np.empty(4, np.float32), np.empty(3, np.float32)
     slots = coarse.count.shape[0]
     slot_words = coarse.words.shape[0] // max(slots, 1)
-    left, number = 0, 0
+    left, number, ended = 0, 0, False
     for i in range(poses.shape[0]):
         starts[i] = left
         if number == which.shape[0] or which[number] != i:
             continue
         number += 1
+        ended = ended or stopped(scene.stop)
+        if ended:
+            missing_bound[i] = 0.0
+            counts[0, i] += np.uint32(reach.starts[i + 1] - reach.starts[i])
+            continue
         m, scale = poses[i], reach.scales[i]
         length, error, farthest = 0, 0.0, 0.0  # the front is not placed yet
         for at in range(reach.starts[i], reach.starts[i + 1]):
-            if at % ROWS_AT_ONCE == 0 and stopped(scene.stop):
+            if ended or (at % ROWS_AT_ONCE == 0 and stopped(scene.stop)):
+                ended = True
                 missing_bound[i] = 0.0
-                counts[0, i] += np.uint32(reach.starts[i + 1] - at)
-                break
+                counts[0, i] += np.uint32(1)
+                continue
             voxel = reach.rows[at]
             if scene.where[voxel, 0] >= 0:
                 rows[left] = voxel
@@ -83,7 +89,8 @@ def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, row
                 for r in range(4):
                     root[r] = placed.nodes[r, 0]
             gap = box_distance(avatar.radius[0] * scale, placed, farthest, scene, index, voxel)
-            if slots > 0 and coarse.slot[voxel] >= 0:
+            ended = stopped(scene.stop)  # the nodes of a voxel take some microseconds
+            if slots > 0 and coarse.slot[voxel] >= 0 and not ended:
                 slot = np.int64(coarse.slot[voxel])
                 for r in range(3):
                     low = scene.coordinates[voxel, r] * scene.voxel_steps

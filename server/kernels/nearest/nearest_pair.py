@@ -394,4 +394,4 @@ def settle_candidates(best, points, m, shift, ints, halves, lanes, off):
         to_beat = units_to_beat(nearest, frame)
         if nearest < units[1] or to_beat < nearest:
             units[1] = min(units[1], nearest)
-            set_cut(best.cut, far, frame, best.deficit, to_beat)
+            set_cut(best.cut, far, frame, best.deficit, min(to_beat, units[1]))

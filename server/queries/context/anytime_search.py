@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import CollideAnswers, Cost, DistanceAnswers, Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...kernels.nearest.best_first_search import (
     OPEN,
@@ -29,10 +28,10 @@ from ...kernels.nearest.best_first_search import (
 )
 from ...kernels.nearest.nearest_pair import NearestPairs
 from ...runtime.stop_flag import StopFlag
-from .missing_voxels import bound_missing, drop_clear_voxels
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, as_held, find_proved_reach, in_unknown, kernel_poses, pieces, to_units
 from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
+from .unloaded_voxels import bound_missing, drop_clear_voxels
 
 # Capacity of the heap [pairs], beyond which the search is depth first: half a megabyte a request.
 HEAP_PAIRS = 1 << 14
@@ -148,7 +147,7 @@ def _gather(
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            part = bound_missing(seen, held, avatar, array, part, which, known.missing_bound, counts)
+            part = bound_missing(seen, held, avatar, array, part, which, known.missing_bound, counts, budget)
             if budget.deadline < math.inf:
                 _search_until(seen, avatar, array, part, which, heap, goal, budget, known, counts)
             else:
@@ -212,10 +211,12 @@ def collide_bounded(
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    clear = drop_clear_voxels(data, avatar, array)
+    # Without a deadline all voxels are loaded, and answers must not depend on what was resident.
+    late = budget.deadline < math.inf
+    clear = drop_clear_voxels(data, avatar, array) if late else lambda reach: reach
     around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent, clear)
     radii = around.units - margin_units
-    early = math.floor(min(budget.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
+    early = budget.tolerance_units
     # Both sides of the comparison are float64 sums: some units of slack make it valid for the exact
     # values.
     certain = (around.units - TOLERANCE_SLACK) / data.arrays.units_per_step
@@ -231,7 +232,10 @@ def collide_bounded(
         lost |= in_unknown(around.boxes, data.unknown, data.nothing_clear)
         np.minimum(known.missing_bound, unknown_gaps(data, around), out=known.missing_bound)
     floor = signed_bound(np.minimum(known.missing_bound, known.lower), data, radii)
-    lower = np.minimum(np.maximum(floor, -radii / UNITS_PER_METRE), np.minimum(upper, margin))
+    lower = np.minimum(
+        np.maximum(floor, -radii / UNITS_PER_METRE),
+        np.minimum(upper, min(margin, margin_units / UNITS_PER_METRE)),
+    )
     verdict = np.where(contact, Verdict.CONTACT, np.where(lost, Verdict.UNKNOWN, Verdict.CLEAR))
     return CollideAnswers(
         verdict.astype(np.uint8), around.outside, counts[0], counts[1], counts[2], lower, upper,

@@ -14,10 +14,12 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
 from ....schemas.wire.question_rules import Question
 from ....schemas.wire.requests import QuestionOptions
+from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
 from ...residency.voxel_cache import VoxelCache
 from ...residency.voxel_states import HeldVoxels
@@ -68,6 +70,11 @@ class QueryBudget(NamedTuple):
     def between_bounds(self) -> float:
         """Return the distance that two bounds may lie apart, however small the distance [m]."""
         return max(self.tolerance, LEAST_RELATIVE if self.relative > 0.0 else 0.0)
+
+    @property
+    def tolerance_units(self) -> int:
+        """Return the tolerance in exact units, rounded down; at most the longest reach."""
+        return math.floor(min(self.tolerance * UNITS_PER_METRE, float(MAX_REACH_UNITS)))
 
     @property
     def spent(self) -> bool:

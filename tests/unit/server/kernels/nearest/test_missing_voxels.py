@@ -13,6 +13,8 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach
 from solidcloud.server.kernels.nearest.missing_voxels import split_missing
+from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.residency.coarse_bounds import CoarseBounds
 from solidcloud.server.runtime.stop_flag import StopFlag
 from solidcloud.server.scene import Scene
@@ -105,17 +107,18 @@ def test_bounds_hold_and_coarse_bounds_are_closer(made: Made, rng: np.random.Gen
 @pytest.mark.interpreted
 def test_once_stopped_nothing_is_known_of_what_was_not_examined(made: Made) -> None:
     body, stop = make_avatar(np.zeros((1, 3)), 0.01), StopFlag()
-    poses = archive_cases.pose_of(np.eye(3), np.array([2.0, 2.0, 2.0]))[None]
+    poses = np.array([archive_cases.pose_of(np.eye(3), np.array([x, 1.0, 1.0])) for x in (0.5, 1.0, 1.5)])
     stop.set("enough")
     stopped = made._replace(arrays=made.arrays._replace(stop=stop.flag))
     reach = made.reach(body, poses, REACH)
     starts, rows = np.empty_like(reach.starts), np.empty_like(reach.rows)
-    bound, counts = np.full(1, math.inf), np.zeros((3, 1), np.uint32)
+    bound, counts = np.full(3, math.inf), np.zeros((3, 3), np.uint32)
     split_missing(
-        poses, body.arrays, stopped.arrays, made.broad, made.coarse.arrays, reach, np.arange(1), starts, rows,
+        poses, body.arrays, stopped.arrays, made.broad, made.coarse.arrays, reach, np.arange(3), starts, rows,
         bound, counts,
     )  # fmt: skip
-    assert bound[0] == 0.0 and counts[0, 0] == reach.starts[1] and starts.tolist() == [0, 0]
+    assert (bound == 0.0).all() and starts.tolist() == [0] * 4
+    assert counts[0].tolist() == np.diff(reach.starts).tolist() and counts[0].min() > 0
 
 
 def test_without_time_to_load_answers_have_the_bounds_of_nodes(tmp_path: Path) -> None:
@@ -139,13 +142,16 @@ def test_without_time_to_load_answers_have_the_bounds_of_nodes(tmp_path: Path) -
             far[0, 0, 3] += 8.0
             scene.distance("body", far, 2.0)
             assert [scene.residency.is_resident(row) for row in range(2)] == [False, True]
-            found = scene.distance("body", pose, 2.0, budget_ms=0.0)
+            # Without the stop flag of `budget_ms`, which compilation would set off.
+            late = QueryBudget(deadline=0.0)
+            found = distance_bounded(scene._data, scene.avatar("body", ""), pose, 2.0, late)
             assert found.lower[0] <= true.signed_distance[0] <= found.upper[0]
             lower[policy] = float(found.lower[0])
         with Scene.open(case.archive, policy=policy, budget_bytes=budget) as scene:
             scene.add_avatar("body", body, 0.01)
             scene.distance("body", pose, 2.0)
             scene.distance("body", far, 2.0)
-            verdicts[policy] = int(scene.collide("body", pose, budget_ms=0.0).verdict[0])
+            touch = collide_bounded(scene._data, scene.avatar("body", ""), pose, 0.0, late)
+            verdicts[policy] = int(touch.verdict[0])
     assert lower["lru"] < 0.0 and lower["lru+prefetch"] > 0.5
     assert verdicts == {"lru": Verdict.UNKNOWN, "lru+prefetch": Verdict.CLEAR}

@@ -15,8 +15,11 @@ from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...kernels.nearest.missing_voxels import split_missing
 from ...residency.coarse_bounds import drop_clear_pairs
 from ...residency.voxel_states import HeldVoxels
+from .query_budget import QueryBudget
 from .query_context import SceneData
 
+# Pairs of pose and voxel bounded by nodes after a deadline: some microseconds each.
+MAX_LATE_PAIRS = 1024
 _NO_COARSE = CoarseArrays(
     np.empty(0, np.float32), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.int32)
 )
@@ -47,6 +50,7 @@ def bound_missing(
     which: NDArray[np.int64],
     missing_bound: NDArray[np.float64],
     counts: NDArray[np.uint32],
+    budget: QueryBudget,
 ) -> VoxelsInReach:
     """Return `part` without the voxels that are not resident; `part` itself if all are.
 
@@ -56,7 +60,9 @@ def bound_missing(
     """
     if not held.late and not held.faults:
         return part
-    coarse = _NO_COARSE if data.coarse is None else data.coarse.arrays
+    # When a deadline has passed, no more time is spent on nodes than on the load of a voxel.
+    hurried = budget.deadline < np.inf and part.starts[-1] > MAX_LATE_PAIRS
+    coarse = _NO_COARSE if data.coarse is None or hurried else data.coarse.arrays
     starts, rows = np.empty_like(part.starts), np.empty(max(1, int(part.starts[-1])), np.int64)
     split_missing(
         poses,

@@ -89,8 +89,20 @@ def test_every_operation_answers_in_both_encodings(service, encoding):
     assert scenes == ScenesAnswer(["floor"], 1, 1)
 
 
-EFFORT = {"tolerance": 0.5, "budget_ms": 20.0, "budget_visits": 7, "radius_model": "local:0.5"}
-PLAIN = {"tolerance": 0.0, "budget_ms": None, "budget_visits": None, "radius_model": None}
+EFFORT = {
+    "tolerance": 0.5,
+    "relative_tolerance": 0.25,
+    "budget_ms": 20.0,
+    "budget_visits": 7,
+    "radius_model": "local:0.5",
+}
+PLAIN = {
+    "tolerance": 0.0,
+    "relative_tolerance": 0.0,
+    "budget_ms": None,
+    "budget_visits": None,
+    "radius_model": None,
+}
 POSES = np.tile(np.eye(4), (3, 1, 1))
 ONE = [ObjectEntry("al"), ObjectEntry("al", 2, 5)]
 REQUESTS = [

@@ -96,6 +96,7 @@ class BuildConfig:
     comparison, five times as slow.
     jobs: number of worker processes; 0: one per core.  memory_bytes: bound on the memory of the
     passes.
+    level: also write a level of detail (schemas/archive/level.py).
     keep: extra columns, among "scan", "intensity" and "normal".
     normal_reach: radius of the neighbourhood from which a normal is estimated [m]
     (schemas/kernels/normal_codes.py), if normals are kept.
@@ -126,6 +127,7 @@ class BuildConfig:
     with_slab: bool = True
     jobs: int = 0
     memory_bytes: int = 2 << 30
+    level: bool = True
     keep: frozenset[str] = field(default_factory=frozenset)
     normal_reach: float = NORMAL_REACH
     strict: bool = False

@@ -18,6 +18,7 @@ import numpy as np
 from ..schemas.archive.archive import Archive
 from ..schemas.archive.archive_writer import write_index
 from ..schemas.archive.index import SHARD_FOLDER, Header
+from ..schemas.archive.level import LEVEL_FOLDER
 from ..schemas.archive.voxel_grid import Lattice
 from ..schemas.archive.vtkhdf import PREVIEW_NAME
 from ..schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
@@ -33,6 +34,7 @@ from .build_limits import (
 from .config import BuildConfig
 from .passes.build_shards import Shard, build_shards
 from .passes.dataset_header import archive_id, make_header
+from .passes.level_pass import write_level
 from .passes.point_spacing import archive_mean
 from .passes.preview import write_preview
 from .passes.spool_pass import spool_scans
@@ -58,7 +60,8 @@ ONE_POINT = "a single distinct point has no closest point: give --radius"
 class BuildSummary(NamedTuple):
     """Result of a build.
 
-    bytes: of index and shards.  preview_bytes: of the preview, 0 if it was deleted.
+    bytes: of index and shards.  preview_bytes, level_bytes: of the preview and of the level of
+    detail, 0 if there is none.
     stages: seconds of each stage.  skipped: reason -> points left out.
     lattice_step, moved_max, radius, radius_error: [m], see schemas/archive/index.py Header.
     faults: faults of the scans that were left out.
@@ -72,6 +75,7 @@ class BuildSummary(NamedTuple):
     shards: int
     bytes: int
     preview_bytes: int
+    level_bytes: int
     seconds: float
     stages: dict[str, float]
     lattice_step: float
@@ -260,7 +264,7 @@ def _check_unchanged(
 
 
 def _read_back(folder: Path, points: int, spool: Spool, build: Transaction) -> None:
-    """Read back everything that was written, to make the preview and to verify every record.
+    """Read back everything that was written, to make level and preview and to verify every record.
 
     The records must contain the points of the scans: a disk may return other data than was written.
     Raise CorruptError if anything differs.
@@ -269,6 +273,9 @@ def _read_back(folder: Path, points: int, spool: Spool, build: Transaction) -> N
     paths: tuple[Path, ...] = ()
     try:
         try:
+            if build.config.level:
+                with build.stage("level", points, "points"):
+                    write_level(folder, build.executor, build.progress)
             with build.stage("preview", points, "points"):
                 write_preview(folder, build.executor, build.progress)
         except CorruptError as error:
@@ -319,14 +326,20 @@ def _summary(
 ) -> BuildSummary:
     """Make the summary of a complete archive."""
     target = build.target
-    sizes = {f.relative_to(target).as_posix(): f.stat().st_size for f in target.rglob("*") if f.is_file()}
+    sizes = {f.relative_to(target): f.stat().st_size for f in target.rglob("*") if f.is_file()}
+    preview, level = (
+        sizes.pop(Path(PREVIEW_NAME), 0),
+        [name for name in sizes if name.parts[0] == LEVEL_FOLDER],
+    )
+    level_bytes = sum(sizes.pop(name) for name in level)
     return BuildSummary(
         archive=target,
         points=header.points,
         voxels=voxels,
         shards=shards,
-        bytes=sum(size for name, size in sizes.items() if name != PREVIEW_NAME),
-        preview_bytes=sizes.get(PREVIEW_NAME, 0),
+        bytes=sum(sizes.values()),
+        preview_bytes=preview,
+        level_bytes=level_bytes,
         seconds=time.perf_counter() - begin,
         stages=build.seconds,
         lattice_step=header.lattice.step,

@@ -90,6 +90,7 @@ class Scene(SceneQuestions):
         open_store: OpenStore | None = None,
         radius_model: str | None = None,
         read_points: ReadPoints | None = None,
+        coarse_bytes: int | None = None,
     ) -> "Scene":
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
 
@@ -102,6 +103,8 @@ class Scene(SceneQuestions):
         them itself.
         read_points: returns the points (n, 3) of an avatar's file [m]; None: files are read as by
         `add_avatar`.
+        coarse_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
+        tolerance before voxels are loaded; None: a sixteenth, 0: none.
         Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
         invalid scene file or a budget that is too small.
         """
@@ -109,7 +112,7 @@ class Scene(SceneQuestions):
         if is_scene_file(path):
             if open_store is not None or radius_model is not None:
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
-            return cls._open_file(path, name, budget_bytes, policy, read_points)
+            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes)
         metrics = RequestStats()
         archive = PlacedArchive.open(
             path,
@@ -119,12 +122,19 @@ class Scene(SceneQuestions):
             open_store=open_store or VoxelStore,
             radius_model=radius_model,
             took=metrics.loaded,
+            coarse_bytes=coarse_bytes,
         )
         return cls([archive], archive.name, metrics)
 
     @classmethod
     def _open_file(
-        cls, path: Path, name: str | None, budget_bytes: int, policy: str, read_points: ReadPoints | None
+        cls,
+        path: Path,
+        name: str | None,
+        budget_bytes: int,
+        policy: str,
+        read_points: ReadPoints | None,
+        coarse_bytes: int | None,
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
         file = read_scene(path)
@@ -134,7 +144,9 @@ class Scene(SceneQuestions):
         own = {each.info.name: (each.points, each.info.radius) for each in avatars}
         metrics = RequestStats()
         with ExitStack() as stack:
-            archives = open_archives(file, path, name, found, budget_bytes, policy, metrics.loaded)
+            archives = open_archives(
+                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes
+            )
             for archive in archives:
                 stack.callback(archive.close)
             with error_location(path, "$.effects"):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
+from ...schemas.archive.level import LEVEL_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
 from ...schemas.process.new_file import sync_path
@@ -27,6 +28,7 @@ from ..build_limits import bytes_beside_records, readers_that_fit
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import position_hash_sum
+from ..passes.level_pass import replace_level, write_level
 from ..passes.preview import write_preview
 from ..passes.verify import voxel_faults
 from ..resume.lock import locked
@@ -72,8 +74,12 @@ class Change(Transaction):
 
     @property
     def reads_all(self) -> bool:
-        """Return whether the change ends by reading all records, for `radius_now` or a preview."""
-        return self.archive.header.radius_model == "mean" or (self.target / PREVIEW_NAME).exists()
+        """Return whether the change ends by reading all records.
+
+        They are read for `radius_now`, a preview or a level.
+        """
+        derived = (self.target / PREVIEW_NAME).exists() or (self.target / LEVEL_FOLDER).exists()
+        return self.archive.header.radius_model == "mean" or derived
 
     def readers(self, counts: NDArray[np.int64]) -> int:
         """Return the number of jobs that may read back voxels of `counts` points at a time.
@@ -249,13 +255,17 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
 
     If the process is killed before the index is renamed, the archive is the old one, and the next
     run deletes the new shards. If it is killed afterwards, the archive is the new one, and the next
-    run deletes the old shards. An existing preview is replaced slightly later; until then it names
-    the old generation.
+    run deletes the old shards. An existing preview and an existing level are replaced slightly
+    later; until then they name the old generation.
     """
     shards, preview = change.target / SHARD_FOLDER, change.folder / PREVIEW_NAME
+    level = change.target / LEVEL_FOLDER
     if (change.target / PREVIEW_NAME).exists():
         with Archive(change.folder) as archive, change.stage("preview", archive.header.points, "points"):
             write_preview(change.folder, change.executor, change.progress)
+    if level.exists():
+        with Archive(change.folder) as archive, change.stage("level", archive.header.points, "points"):
+            write_level(change.folder, change.executor, change.progress)
     try:
         for name in new:
             os.rename(change.folder / SHARD_FOLDER / name, shards / name)
@@ -274,5 +284,7 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
         raise
     if preview.exists():
         os.replace(preview, change.target / PREVIEW_NAME)
+    if level.exists():
+        replace_level(change.target, change.folder / LEVEL_FOLDER, change.folder / "old level")
     sync_path(change.target)
     delete_orphans(change.target, named)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
+from ...schemas.archive.level import LEVEL_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import CorruptError
 from ..config import DEFAULT_VOXEL
@@ -78,7 +79,12 @@ def summarize_archive(archive: Archive) -> ArchiveSummary:
     """
     header = archive.header
     counts = archive.voxels["rows"][:, 2].astype(np.int64)
-    files = [path for path in archive.folder.rglob("*") if path.is_file() and path.name != PREVIEW_NAME]
+    derived = (PREVIEW_NAME, LEVEL_FOLDER)
+    files = [
+        path
+        for path in archive.folder.rglob("*")
+        if path.is_file() and path.relative_to(archive.folder).parts[0] not in derived
+    ]
     try:
         area = surface_area(archive)
         area_from = f"cubes of {length_text(area.edge)} that hold points, in {area.voxels:,} of {len(counts):,} voxels"

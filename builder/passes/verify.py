@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import DecompressedRecord
-from ...schemas.archive.index import SHARD_FOLDER, Header
+from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header
+from ...schemas.archive.level import LEVEL_FOLDER, open_level
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
@@ -20,6 +21,7 @@ from ..kernels.points.voxel_records import last_unenclosing_node, measure_points
 from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges, worker_count
 from ..voxel.exact_enclosure import loose_nodes, sample_nodes
 from ..voxel.record_points import leaves_of, spheres_of, voxel_points
+from .level_pass import check_level
 from .preview import preview_faults
 
 
@@ -124,11 +126,13 @@ def verify_archive(
     progress.start("verify", header.points, "points")
     with unchanged(folder, header):  # because each unit opens the archive again
         results = list(run_units(executor, _verify_rows, units, progress, lambda unit: unit.points))
+        with Archive(folder) as archive:
+            of_level, about_level = level_faults(archive, executor, deep=deep)
     progress.finish()
     found = [
         result for _, result in sorted(zip(units, results, strict=True), key=lambda pair: pair[0].rows.start)
     ]
-    faults += [fault for part in found for fault in part.faults]
+    faults += [*(fault for part in found for fault in part.faults), *of_level]
     points = sum(part.points for part in found)
     others = False
     classes = np.sum([part.classes for part in found], axis=0, dtype=np.int64)
@@ -148,7 +152,7 @@ def verify_archive(
         tuple(faults),
         int(counts[:, 1].sum()),
         proved,
-        (*notes, *more),
+        (*notes, *more, *about_level),
         damaged,
         others,
     )
@@ -274,6 +278,28 @@ def normal_faults(archive: Archive, row: int) -> list[str]:
     if not wrong:
         return []
     return [f"{archive.where(row)}: {wrong} normals are not those of the points: rebuild the archive"]
+
+
+def level_faults(archive: Archive, executor: Executor | None, *, deep: bool) -> tuple[list[str], list[str]]:
+    """Return the faults of the level of an archive, and notes on it; both are empty without a level.
+
+    deep: also check that it is that of the archive's points.
+    """
+    folder = archive.folder / LEVEL_FOLDER
+    if not (folder / INDEX_NAME).is_file():
+        return [], []
+    try:
+        level = open_level(archive)
+    except FormatError as error:
+        return [str(error)], []
+    if level is None:
+        return [], [f"{folder}: belongs to another archive or generation"]
+    level.close()
+    points = archive.voxels["rows"][:, 2].astype(np.int64)
+    faults = list(verify_archive(folder, executor=executor).faults)
+    if deep and not faults:
+        faults += check_level(archive.folder, executor, voxel_ranges(points, jobs_of(executor)), points)
+    return faults, []
 
 
 def _strangers(archive: Archive) -> list[str]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER
+from ...schemas.archive.level import LEVEL_FOLDER
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.process.new_file import is_temporary, remove_temporaries, sync_path
@@ -136,7 +137,8 @@ def check_target(target: Path, overwrite: bool) -> None:
     if not overwrite:
         raise BadRequestError(f"{target}: an archive is here already: give another -o, or --overwrite")
     shards = list((target / SHARD_FOLDER).iterdir()) if (target / SHARD_FOLDER).is_dir() else []
-    strangers = [p for p in target.iterdir() if p.name not in (INDEX_NAME, SHARD_FOLDER, PREVIEW_NAME)]
+    own = (INDEX_NAME, SHARD_FOLDER, PREVIEW_NAME, LEVEL_FOLDER)
+    strangers = [p for p in target.iterdir() if p.name not in own]
     # A unit that was given up may have left a temporary file of a build that was killed before it
     # could remove it.
     strangers += [p for p in shards if not p.is_file() or (p.suffix != ".h5" and not is_temporary(p))]

@@ -25,7 +25,7 @@ SHARD_FOLDER = "shards"
 SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
 DATASETS = ("cells", "nodes", "points")
 # Versions that this software reads. It writes the lowest version that can represent the header.
-FORMAT_VERSIONS = (1, 2, 3, 4)
+FORMAT_VERSIONS = (1, 2, 3, 4, 5)
 
 SHARD_DTYPE = np.dtype([("name", "S24"), ("bytes", "<u8")])
 # One row per voxel, sorted by key.
@@ -107,23 +107,21 @@ class Header:
 
     archive_id: 16 bytes that depend only on the points and options.
     low, high: (3,) int64, least and greatest lattice coordinates of the points, inclusive.
-    radius: half the mean closest-point distance [m].
+    radius: half the mean closest-point distance [m].  radius_sample: number of points sampled.
     radius_error: its standard error [m], 0 if all points were sampled.
-    radius_sample: number of points sampled.
-    moved_max: farthest distance that quantising moved a point along an axis [m].
-    lattice_source: "sources", "given" or "default".
-    models: the stored radius models, in the order of STORED_MODELS.
-    radius_counts: (32,) int64, number of points of each radius class; zeros if none are stored.
+    moved_max: farthest distance that quantising moved a point along an axis [m].  lattice_source:
+    "sources", "given" or "default".
+    models: the stored radius models, in the order of STORED_MODELS.  options: of the build.
+    radius_counts: (32,) int64, points of each radius class; zeros if none are stored.
     radius_capped: number of points with too few neighbours for a local class, which have the
     largest.
-    options: options of the build.
     unknown: (u, 2, 3) int64, lattice boxes, inclusive, of scans that were left out.
     unknown_everywhere: whether a scan with unknown bounds was left out.
     generation: how often scans were added or removed since the build.
     radius_now: `radius` as measured over the points of this generation; None in generation 0, where
     it equals `radius`, and if the radius was given.
     normal_reach: points within this distance determine a normal [m] (kernels/normal_codes.py); 0:
-    no normals are stored.
+    no normals are stored.  is_level: whether the points and classes are those of a level (level.py).
     """
 
     archive_id: bytes
@@ -151,11 +149,12 @@ class Header:
     generation: int = 0
     radius_now: RadiusNow | None = None
     normal_reach: float = 0.0
+    is_level: bool = False
 
     @property
     def radius_class(self) -> bool:
-        """Return True if the points have a radius class."""
-        return self.models != ("mean",)
+        """Return True if the points have a radius class, or the cover class of a level."""
+        return self.models != ("mean",) or self.is_level
 
     @property
     def normals(self) -> bool:
@@ -165,8 +164,8 @@ class Header:
     @property
     def format_version(self) -> int:
         """Return the lowest format version that can represent this header."""
-        if self.normals:
-            return 4
+        if self.is_level or self.normals:
+            return 5 if self.is_level else 4
         if self.generation:
             return 3
         return 2 if self.radius_class else 1
@@ -201,6 +200,8 @@ def _texts(header: Header) -> bytes:
 def _point_columns(header: Header) -> list[bool]:
     """Return a flag for each optional column of the points (`columns` in FORMAT.md)."""
     flags = [header.scan_index, header.intensity]
+    if header.is_level:
+        return flags
     if header.radius_class or header.normals:
         flags += ["local" in header.models, "border" in header.models]
     return [*flags, True] if header.normals else flags
@@ -246,6 +247,7 @@ INDEX_COLUMNS = {
     "radius_counts": IndexColumn(_U8, (RADIUS_CLASSES,), lambda header: header.radius_counts, "radius_class"),
     "radius_capped": IndexColumn(_U8, (1,), lambda header: header.radius_capped, "radius_class"),
     "normal_reach": IndexColumn(_F8, (1,), lambda header: header.normal_reach, "normals"),
+    "level": IndexColumn(_U1, (1,), lambda header: header.is_level, "is_level"),
     "generation": IndexColumn(_U4, (1,), lambda header: header.generation, "generation"),
     "radius_now": IndexColumn(_F8, (3,), _radius_now, "generation"),
     "unknown": IndexColumn(_I8, (-1, 2, 3), lambda header: header.unknown),
@@ -365,7 +367,7 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     held = columns["columns"].astype(bool).tolist()
     models = ("mean", *(name for name, here in zip(("local", "border"), held[2:], strict=False) if here))
     counts, capped = np.zeros(RADIUS_CLASSES), 0
-    if len(models) > 1:
+    if "radius_counts" in columns:
         counts, capped = columns["radius_counts"], int(columns["radius_capped"][0])
     return Header(
         archive_id=archive_id,
@@ -393,4 +395,5 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         generation=generation,
         radius_now=now,
         normal_reach=float(columns["normal_reach"][0]) if "normal_reach" in columns else 0.0,
+        is_level="level" in columns,
     )

@@ -111,12 +111,20 @@ def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
     classes, normals, later = len(kept) > 2 and any(kept[2:4]), len(kept) == 5, "generation" in columns
     if len(kept) not in (2, 4, 5) or (len(kept) == 4 and not classes) or (normals and not kept[4]):
         _refuse("columns", kept, "2 flags, 4 with radius classes, 5 with normals")
-    held = {"radius_class": classes, "normals": normals, "generation": later}
+    is_level = "level" in columns
+    if is_level and (kept != [0, 0] or columns["level"][0] != 1):
+        _refuse("level and columns", [*columns["level"].tolist(), *kept], "1, and no column")
+    held = {
+        "radius_class": classes or is_level,
+        "normals": normals,
+        "generation": later,
+        "is_level": is_level,
+    }
     if any((name in columns) != held[requires] for name, requires in _OPTIONAL.items()):
         _refuse("datasets", [name for name in _OPTIONAL if name in columns], f"those of columns {kept}")
     if normals and not 0 < (reach := float(columns["normal_reach"][0])) <= MAX_NORMAL_REACH:
         _refuse("normal_reach", reach, f"above 0, at most {MAX_NORMAL_REACH:g}")
-    expected = 4 if normals else 3 if later else 2 if classes else 1
+    expected = 5 if is_level else 4 if normals else 3 if later else 2 if classes else 1
     if version != expected:
         _refuse("format_version", version, f"{expected}, from the datasets")
     degree, leaf = columns["tree"].tolist()

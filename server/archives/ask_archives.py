@@ -23,8 +23,9 @@ from ..queries.context.query_budget import NO_LIMIT, QueryBudget, ask_until_stop
 from ..queries.context.query_context import SceneData, with_stop
 from ..queries.path import part_stop, path_question
 from ..runtime.stop_flag import NO_STOP, StopFlag
+from .archive_generation import ArchiveGeneration
 from .merge_answers import answers_in_world, limit_pairs, merge_answers
-from .placed_archive import ArchiveGeneration, PlacedArchive
+from .placed_archive import PlacedArchive
 from .rigid_transform import Pose
 from .scene_info import count_sources
 

@@ -57,6 +57,7 @@ class MaskedArchive(Archive):
         self._boxes = [np.asarray(box, np.float64) for box in boxes]
         self._pose = archive_pose(pose)
         self._file: io.FileIO | None = None
+        self.is_as_stored = False
         self._end = 0
         self._rebuilt: dict[int, _Place] = {}
         self._corrupt: dict[int, CorruptError] = {}

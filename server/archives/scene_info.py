@@ -9,8 +9,8 @@ from msgspec import structs
 from ...schemas.wire.scene_messages import SceneInfo
 from ...schemas.wire.stats import AvatarStats, Counters, StatsAnswer
 from ..observability.request_stats import RequestStats, times_of
+from .archive_generation import ArchiveGeneration
 from .archive_info import listed_sources
-from .placed_archive import ArchiveGeneration
 from .rigid_transform import Pose, transform_boxes, transform_poses
 
 

@@ -24,6 +24,7 @@ from .commands import doctor_command as doctor
 from .commands import export_command as export
 from .commands import info_validate_command as info_validate
 from .commands import inspect_command as inspect
+from .commands import level_command as level
 from .commands import loadtest_command as loadtest
 from .commands import make_command as make
 from .commands import plan_command as plan
@@ -60,6 +61,7 @@ for verb in (
     build.build,
     info_validate.info,
     info_validate.validate,
+    level.level,
     serve.serve,
     accuracy.accuracy,
     query.query,

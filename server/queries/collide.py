@@ -2,19 +2,24 @@
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
-from ..kernels.collide.early_contact import CLEAR, UNKNOWN, write_verdict_bounds
+from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
+from ..kernels.core.voxels_in_reach import VoxelsInReach
 from .context.anytime_search import collide_bounded
+from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
+    LevelOfDetail,
     SceneData,
     as_held,
     find_proved_reach,
@@ -40,33 +45,118 @@ def collide(
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
     if budget.limited:
-        return collide_bounded(data, avatar, poses, margin, budget)
+        answers = collide_bounded(data, avatar, poses, margin, budget)
+        return _with_level_verdicts(data, avatar, poses, margin, budget, answers)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
-    other_units, early = data.radius_units + margin_units, budget.tolerance_units
-    k = len(array)
-    residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
-    clear = drop_clear_voxels(data, avatar, array)
-    reach = find_proved_reach(data, avatar, array, other_units, budget, spent, clear)
-    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    # An avatar without points is clear, even if the index is wrong or a scan was left out.
-    for which, rows, part in (
-        pieces(reach, residency, budget.share, budget.stop) if len(avatar.points) else ()
-    ):
-        if budget.stop:
-            verdict[which[verdict[which] == CLEAR]] = UNKNOWN
-            continue
-        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            seen = as_held(data, held)
-            collide_poses(array, avatar.arrays, seen.arrays, part, which, early, NO_LIMIT, verdict, counts)
-        spent.add(held)
+    spent = CostCounter(begin, data.residency, data.broad.keys)
+    found = np.zeros(len(array), np.uint8)  # verdicts of the poses that the level settles
+
+    def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        found[which] = _level_verdicts(level, avatar, array[which], margin_units, budget, spent)
+        return np.asarray(found[which] != UNKNOWN)
+
+    by_level, coarse = SettledPoses(data, array, budget, ask), drop_clear_voxels(data, avatar, array)
+    verdict, counts, reach = _verdicts(
+        data, avatar, array, margin_units, budget, spent, lambda reach: by_level.drop(coarse(reach))
+    )
+    verdict[by_level.settled] = found[by_level.settled]
     # A load may have proved the index wrong by now.
     if (data.nothing_clear or len(data.unknown)) and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
         verdict[lost & (verdict == CLEAR)] = UNKNOWN
     bounds = verdict_bounds(verdict, reach.units - margin_units, margin, margin_units, budget)
     return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(), **bounds)
+
+
+def _verdicts(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    margin_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+    settled: Callable[[VoxelsInReach], VoxelsInReach] = lambda reach: reach,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint32], VoxelsInReach]:
+    """Return verdicts (k,), counts (3, k) and reach of poses (k, 4, 4).
+
+    Regions that were left out are not considered. settled: see `find_proved_reach`.
+    """
+    k, other_units = len(poses), data.radius_units + margin_units
+    reach = find_proved_reach(data, avatar, poses, other_units, budget, spent, settled)
+    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
+    # An avatar without points is clear, even if the index is wrong or a scan was left out.
+    if not len(avatar.points):
+        return verdict, counts, reach
+    residency, early = data.residency, budget.tolerance_units
+    for which, rows, part in pieces(reach, residency, budget.share, budget.stop):
+        if budget.stop:
+            verdict[which[verdict[which] == CLEAR]] = UNKNOWN
+            continue
+        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
+            seen = as_held(data, held)
+            collide_poses(poses, avatar.arrays, seen.arrays, part, which, early, NO_LIMIT, verdict, counts)
+        spent.add(held)
+    return verdict, counts, reach
+
+
+def _level_verdicts(
+    level: LevelOfDetail,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    margin_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+) -> NDArray[np.uint8]:
+    """Return the verdicts (k,) that follow from the level alone; UNKNOWN where none does.
+
+    CLEAR and CONTACT are those of the scene, EARLY is a pair within margin plus tolerance.
+    """
+    exact, own = level_budget(budget), spent.of_level(level.covers.residency)
+    verdict = np.full(len(poses), UNKNOWN, np.uint8)
+    covered, _, reach = _verdicts(level.covers, avatar, poses, margin_units, exact, own)
+    lost = in_unknown(reach.boxes, level.covers.unknown, level.covers.nothing_clear)
+    clear = (covered == CLEAR) & ~lost
+    verdict[clear] = CLEAR
+    left = np.flatnonzero(~clear)
+    if len(left):
+        within = margin_units + budget.tolerance_units
+        touched, _, _ = _verdicts(level.points, avatar, poses[left], within, exact, own)
+        verdict[left[touched == CONTACT]] = EARLY if budget.tolerance_units else CONTACT
+    spent.add_level(own)
+    return verdict
+
+
+def _with_level_verdicts(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: ArrayLike,
+    margin: float,
+    budget: QueryBudget,
+    answers: CollideAnswers,
+) -> CollideAnswers:
+    """Return the answers of a request with a deadline, with those of its level where voxels are missing."""
+    which = np.flatnonzero((answers.verdict == UNKNOWN) & (answers.voxels_missing > 0))
+    if data.level is None or budget.deadline == math.inf or not len(which) or budget.stop:
+        return answers
+    array, margin_units = kernel_poses(poses)[which], to_units(margin, "margin")
+    spent = CostCounter(0.0, data.residency, data.broad.keys)
+    level = stoppable(data.level, budget)
+    found = asked(lambda: _level_verdicts(level, avatar, array, margin_units, budget, spent))
+    if found is None:
+        return answers
+    if data.nothing_clear:
+        found[found == CLEAR] = UNKNOWN
+    clear, touched = which[found == CLEAR], which[(found == CONTACT) | (found == EARLY)]
+    verdict, lower, upper, exact = (
+        column.copy() for column in (answers.verdict, answers.lower, answers.upper, answers.exact)
+    )
+    rounded = margin_units / UNITS_PER_METRE
+    verdict[clear], lower[clear], exact[clear] = CLEAR, min(float(margin), rounded), True
+    within = float(np.nextafter(max(float(margin), rounded) + budget.tolerance, math.inf))
+    verdict[touched], upper[touched] = CONTACT, np.minimum(upper[touched], within)
+    return structs.replace(answers, verdict=verdict, lower=lower, upper=upper, exact=exact)
 
 
 def verdict_bounds(

@@ -5,18 +5,24 @@ signed_distance.py has the definition.
 
 import math
 import time
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from msgspec import structs
+from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.wire.answers import DistanceAnswers
+from ...schemas.wire.answers import DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.anytime_search import TOLERANCE_SLACK, distance_bounded
+from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
+    LevelOfDetail,
     SceneData,
     as_held,
     find_proved_reach,
@@ -26,6 +32,9 @@ from .context.query_context import (
 )
 from .context.signed_distance import distance_columns, unknown_gaps
 from .context.unloaded_voxels import bound_missing
+
+# Rounding of square roots and of placed points in a bound [exact units].
+_ROUNDING = 4.0
 
 
 def distance(
@@ -43,45 +52,178 @@ def distance(
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     if budget.limited:
-        return distance_bounded(data, avatar, poses, reach, budget)
+        answers = distance_bounded(data, avatar, poses, reach, budget)
+        return _with_level_distances(data, avatar, poses, reach, budget, answers)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
-    k = len(array)
-    residency, spent = data.residency, CostCounter(begin, data.residency, data.broad.keys)
-    around = find_proved_reach(data, avatar, array, data.radius_units + reach_units, budget, spent)
-    nearest = NearestPairs(
-        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
-    )
-    counts = np.zeros((3, k), np.uint32)
-    tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
+    spent = CostCounter(begin, data.residency, data.broad.keys)
+    found = no_pairs(len(array))
+
+    def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        if len(data.arrays.radius_deficit) > 1:  # the level does not know the radius of its points
+            return np.zeros(len(which), bool)
+        of_level = _search_level(level, avatar, array[which], reach_units, budget, spent)
+        settled = _settled(of_level, reach_units, budget)
+        for column, own in zip(found, of_level.pairs, strict=True):
+            column[which[settled]] = own[settled]
+        return settled
+
+    by_level = SettledPoses(data, array, budget, ask)
+    nearest, counts, around = _pairs(data, avatar, array, reach_units, budget, spent, by_level.drop)
+    for column, own in zip(nearest, found, strict=True):
+        column[by_level.settled] = own[by_level.settled]
     if len(avatar.points):
-        for which, rows, part in pieces(around, residency, budget.share, budget.stop):
-            if budget.stop:
-                nearest.missing_bound[which] = 0.0
-                continue
-            with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-                seen = as_held(data, held)
-                own = bound_missing(
-                    seen, held, avatar, array, part, which, nearest.missing_bound, counts, budget
-                )
-                nearest_poses(
-                    array,
-                    avatar.arrays,
-                    seen.arrays,
-                    data.broad,
-                    own,
-                    reach_units,
-                    which,
-                    budget.relative,
-                    tolerance,
-                    NO_LIMIT,
-                    nearest,
-                    counts,
-                )
-            spent.add(held)
         np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
     return DistanceAnswers(
         **distance_columns(data, around, float(reach), reach_units, nearest, counts),
         **spent.fields(),
     )
+
+
+def no_pairs(k: int) -> NearestPairs:
+    """Return the pairs of k poses before any is found: none, and nothing missing."""
+    return NearestPairs(
+        np.full(k, -1, np.int64), np.zeros((k, 6), np.int64), np.zeros(k, np.int64), np.full(k, math.inf)
+    )
+
+
+def _pairs(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    reach_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+    settled: Callable[[VoxelsInReach], VoxelsInReach] = lambda reach: reach,
+) -> tuple[NearestPairs, NDArray[np.uint32], VoxelsInReach]:
+    """Return nearest pairs, counts (3, k) and reach of poses (k, 4, 4).
+
+    Regions that were left out are not considered. settled: see `find_proved_reach`.
+    """
+    k, residency = len(poses), data.residency
+    around = find_proved_reach(data, avatar, poses, data.radius_units + reach_units, budget, spent, settled)
+    nearest, counts = no_pairs(k), np.zeros((3, k), np.uint32)
+    tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
+    if not len(avatar.points):
+        return nearest, counts, around
+    for which, rows, part in pieces(around, residency, budget.share, budget.stop):
+        if budget.stop:
+            nearest.missing_bound[which] = 0.0
+            continue
+        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
+            seen = as_held(data, held)
+            own = bound_missing(seen, held, avatar, poses, part, which, nearest.missing_bound, counts, budget)
+            nearest_poses(
+                poses,
+                avatar.arrays,
+                seen.arrays,
+                data.broad,
+                own,
+                reach_units,
+                which,
+                budget.relative,
+                tolerance,
+                NO_LIMIT,
+                nearest,
+                counts,
+            )
+        spent.add(held)
+    return nearest, counts, around
+
+
+class _LevelDistances(NamedTuple):
+    """Result of a search of the level for k poses.
+
+    pairs: the nearest representatives; their `missing_bound` is `lower` in steps.
+    nearest, lower: (k,) float64, upper and lower bound of the distance between the avatar's centres
+    and those of the scene [exact units]; inf: no pair within reach.
+    radii: (k,) int64, sum of the radii of avatar and scene, exact units.
+    reach: of the cover spheres.
+    """
+
+    pairs: NearestPairs
+    nearest: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    radii: NDArray[np.int64]
+    reach: VoxelsInReach
+
+
+def _search_level(
+    level: LevelOfDetail,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    reach_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+) -> _LevelDistances:
+    """Search the level of a scene with a single radius under poses (k, 4, 4)."""
+    exact, own = level_budget(budget), spent.of_level(level.covers.residency)
+    covered, _, reach = _pairs(level.covers, avatar, poses, reach_units, exact, own)
+    np.minimum(covered.missing_bound, unknown_gaps(level.covers, reach), out=covered.missing_bound)
+    pairs, _, _ = _pairs(level.points, avatar, poses, reach_units, exact, own)
+    spent.add_level(own)
+    # All points lie within the cover radius of a representative, also those of voxels of the level
+    # that are missing.
+    covers, scene = level.covers.radius_units, level.points.radius_units
+    beyond, nearest = _lengths(covered), _lengths(pairs)
+    lower = beyond - (covers - covered.deficit) + scene
+    missing = covered.missing_bound * level.covers.arrays.units_per_step - covers + scene
+    lower = np.maximum(np.minimum(lower, missing) - _ROUNDING, 0.0)
+    pairs.deficit[:] = 0
+    pairs.missing_bound[:] = lower / level.covers.arrays.units_per_step * (1.0 - 1e-12)
+    radii = reach.units - reach_units - covers + scene
+    return _LevelDistances(pairs, nearest, lower, radii, reach)
+
+
+def _lengths(pairs: NearestPairs) -> NDArray[np.float64]:
+    """Return the distances of pairs (k,) [exact units]; inf for none."""
+    square = np.where(pairs.square >= 0, pairs.square.astype(np.float64), np.inf)
+    return np.asarray(np.sqrt(square), np.float64)
+
+
+def _settled(found: _LevelDistances, reach_units: int, budget: QueryBudget) -> NDArray[np.bool_]:
+    """Return which poses (k,) the level answers within the tolerance, or without any pair in reach."""
+    with np.errstate(invalid="ignore"):  # no pair within reach: inf - inf, or no share of inf
+        allowed = np.fmax(budget.between_bounds * UNITS_PER_METRE, budget.relative * found.lower)
+        near = found.nearest - found.lower <= allowed - TOLERANCE_SLACK
+    return np.where(np.isfinite(found.nearest), near, found.lower > found.radii + reach_units)
+
+
+def _with_level_distances(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: ArrayLike,
+    reach: float,
+    budget: QueryBudget,
+    answers: DistanceAnswers,
+) -> DistanceAnswers:
+    """Return the answers of a request with a deadline, with closer bounds where voxels are missing."""
+    which = np.flatnonzero(~answers.exact & (answers.voxels_missing > 0))
+    one_radius = len(data.arrays.radius_deficit) == 1
+    if data.level is None or budget.deadline == math.inf or not len(which) or not one_radius or budget.stop:
+        return answers
+    array, reach_units = kernel_poses(poses)[which], to_units(reach, "reach")
+    spent = CostCounter(0.0, data.residency, data.broad.keys)
+    level = stoppable(data.level, budget)
+    found = asked(lambda: _search_level(level, avatar, array, reach_units, budget, spent))
+    if found is None:
+        return answers
+    if data.nothing_clear:
+        found.pairs.missing_bound[:] = 0.0
+    own = found.reach._replace(units=found.radii + reach_units)
+    columns = distance_columns(
+        data, own, reach, reach_units, found.pairs, np.zeros((3, len(which)), np.uint32)
+    )
+    closer = columns["upper"] < answers.upper[which]
+    at = which[closer]
+    changed = {}
+    for name in ("signed_distance", "upper", "witness_avatar", "witness_cloud", "normal"):
+        changed[name] = getattr(answers, name).copy()
+        changed[name][at] = columns[name][closer]
+    lower = answers.lower.copy()
+    lower[which] = np.minimum(np.maximum(lower[which], columns["lower"]), changed["upper"][which])
+    verdict = answers.verdict.copy()
+    verdict[which[changed["upper"][which] <= 0]] = Verdict.CONTACT
+    verdict[which[lower[which] > 0]] = Verdict.CLEAR
+    return structs.replace(answers, lower=lower, verdict=verdict, **changed)

@@ -18,13 +18,13 @@ from contextlib import AbstractContextManager
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
+from ...schemas.errors import CorruptError, MisleadingIndexError
 from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
 from .arena import ArenaBuffer
 from .eviction import EvictionPolicy, make_policy
 from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
-from .voxel_states import BackgroundLoad, HeldVoxels, Hold, VoxelStates
+from .voxel_states import BackgroundLoad, HeldVoxels, Hold, VoxelStates, voxel_sizes
 from .voxel_store import VoxelStore
 
 
@@ -34,25 +34,26 @@ class VoxelCache:
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
     on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
     on_loaded: called with the row and the runs of each loaded voxel, by the loading thread, before
-    the voxel is visible to other threads.
-    on_proved: called at the same point with the row of a voxel that matches the index.
-    on_load_time: called after each load with its duration [s].
+    the voxel is visible to other threads.  on_proved: called at the same point with the row of a
+    voxel that matches the index.  on_load_time: called after each load with its duration [s].
     stats: counts of the cache, written under its lock.
     misled: whether a loaded record contradicts the index. The index selects the voxels of a query;
     once it is wrong, it may have failed to select any voxel.
     """
 
-    def __init__(self, store: VoxelStore, budget_bytes: int, policy: EvictionPolicy | None = None) -> None:
+    def __init__(
+        self,
+        store: VoxelStore,
+        budget_bytes: int,
+        policy: EvictionPolicy | None = None,
+        *,
+        refuse_large: bool = True,
+    ) -> None:
         """Reserve `budget_bytes` for the voxels of `store`. policy: None for `lru`.
 
-        Raise BadRequestError if the largest voxel exceeds the budget.
+        Raise BadRequestError for a larger voxel, or without `refuse_large`, give it a permanent fault.
         """
-        largest = ArenaBuffer.rounded(int(store.sizes.max(initial=0)))
-        if budget_bytes < largest:
-            raise BadRequestError(
-                f"cache of {budget_bytes} bytes: the largest voxel takes {largest}: give a larger --cache, "
-                "or build with a smaller --voxel"
-            )
+        sizes = voxel_sizes(store.sizes, budget_bytes, refuse_large=refuse_large)
         self.budget_bytes = budget_bytes
         self.buffer = ArenaBuffer(budget_bytes)
         self.where = np.full((len(store.sizes), 3), -1, np.int64)
@@ -62,9 +63,10 @@ class VoxelCache:
         self.on_proved: Callable[[int], None] | None = None
         self.misled = False
         self._store = store
-        self._sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
+        self._sizes = [size if size <= budget_bytes else 0 for size in sizes]
         self.policy = policy or make_policy("lru", budget_bytes)
         self._states = VoxelStates(self.buffer, self._sizes, self.where, self.policy, store.archive.where)
+        self._states.refuse_larger(sizes, budget_bytes)
         self.stats = self._states.stats
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
@@ -102,7 +104,7 @@ class VoxelCache:
             return self.stats.counters(allocator.evictions, allocator.moved_bytes)
 
     def load_times(self) -> list[float]:
-        """Return the durations of the last loads [s], in no particular order."""
+        """Return the durations of the last loads [s], unordered."""
         with self._lock:
             return list(self.stats.times)
 

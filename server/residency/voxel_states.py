@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.errors import BadRequestError
 from ..runtime.stop_flag import StopFlag
 from .allocator import VoxelAllocator
 from .arena import ArenaBuffer
@@ -36,6 +37,21 @@ class HeldVoxels(NamedTuple):
     faults: tuple[str, ...]
     late: tuple[int, ...] = ()
     waited: float = 0.0
+
+
+def voxel_sizes(sizes: NDArray[np.int64], budget_bytes: int, *, refuse_large: bool) -> list[int]:
+    """Return the bytes that each voxel takes in the arena.
+
+    Raise BadRequestError if `refuse_large` and the largest exceeds the budget.
+    """
+    rounded = [ArenaBuffer.rounded(int(size)) for size in sizes]
+    largest = max(rounded, default=0)
+    if refuse_large and budget_bytes < largest:
+        raise BadRequestError(
+            f"cache of {budget_bytes} bytes: the largest voxel takes {largest}: give a larger --cache, "
+            "or build with a smaller --voxel"
+        )
+    return rounded
 
 
 class BackgroundLoad(Enum):
@@ -117,6 +133,14 @@ class VoxelStates:
     def fault(self, row: int) -> str:
         """Return why a voxel cannot be read; "" if it has no fault."""
         return self._faults.get(row, "") or self._temporary_faults.get(row, "")
+
+    def refuse_larger(self, sizes: list[int], most: int) -> None:
+        """Give voxels of more than `most` bytes a permanent fault, before anything is loaded."""
+        for row, size in enumerate(sizes):
+            if size > most:
+                self._faults[row] = (
+                    f"{self._describe(row)}: takes {size} bytes of a cache of {most}: give a larger --cache"
+                )
 
     def missing(self, rows: Iterable[int]) -> list[int]:
         """Return the rows that are neither resident nor being loaded, and have no fault."""

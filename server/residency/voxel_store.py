@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import OPTIONAL_COLUMNS
+from ...schemas.archive.level import NODE_CLASS
 from ...schemas.archive.voxel import top_shift
 from ..kernels.core.scene_arrays import (
     LANES,
     Arena,
     block_words,
     lay_classes,
+    lay_node_class,
     lay_out,
     normal_run,
     resident_bytes,
@@ -82,6 +84,8 @@ class VoxelStore:
             with self.archive.locating(row):
                 record.read_classes(classes)
             lay_classes(record.tree, classes, arena.ints, where)
+            if header.is_level:
+                lay_node_class(len(record.links.first), NODE_CLASS, arena.ints, where)
         if header.scan_index:
             scans = arena.halves[scan_run(where[None], 0, words) :]
             record.read_scans(scans[: leaves * LANES].reshape(leaves, LANES))

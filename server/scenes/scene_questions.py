@@ -15,9 +15,10 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import Cost, Part
 from ...schemas.wire.question_rules import Question
 from ...schemas.wire.requests import make_objects, make_vectors
+from ..archives.archive_generation import ArchiveGeneration
 from ..archives.ask_archives import PathParts, PreparedQuery, Rows, ask_along, ask_each, make_legs, rows_of
 from ..archives.merge_answers import limit_pairs
-from ..archives.placed_archive import ArchiveGeneration, PlacedArchive
+from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..avatars.client_avatars import Avatars
 from ..observability.request_stats import RequestStats

@@ -56,7 +56,7 @@ def row_types(columns: Columns) -> tuple[np.dtype, np.dtype, np.dtype]:
     points = point_dtype(
         scan_index=bool(kept[0]),
         intensity=bool(kept[1]),
-        radius_class=len(kept) > 2 and any(kept[2:4]),
+        radius_class="level" in columns or (len(kept) > 2 and any(kept[2:4])),
         normal=len(kept) > 4,
     )
     return CELL_DTYPE, NODE_DTYPE, points

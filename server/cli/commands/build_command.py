@@ -90,6 +90,12 @@ def build(
     cluster: Annotated[
         str | None, typer.Option(help="local:N: start a dask cluster of N workers for this build.")
     ] = None,
+    no_level: Annotated[
+        bool,
+        typer.Option(
+            "--no-level", help="Write no level of detail, from which servers answer before they load."
+        ),
+    ] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on a point that is not finite.")] = False,
     skip_bad: Annotated[
         bool,
@@ -137,6 +143,7 @@ def build(
         memory_bytes=parse_bytes(memory, "--memory"),
         spacing=spacing,
         keep=frozenset(filter(None, keep.split(","))),
+        level=not no_level,
         normal_reach=normal_reach,
         radius=fixed,
         models=models,

@@ -25,6 +25,12 @@ def serve(
             autocompletion=among("lru", "lru+prefetch", "distance", "s3fifo"),
         ),
     ] = "lru+prefetch",
+    coarse_bytes: Annotated[
+        str | None,
+        typer.Option(
+            help="The part of --cache for levels of detail, such as 64MB; default: a sixteenth. 0B: use none."
+        ),
+    ] = None,
     metrics_port: Annotated[
         int, typer.Option(help="TCP port of Prometheus metrics, at http://127.0.0.1:PORT/metrics; 0: none.")
     ] = 0,
@@ -111,6 +117,7 @@ def serve(
         max_avatar_clients=max_avatar_clients,
     )
     budget = parse_bytes(cache, "--cache")
+    coarse = None if coarse_bytes is None else parse_bytes(coarse_bytes, "--coarse-bytes")
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # until `serve_scenes` waits for signals
@@ -121,7 +128,9 @@ def serve(
         if start.enter_context(files.starting()):
             rehearse(what, files)
         start.enter_context(warmed_in_parallel(what))
-        scene = stack.enter_context(Scene.open(what, name, budget_bytes=budget, policy=policy))
+        scene = stack.enter_context(
+            Scene.open(what, name, budget_bytes=budget, policy=policy, coarse_bytes=coarse)
+        )
         if log is not None:
             stack.enter_context(recorded(scene, what, log))
         if not serve_scenes([scene], config, ready=start.close):

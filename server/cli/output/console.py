@@ -66,6 +66,9 @@ def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
     yield "archive", f"{summary.archive}, {bytes_text(summary.bytes)}, {each:.2f} bytes per point"
     if summary.preview_bytes:
         yield "preview", f"preview.vtkhdf for ParaView, {bytes_text(summary.preview_bytes)}"
+    if summary.level_bytes:
+        share = summary.level_bytes / max(summary.bytes, 1)
+        yield "level", f"level of detail, {bytes_text(summary.level_bytes)}, {share:.1%} of the archive"
     yield "points", f"{summary.points:,} in {summary.voxels:,} voxels, {summary.shards} shards"
     yield (
         "lattice",

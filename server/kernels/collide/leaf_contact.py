@@ -12,7 +12,7 @@ from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK, lanes_meet, next_near, nodes_meet
 from ..core.placed_avatar import node_reach, pair_in_reach, place_block_once, place_node
-from ..core.scene_arrays import FIRST, LANES, NO_LIMIT, node_class, point_class, should_end
+from ..core.scene_arrays import FIRST, LANES, NO_LIMIT, leaf_class, node_class, point_class, should_end
 from .early_contact import CLEAR, CONTACT, EARLY
 
 U = np.uint64  # see placed_avatar.py
@@ -63,7 +63,7 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class
     low_y = location.y + np.float32(ints[U(block_at + 1)])
     low_z = location.z + np.float32(ints[U(block_at + 2)])
     early = scratch.early[1]
-    far = max(by_class.far[node_class(ints, row, mask)], early)  # for the largest sphere in the block
+    far = max(by_class.far[leaf_class(ints, row, mask)], early)  # for the largest sphere in the block
     begin = 0
     while begin < LANES:
         lane, tested = next_near(

@@ -49,10 +49,11 @@ BLOCK_WORDS = 4
 CLASSES = BLOCK_WORDS
 CLASSED_BLOCK_WORDS = BLOCK_WORDS + LANES // 4
 FIRST, COUNT = 10, 11  # columns of a row that hold int32
-# A row's COUNT: the low byte is the number of children or points; the radius class starts at this
-# bit.
+# A row's COUNT: the low byte is the number of children or points. From these bits on, the radius
+# class of the node, five bits, and that of the largest sphere in its block or below it.
 COUNTED = 0xFF
 CLASS_SHIFT = 8
+LEAF_CLASS_SHIFT = 13
 LOCAL_MASK = LOCAL_CLASSES - 1
 # Largest number of node visits, for a search without a budget.
 NO_LIMIT = 1 << 62
@@ -145,6 +146,15 @@ def normal_run(where, voxel, block_words, with_scan):
 def node_class(ints, row, mask):
     """Return a scene node's index into `radius_deficit`. mask: the number of classes minus one."""
     return np.uint64(ints[np.uint64(row + COUNT)] >> CLASS_SHIFT) & mask
+
+
+@njit_no_refcount
+def leaf_class(ints, row, mask):
+    """Return the index into `radius_deficit` of the largest sphere in a leaf node's block.
+
+    It is the node's class, except in a level of detail. mask: as for `node_class`.
+    """
+    return np.uint64(ints[np.uint64(row + COUNT)] >> LEAF_CLASS_SHIFT) & mask
 
 
 @njit_no_refcount
@@ -251,9 +261,23 @@ def lay_classes(links, classes, ints, where):
                 largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
         else:
             for child in range(first[node], first[node] + (ints[row + COUNT] & COUNTED)):
-                own = np.int64(ints[where[0] + child * ROW_WORDS + COUNT]) >> CLASS_SHIFT
+                own = np.int64(ints[where[0] + child * ROW_WORDS + COUNT]) >> LEAF_CLASS_SHIFT
                 largest, all_rim = np.int64(max(largest, own & LOCAL_MASK)), all_rim & own
-        ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | ((largest | all_rim) << CLASS_SHIFT)
+        own = largest | all_rim
+        ints[row + COUNT] = (ints[row + COUNT] & COUNTED) | (own << CLASS_SHIFT) | (own << LEAF_CLASS_SHIFT)
+
+
+@nb.njit(nogil=True, cache=True)
+def lay_node_class(nodes, own, ints, where):
+    """Replace the radius class of all nodes of a voxel, `nodes` of them, by `own`.
+
+    The classes of leaf nodes' blocks stay.
+    """
+    row = where[0]
+    for _ in range(nodes):
+        of_block = ints[row + COUNT] >> LEAF_CLASS_SHIFT << LEAF_CLASS_SHIFT
+        ints[row + COUNT] = np.int32(of_block | (own << CLASS_SHIFT) | (ints[row + COUNT] & COUNTED))
+        row += ROW_WORDS
 
 
 @nb.intrinsic

@@ -39,7 +39,17 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
-from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
+from ..core.scene_arrays import (
+    COUNT,
+    COUNTED,
+    FIRST,
+    LANES,
+    ROW_WORDS,
+    leaf_class,
+    node_class,
+    point_class,
+    stopped,
+)
 from .contact_times import INFINITE, try_pair
 from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
 from .screw_motion import pose_at
@@ -87,8 +97,8 @@ def _leaves(sweep, chord, voxel, block, row):
     words, ints, halves = scene.words, scene.ints, scene.halves
     lanes, displacements, keep, off = moving.lanes, moving.displacements, moving.keep, moving.off
     thresholds, mask = moving.thresholds, np.uint64(scene.radius_deficit.shape[0] - 1)
-    largest = node_class(ints, row, mask)  # class of the spheres in the scene's block
-    threshold, far = thresholds[0, largest], thresholds[1, largest]
+    threshold = thresholds[0, node_class(ints, row, mask)]
+    far = thresholds[1, leaf_class(ints, row, mask)]  # for the largest sphere in the scene's block
     latest = _latest(moving)
     cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
     nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]

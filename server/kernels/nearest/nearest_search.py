@@ -32,7 +32,17 @@ from ..core.placed_avatar import (
     place_lanes,
     place_root,
 )
-from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, should_end, stopped
+from ..core.scene_arrays import (
+    COUNT,
+    COUNTED,
+    FIRST,
+    LANES,
+    ROW_WORDS,
+    leaf_class,
+    node_class,
+    should_end,
+    stopped,
+)
 from .block_distances import mark_near, nearest_squares, unmark_beyond_box
 from .nearest_pair import (
     found_units,
@@ -107,7 +117,7 @@ def _search_leaves(m, a, row, avatar, placed, scene, location, best, off):
     low_x = off[0] + np.float32(ints[U(block_at)])
     low_y = off[1] + np.float32(ints[U(block_at + 1)])
     low_z = off[2] + np.float32(ints[U(block_at + 2)])
-    halves, c = scene.halves, node_class(ints, row, best.mask)
+    halves, c = scene.halves, leaf_class(ints, row, best.mask)
     unmark_beyond_box(halves, lane_at, low_x, low_y, low_z, lanes, block, best.far[c], keep)
     least, tested = nearest_squares(
         halves, lane_at, low_x, low_y, low_z, lanes, block, keep, best.keep8, best.squares
@@ -286,7 +296,7 @@ def _search_widening(
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
     nodes are far.
-    gaps: for each voxel, see `box_distance`; inf: not resident.  classes: of their root nodes.
+    gaps: for each voxel, see `box_distance`; inf: not resident.  classes: of their largest spheres.
     """
     units, found, deficit, cut = best.units, best.found, best.deficit, best.cut
     # Under the radius model, no sphere here is larger than the largest minus this.
@@ -380,7 +390,7 @@ def _nearest_poses(
             gap = box_distance(root, placed, best.frame[1], scene, index, reach.rows[at])
             row = scene.where[reach.rows[at], 0]
             if row >= 0:
-                gaps[at - first], classes[at - first] = gap, node_class(scene.ints, row, best.mask)
+                gaps[at - first], classes[at - first] = gap, leaf_class(scene.ints, row, best.mask)
             else:
                 gaps[at - first], classes[at - first] = np.inf, U(0)
                 counts[0, i] += np.uint32(1)

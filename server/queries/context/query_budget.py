@@ -164,6 +164,15 @@ class CostCounter:
         rows = [int(self._keys.searchsorted(key)) for key in cost.late]
         self.add(HeldVoxels(cost.hits, cost.misses, cost.faults, tuple(rows), cost.wait_seconds))
 
+    def of_level(self, residency: VoxelCache) -> "CostCounter":
+        """Return a counter for a query of the level of the same scene, for `add_level`."""
+        return CostCounter(self.begin, residency, self._keys)
+
+    def add_level(self, cost: "CostCounter") -> None:
+        """Add the waits and faults of a query of the level. Its voxels are not those of the scene."""
+        self.waited += cost.waited
+        self.faults.update(cost.faults)
+
     def fields(self) -> dict[str, Any]:
         """Return the fields of `Cost`; call it when the answer is complete."""
         return {

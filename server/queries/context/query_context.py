@@ -65,6 +65,21 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
 }
 
 
+class LevelOfDetail(NamedTuple):
+    """Representatives of a scene's points (schemas/archive/level.py), as data that queries read.
+
+    covers: the representatives with spheres that contain all spheres of the scene: where these are
+    clear, the scene is.
+    points: the same with the scene's smallest spheres: a contact with one is a contact of the
+    scene.
+    settles_exact: whether requests without a tolerance use the level too.
+    """
+
+    covers: "SceneData"
+    points: "SceneData"
+    settles_exact: bool
+
+
 class SceneData(NamedTuple):
     """Data of one scene that every query reads; made once, by `make_scene_data`.
 
@@ -75,6 +90,7 @@ class SceneData(NamedTuple):
     unknown_everywhere: whether the build left out a scan with unknown bounds.
     keeps_scan: whether the arena stores the scan of each point.
     coarse: coarse bounds of voxels that are not in memory; None if the scene has none.
+    level: its level of detail; None if it has none.
     """
 
     residency: VoxelCache
@@ -86,6 +102,7 @@ class SceneData(NamedTuple):
     unknown_everywhere: bool
     keeps_scan: bool
     coarse: CoarseBounds | None = None
+    level: LevelOfDetail | None = None
 
     @property
     def nothing_clear(self) -> bool:

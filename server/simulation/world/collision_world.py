@@ -18,7 +18,8 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
-from ...archives.placed_archive import ArchiveGeneration, PlacedArchive
+from ...archives.archive_generation import ArchiveGeneration
+from ...archives.placed_archive import PlacedArchive
 from ...archives.rigid_transform import rotate_vectors, transform_points, transform_poses
 from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts

@@ -159,8 +159,11 @@ def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None
         assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
     files = {name: len(data) for name, data in content(out / "a").items()}
     assert summary.preview_bytes == files.pop("preview.vtkhdf") > 0
+    level = {name for name in files if name.startswith("level/")}
+    assert summary.level_bytes == sum(files.pop(name) for name in level) > 0
     assert summary.bytes == sum(files.values())
-    assert list(summary.stages) == ["survey", "spool", "build", "radius", "preview", "verify", "publish"]
+    stages = ["survey", "spool", "build", "radius", "level", "preview", "verify", "publish"]
+    assert list(summary.stages) == stages
     assert (summary.skipped, summary.faults) == ({}, ())
 
 

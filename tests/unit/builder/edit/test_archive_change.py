@@ -1,6 +1,7 @@
 """A change holds what `--memory` allows, or is refused before anything is changed, in the words of a build."""
 
 import re
+import shutil
 import tracemalloc
 from collections import defaultdict
 from pathlib import Path
@@ -25,6 +26,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.resume import transaction
 from solidcloud.builder.run.executor import ProcessExecutor
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.level import LEVEL_FOLDER
 from solidcloud.schemas.archive.voxel_grid import voxel_coordinates
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
@@ -106,13 +108,14 @@ def test_what_is_too_large_already_is_refused_before_a_scan_or_a_record_is_read(
 def test_a_voxel_that_nobody_reads_may_be_as_large_as_it_is(
     built: Build, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a given radius, and no preview, only what is touched is read."""
+    """With a given radius, no preview and no level, only what is touched is read."""
     target = built(tmp_path / "x", "a", radius=0.01)
     far = synthetic_scans.write_ply(tmp_path / "far.ply", np.array([[3.1, 3.1, 3.1]]))
     most_points(monkeypatch, largest(target) - 1)
     with pytest.raises(SolidcloudError, match=ADVICE):
         add_scans(target, [far], jobs=1, memory_bytes=LEAST)
     (target / PREVIEW_NAME).unlink()
+    shutil.rmtree(target / LEVEL_FOLDER)
     assert add_scans(target, [far], jobs=1, memory_bytes=LEAST).built == 1
     more = denser(target, tmp_path / "more.ply")
     with pytest.raises(SolidcloudError, match=ADVICE):

@@ -22,15 +22,26 @@ from solidcloud.builder.edit import rebuild_voxels as rebuild_module
 from solidcloud.builder.edit.archive_change import delete_orphans
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.edit.rebuild_voxels import ChangeSummary
+from solidcloud.builder.passes.level_pass import write_level
 from solidcloud.builder.passes.preview import write_preview
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import INDEX_NAME, SHARD_FOLDER
+from solidcloud.schemas.archive.level import LEVEL_FOLDER
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import SolidcloudError
 
 # What changes files, all of which a change goes through by name.
 STEPS = ("replace", "rename", "unlink", "fsync", "link", "symlink", "mkdir", "rmdir")
+
+
+def of_level(files: dict[str, bytes], *, remove: bool = False) -> dict[str, bytes]:
+    """Return the files of the level among those of an archive, and remove them from the others."""
+    level = {name: held for name, held in files.items() if name.startswith(f"{LEVEL_FOLDER}/")}
+    if remove:
+        for name in level:
+            del files[name]
+    return level
 
 
 def run_killed(change: Callable[[], object], step: int | None) -> list[str]:
@@ -106,9 +117,12 @@ def test_killed_anywhere_it_is_the_old_archive_or_the_new_one(
         found = snapshot(target)
         is_new = found[INDEX_NAME] == new[INDEX_NAME]
         seen.add(is_new)
-        preview = found.pop(PREVIEW_NAME)
+        preview, level = found.pop(PREVIEW_NAME), of_level(found, remove=True)
+        assert level in ({}, of_level(old)) or (is_new and level == of_level(new)), "old, new or none"
         assert preview == old[PREVIEW_NAME] or (is_new and preview == new[PREVIEW_NAME])
-        whole = {name: held for name, held in (new if is_new else old).items() if name != PREVIEW_NAME}
+        whole = dict(new if is_new else old)
+        del whole[PREVIEW_NAME]
+        of_level(whole, remove=True)
         assert whole.items() <= found.items(), "what the index names is there, byte for byte"
         if not is_new:
             change(target)
@@ -117,6 +131,7 @@ def test_killed_anywhere_it_is_the_old_archive_or_the_new_one(
             with Archive(target) as archive:
                 delete_orphans(target, {name for name, _ in archive.shards()})
             write_preview(target)
+            write_level(target)
             assert snapshot(target) == new
         shutil.rmtree(place)
     assert seen == {False, True}

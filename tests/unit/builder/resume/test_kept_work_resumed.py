@@ -97,7 +97,7 @@ def test_a_build_killed_at_any_deed_goes_on_to_the_same_bytes(
     request.addfinalizer(gc.unfreeze)
     deeds = killed(tmp_path / "judge", 10**9)
     expected = content(tmp_path / "judge" / "hall")
-    assert len(expected) == 4
+    assert len([name for name in expected if not name.startswith("level/")]) == 4
     assert deeds > 40
     # What is overwritten plays a part at the end alone. Else every second deed: scripts/kill_builds kills at any.
     for most in range(deeds - 30, deeds) if overwrite else range(0, deeds, 2):

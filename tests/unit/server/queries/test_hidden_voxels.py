@@ -150,7 +150,8 @@ def test_no_hidden_voxel_is_clear(name: str, every: Hidden, opened: Callable[[Pa
             answers = QUESTIONS[name](scene, place[None])
             assert (answers.verdict != Verdict.CLEAR).all(), place
             if "dark" not in name:
-                assert scene.residency.misled
+                # A contact may be known from the level, without a load.
+                assert scene.residency.misled or (answers.verdict == Verdict.CONTACT).all()
     with opened(every.folder) as scene:
         assert (QUESTIONS[name](scene, every.hidden).verdict != Verdict.CLEAR).all()
 

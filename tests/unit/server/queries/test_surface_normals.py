@@ -18,8 +18,8 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.schemas.kernels.normal_codes import LINE, NO_NORMAL, THICK, decode_normal
+from solidcloud.server.archives.archive_generation import ArchiveGeneration
 from solidcloud.server.archives.masked_archive import MaskedArchive
-from solidcloud.server.archives.placed_archive import ArchiveGeneration
 from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
 from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.surface_normals import Normals, warm
@@ -200,7 +200,7 @@ def test_what_is_kept_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> No
         for place in voxels.values():
             none.code(place, REACH)
             assert none.used_bytes == 0
-        assert Normals(opened.store, opened.data).most_bytes == (1 << 24) // 32
+        assert Normals(opened.store, opened.data).most_bytes == opened.data.residency.budget_bytes // 32
 
 
 def test_each_reach_has_its_own_and_wrong_ones_are_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from solidcloud.server.archives.placed_archive import ArchiveGeneration
+from solidcloud.server.archives.archive_generation import ArchiveGeneration
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach
 from solidcloud.server.queries.collide import collide

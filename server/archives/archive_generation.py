@@ -1,0 +1,256 @@
+"""Generation of an archive: the content of its folder at one opening, with what is resident of it.
+
+A generation counts its readers; the last one to leave closes its files and releases its memory.
+"""
+
+import math
+import threading
+import weakref
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Self
+
+import numpy as np
+
+from ...schemas.archive.units import UNITS_PER_METRE
+from ...schemas.archive.voxel_grid import MAX_COORDINATE
+from ...schemas.errors import BadRequestError
+from ...schemas.wire.warming_parts import MOTION, PARTS
+from ..avatars.avatar_model import AvatarModel
+from ..queries.context.level_of_detail import open_level_data, with_level
+from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
+from ..queries.engine_table import warm_engines
+from ..residency.coarse_bounds import coarse_filler, make_coarse_bounds
+from ..residency.eviction import make_policy, prefetches
+from ..residency.index_proof import ProvedBounds
+from ..residency.level_store import in_turn, level_filler, open_level_store
+from ..residency.motion_prediction import User, UserTracks
+from ..residency.prefetch import Prefetcher
+from ..residency.voxel_cache import VoxelCache
+from ..residency.voxel_store import VoxelStore
+from ..runtime.threads import start_thread
+
+# A request of more poses does not update the user's position: its last pose may be anywhere.
+_MAX_USER_POSES = 8
+# Limits of margin or reach [m] and of an avatar's scale (voxels_in_reach.py refuses other requests).
+_MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
+_FLOAT64 = np.dtype(np.float64)  # comparing dtypes is faster than comparing with the type
+_NUMBER = (float, int)  # `float | int` would be constructed for each request
+# Voxels within this distance of a user are prefetched, however far its requests reach [m].
+_USER_REACH = 1.0
+# Number of radius models whose tables are cached. Clients may name any number of models.
+_MAX_MODELS = 64
+
+
+class ArchiveGeneration:
+    """Store and resident voxels of an archive, open until its last reader leaves. Thread-safe.
+
+    data: scene data that every query reads, with the scene's default radius model.
+    radius_model: function that returns the scene data with the radius model of a name; None: the
+    default. It raises BadRequestError for an invalid model, or one that the archive does not store.
+    Only readers may use `data` and `radius_model`.
+    kept: data that other modules store with this generation, by module name.
+    number: counts the generations of this archive, from 0.
+    ended: event that is set when the last reader has left and everything is closed.
+    """
+
+    data: SceneData
+    radius_model: Callable[[str | None], SceneData]
+
+    def __init__(
+        self,
+        store: VoxelStore,
+        budget_bytes: int,
+        policy: str = "lru",
+        number: int = 0,
+        took: Callable[[float], None] | None = None,
+        radius_model: str | None = None,
+        coarse_bytes: int | None = None,
+    ) -> None:
+        """Open a generation whose first reader is the caller, which must `release` it.
+
+        budget_bytes: limit of memory for voxels, level and coarse bounds.  policy: see eviction.py.
+        coarse_bytes: of it for the level; None: see `level_budget`.
+        number: of this generation.  took: called with the duration of each load [s].
+        radius_model: the default; None: the archive's single radius. Raise BadRequestError for one
+        that the archive does not store.
+        """
+        self.store, self.number = store, number
+        self.kept: dict[str, Any] = {}
+        self.ended = threading.Event()
+        bounds, lattice = ProvedBounds(store.archive), store.archive.header.lattice
+        around = UserTracks(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
+        ahead = prefetches(policy)
+        self._level = open_level_store(store, budget_bytes, coarse_bytes)
+        if self._level is not None:
+            budget_bytes -= self._level.bytes
+        coarse = make_coarse_bounds(store, budget_bytes) if ahead else None
+        if coarse is not None:
+            budget_bytes -= coarse.bytes
+        residency = VoxelCache(
+            store,
+            budget_bytes,
+            make_policy(policy, budget_bytes, around.path_distances),
+            # What was given to the level may leave too little for a voxel.
+            refuse_large=self._level is None or coarse_bytes is None,
+        )
+        residency.on_load_time = took
+        if coarse is not None:
+            arena, remember = residency.buffer.arena, coarse.store_from_arena
+            residency.on_loaded = lambda row, where: remember(row, arena, where)
+        # If the level or the coarse bounds of all voxels do not fit, only those of requested voxels
+        # are stored.
+        fill = in_turn(
+            level_filler(self._level),
+            coarse_filler(coarse, store) if coarse is not None and coarse.has_room_for_all else None,
+        )
+        weak = weakref.ref(self)  # the prefetcher's thread must not keep a generation alive
+        self.prefetcher = Prefetcher(
+            residency,
+            around,
+            prefetch=ahead,
+            idle=fill,
+            running_requests=lambda: (opened := weak()) is not None and opened._readers > 1,
+        )
+        figure = make_scene_data(store.archive, residency, bounds, coarse)
+        level = None
+        if self._level is not None:
+            level = open_level_data(
+                self._level.store.archive,
+                self._level.residency,
+                settles_exact=ahead or coarse_bytes is not None,
+            )
+
+        def with_radii(text: str | None) -> SceneData:
+            made = figure if text is None else with_radius_model(figure, store.archive, text)
+            return with_level(made, level)
+
+        data = with_radii(radius_model)
+        self.data = data
+
+        @lru_cache(_MAX_MODELS)
+        def with_model(text: str | None) -> SceneData:
+            return data if text is None else with_radii(text)
+
+        self.radius_model = with_model
+        self._lock = threading.Lock()
+        self._readers = 1
+        self._ending: threading.Thread | None = None
+
+    def take(self) -> bool:
+        """Add a reader, which must `release`. Return False if the last reader has already left."""
+        with self._lock:
+            if self._readers:
+                self._readers += 1
+                return True
+        return False
+
+    def release(self) -> None:
+        """Remove a reader. The last one closes the files and frees the memory."""
+        with self._lock:
+            self._readers -= 1
+            if self._readers:
+                return
+        if self.prefetcher.running:
+            # `_end` waits for the prefetcher's thread. The calling thread may be in garbage
+            # collection with any lock held, so another thread waits.
+            self._ending = start_thread("end", self._end)
+        else:
+            self._end()
+
+    def join(self) -> None:
+        """Wait until everything is closed, if the last reader has left.
+
+        Do not call it during garbage collection, which may hold a lock that closing needs.
+        """
+        if self._ending is not None:
+            self._ending.join()
+
+    def _end(self) -> None:
+        """Stop prefetching, drop the memory and close the files."""
+        self.prefetcher.stop()
+        del self.data, self.radius_model, self.prefetcher, self.kept
+        if self._level is not None:
+            self._level.store.close()
+        self.store.close()
+        self.ended.set()
+
+    def __enter__(self) -> Self:
+        """Return this generation; the caller is already a reader."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release this generation."""
+        self.release()
+
+    def taken(self) -> Self:
+        """Add a reader and return this generation. Raise BadRequestError if it has ended."""
+        if not self.take():
+            raise BadRequestError(f"{self.store.archive.folder}: this scene is closed: open it again")
+        return self
+
+    def record_user(self, user: User, avatar: AvatarModel, poses: Any, around: float) -> bool:
+        """Record the position of a user: the last of at most _MAX_USER_POSES poses of its avatar.
+
+        poses: (k, 4, 4) or (4, 4), avatar to archive, not checked yet.
+        around: margin or reach, in addition to the radii of avatar and scan [m].
+        Return whether the voxels in reach are used in passing (`QueryBudget.scan`), because there
+        are more poses or the user teleported.
+        """
+        # A request with other arguments will be refused, or has no voxels to prefetch.
+        if not isinstance(poses, np.ndarray) or poses.dtype != _FLOAT64:
+            return False
+        if poses.shape[1:] != (4, 4):
+            if poses.shape != (4, 4):
+                return False
+            poses = poses[None]
+        if not len(poses) or not len(avatar.points):
+            return False
+        if not isinstance(around, _NUMBER) or not 0 <= around <= _MAX_AROUND:
+            return False
+        if len(poses) > _MAX_USER_POSES:
+            return True
+        (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = poses[-1].tolist()
+        x, y, z = avatar.arrays.center[0].tolist()
+        x, y, z = a * x + b * y + c * z + tx, d * x + e * y + f * z + ty, g * x + h * y + i * z + tz
+        scale = math.sqrt(a * a + d * d + g * g)
+        limit = MAX_COORDINATE
+        if not (
+            _MIN_SCALE <= scale <= 1 / _MIN_SCALE and abs(x) <= limit and abs(y) <= limit and abs(z) <= limit
+        ):
+            return False
+        near = around if around < _USER_REACH else _USER_REACH
+        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
+        return self.prefetcher.record_pose(user, (x, y, z), reach)
+
+    def warm(self, *parts: str) -> None:
+        """Run the queries of these parts once, with a load; see `Scene.warm`."""
+        archive = self.store.archive
+        self.data.bounds.trees()  # made before the first load, which tightens the bounds
+        row = int(np.argmin(self.store.sizes))
+        corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
+        x, y, z = place = archive.header.lattice.to_world(corner).tolist()
+        for part in parts or PARTS:
+            self.prefetcher.warm((x, y, z), predict=part == MOTION)
+            warm_engines(self.data, place, part)
+
+    def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:
+        """Load the voxels that are resident in `other`, until `stopped` returns True.
+
+        If not all fit, load those that were used last. After a reload, requests at the users'
+        positions then do not wait for the disk.
+        """
+        residency, keys = self.data.residency, self.store.archive.voxels["key"]
+        wanted = other.store.archive.voxels["key"][other.data.residency.recent()]
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        rows, room = [], residency.buffer.total_bytes
+        for row in at[keys[at] == wanted][::-1].tolist():
+            room -= residency.bytes_of([row])
+            if room < 0:
+                break
+            rows.append(row)
+        for row in reversed(rows):
+            if stopped():
+                return
+            with residency.hold([row]):
+                pass

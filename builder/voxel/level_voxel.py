@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.voxel import MAX_LEAF, VoxelData, link_nodes, top_shift
+from ...schemas.archive.voxel_grid import voxel_keys
 from ..config import BuildConfig
 from ..kernels.points.octree_cells import voxel_codes
 from ..kernels.points.representatives import Runs, choose_representatives, empty_runs, enclose_runs
-from ..kernels.points.voxel_records import link_parents
+from ..kernels.points.voxel_records import Leaves, link_parents
 from ..kernels.trees.bounding_sphere import ceil_sqrt
 from .record_points import leaves_of, voxel_points
 from .voxel_octree import VoxelPoints, build_voxel
@@ -23,45 +24,80 @@ _MAX_RADIUS = (1 << 16) - 1
 
 
 class LevelVoxel(NamedTuple):
-    """Voxel of a level. low, high: (3,) int64, bounds of its representatives [voxel steps]."""
+    """Voxel of a level. low, high: (3,) int64, bounds of its representatives [its own steps]."""
 
     voxel: VoxelData
     low: NDArray[np.int64]
     high: NDArray[np.int64]
 
 
-def level_voxel(record: DecompressedRecord, squares: NDArray[np.int64], config: BuildConfig) -> LevelVoxel:
-    """Make the level of one voxel. squares: `squared_covers` of the lattice."""
-    made = _level_voxel(record, squares, config)
-    # A radius beyond 16 bits takes representatives in opposite corners of a cell whose runs end in
-    # others. Without covers, the bounds are those of an ordinary voxel, which fit.
-    return made if made is not None else _require(_level_voxel(record, squares[:1] * 0, config))
+def level_voxels(
+    record: DecompressedRecord,
+    coordinate: NDArray[np.int64],
+    halvings: int,
+    squares: NDArray[np.int64],
+    config: BuildConfig,
+) -> list[LevelVoxel]:
+    """Make the voxels of the level of one voxel, in ascending order of their keys.
 
-
-def _require(made: LevelVoxel | None) -> LevelVoxel:
+    coordinate: (3,) of the voxel.  halvings: how often its edge is halved for the level.
+    squares: `squared_covers` of the lattice.
+    """
+    made = _level_voxels(record, coordinate, halvings, squares, config)
+    if made is None:
+        # A radius beyond 16 bits takes representatives in opposite corners of a cell whose runs end
+        # in others. Without covers, the bounds are those of ordinary voxels, which fit.
+        made = _level_voxels(record, coordinate, halvings, squares[:1] * 0, config)
     assert made is not None
     return made
 
 
-def _level_voxel(
-    record: DecompressedRecord, squares: NDArray[np.int64], config: BuildConfig
-) -> LevelVoxel | None:
-    """Make the level of one voxel; return None if a radius exceeds what can be stored."""
-    leaves = leaves_of(record)
+def _level_voxels(
+    record: DecompressedRecord,
+    coordinate: NDArray[np.int64],
+    halvings: int,
+    squares: NDArray[np.int64],
+    config: BuildConfig,
+) -> list[LevelVoxel] | None:
+    """Make the voxels of a level; return None if a radius exceeds what can be stored."""
+    leaves, steps = leaves_of(record), record.voxel_steps >> halvings
     # Few leaf nodes are divided, in sparse voxels.
     room = empty_runs(record.leaves + MAX_LEAF)
     found = choose_representatives(leaves, squares, room)
     if found < 0:
         room = empty_runs(record.shape.point_rows + MAX_LEAF)
         found = choose_representatives(leaves, squares, room)
-    runs = Runs._make(np.ascontiguousarray(column[:found]) for column in room)
+    runs = Runs._make(column[:found] for column in room)
+    parts = (coordinate << halvings) + runs.xyz // steps
+    keys = voxel_keys(parts)
+    made = []
+    for key in np.unique(keys).tolist():
+        which = np.flatnonzero(keys == key) if halvings else np.arange(found)
+        corner = parts[which[0]] * steps - coordinate * record.voxel_steps
+        own = Runs._make(np.ascontiguousarray(column[which]) for column in runs)
+        voxel = _enclosing_voxel(leaves, own, corner, key, steps, config)
+        if voxel is None:
+            return None
+        made.append(voxel)
+    return made
+
+
+def _enclosing_voxel(
+    leaves: Leaves, runs: Runs, corner: NDArray[np.int64], key: int, steps: int, config: BuildConfig
+) -> LevelVoxel | None:
+    """Build a voxel of a level and enlarge its bounds; return None if a radius exceeds 16 bits.
+
+    leaves, runs: of the voxel of the archive.  corner: (3,) of the level's voxel in it.  steps: the
+    edge of the level's voxel.
+    """
     # Of representatives at one position, the one of the largest cover radius remains.
-    codes = voxel_codes(runs.xyz)
+    within = (runs.xyz - corner).astype(np.int32)
+    codes = voxel_codes(within)
     order = np.lexsort((-runs.classes.astype(np.int16), codes))
     first = order[np.append(True, codes[order[1:]] != codes[order[:-1]])]
-    local, places = np.ascontiguousarray(runs.xyz[first]), codes[first]
+    local, places = np.ascontiguousarray(within[first]), codes[first]
     points = VoxelPoints(local, radius_class=runs.classes[first])
-    voxel = build_voxel(record.key, points, record.voxel_steps, config)
+    voxel = build_voxel(key, points, steps, config)
     links = link_nodes(voxel)
     stored = voxel_points(voxel, links)
     leaf = np.flatnonzero(links.is_leaf)
@@ -69,17 +105,15 @@ def _level_voxel(
     above = np.empty(len(places), np.int32)  # of each representative in the order of `places`
     held = np.repeat(leaf, voxel.nodes.count[leaf].astype(np.int64))
     above[np.searchsorted(places, voxel_codes(stored.astype(np.int32)))] = held
-    nodes, unit = voxel.nodes, np.where(links.cell < 0, 1 << top_shift(record.voxel_steps), 1)
-    corner = np.where((links.cell < 0)[:, None], 0, voxel.cells.low[np.maximum(links.cell, 0)])
-    centers = corner + nodes.center.astype(np.int64) * unit[:, None]
+    nodes, unit = voxel.nodes, np.where(links.cell < 0, 1 << top_shift(steps), 1)
+    low = np.where((links.cell < 0)[:, None], 0, voxel.cells.low[np.maximum(links.cell, 0)])
     reach2, slab = np.zeros(len(unit), np.int64), nodes.slab.astype(np.int64)
-    parents = link_parents(links.first, nodes.count, links.is_leaf)
     enclose_runs(
         leaves,
         runs,
         above[np.searchsorted(places, codes)],
-        parents,
-        centers,
+        link_parents(links.first, nodes.count, links.is_leaf),
+        corner + low + nodes.center.astype(np.int64) * unit[:, None],
         nodes.normal.astype(np.int64),
         reach2,
         slab,
@@ -88,5 +122,5 @@ def _level_voxel(
     if int(radius.max()) > _MAX_RADIUS:
         return None
     nodes = nodes._replace(radius=radius.astype(np.uint16), slab=slab.astype(np.int32))
-    low, high = (edge(local, axis=0).astype(np.int64) for edge in (np.min, np.max))
-    return LevelVoxel(voxel._replace(nodes=nodes), low, high)
+    least, most = (edge(local, axis=0).astype(np.int64) for edge in (np.min, np.max))
+    return LevelVoxel(voxel._replace(nodes=nodes), least, most)

@@ -1,7 +1,7 @@
 """Level of detail of an archive: an archive of representatives of its points, in a folder of its own.
 
-Every point of the archive lies within a known distance, the *cover radius*, of a representative in
-the same voxel, which is a point of the archive itself. A sphere of that radius around each
+Every point of the archive lies within a known distance, the *cover radius*, of a representative,
+which is a point of the same voxel of the archive. A sphere of that radius around each
 representative therefore contains all points, and a contact with a representative is a contact with
 the archive. A level holds about a thirtieth of the points: one for each leaf node. Its spheres and
 slabs enclose all points of the archive that the representatives below stand for. Its records are
@@ -21,6 +21,7 @@ from .archive import Archive
 from .index import INDEX_NAME, Header
 from .radius_model import RADIUS_CLASSES
 from .units import UNITS_PER_METRE
+from .voxel_grid import voxel_keys
 
 # Folder of the level, inside the folder of its archive.
 LEVEL_FOLDER = "level"
@@ -81,8 +82,7 @@ def open_level(archive: Archive) -> Archive | None:
         return None
     same = (
         header.is_level
-        and header.lattice == described.lattice
-        and np.array_equal(level.voxels["key"], archive.voxels["key"])
+        and _covers_voxels(level, archive)
         and np.array_equal(header.unknown, described.unknown)
         and header.unknown_everywhere == described.unknown_everywhere
     )
@@ -93,3 +93,13 @@ def open_level(archive: Archive) -> Archive | None:
             "unknown regions: delete this folder, which is not needed"
         )
     return level
+
+
+def _covers_voxels(level: Archive, archive: Archive) -> bool:
+    """Return whether the voxels of a level divide those of its archive, and leave none of them out."""
+    ours, theirs = level.header.lattice, archive.header.lattice
+    halvings = (theirs.voxel_steps // ours.voxel_steps).bit_length() - 1
+    if ours.voxel_steps << max(halvings, 0) != theirs.voxel_steps or ours[:2] != theirs[:2]:
+        return False
+    described = np.unique(voxel_keys(level.coordinates >> halvings))
+    return np.array_equal(described, archive.voxels["key"])

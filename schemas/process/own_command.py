@@ -9,7 +9,7 @@ import sys
 NAME = "solidcloud"
 # Subcommands, by which messages name the command; server/cli/main.py declares them.
 VERBS = (
-    *("accuracy", "add", "build", "doctor", "export", "info", "inspect", "loadtest", "make", "plan"),
+    *("accuracy", "add", "build", "doctor", "export", "info", "inspect", "level", "loadtest", "make", "plan"),
     *("query", "reload", "remove", "replay", "scene", "serve", "top", "validate"),
 )
 _MENTION = re.compile(rf"(?<![\w./-]){NAME} (?=(?:{'|'.join(VERBS)})\b|--)")

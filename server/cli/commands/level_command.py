@@ -5,7 +5,7 @@ from .command_options import ArchivePath, interruptible, parse_bytes
 
 
 def level(archive: ArchivePath, jobs: Jobs = 0, memory: Memory = "2GB") -> None:
-    """Write the level of detail of an archive anew.
+    """Write the level of detail of an archive.
 
     Builds write one, unless --no-level is given; archives of earlier versions have none.
     """

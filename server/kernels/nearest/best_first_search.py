@@ -40,6 +40,7 @@ from ..core.scene_arrays import (
     stopped,
 )
 from .block_distances import any_near, mark_near
+from .missing_voxels import box_distance
 from .nearest_pair import (
     BestPair,
     found_units,
@@ -49,7 +50,6 @@ from .nearest_pair import (
     set_cut,
     upper_bound,
 )
-from .nearest_search import box_distance
 from .pair_heap import pop_top, sift_up
 
 # Status of a search: it continues; it ended because no pair is open, because the answer has the

@@ -4,6 +4,8 @@ The index bounds a voxel by a box. Coarse bounds, where they are stored, bound i
 (kernels/collide/coarse_clearance.py), which follow its surfaces.
 """
 
+import math
+
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
@@ -12,9 +14,25 @@ from ..core.node_overlap import make_thresholds
 from ..core.placed_avatar import make_front, make_placed, place_front, place_root
 from ..core.scene_arrays import ROW_WORDS, ROWS_AT_ONCE, stopped
 from .nearest_pair import lower_bound
-from .nearest_search import box_distance
 
 U = np.uint64  # see placed_avatar.py
+
+
+@njit_no_refcount
+def box_distance(root, placed, farthest, scene, index, voxel):
+    """Return a lower bound of the distance of the avatar's centres from a voxel's points.
+
+    In steps, at least 0, from the index alone.  root: radius of the avatar's root sphere, scaled
+    [m].  farthest: of `place_nodes`.
+    """
+    square = 0.0
+    for r in range(3):
+        center = placed.frame[r]  # the root's centre, to half a step an axis
+        gap = np.float64(max(index.low[voxel, r] - center, center - index.high[voxel, r], 0))
+        square += gap * gap
+    # One step for the frame's rounding; for the other terms see `make_thresholds`.
+    error = 1.0 + 2.0 / scene.units_per_step + farthest * 2.0**-46
+    return max(math.sqrt(square) * (1.0 - 1e-9) - root / scene.step * (1.0 + 1e-9) - error, 0.0)
 
 
 @njit_no_refcount

@@ -13,7 +13,6 @@ children in the order of their bounds, which are nearly equal over a floor, took
 visiting them in stored order (scripts/bench_engine, distance on the walk).
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +43,7 @@ from ..core.scene_arrays import (
     stopped,
 )
 from .block_distances import mark_near, nearest_squares, unmark_beyond_box
+from .missing_voxels import box_distance
 from .nearest_pair import (
     found_units,
     lower_bound,
@@ -269,23 +269,6 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
                 depth += 1
             child += ROW_WORDS
     settle_candidates(best, points, m, placed.shift, ints, scene.halves, lanes, off)
-
-
-@njit_no_refcount
-def box_distance(root, placed, farthest, scene, index, voxel):
-    """Return a lower bound of the distance of the avatar's centres from a voxel's points.
-
-    In steps, at least 0, from the index alone.  root: radius of the avatar's root sphere, scaled
-    [m].  farthest: of `place_nodes`.
-    """
-    square = 0.0
-    for r in range(3):
-        center = placed.frame[r]  # the root's centre, to half a step an axis
-        gap = np.float64(max(index.low[voxel, r] - center, center - index.high[voxel, r], 0))
-        square += gap * gap
-    # One step for the frame's rounding; for the other terms see `make_thresholds`.
-    error = 1.0 + 2.0 / scene.units_per_step + farthest * 2.0**-46
-    return max(math.sqrt(square) * (1.0 - 1e-9) - root / scene.step * (1.0 + 1e-9) - error, 0.0)
 
 
 @njit_no_refcount

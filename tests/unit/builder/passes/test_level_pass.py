@@ -53,7 +53,8 @@ def test_every_point_is_covered_by_a_point_of_its_voxel(kind: str, tmp_path: Pat
         with level:
             for row in range(len(archive.voxels)):
                 points = lattice_points(archive, row)
-                voxel, links = level.read_voxel(row)
+                (at,) = np.flatnonzero(level.voxels["key"] == archive.voxels["key"][row])
+                voxel, links = level.read_voxel(int(at))
                 chosen = voxel_points(voxel, links).astype(np.int64)
                 kept += len(chosen)
                 assert voxel.radius_class is not None

@@ -107,7 +107,7 @@ def test_a_level_that_says_otherwise_is_refused(archive: Path, name: str) -> Non
 def test_a_damaged_level_is_an_error_that_names_it(archive: Path) -> None:
     index = archive / LEVEL_FOLDER / "index.h5"
     index.write_bytes(index.read_bytes()[:500])
-    with Archive(archive) as opened, pytest.raises((FormatError, CorruptError), match="level/index.h5"):
+    with Archive(archive) as opened, pytest.raises((FormatError, CorruptError), match=r"level/index\.h5"):
         open_level(opened)
 
 

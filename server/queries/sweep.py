@@ -16,6 +16,7 @@ from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
+from .context.level_of_detail import asked, level_budget, stoppable
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
 
@@ -123,8 +124,35 @@ def sweep(
     distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
     A motion that is clear with a budget of visits is clear with a larger one. A contact found may
     be lost with a larger budget, which may be spent on an unresolved place before it.
+    Where voxels are late, the scene's level of detail may prove more of a motion clear.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
+    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget)
+    which = np.flatnonzero((answers.verdict == Verdict.UNKNOWN) & (answers.voxels_missing > 0))
+    if data.level is None or budget.deadline == np.inf or not len(which) or budget.stop or data.nothing_clear:
+        return answers
+    covers = stoppable(data.level, budget).covers
+    first, last = kernel_poses(pose_from)[which], kernel_poses(pose_to)[which]
+    found = asked(lambda: _sweep(covers, avatar, first, last, margin, tolerance, level_budget(budget)))
+    if found is None:
+        return answers
+    lower, verdict, exact = answers.lower.copy(), answers.verdict.copy(), answers.exact.copy()
+    lower[which] = np.maximum(lower[which], found.lower)
+    clear = which[found.verdict == Verdict.CLEAR]
+    verdict[clear], exact[clear] = Verdict.CLEAR, True
+    return msgspec.structs.replace(answers, lower=lower, verdict=verdict, exact=exact)
+
+
+def _sweep(
+    data: SceneData,
+    avatar: AvatarModel,
+    pose_from: ArrayLike,
+    pose_to: ArrayLike,
+    margin: float,
+    tolerance: float,
+    budget: QueryBudget,
+) -> SweepAnswers:
+    """Answer `sweep` from the voxels of the scene alone."""
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")

@@ -62,6 +62,9 @@ def test_without_a_voxel_everything_said_is_true(
         signed = np.array([math.inf if found is None else found.signed for found in judged])
         within = np.where(signed <= reach, signed, np.inf)
         room = level_bytes(case.archive)
+        with Scene.open(case.archive, coarse_bytes=0) as scene:
+            scene.add_avatar("avatar", avatar, 0.02)
+            true = scene.sweep("avatar", poses[:-1], poses[1:], margin, radius_model=model)
         for tolerance in TOLERANCES:
             options: dict[str, Any] = {
                 "radius_model": model,
@@ -80,6 +83,12 @@ def test_without_a_voxel_everything_said_is_true(
                 assert (near.lower <= np.minimum(within, reach) + 1e-9).all()
                 assert (near.upper >= within - 1e-9).all()
                 assert alone.residency.resident == 0
+                swept = alone.sweep(
+                    "avatar", poses[:-1], poses[1:], margin, budget_ms=0.0, radius_model=model
+                )
+                clear = swept.verdict == Verdict.CLEAR
+                assert (true.verdict[clear] == Verdict.CLEAR).all() and (swept.lower[clear] == 1.0).all()
+                assert (swept.lower <= np.minimum(true.upper, 1.0)).all()
             with Scene.open(case.archive) as whole:
                 whole.add_avatar("avatar", avatar, 0.02)
                 touch = whole.collide("avatar", poses, margin, **options)

@@ -121,9 +121,9 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     """Statistics of a scene's cache and of its users.
 
     generation: of the archive.  policy: name of the eviction policy.
-    budget_bytes: limit for decoded voxels and coarse bounds together.
+    budget_bytes: limit for decoded voxels, coarse bounds and levels of detail together.
     resident_bytes: used by decoded voxels, `resident` of the `voxels` in the archive.
-    coarse_bytes: used by coarse bounds.  kept: voxels in which users stand.
+    coarse_bytes: of coarse bounds and levels.  kept: voxels in which users stand.
     The counters of `Counters` begin when this generation is first served.
 
     The following begin when the scene is first served.

@@ -117,6 +117,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "builder/kernels/points/content_hash.py": (BUILDER + "kernels/points/test_content_hash.py",),
     "builder/kernels/neighbours/nearest_points.py": (BUILDER + "kernels/neighbours/test_nearest_points.py",),
+    "builder/kernels/points/representatives.py": (BUILDER + "passes/test_level_pass.py",),
     "builder/kernels/points/voxel_records.py": (BUILDER + "kernels/points/test_voxel_records.py",),
     "builder/kernels/points/occupied_cubes.py": (BUILDER + "kernels/points/test_occupied_cubes.py",),
     "builder/kernels/points/lzf_decoder.py": (BUILDER + "kernels/points/test_lzf_decoder.py",),

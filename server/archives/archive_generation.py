@@ -137,6 +137,12 @@ class ArchiveGeneration:
         self._readers = 1
         self._ending: threading.Thread | None = None
 
+    @property
+    def coarse_bytes(self) -> int:
+        """Return the memory of coarse bounds and of the level of detail [bytes]."""
+        coarse = self.data.coarse
+        return (0 if coarse is None else coarse.bytes) + (0 if self._level is None else self._level.bytes)
+
     def take(self) -> bool:
         """Add a reader, which must `release`. Return False if the last reader has already left."""
         with self._lock:

@@ -90,7 +90,7 @@ def make_stats(
     total, users = metrics.snapshot()
     counts = total.counts
     residencies = [opened.data.residency for opened in each]
-    coarse = [0 if opened.data.coarse is None else opened.data.coarse.bytes for opened in each]
+    coarse = [opened.coarse_bytes for opened in each]
     counters = [structs.asdict(residency.counters()) for residency in residencies]
     loads = [seconds for residency in residencies for seconds in residency.load_times()]
     return StatsAnswer(

@@ -145,8 +145,10 @@ def test_build_says_what_it_made(scan: Path, tmp_path: Path, capsys: pytest.Capt
     made = json.loads(capsys.readouterr().out)
     assert made["points"] == len(floor()) and made["archive"] == str(target)
     preview = target / "preview.vtkhdf"
-    stored = [path for path in target.rglob("*") if path.is_file() and path != preview]
+    level = {path for path in (target / "level").rglob("*") if path.is_file()}
+    stored = [path for path in target.rglob("*") if path.is_file() and path != preview and path not in level]
     assert made["bytes"] == sum(path.stat().st_size for path in stored)
+    assert made["level_bytes"] == sum(path.stat().st_size for path in level) > 0
     assert made["preview_bytes"] == preview.stat().st_size
     assert made["radius"] == pytest.approx(0.05, rel=1e-9)
     assert run(["build", str(scan), "-o", str(target)]) == 2
@@ -155,6 +157,7 @@ def test_build_says_what_it_made(scan: Path, tmp_path: Path, capsys: pytest.Capt
     shown = capsys.readouterr()
     assert "points/s" in shown.out and "bytes per point" in shown.out
     assert re.search(r"preview +preview\.vtkhdf for ParaView, \d", shown.out)
+    assert re.search(r"level +level of detail, \d", shown.out)
 
 
 def test_broken_scan_stops_the_build_unless_it_is_skipped(

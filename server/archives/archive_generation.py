@@ -70,7 +70,7 @@ class ArchiveGeneration:
         """Open a generation whose first reader is the caller, which must `release` it.
 
         budget_bytes: limit of memory for voxels, level and coarse bounds.  policy: see eviction.py.
-        coarse_bytes: of it for the level; None: see `level_budget`.
+        coarse_bytes: of it for the level; None: see `open_level_store`.
         number: of this generation.  took: called with the duration of each load [s].
         radius_model: the default; None: the archive's single radius. Raise BadRequestError for one
         that the archive does not store.
@@ -78,10 +78,34 @@ class ArchiveGeneration:
         self.store, self.number = store, number
         self.kept: dict[str, Any] = {}
         self.ended = threading.Event()
+        self._lock = threading.Lock()
+        self._readers = 1
+        self._ending: threading.Thread | None = None
+        self._level = open_level_store(store, budget_bytes, coarse_bytes)
+        try:
+            self._assemble(budget_bytes, policy, took, radius_model, is_coarse=coarse_bytes is not None)
+        except BaseException:
+            if self._level is not None:
+                self._level.store.close()
+            raise
+
+    def _assemble(
+        self,
+        budget_bytes: int,
+        policy: str,
+        took: Callable[[float], None] | None,
+        radius_model: str | None,
+        *,
+        is_coarse: bool,
+    ) -> None:
+        """Make caches, prefetcher and scene data. is_coarse: whether memory was given to the level.
+
+        The other parameters are as in `__init__`.
+        """
+        store = self.store
         bounds, lattice = ProvedBounds(store.archive), store.archive.header.lattice
         around = UserTracks(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
         ahead = prefetches(policy)
-        self._level = open_level_store(store, budget_bytes, coarse_bytes)
         if self._level is not None:
             budget_bytes -= self._level.bytes
         coarse = make_coarse_bounds(store, budget_bytes) if ahead else None
@@ -92,7 +116,7 @@ class ArchiveGeneration:
             budget_bytes,
             make_policy(policy, budget_bytes, around.path_distances),
             # What was given to the level may leave too little for a voxel.
-            refuse_large=self._level is None or coarse_bytes is None,
+            refuse_large=self._level is None or not is_coarse,
         )
         residency.on_load_time = took
         if coarse is not None:
@@ -118,7 +142,7 @@ class ArchiveGeneration:
             level = open_level_data(
                 self._level.store.archive,
                 self._level.residency,
-                settles_exact=ahead or coarse_bytes is not None,
+                settles_exact=ahead or is_coarse,
             )
 
         def with_radii(text: str | None) -> SceneData:
@@ -133,9 +157,6 @@ class ArchiveGeneration:
             return data if text is None else with_radii(text)
 
         self.radius_model = with_model
-        self._lock = threading.Lock()
-        self._readers = 1
-        self._ending: threading.Thread | None = None
 
     @property
     def coarse_bytes(self) -> int:
@@ -236,6 +257,9 @@ class ArchiveGeneration:
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         x, y, z = place = archive.header.lattice.to_world(corner).tolist()
+        if self._level is not None:  # the kernels that lay a voxel of it out
+            with self._level.residency.hold([int(np.argmin(self._level.store.sizes))]):
+                pass
         for part in parts or PARTS:
             self.prefetcher.warm((x, y, z), predict=part == MOTION)
             warm_engines(self.data, place, part)

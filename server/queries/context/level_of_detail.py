@@ -31,9 +31,10 @@ LEVEL_GRACE = 2e-3
 
 
 class LevelData(NamedTuple):
-    """Opened level, before a radius model is chosen. covers: (32,) int64, of the classes that occur.
+    """Opened level, before a radius model is chosen.
 
-    data: of its archive.  settles_exact: see `LevelOfDetail`.
+    data: of its archive.  occurs: (32,) bool, cover classes that a representative has.
+    settles_exact: see `LevelOfDetail`.
     """
 
     data: SceneData

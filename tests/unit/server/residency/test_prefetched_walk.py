@@ -52,7 +52,8 @@ def test_a_walk_is_answered_as_with_everything_in_memory(
         stats = scene.stats()
         assert stats.evicted > 0 and stats.resident_bytes + stats.coarse_bytes <= budget
         assert stats.requests == len(poses) and len(stats.users) == 1
-        assert (stats.coarse_bytes > 0) == (policy != "lru" and budget > 32 * SLOT_BYTES)
+        with scene.archives[0].take() as opened:
+            assert (opened.data.coarse is not None) == (policy != "lru" and budget > 32 * SLOT_BYTES)
 
 
 def test_a_path_washes_out_no_more_than_its_share(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -57,7 +57,7 @@ def test_contact_begins_at_the_unit_of_the_definition(
     archive_of: Callable[[str], Path], question: str, name: str, kind: str
 ) -> None:
     case = archive_cases.Case(archive_of(kind), work_counts.scene_points(kind))
-    with work_counts.opened(case.archive) as scene:
+    with work_counts.opened(case.archive, question) as scene:
         at = margins(case, scene, name)
         assert len(at) >= 3
         for i, margin in at:

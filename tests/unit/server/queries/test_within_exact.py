@@ -19,7 +19,7 @@ def nearest(points: NDArray[np.int64], query: NDArray[np.int64]) -> tuple[int, l
 
 @pytest.mark.parametrize("kind", ["fine", "flat"])
 def test_the_nearest_and_the_reach_are_those_of_the_definition(tmp_path: Path, kind: str) -> None:
-    with work_counts.opened(work_counts.build(tmp_path, kind)) as scene:
+    with work_counts.opened(work_counts.build(tmp_path, kind), "within") as scene:
         info = scene.info()
         origin = np.array(info.origin)
         lattice = naive.lattice_of(work_counts.scene_points(kind), origin, info.lattice_step)

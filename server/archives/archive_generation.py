@@ -164,6 +164,11 @@ class ArchiveGeneration:
         coarse = self.data.coarse
         return (0 if coarse is None else coarse.bytes) + (0 if self._level is None else self._level.bytes)
 
+    @property
+    def has_level(self) -> bool:
+        """Return whether a level of detail is open."""
+        return self._level is not None
+
     def take(self) -> bool:
         """Add a reader, which must `release`. Return False if the last reader has already left."""
         with self._lock:

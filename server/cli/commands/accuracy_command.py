@@ -20,7 +20,7 @@ def accuracy(
 ) -> None:
     """Measure what accuracy costs in query time.
 
-    Varies one setting at a time. Writes a table, an HTML page and charts.
+    Measures times in memory and from disk against the error allowed. Writes an HTML page, charts and JSON.
     """
     import tempfile
 
@@ -29,7 +29,7 @@ def accuracy(
     with needs_extra("made"):
         from ...report.accuracy.accuracy_report import run as measure
     from ...report.accuracy.measurement.measurement_plan import BRIEF, FULL
-    from ...report.accuracy.page.page_texts import findings
+    from ...report.accuracy.page.accuracy_texts import findings
     from ..output.progress_display import progress_listener
 
     with (
@@ -41,7 +41,7 @@ def accuracy(
         report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
     for line in (
         *report.facts["warnings"],
-        *findings(report.rows, report.facts["poses_judged_by_every_pair"]),
+        *findings(report),
     ):
         print(line)
-    print(f"wrote {output / 'accuracy.html'}, accuracy.csv, accuracy.json and charts")
+    print(f"wrote {output / 'accuracy.html'}, accuracy.json and charts")

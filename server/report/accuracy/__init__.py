@@ -1,6 +1,6 @@
-"""`solidcloud accuracy`: query time and errors of each setting.
+"""`solidcloud accuracy`: what an error allowed saves in time, and which errors settings have.
 
-May import server.report.accuracy.measurement, server.report.accuracy.page, server.report.common,
-builder, schemas.
-Begin with accuracy_report.py; measurement/ fills in the results, page/ draws and describes them.
+May import server/scene.py, server.report.accuracy.measurement, server.report.accuracy.page,
+server.report.common, builder, schemas.
+Begin with accuracy_report.py; measurement/ measures, page/ draws and describes the results.
 """

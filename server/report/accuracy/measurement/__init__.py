@@ -1,5 +1,5 @@
-"""The measurements of `solidcloud accuracy`: test data, settings, reference answers, times and errors.
+"""The measurements of `solidcloud accuracy`: test data, reference answers, and a module for each of its questions.
 
-May import server.avatars, server.report.common, server.residency, server/scene.py, builder, schemas.
-Begin with engine_settings.py.
+May import server.avatars, server.report.common, server/scene.py, builder, schemas.
+Begin with accuracy_results.py.
 """

@@ -1,12 +1,12 @@
-"""Test data of the accuracy report: scene, avatar, and poses at which settings are compared."""
+"""Test data of the accuracy report: archive, avatar, and poses at which answers are compared."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .....builder.config import DEFAULT_STEP, BuildConfig
+from .....builder.pipeline import build_archive
 from .....builder.synthetic.facade import build_facade
 from .....builder.synthetic.figure import figure_points
 from .....builder.synthetic.scenes import make_facade
@@ -18,9 +18,8 @@ from .....schemas.archive.index import Header
 from ....avatars.avatar_file import read_avatar
 from ....avatars.avatar_model import make_avatar
 from ...common.floor_walk import floor_walk
+from ...common.paired_times import Floats
 from .measurement_plan import MeasurementPlan
-
-Floats = NDArray[np.float64]
 
 AVATAR = "avatar"
 SEED = 2012
@@ -28,34 +27,34 @@ SEED = 2012
 REACH = 0.5
 # Maximum offset of poses from the walk, to both sides and upwards [m]: about one in nine touches.
 SIDEWAYS, UPWARDS = 0.2, 0.2
+# The walk through a given archive follows voxels within BESIDE of a line [m]: at most CROSSED, of at
+# most CROSSED_POINTS. Its floor is found by at most SAMPLED points of each.
+BESIDE, CROSSED, CROSSED_POINTS, SAMPLED = 2.0, 96, 30_000_000, 50_000
 
 
 class MeasuredScene(NamedTuple):
     """Test data of a measurement.
 
-    name: for titles.  scan: file to build.
-    config: default configuration of its build, with a lattice step.
+    name: for titles.  archive: its folder.
     warnings: sentences about what cannot be measured.
     truth: ground truth of the generated façade; None for other scans.
+    modelled: archive of the same scan with all radius models; None without ground truth.
+    config: of the build of `modelled`.
     is_figure: the avatar is the generated figure; the doorway error is defined only for it.
-    avatar: (n, 3) [m].  walk: (k, 4, 4), poses on which times are measured.
+    avatar: (n, 3) [m].  walk: (k, 4, 4), from one end to the other.
     around: (k, 4, 4), the walk's poses with random offsets.
     """
 
     name: str
-    scan: Path
-    config: BuildConfig
+    archive: Path
     warnings: tuple[str, ...]
     truth: SceneTruth | None
+    modelled: Path | None
+    config: BuildConfig
     is_figure: bool
     avatar: Floats
     walk: Floats
     around: Floats
-
-    @property
-    def step(self) -> float:
-        """Return the lattice step [m]."""
-        return self.config.resolution or DEFAULT_STEP
 
     @property
     def judged(self) -> Floats:
@@ -63,46 +62,46 @@ class MeasuredScene(NamedTuple):
         return np.concatenate([self.walk, self.around])
 
 
-def generated_scene(plan: MeasurementPlan, avatar: Path | None, folder: Path) -> MeasuredScene:
-    """Generate the façade's scan in `folder`, and return it with the walk through it."""
+def generated_scene(
+    plan: MeasurementPlan, avatar: Path | None, models: frozenset[str], folder: Path
+) -> MeasuredScene:
+    """Generate the façade's scan in `folder`, build it, and return it with the walk through it.
+
+    models: radius models stored in the second archive.
+    """
     scan = folder / "facade.laz"
     made = make_facade(scan, points=plan.points)
     body = figure_points() if avatar is None else read_avatar(avatar)
     _, walk = walk_poses(build_facade().truth, plan.frames)
-    name, truth = f"generated façade of {made.points:,} points", read_truth(made.truth)
-    config = BuildConfig(resolution=DEFAULT_STEP, overwrite=True)
-    return MeasuredScene(name, scan, config, (), truth, avatar is None, body, walk, _moved(walk))
+    # These archives usually have one shard: more processes would only load numba several times.
+    plain = BuildConfig(resolution=DEFAULT_STEP, overwrite=True, jobs=1)
+    config = BuildConfig(resolution=DEFAULT_STEP, overwrite=True, jobs=1, models=models)
+    for name, chosen in (("plain", plain), ("modelled", config)):
+        build_archive([scan], folder / name, chosen)
+    return MeasuredScene(
+        f"generated façade of {made.points:,} points", folder / "plain", (), read_truth(made.truth),
+        folder / "modelled", config, avatar is None, body, walk, _moved(walk),
+    )  # fmt: skip
 
 
-def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Path | None, folder: Path) -> MeasuredScene:
-    """Write the points nearest to an archive's middle voxel to `folder`, with a straight walk.
+def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Path | None) -> MeasuredScene:
+    """Return an archive with a straight walk over its floor, through the voxels around its middle.
 
-    They are built with the archive's options and its radius: fewer points would have another mean.
     Raises BadDataError if there is no floor to stand on.
     """
     with Archive(archive) as opened:
-        points, total = _middle_points(opened, plan.max_points), opened.header.points
-        config, warnings = config_of(opened.header), unknown_regions(opened.header)
-    scan = folder / "points.ply"
-    write_ply(scan, points)
+        points = middle_points(opened)
+        header, warnings = opened.header, unknown_regions(opened.header)
     body = figure_points() if avatar is None else read_avatar(avatar)
     walk = floor_walk(points)[1]
     walk = walk[np.linspace(0, len(walk) - 1, min(plan.frames, len(walk))).astype(int)]
     # The walk places avatar points on scan points. Raise it by both radii: the spheres would else
     # intersect the floor at every pose.
-    walk[:, 2, 3] += (config.radius or 0.0) + make_avatar(body).radius
-    name = f"{archive.resolve().name}, {len(points):,} of {total:,} points"
-    return MeasuredScene(name, scan, config, warnings, None, avatar is None, body, walk, _moved(walk))
-
-
-def config_of(header: Header) -> BuildConfig:
-    """Return options that build an archive's points again with its radius, lattice and nodes."""
-    options = header.options
-    return BuildConfig(
-        voxel=header.lattice.voxel_size, resolution=header.lattice.step, radius=header.radius, degree=header.degree,
-        leaf=header.leaf, cell_points=options["cell_points"], cells=options.get("cells", "octree"),
-        with_slab=options["with_slab"], models=frozenset(header.models), overwrite=True,
-    )  # fmt: skip
+    walk[:, 2, 3] += header.radius + make_avatar(body).radius
+    name = f"{archive.resolve().name}, {header.points:,} points"
+    return MeasuredScene(
+        name, archive, warnings, None, None, BuildConfig(), avatar is None, body, walk, _moved(walk)
+    )
 
 
 def unknown_regions(header: Header) -> tuple[str, ...]:
@@ -113,35 +112,28 @@ def unknown_regions(header: Header) -> tuple[str, ...]:
         where = f"in {len(header.unknown)} region{'s' * (len(header.unknown) > 1)}"
     else:
         return ()
-    return (
-        f"Scans were left out of this archive: it answers unknown {where}. That is not measured here: its points are "
-        "built again without those regions.",
-    )
+    return (f"Scans were left out of this archive: it answers unknown {where}. Such poses are not measured.",)
 
 
-def write_ply(target: Path, points: Floats) -> None:
-    """Write points (n, 3) as a binary PLY of doubles."""
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [f"property double {axis}" for axis in "xyz"] + ["end_header", ""]
-    target.write_bytes("\n".join(header).encode() + points.astype("<f8").tobytes())
+def middle_points(archive: Archive) -> Floats:
+    """Return points (n, 3), world frame [m], of the voxels along the middle of the longer horizontal axis.
 
-
-def _middle_points(archive: Archive, most: int) -> Floats:
-    """Return the points (n, 3), world frame [m], of the voxels nearest to the scene's middle.
-
-    At most `most` points, but at least one voxel.
+    Of the voxels within BESIDE of the middle line, those nearest to the middle: at most CROSSED, of
+    at most CROSSED_POINTS; of each about SAMPLED points at most.
     """
-    middle = np.median(archive.coordinates, axis=0)
-    held: list[Floats] = []
-    count = 0
-    for row in np.argsort(((archive.coordinates - middle) ** 2).sum(axis=1), kind="stable"):
-        count += int(archive.voxels["rows"][row, 2])
-        if held and count > most:
-            break
-        local = voxel_points(*archive.read_voxel(int(row)))
-        lattice = archive.header.lattice
-        held.append(lattice.to_world(local + archive.coordinates[row] * lattice.voxel_steps))
-    return np.concatenate(held)
+    at, lattice = archive.coordinates, archive.header.lattice
+    along = int(np.argmax(np.ptp(at, axis=0)[:2]))
+    middle = np.median(at, axis=0)
+    beside = np.abs(at[:, 1 - along] - middle[1 - along]) * lattice.voxel_size
+    line = np.flatnonzero(beside <= max(BESIDE, beside.min()))
+    order = line[np.argsort(np.abs(at[line, along] - middle[along]), kind="stable")][:CROSSED]
+    counts = np.cumsum(archive.voxels["rows"][order, 2].astype(np.int64))
+    kept = []
+    for row in order[: max(1, int((counts <= CROSSED_POINTS).sum()))].tolist():
+        local = voxel_points(*archive.read_voxel(row))
+        local = local[:: max(1, -(-len(local) // SAMPLED))]
+        kept.append(lattice.to_world(local + at[row] * lattice.voxel_steps))
+    return np.concatenate([np.empty((0, 3)), *kept])
 
 
 def _moved(walk: Floats) -> Floats:

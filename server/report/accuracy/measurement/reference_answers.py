@@ -86,12 +86,11 @@ def check_reference(
 ) -> int:
     """Check the reference verdicts against brute force at `poses` poses.
 
-    Brute force tests every pair of points in integers. Half of the poses are near-tangent, if there
-    are enough. Returns the number of poses compared.
+    Brute force tests every pair of points in integers, of those scan points in the box around the
+    avatar. Half of the poses are near-tangent, if there are enough. Returns the number of poses
+    compared.
     Raises InternalError if a verdict differs.
     """
-    scene = _scene_units(archive)
-    scene = scene[np.argsort(scene[:, 0], kind="stable")]
     origin = np.array(archive.header.lattice.origin)
     avatar = make_avatar(measured.avatar)
     reach = round(archive.header.radius * UNITS_PER_METRE) + round(avatar.radius * UNITS_PER_METRE)
@@ -100,13 +99,51 @@ def check_reference(
     near, far = near.astype(int), far.astype(int)
     compared = np.concatenate([reference.tangent_poses[near], measured.judged[far]])
     expected = np.concatenate([reference.tangent[near], reference.contact[far]])
-    for number, (pose, contact) in enumerate(zip(compared, expected, strict=True)):
-        if _touches(_placed_units(pose, measured.avatar, origin), scene, reach) != contact:
+    voxels = VoxelSteps(archive)
+    for number in np.argsort(compared[:, 0, 3], kind="stable"):
+        placed = _placed_units(compared[number], measured.avatar, origin)
+        around = reach / UNITS_PER_METRE + 2 * archive.header.lattice.step
+        low = placed.min(axis=0) / UNITS_PER_METRE - around + origin
+        high = placed.max(axis=0) / UNITS_PER_METRE + around + origin
+        steps = voxels.in_box(low, high)
+        scene = np.rint(steps.astype(np.float64) * archive.header.lattice.units_per_step).astype(np.int64)
+        scene = scene[np.argsort(scene[:, 0], kind="stable")]
+        if _touches(placed, scene, reach) != expected[number]:
             raise InternalError(
-                f"pose {number} of those judged: the server answers {'contact' if contact else 'clear'}, a test of "
-                "every pair of points finds the opposite: this is a bug of this software, report it"
+                f"pose {number} of those judged: the server answers "
+                f"{'contact' if expected[number] else 'clear'}, a test of every pair of points finds the "
+                "opposite: this is a bug of this software, report it"
             )
     return len(compared)
+
+
+class VoxelSteps:
+    """Points of an archive's voxels in lattice steps; the voxels of the last box are kept."""
+
+    def __init__(self, archive: Archive) -> None:
+        """Read from an open archive."""
+        self._archive = archive
+        self._held: dict[int, NDArray[np.int64]] = {}
+
+    def in_box(self, low: Floats, high: Floats) -> NDArray[np.int64]:
+        """Return the points (n, 3), from the origin, of all voxels that meet a box, world frame [m]."""
+        lattice = self._archive.header.lattice
+        edge = lattice.voxel_size
+        first = np.floor((low - np.array(lattice.origin)) / edge).astype(np.int64)
+        last = np.floor((high - np.array(lattice.origin)) / edge).astype(np.int64)
+        at = self._archive.coordinates
+        rows = np.flatnonzero(((at >= first) & (at <= last)).all(axis=1)).tolist()
+        self._held = {row: self._held.get(row, np.empty((0, 3), np.int64)) for row in rows}
+        for row in rows:
+            if not len(self._held[row]):
+                local = voxel_points(*self._archive.read_voxel(row))
+                self._held[row] = (local + at[row] * lattice.voxel_steps).astype(np.int64)
+        return np.concatenate([np.empty((0, 3), np.int64), *self._held.values()])
+
+
+def points_in_box(archive: Archive, low: Floats, high: Floats) -> Floats:
+    """Return the scan points (n, 3) of all voxels that meet a box, world frame [m]."""
+    return archive.header.lattice.to_world(VoxelSteps(archive).in_box(low, high))
 
 
 def _touches(avatar: Units, scene: Units, reach: int) -> bool:
@@ -132,13 +169,3 @@ def _placed_units(pose: Floats, points: Floats, origin: Floats) -> Units:
     x, y, z = points.T
     placed = [((m[0] * x + m[1] * y) + m[2] * z) + t for m, t in zip(pose[:3, :3], shift, strict=True)]
     return np.rint(np.stack(placed, axis=1) * UNITS_PER_METRE).astype(np.int64)
-
-
-def _scene_units(archive: Archive) -> Units:
-    """Return all scan points (n, 3) in exact units from the origin (NUMERICS.md N5)."""
-    lattice = archive.header.lattice
-    steps = [
-        voxel_points(*archive.read_voxel(row)) + coordinate * lattice.voxel_steps
-        for row, coordinate in enumerate(archive.coordinates)
-    ]
-    return np.rint(np.concatenate(steps).astype(np.float64) * lattice.units_per_step).astype(np.int64)

@@ -12,8 +12,8 @@ from .....builder.synthetic.sheet import make_sheet
 from ....scene import Scene
 from ...common.doorway import doorway_error
 from ...common.wall_leak import leak
+from .accuracy_results import RadiusRow
 from .measured_scene import AVATAR
-from .setting_results import SHEET, Row
 
 MODELS = ("mean", "border")
 FACTORS = (1.0, 2.0, 3.0)
@@ -22,7 +22,7 @@ FACTORS = (1.0, 2.0, 3.0)
 SPACING = 0.03
 
 
-def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[Row]:
+def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[RadiusRow]:
     """Measure the sheet of builder/synthetic/sheet.py: doorway error and leak of MODELS with FACTORS.
 
     Times are not measured here, but on the façade.
@@ -37,13 +37,9 @@ def measure_sheet(folder: Path, tick: Callable[[], None]) -> list[Row]:
         for model in MODELS:
             for factor in FACTORS:
                 name = model if factor == 1.0 else f"{model}:{factor:g}"
-                row = Row(SHEET, name, factor, name == MODELS[0])
-                row.scene = f"a sheet of points {SPACING * 1000:g} mm apart"
-                row.doorway_mm = doorway_error(scene, AVATAR, made.truth, radius_model=name).error
+                doorway = doorway_error(scene, AVATAR, made.truth, radius_model=name).error
                 found = leak(scene, made.places, radius_model=name)
-                row.leak_p50_mm, row.leak_p99_mm, row.leak_worst_mm = found.p50, found.p99, found.worst
-                row.leak_share = found.passed
-                rows.append(row)
+                rows.append(RadiusRow("sheet", model, name, factor, None, doorway, None, *found))
                 tick()
     return rows
 

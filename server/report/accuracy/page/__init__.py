@@ -1,5 +1,5 @@
 """The page of `solidcloud accuracy`: charts, texts and HTML, made from the results.
 
 May import server.report.accuracy.measurement, server.report.common, builder, schemas.
-Begin with html_page.py.
+Begin with accuracy_page.py.
 """

@@ -1,12 +1,13 @@
 """Pictures of a load test as PNG bytes: hit rate, stalls, bytes, round trips, resident voxels."""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...common.line_charts import label_ends, plain_ticks
 from ...common.sphere_pictures import load_pyplot
 from ..runs.load_cases import ECHO, Ran
 from ..users.archive_voxels import Voxels
@@ -21,8 +22,6 @@ MARKS = "osD^vP*X"
 # One hue, from light to dark, for percentiles: they differ in grey, too.
 SHADES = ("#9dc3e0", "#5a9bcb", "#1b6ca8", "#0b2f4d")
 LABEL_FONT = 8.5
-# Least distance between labels beside the lines' ends, and from the axes, as shares of the axes.
-LABEL_GAP, LABEL_AT = 0.055, 1.03
 
 
 def png(figure: Any) -> bytes:
@@ -41,53 +40,10 @@ def _axes(title: str, width: float = 9.0, height: float = 4.6) -> tuple[Any, Any
     return figure, axes
 
 
-def label_ends(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
-    """Write the name of each line beside the axes at the height of its end, with a thin line to it.
-
-    ends: x and y of a line's last point, its name and its colour. Names keep a distance from one
-    another, so that none overlaps another or a line. The limits of the axes must be final.
-    """
-    to_axes = axes.transData + axes.transAxes.inverted()
-    known = [end for end in ends if np.isfinite(end[1])]
-    heights = np.array([to_axes.transform(end[:2])[1] for end in known])
-    for (x, y, name, colour), height in zip(known, spread(heights, LABEL_GAP), strict=True):
-        axes.annotate(
-            name, (x, y), xytext=(LABEL_AT, float(height)), textcoords="axes fraction", fontsize=LABEL_FONT,
-            color=colour, va="center", ha="left", annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 1, "shrinkB": 3},
-        )  # fmt: skip
-
-
-def spread(heights: Floats, gap: float) -> Floats:
-    """Return heights (k,) in the same order, at least `gap` apart, moved as little as is simple."""
-    found = heights.astype(np.float64)
-    order = np.argsort(found, kind="stable")
-    for _ in range(100):
-        apart = np.diff(found[order])
-        close = np.flatnonzero(apart < gap - 1e-9)
-        if not len(close):
-            break
-        for k in close:
-            missing = (gap - (found[order[k + 1]] - found[order[k]])) / 2
-            if missing > 0:
-                found[order[k]] -= missing
-                found[order[k + 1]] += missing
-    return found
-
-
 def _frame(axes: Any) -> tuple[float, float, str, str]:
     """Draw the line above which a frame stalls; return its end for `label_ends`."""
     axes.axhline(1e3 * FRAME, color=LIMIT, lw=1.1, ls="--")
     return axes.get_xlim()[1], 1e3 * FRAME, "a frame: 33 ms", LIMIT
-
-
-def _plain_ticks(axis: Any) -> None:
-    """Format a logarithmic axis with plain numbers, at 1, 2 and 5."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _ticks_at(axes: Any, values: list[float]) -> None:
@@ -120,7 +76,7 @@ def hit_rate(runs: list[Ran]) -> bytes:
     axes.set(xlabel="budget, share of the scene's decoded bytes", xscale="log")
     _ticks_at(axes, sorted({r.case.share for r in runs}))
     _settle(axes)
-    label_ends(axes, ends)
+    label_ends(axes, ends, LABEL_FONT)
     return png(figure)
 
 
@@ -151,10 +107,10 @@ def stalls(runs: list[Ran]) -> bytes:
             ends.append((own[-1].speed, float(1e3 * values[-1]), name, SHADES[max(k, 1)]))
         drawn.append((axes, ends))
     for axes, ends in drawn:  # once all panels have set the limits that they share
-        _plain_ticks(axes.yaxis)
+        plain_ticks(axes.yaxis)
         _settle(axes)
         ends.append(_frame(axes))
-        label_ends(axes, ends)
+        label_ends(axes, ends, LABEL_FONT)
     return png(figure)
 
 
@@ -172,11 +128,11 @@ def round_trips(runs: list[Ran]) -> bytes:
             axes.plot(users, values, MARKS[k % 8] + style, color=colour, lw=1.6, markerfacecolor=face)
             ends.append((users[-1], values[-1], f"{side}, p{PERCENTILES[at]:g}", colour))
     axes.set(xlabel="users, 30 frames a second each", xscale="log", yscale="log")
-    _plain_ticks(axes.yaxis)
+    plain_ticks(axes.yaxis)
     _ticks_at(axes, sorted({r.case.users for r in runs}))
     _settle(axes)
     ends.append(_frame(axes))
-    label_ends(axes, ends)
+    label_ends(axes, ends, LABEL_FONT)
     return png(figure)
 
 

@@ -11,6 +11,7 @@ from picture_checks import alike_in_grey, drawn_figures, overlaps
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.stats import StatsAnswer
 from solidcloud.server.report.common.bench_results import MET, MISSED, Part, goal_rows
+from solidcloud.server.report.common.line_charts import label_ends, spread
 from solidcloud.server.report.load.page import load_page, load_pictures
 from solidcloud.server.report.load.runs import load_cases, verdict_check
 from solidcloud.server.report.load.runs.load_cases import ECHO, Case, Ran
@@ -234,11 +235,11 @@ def test_the_page_of_a_running_test_says_so_and_reloads_itself(tmp_path: Path) -
 
 def test_labels_keep_their_order_and_a_distance() -> None:
     heights = np.array([0.5, 0.52, 0.51, 0.9, 0.1])
-    found = load_pictures.spread(heights, 0.06)
+    found = spread(heights, 0.06)
     assert np.argsort(found).tolist() == np.argsort(heights).tolist()
     assert (np.diff(np.sort(found)) >= 0.06 - 1e-6).all()
     assert found[3:].tolist() == [0.9, 0.1], "nothing is near them"
-    assert load_pictures.spread(np.full(4, 0.5), 0.1) == pytest.approx([0.35, 0.45, 0.55, 0.65], abs=0.01)
+    assert spread(np.full(4, 0.5), 0.1) == pytest.approx([0.35, 0.45, 0.55, 0.65], abs=0.01)
 
 
 def overlapping(axes) -> list[tuple[str, str]]:
@@ -279,7 +280,7 @@ def test_names_of_lines_stand_beside_the_axes_without_overlap() -> None:
         ends.append((1.0, level, f"line {k}", "#000000"))
     axes.set_yscale("log")
     load_pictures._settle(axes)
-    load_pictures.label_ends(axes, ends)
+    label_ends(axes, ends, load_pictures.LABEL_FONT)
     assert len(axes.texts) == 5 and overlapping(axes) == []
     right = axes.get_window_extent().x1
     assert all(Text.get_window_extent(text).x0 > right for text in axes.texts)

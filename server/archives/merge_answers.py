@@ -213,11 +213,13 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
     """
     k = len(answers[0])
     clusters, cluster_starts, cluster_rows = _by_pose(answers, "cluster_starts", k)
-    deepest = np.concatenate([a.cluster_deepest for a in answers])[clusters]
-    cloud = np.concatenate([a.cluster_cloud for a in answers])[clusters]
-    order = np.lexsort((*cloud.T[::-1], deepest, cluster_rows))
+    own = {name: np.concatenate([_column(a, name) for a in answers])[clusters] for name in _CLUSTERS}
+    # Clusters of several archives may contain the same deepest pair.
+    keys = (*_by_axis(own["cluster_high"]), *_by_axis(own["cluster_low"]), own["cluster_count"])
+    keys += (*_by_axis(own["cluster_avatar"]), *_by_axis(own["cluster_cloud"]), own["cluster_deepest"])
+    order = np.lexsort((*keys, cluster_rows))
     clusters = clusters[order]
-    fields = {name: np.concatenate([_column(a, name) for a in answers])[clusters] for name in _CLUSTERS}
+    fields = {name: column[order] for name, column in own.items()}
     fields["cluster_starts"] = cluster_starts
     # New number of each archive's cluster within its pose.
     place = np.empty(len(clusters), np.int64)
@@ -225,9 +227,16 @@ def _contacts(answers: Sequence[ContactsAnswers]) -> dict[str, Any]:
     pairs, pair_starts, pair_rows = _by_pose(answers, "pair_starts", k)
     columns = {name: np.concatenate([_column(a, name) for a in answers])[pairs] for name in _PAIRS}
     columns["cluster"] = place[_own_clusters(answers)][pairs].astype(np.int32)
-    keys = (columns["avatar_index"], *columns["avatar_point"].T[::-1], *columns["cloud_point"].T[::-1])
+    keys = (columns["scan_index"], columns["cluster"], columns["avatar_index"])
+    keys += (*_by_axis(columns["avatar_point"]), *_by_axis(columns["cloud_point"]))
     order = np.lexsort((*keys, columns["signed_distance"], pair_rows))
     return fields | {name: column[order] for name, column in columns.items()} | {"pair_starts": pair_starts}
+
+
+def _by_axis(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Return the keys with which `np.lexsort` sorts points (n, 3) by x, then y, then z."""
+    x, y, z = points.T
+    return z, y, x
 
 
 def _by_pose(

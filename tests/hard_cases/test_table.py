@@ -12,7 +12,7 @@ import pytest
 from project_scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[2]
-ROWS = 34
+ROWS = 40
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,11 @@ def level_bytes(folder: Path) -> int:
         return sum(ArenaBuffer.rounded(int(size)) for size in level.store.sizes)
 
 
+@pytest.mark.case(
+    35,
+    "25 scenes, six tolerances, radii per point: brute force, with no voxel in memory, and from an empty cache on",
+    compiled_only="it opens hundreds of scenes",
+)
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -102,6 +107,9 @@ def test_without_a_voxel_everything_said_is_true(
                 judge_distance(near, within, reach, tolerance, True)
 
 
+@pytest.mark.case(
+    35, "a dense wall: tolerances of 10 and 30 cm need no voxel, an exact answer does; both are right"
+)
 @pytest.mark.interpreted
 def test_a_dense_wall_is_answered_from_its_level(tmp_path: Path, rng: np.random.Generator) -> None:
     """Where points are some centimetres apart, 10 and 30 cm need no voxel; an exact answer does."""

@@ -82,17 +82,17 @@ def field_touches(field: DistanceField, avatar: Floats, poses: Floats, threshold
 
 
 def field_box(
-    avatar: Floats, poses: Floats, contact: NDArray[np.bool_], cells: int, cell: float
+    avatar: Floats, poses: Floats, distance: Floats, cells: int, cell: float
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return a box of at most `cells` cells around poses (k, 4, 4), most of all those in contact (k,).
+    """Return a box of at most `cells` cells around poses (k, 4, 4), of as many classes and poses as possible.
 
+    distance: (k,) signed, of the poses [m].
     Returns its low and high corner (3,) [m], and which poses it holds with the avatar (n, 3).
     """
     across = float(np.hypot(*np.abs(avatar[:, :2]).max(axis=0))) + AROUND
     below, above = float(avatar[:, 2].min()) - AROUND, float(avatar[:, 2].max()) + AROUND
     places = poses[:, :3, 3]
-    worth = np.where(contact, 5, 1)
-    best, most = (np.zeros(3), np.zeros(3), np.zeros(len(poses), bool)), 0
+    best, most = (np.zeros(3), np.zeros(3), np.zeros(len(poses), bool)), (0, 0)
     for centre in places[:: max(1, len(places) // 60)]:
         # As high as the avatar, and CLIMB more on each side; as wide as the cells suffice.
         low_z, high_z = centre[2] + below - CLIMB, centre[2] + above + CLIMB
@@ -101,8 +101,9 @@ def field_box(
         high = np.array([centre[0] + wide / 2, centre[1] + wide / 2, high_z])
         inside = (np.abs(places[:, :2] - centre[:2]) <= wide / 2 - across).all(axis=1)
         inside &= np.abs(places[:, 2] - centre[2]) <= CLIMB
-        if (total := int(worth[inside].sum())) > most:
-            best, most = (low, high, inside), total
+        found = len(class_members(distance[inside])), int(inside.sum())
+        if found > most:
+            best, most = (low, high, inside), found
     return best
 
 
@@ -120,7 +121,7 @@ def field_rows(
     scene: with the avatar added, for the exact answer's time.  tick: called after each field.
     Returns no rows if the box holds no class of poses.
     """
-    low, high, inside = field_box(avatar, poses, reference.contact, plan.field_cells, min(plan.cells))
+    low, high, inside = field_box(avatar, poses, reference.distance, plan.field_cells, min(plan.cells))
     kinds = {
         name: kept
         for name, rows in class_members(np.where(inside, reference.distance, np.nan)).items()

@@ -14,11 +14,11 @@ from .accuracy_results import REPEATS, FrameRow
 from .cold_curve import along
 from .measured_scene import AVATAR
 
-PASSES, PAIRS = 2, 5
+PASSES, PAIRS = 2, 4
 # Maximum distance of a motion command's target from the avatar [m]. Without it, an avatar that waits
 # before an obstacle would have ever longer motions swept.
 AHEAD = 0.25
-SPACING, MOST = 1.4 / 30.0, 600  # of the targets: 1.4 m/s at 30 frames a second
+SPACING, MOST = 1.4 / 30.0, 300  # of the targets: 1.4 m/s at 30 frames a second
 
 
 def scene_text(archive: Path, tolerance: float) -> str:

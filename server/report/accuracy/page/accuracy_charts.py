@@ -10,6 +10,7 @@ import numpy as np
 from ...common.line_charts import label_ends, plain_ticks
 from ...common.sphere_pictures import load_pyplot
 from ..measurement.accuracy_results import MemoryRow, RadiusRow, Report
+from ..measurement.pose_classes import CLASSES
 
 # A chart is 1280 pixels wide. Shown at 400 its texts are 9 pixels high.
 WIDTH, DPI, FONT = 6.4, 200, 10.5
@@ -72,9 +73,8 @@ def draw_memory(report: Report, target: Path) -> Path:
     figure, panel = load_pyplot().subplots(figsize=(WIDTH, 4.6), dpi=DPI, layout="constrained")
     rows = [row for row in report.memory if row.question == "collide"]
     panel.set_yscale("log")
-    kinds = list(dict.fromkeys(row.kind for row in rows))
     for field in report.fields:
-        at = kinds.index(field.kind)
+        at = list(CLASSES).index(field.kind)
         # A field's error is at most a diagonal of its cells.
         panel.plot(
             [field.cell * 3**0.5], [field.time_us], "P", color=KIND_COLOURS[at], ms=8, markeredgecolor="white"
@@ -199,13 +199,14 @@ def _draw_classes(panel: Any, rows: Sequence[MemoryRow], *, ratios: bool) -> End
 
     Returns the ends of the lines, to be labelled.
     """
-    kinds = list(dict.fromkeys(row.kind for row in rows))
     ends = []
     tolerances = sorted({row.tolerance for row in rows})
     places = {tolerance: tolerance or tolerances[1] * EXACT_AT for tolerance in tolerances}
     panel.set_xscale("log")
-    for number, kind in enumerate(kinds):
+    for number, kind in enumerate(CLASSES):
         own = [row for row in rows if row.kind == kind]
+        if not own:
+            continue
         x = [places[row.tolerance] for row in own]
         y = [100 * row.ratio if ratios else row.time_us for row in own]
         colour, mark = KIND_COLOURS[number], KIND_MARKS[number]

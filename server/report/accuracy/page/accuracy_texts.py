@@ -140,9 +140,10 @@ def _fields(report: Report) -> str:
     engine = sum(share * row.time_us / row.ratio for share, row in zip(shares, own, strict=True))
     wrong = sum(share * (row.false_clear + row.early) for share, row in zip(shares, own, strict=True))
     return (
-        f"A distance field with cells of {cell * 100:g} cm takes {field / engine:.1f} times as long as the exact answer, "
-        f"is wrong at {100 * wrong / sum(shares):.0f} % of the poses, and takes {size_name(own[0].scene_bytes)} for the "
-        f"whole scene, whose voxels take {size_name(report.facts['decoded_bytes'])}."
+        f"A distance field with cells of {cell * 100:g} cm takes {field / engine:.1f} times as long as the "
+        f"exact answer, is wrong at {100 * wrong / sum(shares):.0f} % of the poses, and takes "
+        f"{size_name(own[0].scene_bytes)} for the whole scene, whose voxels take "
+        f"{size_name(report.facts['decoded_bytes'])}."
     )
 
 
@@ -160,8 +161,8 @@ def _walks(report: Report) -> str:
     least = min(bounds, key=lambda row: row.memory)
     return (
         f"A walk at 5 m/s with {least.memory:g} of the scene in memory, by bounds: {least.stalls} of "
-        f"{least.frames} frames over 33 ms, {least.false_clear} wrongly clear, {100 * least.early:.0f} % of the "
-        "clear poses stopped early."
+        f"{least.frames} frames over 33 ms, {least.false_clear} wrongly clear, {100 * least.early:.0f} % of "
+        "the clear poses stopped early."
     )
 
 
@@ -171,8 +172,9 @@ def _radii(report: Report) -> str:
     if mean is None or local is None:
         return ""
     said = (
-        f"A ball of 5 cm radius passes right through a wall at {100 * mean.passed:.1f} % of the places with one "
-        f"radius for all points, and at {100 * local.passed:.1f} % with one that follows their spacing (local)"
+        f"A ball of 5 cm radius passes right through a wall at {100 * mean.passed:.1f} % of the places with "
+        f"one radius for all points, and at {100 * local.passed:.1f} % with one that follows their spacing "
+        "(local)"
     )
     if mean.time_us and local.time_us:
         said += f", which takes {local.time_us / mean.time_us:.2f} times as long"

@@ -26,6 +26,8 @@ from .reference_answers import ReferenceAnswers, points_in_box
 
 # Space around the avatar in the box, and the height that poses may differ by from its middle [m].
 AROUND, CLIMB = 0.3, 0.5
+# A box holds few of a long walk's poses: smaller classes are measured than elsewhere.
+FEW = 5
 
 
 class DistanceField(NamedTuple):
@@ -101,7 +103,7 @@ def field_box(
         high = np.array([centre[0] + wide / 2, centre[1] + wide / 2, high_z])
         inside = (np.abs(places[:, :2] - centre[:2]) <= wide / 2 - across).all(axis=1)
         inside &= np.abs(places[:, 2] - centre[2]) <= CLIMB
-        found = len(class_members(distance[inside])), int(inside.sum())
+        found = len(class_members(distance[inside], FEW)), int(inside.sum())
         if found > most:
             best, most = (low, high, inside), found
     return best
@@ -122,11 +124,7 @@ def field_rows(
     Returns no rows if the box holds no class of poses.
     """
     low, high, inside = field_box(avatar, poses, reference.distance, plan.field_cells, min(plan.cells))
-    kinds = {
-        name: kept
-        for name, rows in class_members(np.where(inside, reference.distance, np.nan)).items()
-        if len(kept := rows[inside[rows]])
-    }
+    kinds = class_members(np.where(inside, reference.distance, np.nan), FEW)
     reach = scene.info().radius + (scene.add_avatar(AVATAR, avatar).radius or 0.0)
     points = points_in_box(archive, low, high)
     scene_low, scene_high = np.array(scene.info().bounds)

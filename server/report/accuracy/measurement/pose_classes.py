@@ -20,12 +20,12 @@ CLASSES = {
 FEWEST, CALL, LONGEST = 20, 600, 1200
 
 
-def class_members(distance: Floats) -> dict[str, NDArray[np.int64]]:
-    """Return name -> rows of the poses with signed distances (k,) [m], for each class that is large enough."""
+def class_members(distance: Floats, fewest: int = FEWEST) -> dict[str, NDArray[np.int64]]:
+    """Return name -> rows of the poses with signed distances (k,) [m], for each class of at least `fewest`."""
     found = {}
     for name, (low, high) in CLASSES.items():
         members = np.flatnonzero((distance > low) & (distance <= high))
-        if len(members) >= FEWEST:
+        if len(members) >= fewest:
             found[name] = members
     return found
 

@@ -91,22 +91,24 @@ def check_reference(
     compared.
     Raises InternalError if a verdict differs.
     """
-    origin = np.array(archive.header.lattice.origin)
+    lattice = archive.header.lattice
+    origin = np.array(lattice.origin)
     avatar = make_avatar(measured.avatar)
     reach = round(archive.header.radius * UNITS_PER_METRE) + round(avatar.radius * UNITS_PER_METRE)
-    near = np.linspace(0, max(len(reference.tangent) - 1, 0), min(poses // 2, len(reference.tangent)))
-    far = np.linspace(0, len(reference.contact) - 1, poses - len(near))
-    near, far = near.astype(int), far.astype(int)
-    compared = np.concatenate([reference.tangent_poses[near], measured.judged[far]])
-    expected = np.concatenate([reference.tangent[near], reference.contact[far]])
+    tangent = np.linspace(0, max(len(reference.tangent) - 1, 0), min(poses // 2, len(reference.tangent)))
+    others = np.linspace(0, len(reference.contact) - 1, poses - len(tangent))
+    tangent, others = tangent.astype(int), others.astype(int)
+    compared = np.concatenate([reference.tangent_poses[tangent], measured.judged[others]])
+    expected = np.concatenate([reference.tangent[tangent], reference.contact[others]])
     voxels = VoxelSteps(archive)
     for number in np.argsort(compared[:, 0, 3], kind="stable"):
         placed = _placed_units(compared[number], measured.avatar, origin)
-        around = reach / UNITS_PER_METRE + 2 * archive.header.lattice.step
-        low = placed.min(axis=0) / UNITS_PER_METRE - around + origin
-        high = placed.max(axis=0) / UNITS_PER_METRE + around + origin
-        steps = voxels.in_box(low, high)
-        scene = np.rint(steps.astype(np.float64) * archive.header.lattice.units_per_step).astype(np.int64)
+        around = reach / UNITS_PER_METRE + 2 * lattice.step
+        low = placed.min(axis=0) / UNITS_PER_METRE - around
+        high = placed.max(axis=0) / UNITS_PER_METRE + around
+        steps = voxels.in_box(low + origin, high + origin)
+        near = (steps >= np.floor(low / lattice.step)) & (steps <= np.ceil(high / lattice.step))
+        scene = np.rint(steps[near.all(axis=1)].astype(np.float64) * lattice.units_per_step).astype(np.int64)
         scene = scene[np.argsort(scene[:, 0], kind="stable")]
         if _touches(placed, scene, reach) != expected[number]:
             raise InternalError(

@@ -48,26 +48,27 @@ def cold_row(report: Report, tolerance: float | None) -> ColdRow | None:
     return next((row for row in report.cold if row.tolerance == tolerance), None)
 
 
-def saved(ratio: float) -> str:
-    """Describe a ratio of times: saves 42 %, saves nothing, or costs 20 % more."""
+def saved(ratio: float, what: str) -> str:
+    """Describe a ratio: saves 42 % of what there is, saves none of it, or adds 20 % to it."""
     if abs(ratio - 1.0) <= SAME:
-        return "saves nothing"
-    return f"saves {100 * (1 - ratio):.0f} %" if ratio < 1.0 else f"costs {100 * (ratio - 1):.0f} % more"
+        return f"saves none of the {what}"
+    if ratio < 1.0:
+        return f"saves {100 * (1 - ratio):.0f} % of the {what}"
+    return f"adds {100 * (ratio - 1):.0f} % to the {what}"
 
 
 def answer(report: Report) -> str:
     """Return the answer to what accuracy costs in time, in one sentence."""
     near, rest = _near_and_rest(report, NEAR)
-    said = (
-        f"With the scene in memory, an error of {NEAR * 100:g} cm {saved(_ratio(near, report))} of the time"
-    )
-    said += (
-        f" where a pose touches or is that near, and {saved(_ratio(rest, report))} elsewhere" if rest else ""
-    )
+    said = f"With the scene in memory, an error of {NEAR * 100:g} cm"
+    if near:
+        said += f" {saved(_ratio(near, report), 'time')} where a pose touches or is that near"
+    if rest:
+        said += f"{', and' if near else ''} {saved(_ratio(rest, report), 'time')} elsewhere"
     cold = cold_row(report, COARSE)
     if cold is not None:
-        said += f"; with nothing in memory, {COARSE * 100:g} cm {saved(cold.wait)} of the wait"
-        said += f" and {saved(cold.bytes_ratio)} of the bytes" if cold.bytes_ratio is not None else ""
+        said += f"; with nothing in memory, {COARSE * 100:g} cm {saved(cold.wait, 'wait')}"
+        said += f" and {saved(cold.bytes_ratio, 'bytes')}" if cold.bytes_ratio is not None else ""
     return said + "."
 
 
@@ -133,7 +134,7 @@ def _fields(report: Report) -> str:
     exact = {row.kind: row for row in _rows(report, 0.0)}
     cell = min((row.cell for row in report.fields), default=0.0)
     own = [row for row in report.fields if row.cell == cell and row.kind in exact]
-    if not own:
+    if len(own) < 2:  # of a single class there is no mean to speak of
         return ""
     shares = [exact[row.kind].share for row in own]
     field = sum(share * row.time_us for share, row in zip(shares, own, strict=True))

@@ -105,7 +105,8 @@ def measure(
         walks = walk_rows(measured.archive, body, measured.walk, plan.shares, plan.walked, tick)
     radii = _radii(measured, scratch, plan, progress)
     with _part(progress, "frames", len(plan.frame_tolerances)) as tick:
-        frames = frame_rows(measured.archive, body, measured.walk, plan.frame_tolerances, scratch, tick)
+        walk, touching = measured.walk, reference.contact[: len(measured.walk)]
+        frames = frame_rows(measured.archive, body, walk, touching, plan.frame_tolerances, scratch, tick)
     facts |= {"poses_judged_by_every_pair": checked, "seconds": time.perf_counter() - begin}
     return Report(facts, memory, fields, cold, walks, radii, frames)
 

@@ -17,11 +17,13 @@ LAYER, DENSE = 0.05, 0.2
 OUTLIERS = 0.02
 
 
-def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def floor_walk(
+    points: NDArray[np.float64], quantile: float = 0.5
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the times (1200,) [s] and poses (1200, 4, 4) of a walk through points (n, 3) [m].
 
     Poses are avatar to world. The walk has 30 poses per second. It follows the longer horizontal
-    axis, at the median of the other. The avatar faces its direction of motion, with its feet SOLE
+    axis, at a quantile of the points along the other. The avatar faces its direction of motion, with its feet SOLE
     above the lowest dense layer of points around it.
     Raises BadDataError if there are too few points to detect a floor.
     """
@@ -30,7 +32,7 @@ def floor_walk(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     )
     along = int(np.argmax(high - low))
     across = 1 - along
-    middle = float(np.median(points[:, across])) if len(points) else 0.0
+    middle = float(np.quantile(points[:, across], quantile)) if len(points) else 0.0
     near = points[np.abs(points[:, across] - middle) < HALF]
     places = np.arange(low[along], high[along] + SPACING, SPACING)
     floors = np.array([floor_height(near[np.abs(near[:, along] - place) < HALF, 2]) for place in places])

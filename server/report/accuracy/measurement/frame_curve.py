@@ -6,6 +6,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .....schemas.process.new_file import new_file
 from ....scene import Scene
@@ -34,16 +35,19 @@ def frame_rows(
     archive: Path,
     avatar: Floats,
     walk: Floats,
+    contact: NDArray[np.bool_],
     tolerances: tuple[float, ...],
     folder: Path,
     tick: Callable[[], None],
 ) -> list[FrameRow]:
-    """Move an avatar along a walk (k, 4, 4), frame by frame, with each tolerance of the effect `sweep`.
+    """Move an avatar along a walk, frame by frame, with each tolerance of the effect `sweep`.
+
+    walk: (k, 4, 4).  contact: (k,), poses that touch. The frames follow the longest part that does not.
 
     Pairs of walks, with the first tolerance and with another, are timed in turn.
     folder: receives scene files.  tick: called after each tolerance.
     """
-    walk = along(walk, SPACING)[:MOST]
+    walk = along(walk[longest_run(~contact)], SPACING)[:MOST]
     rows = []
     with ExitStack() as stack:
         first = stack.enter_context(_scene(archive, avatar, tolerances[0], folder))
@@ -72,6 +76,16 @@ def frame_rows(
             )  # fmt: skip
             tick()
     return rows
+
+
+def longest_run(wanted: NDArray[np.bool_]) -> slice:
+    """Return the longest run of True in (k,); all if there is none."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]])))
+    if not len(edges):
+        return slice(0, len(wanted))
+    begin, end = edges[::2], edges[1::2]
+    at = int(np.argmax(end - begin))
+    return slice(int(begin[at]), int(end[at]))
 
 
 def _scene(archive: Path, avatar: Floats, tolerance: float, folder: Path) -> Scene:

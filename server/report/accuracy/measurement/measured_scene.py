@@ -15,8 +15,10 @@ from .....builder.synthetic.walk import walk_poses
 from .....builder.voxel.record_points import voxel_points
 from .....schemas.archive.archive import Archive
 from .....schemas.archive.index import Header
+from .....schemas.wire.answers import Verdict
 from ....avatars.avatar_file import read_avatar
 from ....avatars.avatar_model import make_avatar
+from ....scene import Scene
 from ...common.floor_walk import floor_walk
 from ...common.paired_times import Floats
 from .measurement_plan import MeasurementPlan
@@ -30,6 +32,8 @@ SIDEWAYS, UPWARDS = 0.2, 0.2
 # The walk through a given archive follows voxels within BESIDE of a line [m]: at most CROSSED, of at
 # most CROSSED_POINTS. Its floor is found by at most SAMPLED points of each.
 BESIDE, CROSSED, CROSSED_POINTS, SAMPLED = 2.0, 96, 30_000_000, 50_000
+# Quantiles across the middle line at which walks are tried: one may lead along the inside of a wall.
+LINES = (0.5, 0.3, 0.7, 0.1, 0.9)
 
 
 class MeasuredScene(NamedTuple):
@@ -87,21 +91,33 @@ def generated_scene(
 def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Path | None) -> MeasuredScene:
     """Return an archive with a straight walk over its floor, through the voxels around its middle.
 
+    Of walks along LINES, it is the one with the most clear poses.
+
     Raises BadDataError if there is no floor to stand on.
     """
     with Archive(archive) as opened:
         points = middle_points(opened)
         header, warnings = opened.header, unknown_regions(opened.header)
     body = figure_points() if avatar is None else read_avatar(avatar)
-    walk = floor_walk(points)[1]
+    walks = [floor_walk(points, quantile)[1] for quantile in LINES]
+    for walk in walks:
+        # The walk places avatar points on scan points. Raise it by both radii: the spheres would else
+        # intersect the floor at every pose.
+        walk[:, 2, 3] += header.radius + make_avatar(body).radius
+    walk = _freest(archive, body, walks)
     walk = walk[np.linspace(0, len(walk) - 1, min(plan.frames, len(walk))).astype(int)]
-    # The walk places avatar points on scan points. Raise it by both radii: the spheres would else
-    # intersect the floor at every pose.
-    walk[:, 2, 3] += header.radius + make_avatar(body).radius
     name = f"{archive.resolve().name}, {header.points:,} points"
     return MeasuredScene(
         name, archive, warnings, None, None, BuildConfig(), avatar is None, body, walk, _moved(walk)
     )
+
+
+def _freest(archive: Path, avatar: Floats, walks: list[Floats]) -> Floats:
+    """Return the walk with the most clear poses, the first of several."""
+    with Scene.open(archive) as scene:
+        scene.add_avatar(AVATAR, avatar)
+        clear = [(scene.collide(AVATAR, walk[::10]).verdict == Verdict.CLEAR).sum() for walk in walks]
+    return walks[int(np.argmax(clear))]
 
 
 def unknown_regions(header: Header) -> tuple[str, ...]:

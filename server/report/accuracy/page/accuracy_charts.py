@@ -73,7 +73,8 @@ def draw_memory(report: Report, target: Path) -> Path:
     figure, panel = load_pyplot().subplots(figsize=(WIDTH, 4.6), dpi=DPI, layout="constrained")
     rows = [row for row in report.memory if row.question == "collide"]
     panel.set_yscale("log")
-    for field in report.fields:
+    shown = {row.kind for row in rows}
+    for field in (each for each in report.fields if each.kind in shown):
         at = list(CLASSES).index(field.kind)
         # A field's error is at most a diagonal of its cells.
         panel.plot(

@@ -187,8 +187,8 @@ def _radii(report: Report) -> str:
 def _frames(report: Report) -> str:
     if not report.frames:
         return ""
-    last = report.frames[-1]
+    first, last = report.frames[0], report.frames[-1]
     return (
-        f"A frame of a walk takes {report.frames[0].time_us:.0f} µs; with a tolerance of "
+        f"A frame of a walk of {first.way:.1f} m takes {first.time_us:.0f} µs; with a tolerance of "
         f"{last.tolerance * 100:g} cm for its sweeps it takes {last.ratio:.2f} times as long."
     )

@@ -17,7 +17,7 @@ from solidcloud.server.report.accuracy.accuracy_report import reference_warnings
 from solidcloud.server.report.accuracy.measurement import frame_curve, measured_scene
 from solidcloud.server.report.accuracy.measurement.cold_curve import cold_curve
 from solidcloud.server.report.accuracy.measurement.distance_field import field_rows
-from solidcloud.server.report.accuracy.measurement.frame_curve import frame_rows
+from solidcloud.server.report.accuracy.measurement.frame_curve import frame_rows, longest_run
 from solidcloud.server.report.accuracy.measurement.measured_scene import (
     AVATAR,
     REACH,
@@ -225,7 +225,13 @@ def test_a_frame_with_a_tolerance_ends_near_that_without(
     monkeypatch.setattr(frame_curve, "PAIRS", 2)
     monkeypatch.setattr(frame_curve, "MOST", 20)
     avatar, walk = judged.measured.avatar, judged.measured.walk
-    rows = frame_rows(judged.folder, avatar, walk, (1e-5, 0.1), tmp_path, judged.tick)
+    touching = judged.exact.contact[: len(walk)]
+    rows = frame_rows(judged.folder, avatar, walk, touching, (1e-5, 0.1), tmp_path, judged.tick)
     assert [row.tolerance for row in rows] == [1e-5, 0.1]
     assert rows[0].apart_mm == 0.0 and rows[1].apart_mm < 150.0
     assert all(row.time_us > 0 and row.p99_us >= row.time_us / 2 and row.way > 0 for row in rows)
+
+
+def test_frames_follow_the_longest_part_that_is_clear() -> None:
+    assert longest_run(np.array([True, False, True, True, False])) == slice(2, 4)
+    assert longest_run(np.ones(3, bool)) == slice(0, 3) == longest_run(np.zeros(3, bool))

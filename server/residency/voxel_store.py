@@ -10,6 +10,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import OPTIONAL_COLUMNS
 from ...schemas.archive.level import NODE_CLASS
 from ...schemas.archive.voxel import top_shift
+from ..kernels.core.node_boxes import lay_boxes
 from ..kernels.core.scene_arrays import (
     LANES,
     Arena,
@@ -45,6 +46,9 @@ class VoxelStore:
         rows, header = self.archive.voxels, self.archive.header
         self.with_normals = header.normals and header.normal_reach == normals
         self._columns = [name for name in OPTIONAL_COLUMNS if name != "normal" or self.with_normals]
+        # Nodes of a level enclose points that the level does not hold; an archive without slabs has the
+        # paper's spheres alone, for comparison.
+        self._with_boxes = bool(header.options.get("with_slab", True)) and not header.is_level
         self.sizes = resident_bytes(
             rows["rows"][:, 1].astype(np.int64),
             rows["leaves"].astype(np.int64),
@@ -79,6 +83,8 @@ class VoxelStore:
         lanes = arena.halves[where[2] :]
         with self.archive.locating(row):
             record.read_points(lanes[: leaves * 3 * LANES].reshape(leaves, 3, LANES))
+        if self._with_boxes:
+            lay_boxes(len(record.links.first), words, header.lattice.step, arena, where)
         if header.radius_class:
             classes = np.empty((leaves, LANES), np.uint8)
             with self.archive.locating(row):

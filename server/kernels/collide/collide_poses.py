@@ -103,7 +103,7 @@ def _collide_voxel(
             count = compact_marked(bounds, which, listed, listed8, at, steps, to)
             at = to
             thick = words[U(row + 9)] - words[U(row + 8)]
-            if first < 0 or thick < FLAT * words[U(row + 7)] * bounds[3, U(at)]:
+            if first < 0 or thick < FLAT * abs(words[U(row + 7)]) * bounds[3, U(at)]:
                 left = at
                 for i in range(at, at + count):
                     a = front_first + np.int64(which[U(i)])

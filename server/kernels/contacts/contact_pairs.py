@@ -19,7 +19,7 @@ from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import (
     ONE_SLACK,
-    SLACK,
+    lanes_meet,
     make_class_thresholds,
     make_thresholds,
     nodes_meet,
@@ -84,18 +84,7 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
     )
     fars, mask = scratch.by_class.far, scratch.by_class.mask
     threshold = scratch.by_class.threshold[node_class(ints, row, mask)]
-    cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
-    nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
-    both = words[row + 3] + threshold
-    wide = words[row + 7] * (threshold + SLACK * both + SLACK * both)
-    least, most = words[row + 8] - wide, words[row + 9] + wide
-    square = both * both * ONE_SLACK
-    met = False
-    for j in range(LANES):
-        dx, dy, dz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
-        along = nx * dx + ny * dy + nz * dz
-        met |= (dx * dx + dy * dy + dz * dz <= square) & (along <= most) & (along >= least)
-    if not met:
+    if not lanes_meet(words, row, lanes, block, off[0], off[1], off[2], threshold, keep):
         return
     scene_block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + scene_block * scene.block_words

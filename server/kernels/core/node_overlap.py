@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
 from .kernel_decorators import njit_inlined, njit_no_refcount
+from .node_boxes import box_square, has_box
 from .placed_avatar import pad_list
 from .scene_arrays import LANES
 
@@ -144,12 +145,17 @@ def nodes_meet(words, row, x, y, z, radius, threshold):
     """Return whether a sphere may come within `threshold` of a node's points, by the node's bounds.
 
     x, y, z: float32, relative to the voxel's low corner.  threshold: reach plus error. Tests the
-    sphere as in [Fig12] line 2, then the slab.
+    sphere as in [Fig12] line 2, and the slab or the box.
     """
     w = U(row)
     dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
     span = radius + threshold
     both = words[w + U(3)] + span
+    if has_box(words, row):
+        outside = span + SLACK * both + SLACK * both
+        return (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK) & (
+            box_square(words, row, dx, dy, dz) <= outside * outside * ONE_SLACK
+        )
     along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
     # The sphere test decides beyond `both`; the rounding of `along` is therefore at most SLACK of
     # it.
@@ -178,7 +184,7 @@ def power_distance(words, row, x, y, z):
 def mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, threshold, keep):
     """Mark in `keep` the nodes of a list that meet the scene node `row`.
 
-    The test is that of `nodes_meet`: the sphere, then the slab.
+    The test is that of `nodes_meet`.
     at: the start of the list.  steps: its length in units of LANES nodes.  off: from the frame to
     the voxel's low corner.  threshold: reach plus error. Returns whether any node meets.
     """
@@ -189,6 +195,22 @@ def mark_meeting(words, row, bounds, at, steps, off_x, off_y, off_z, threshold, 
     low, high = words[w + U(8)], words[w + U(9)]
     any_meets = False
     begin, to = U(at), U(0)
+    if length < np.float32(0.0):
+        for _ in range(steps):
+            for j in range(LANES):
+                i = begin + U(j)
+                dx, dy, dz = bounds[0, i] - cx, bounds[1, i] - cy, bounds[2, i] - cz
+                span = bounds[3, i] + threshold
+                both = radius + span
+                outside = span + (SLACK * both + SLACK * both)
+                meets = (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK) & (
+                    box_square(words, row, dx, dy, dz) <= outside * outside * ONE_SLACK
+                )
+                keep[to + U(j)] = meets
+                any_meets |= meets
+            begin += U(LANES)
+            to += U(LANES)
+        return any_meets
     for _ in range(steps):
         for j in range(LANES):
             i = begin + U(j)
@@ -251,6 +273,15 @@ def lanes_meet(words, row, lanes, block, off_x, off_y, off_z, threshold, keep):
     square = both * both * ONE_SLACK
     b = U(block)
     any_meets = False
+    if has_box(words, row):
+        outside = threshold + SLACK * both + SLACK * both
+        outside = outside * outside * ONE_SLACK
+        for j in range(LANES):
+            dx, dy, dz = lanes[b, 0, U(j)] - cx, lanes[b, 1, U(j)] - cy, lanes[b, 2, U(j)] - cz
+            meets = (dx * dx + dy * dy + dz * dz <= square) & (box_square(words, row, dx, dy, dz) <= outside)
+            keep[U(j)] = meets
+            any_meets |= meets
+        return any_meets
     for j in range(LANES):
         dx, dy, dz = lanes[b, 0, U(j)] - cx, lanes[b, 1, U(j)] - cy, lanes[b, 2, U(j)] - cz
         along = nx * dx + ny * dy + nz * dz

@@ -38,6 +38,7 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_boxes import has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
 from ..core.scene_arrays import (
     COUNT,
@@ -64,7 +65,8 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     """Return whether a moving sphere may come within `threshold` of a node's points.
 
     The sphere moves from (x, y, z) by (dx, dy, dz); its way up to the fraction `latest` counts.
-    threshold: reach plus error. Tests the sphere, then the slab. All float32.
+    threshold: reach plus error. Tests the sphere, then the slab or each pair of sides of the box. All
+    float32.
     """
     wx, wy, wz = x - words[row], y - words[row + 1], z - words[row + 2]
     span = radius + threshold
@@ -73,6 +75,14 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
     if ex * ex + ey * ey + ez * ez > both * both * ONE_SLACK:
         return False
+    if has_box(words, row):
+        wide = span + SLACK * both + SLACK * both
+        for k in range(3):
+            begin, way = (wx, dx) if k == 0 else (wy, dy) if k == 1 else (wz, dz)
+            end, most = begin + latest * way, words[row + 4 + k] + wide
+            if min(begin, end) > most or max(begin, end) < -most:
+                return False
+        return True
     nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
     begin = nx * wx + ny * wy + nz * wz
     end = begin + latest * (nx * dx + ny * dy + nz * dz)
@@ -103,19 +113,25 @@ def _leaves(sweep, chord, voxel, block, row):
     cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
     nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
     both = words[row + 3] + threshold
-    wide = words[row + 7] * (threshold + SLACK * both + SLACK * both)
+    wide = abs(words[row + 7]) * (threshold + SLACK * both + SLACK * both)
     least, most = words[row + 8] - wide, words[row + 9] + wide
-    square = both * both * ONE_SLACK
+    square, boxed = both * both * ONE_SLACK, has_box(words, row)
     for j in range(LANES):
         dx, dy, dz = displacements[block, 0, j], displacements[block, 1, j], displacements[block, 2, j]
         wx, wy, wz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
         t = min(max(-(wx * dx + wy * dy + wz * dz) * displacements[block, 3, j], ZERO), latest)
         ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
-        begin = nx * wx + ny * wy + nz * wz
-        end = begin + latest * (nx * dx + ny * dy + nz * dz)
-        keep[j] = (
-            (ex * ex + ey * ey + ez * ez <= square) & (min(begin, end) <= most) & (max(begin, end) >= least)
-        )
+        near = ex * ex + ey * ey + ez * ez <= square
+        if boxed:
+            ex, ey, ez = wx + latest * dx, wy + latest * dy, wz + latest * dz
+            near &= (min(wx, ex) <= nx + wide) & (max(wx, ex) >= -nx - wide)
+            near &= (min(wy, ey) <= ny + wide) & (max(wy, ey) >= -ny - wide)
+            near &= (min(wz, ez) <= nz + wide) & (max(wz, ez) >= -nz - wide)
+        else:
+            begin = nx * wx + ny * wy + nz * wz
+            end = begin + latest * (nx * dx + ny * dy + nz * dz)
+            near &= (min(begin, end) <= most) & (max(begin, end) >= least)
+        keep[j] = near
     scene_block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.radius_model import RIM_BIT
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import STACK
+from ..core.node_overlap import STACK, lanes_meet
 from ..core.placed_avatar import MAX_REACH_UNITS, PlacedAvatar, make_placed, place_block, place_nodes
 from ..core.scene_arrays import (
     COUNT,
@@ -39,7 +39,7 @@ from ..core.scene_arrays import (
     node_class,
     stopped,
 )
-from .block_distances import any_near, mark_near
+from .block_distances import any_near
 from .missing_voxels import box_distance
 from .nearest_pair import (
     BestPair,
@@ -298,7 +298,7 @@ def _resume(m, pose, avatar, scene, search, goal, enough, budget, until):
             lane_at = where[voxel, 2] + scene_block * 3 * LANES
             lx, ly = off_x + np.float32(ints[block_at]), off_y + np.float32(ints[block_at + 1])
             lz = off_z + np.float32(ints[block_at + 2])
-            mark_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep)
+            lanes_meet(words, row, lanes, block, off_x, off_y, off_z, cut[c], keep)
             for lane in range(avatar_count[a]):
                 if not keep[lane]:
                     continue

@@ -8,34 +8,9 @@ block.
 import numpy as np
 
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_overlap import ONE_SLACK, SLACK
 from ..core.scene_arrays import LANES
 
 U = np.uint64  # see placed_avatar.py
-
-
-@njit_inlined
-def mark_near(lanes, block, words, row, off_x, off_y, off_z, cut, keep):
-    """Mark the points of an avatar's block that may be within `cut` [steps] of a scene node.
-
-    Writes keep (LANES,). Returns whether any point is marked.
-    """
-    at = U(row)
-    cx, cy, cz = words[at] + off_x, words[at + U(1)] + off_y, words[at + U(2)] + off_z
-    nx, ny, nz = words[at + U(4)], words[at + U(5)], words[at + U(6)]
-    both = words[at + U(3)] + cut
-    wide = words[at + U(7)] * (cut + SLACK * both + SLACK * both)
-    least, most = words[at + U(8)] - wide, words[at + U(9)] + wide
-    limit = both * both * ONE_SLACK
-    b, any_near = U(block), False
-    for lane in range(LANES):
-        j = U(lane)
-        dx, dy, dz = lanes[b, 0, j] - cx, lanes[b, 1, j] - cy, lanes[b, 2, j] - cz
-        along = nx * dx + ny * dy + nz * dz
-        near = (dx * dx + dy * dy + dz * dz <= limit) & (along <= most) & (along >= least)
-        keep[j] = near
-        any_near |= near
-    return any_near
 
 
 @njit_no_refcount

@@ -19,6 +19,7 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import (
     STACK,
     ClassThresholds,
+    lanes_meet,
     make_class_thresholds,
     nodes_meet,
     set_class_thresholds,
@@ -35,7 +36,6 @@ from ..core.scene_arrays import (
     scan_run,
     stopped,
 )
-from .block_distances import mark_near
 from .nearest_pair import lower_bound, set_cut
 
 
@@ -129,7 +129,7 @@ def _search_leaves(
         placed.stamp[block] = 0
     # For flat walls along flat avatars, the avatar's sphere excludes little and its points exclude
     # nearly everything.
-    if not mark_near(lanes, block, words, row, off[0], off[1], off[2], widest, keep):
+    if not lanes_meet(words, row, lanes, block, off[0], off[1], off[2], widest, keep):
         return
     low_x = off[0] + np.float32(ints[block_at])
     low_y = off[1] + np.float32(ints[block_at + 1])

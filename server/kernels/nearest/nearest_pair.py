@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_boxes import box_square, has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, U32, make_thresholds
 from ..core.placed_avatar import lattice_to_units, place, to_units
 from ..core.scene_arrays import LANES, NO_LIMIT, point_class
@@ -108,13 +109,16 @@ def lower_bound(words, row, x, y, z, radius):
     """Return a lower bound of the distance of a sphere's points from a node's points [steps].
 
     x, y, z: float32, relative to the voxel's low corner. The bound is the larger of the sphere's
-    and the slab's, minus all float32 rounding of this function; a negative bound says nothing. It
+    and that of the slab or the box, minus all float32 rounding of this function; a negative bound says nothing. It
     does not include the errors of placed coordinates: `BestPair.cut` does.
     """
     at = U(row)  # not negative: saves a comparison for every index
     dx, dy, dz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     apart = np.sqrt(dx * dx + dy * dy + dz * dz)
     both = words[at + U(3)] + radius
+    if has_box(words, row):
+        gap = np.sqrt(box_square(words, row, dx, dy, dz))
+        return max(apart - both, gap - radius) - SLACK * (apart + both)
     along = words[at + U(4)] * dx + words[at + U(5)] * dy + words[at + U(6)] * dz
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.

@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
-from ..core.node_overlap import BROAD, FLAT, ONE_SLACK, SLACK, STACK, compact_marked, copy_node, mark_meeting
+from ..core.node_overlap import (
+    BROAD,
+    FLAT,
+    STACK,
+    compact_marked,
+    copy_node,
+    lanes_meet,
+    mark_meeting,
+    nodes_meet,
+)
 from ..core.placed_avatar import (
     make_front,
     make_placed,
@@ -42,7 +51,7 @@ from ..core.scene_arrays import (
     should_end,
     stopped,
 )
-from .block_distances import mark_near, nearest_squares, unmark_beyond_box
+from .block_distances import nearest_squares, unmark_beyond_box
 from .missing_voxels import box_distance
 from .nearest_pair import (
     found_units,
@@ -162,7 +171,7 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratc
             if placed.stamp[block] != pose:
                 place_lanes(avatar.points, m, block, placed.lanes, placed.shift, placed.frame, scene.step)
                 placed.stamp[block] = pose
-            if mark_near(placed.lanes, block, words, row, off[0], off[1], off[2], within, best.keep):
+            if lanes_meet(words, row, placed.lanes, block, off[0], off[1], off[2], within, best.keep):
                 _search_leaves(m, a, row, avatar, placed, scene, location, best, off)
             continue
         begin = depth
@@ -175,25 +184,6 @@ def _search_below(avatar, m, pose, a, row, placed, scene, location, best, scratc
             if key <= within:
                 _push(below, keys, begin, depth, child, key)
                 depth += 1
-
-
-@njit_no_refcount
-def node_near(words, row, x, y, z, span):
-    """Return whether a scene node may hold a point within `span` of a position.
-
-    x, y, z: float32, relative to the voxel's low corner. span: includes the error. Tests the
-    sphere, then the slab, as in `nodes_meet`.
-    """
-    w = U(row)
-    dx, dy, dz = x - words[w], y - words[w + U(1)], z - words[w + U(2)]
-    both = words[w + U(3)] + span
-    along = words[w + U(4)] * dx + words[w + U(5)] * dy + words[w + U(6)] * dz
-    wide = words[w + U(7)] * (span + SLACK * both + SLACK * both)
-    return (
-        (dx * dx + dy * dy + dz * dz <= both * both * ONE_SLACK)
-        & (along <= words[w + U(9)] + wide)
-        & (along >= words[w + U(8)] - wide)
-    )
 
 
 @njit_no_refcount
@@ -217,7 +207,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
     counters[0] += 1
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     broad = BROAD * radius
-    if not node_near(words, location[0], x, y, z, radius + cut[node_class(ints, location[0], mask)]):
+    if not nodes_meet(words, location[0], x, y, z, radius, cut[node_class(ints, location[0], mask)]):
         return
     stack[0, 0], stack[0, 1], stack[0, 2] = location[0], 0, count
     depth = 1
@@ -235,7 +225,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
             count = compact_marked(bounds, which, listed, listed8, at, steps, to)
             at = to
             thick = words[U(row + 9)] - words[U(row + 8)]
-            if first < 0 or thick < FLAT * words[U(row + 7)] * bounds[3, U(at)]:
+            if first < 0 or thick < FLAT * abs(words[U(row + 7)]) * bounds[3, U(at)]:
                 left = at
                 for i in range(at, at + count):
                     a = front_first + np.int64(which[U(i)])
@@ -246,7 +236,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
                             place_lanes(points, m, block, lanes, shift, frame, step)
                             stamp[U(block)] = pose
                         counters[0] += 1
-                        if not mark_near(lanes, block, words, row, off_x, off_y, off_z, cut[c], keep):
+                        if not lanes_meet(words, row, lanes, block, off_x, off_y, off_z, cut[c], keep):
                             continue
                         if first < 0:
                             _search_leaves(m, a, row, avatar, placed, scene, location, best, off)
@@ -265,7 +255,7 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
         counters[0] += children
         for _ in range(children):
             stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2] = child, at, count
-            if node_near(words, child, x, y, z, radius + cut[node_class(ints, child, mask)]):
+            if nodes_meet(words, child, x, y, z, radius, cut[node_class(ints, child, mask)]):
                 depth += 1
             child += ROW_WORDS
     settle_candidates(best, points, m, placed.shift, ints, scene.halves, lanes, off)

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_boxes import has_box
 from ..core.node_overlap import U32
 from ..core.placed_avatar import lattice_to_units
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
@@ -97,7 +98,7 @@ def _meet_node(words, row, ray, radius, limit):
     limit: spheres beyond it count as not met.
     ray: (12,) float64: origin relative to the voxel's low corner, direction, and two more axes of
     its frame.  radius: of the largest sphere below, inflated by the rounding of this function. The
-    ray is clipped by the node's sphere, then by its slab.
+    ray is clipped by the node's sphere, then by its slab or its box.
     """
     dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
     a = dx * ray[6] + dy * ray[7] + dz * ray[8]
@@ -112,6 +113,20 @@ def _meet_node(words, row, ray, radius, limit):
     if last < 0.0 or first > limit:
         return np.inf
     first = max(first, 0.0)
+    if has_box(words, row):
+        for k in range(3):
+            off = dx if k == 0 else dy if k == 1 else dz
+            slope, wide = ray[3 + k], np.float64(words[row + 4 + k]) + radius
+            if slope == 0.0:
+                if abs(off) > wide:
+                    return np.inf
+                continue
+            # Where the ray enters and leaves the two sides; both bounds outwards.
+            begin, end = (off - wide) / slope, (off + wide) / slope
+            slack = (abs(begin) + abs(end)) * 2.0**-50
+            first = max(first, min(begin, end) - slack)
+            last = min(last, max(begin, end) + slack)
+        return first if first <= min(last, limit) else np.inf
     nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
     slope = nx * ray[3] + ny * ray[4] + nz * ray[5]
     offset = nx * dx + ny * dy + nz * dz

@@ -28,9 +28,9 @@ def _below_node(words, row, x, y, z, limit):
 
     x, y, z: float64, relative to the voxel's low corner. Also returns the distance to the node's
     centre. Beyond `limit`, the bound may be as low as that of the sphere alone.
-    The node's points lie in its sphere and in its slab, and therefore in the round disc that
-    contains both. Rounding: less than 2^-24 of the distance to the centre, where the root of a
-    small difference magnifies it.
+    The node's points lie in its sphere and in its box; or in its sphere and in its slab, and
+    therefore in the round disc that contains both. Rounding: less than 2^-24 of the distance to the
+    centre, where the root of a small difference magnifies it.
     """
     dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
     nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
@@ -40,6 +40,9 @@ def _below_node(words, row, x, y, z, limit):
     middle = math.sqrt(square)
     slack = middle * 2.0**-24
     below: float = middle - radius
+    if length < 0.0 and below <= limit:
+        ex, ey, ez = max(abs(dx) - nx, 0.0), max(abs(dy) - ny, 0.0), max(abs(dz) - nz, 0.0)
+        below = max(below, math.sqrt(ex * ex + ey * ey + ez * ez))
     if length > 0.0 and below <= limit:
         inverse = 1.0 / length
         along = (nx * dx + ny * dy + nz * dz) * inverse

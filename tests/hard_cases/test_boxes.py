@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from numpy.typing import NDArray
+from served_nodes import row_encloses
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import cover_units, open_level
@@ -338,14 +339,6 @@ def test_case_39_nodes_of_a_level_enclose_what_they_stand_for(tmp_path: Path, ki
                 apart = [(p - b) * step * UNITS for p, b in zip(point, place, strict=True)]
                 if sum(d * d for d in apart) > int(covers[number]) ** 2:
                     continue
-                held_by += all(encloses(rows[node], point) for node in above[-1 - number])
+                held_by += all(row_encloses(rows[node], point) for node in above[-1 - number])
             assert held_by, point
         store.close()
-
-
-def encloses(row: Vector, point: Vector) -> bool:
-    """Return whether a node as served encloses a point: in its sphere and in its slab."""
-    apart = [p - c for p, c in zip(point, row[:3], strict=True)]
-    along = sum((n * d for n, d in zip(row[4:7], apart, strict=True)), Fraction(0))
-    inside = sum((d * d for d in apart), Fraction(0)) <= row[3] ** 2
-    return inside and (not any(row[4:7]) or row[8] <= along <= row[9])

@@ -23,7 +23,6 @@ from .codec import (
     RecordShape,
     decompress_record,
     decompress_tree,
-    point_dtype,
 )
 from .index import (
     DATASETS,
@@ -89,12 +88,7 @@ class Archive:
             archive_id, columns = read_index(path)
             self.header = read_header(archive_id, columns)
             self.voxels = columns["voxels"]
-            self._shape_dtype = point_dtype(
-                scan_index=self.header.scan_index,
-                intensity=self.header.intensity,
-                radius_class=self.header.radius_class,
-                normal=self.header.normals,
-            )
+            self._shape_dtype = self.header.point_dtype
             self._shards = [
                 (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
             ]

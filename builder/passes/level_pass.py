@@ -148,6 +148,7 @@ def _level_header(header: Header, steps: int, rows: NDArray, counts: list[NDArra
         radius_now=None,
         normal_reach=0.0,
         is_level=True,
+        is_sealed=False,
     )
 
 

@@ -71,7 +71,7 @@ class SpoolUnit:
     folder: Path
     name: str
     run_points: int
-    brightest: float
+    brightest: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

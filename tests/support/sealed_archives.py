@@ -18,6 +18,7 @@ from solidcloud.builder.voxel.masked_voxel import build_masked_voxel, read_point
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.seal import SEAL_NAME, make_seal
 from solidcloud.schemas.archive.voxel_grid import voxel_coordinates, voxel_keys
+from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from synthetic_scans import make_scan, write_las, write_xyz
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
@@ -60,8 +61,16 @@ def change(name: str, to: Callable[[NDArray], NDArray]) -> Callable[[Path], None
         forge(
             folder, lambda columns: columns.__setitem__(name, to(columns[name]).astype(columns[name].dtype))
         )
+        if name in ("origin", "step"):
+            _remove_copies(folder)
 
     return forgery
+
+
+def _remove_copies(folder: Path) -> None:
+    """Remove what would contradict a forged index, and what no reader needs: the level and the preview."""
+    shutil.rmtree(folder / "level")
+    (folder / PREVIEW_NAME).unlink()
 
 
 def _first(value: Callable[[float], float]) -> Callable[[NDArray], NDArray]:
@@ -104,7 +113,7 @@ def _forget_the_unknown_region(folder: Path) -> None:
         assert not columns["unknown_everywhere"][0]
 
     forge(folder, changed)
-    shutil.rmtree(folder / "level")  # it names the region too
+    _remove_copies(folder)  # it names the region too
 
 
 def _sum_up(columns: Columns, classes: NDArray, points: int) -> None:
@@ -135,7 +144,7 @@ def _leave_out_a_voxel(folder: Path) -> None:
         _sum_up(columns, classes, gone)
 
     forge(folder, changed)
-    shutil.rmtree(folder / "level")  # it has this voxel; without it, answers are slower and the same
+    _remove_copies(folder)  # it has this voxel; without it, answers are slower and the same
 
 
 def _leave_out_points(folder: Path) -> None:
@@ -155,6 +164,7 @@ def _leave_out_points(folder: Path) -> None:
         _sum_up(columns, classes, int(np.count_nonzero(~stays)))
 
     forge(folder, changed)
+    _remove_copies(folder)
 
 
 def _move_points(folder: Path) -> None:
@@ -177,6 +187,7 @@ def _move_points(folder: Path) -> None:
         _sum_up(columns, np.zeros(32), 0)
 
     forge(folder, changed)
+    _remove_copies(folder)
 
 
 def _give_a_voxel_another_cell(folder: Path) -> None:
@@ -197,7 +208,7 @@ def _give_a_voxel_another_cell(folder: Path) -> None:
         raise AssertionError("no free cell")
 
     forge(folder, changed)
-    shutil.rmtree(folder / "level")
+    _remove_copies(folder)
 
 
 def _shrink_spheres(folder: Path) -> None:

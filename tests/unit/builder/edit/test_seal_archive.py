@@ -265,23 +265,21 @@ def test_a_server_keeps_what_it_serves_if_the_seal_is_gone(copy: Path, tmp_path:
         with pytest.raises(FormatError, match="not found, expected the seal"):
             scene.reload()
         assert scene.info().points == before
-        seal_archive(copy, KEY)
-        scene.reload()
+    seal_archive(copy, KEY)
+    with Scene.open(copy, archive_key=key_file(tmp_path)) as scene:
         assert scene.info().points == before + 200
 
 
 def test_every_archive_of_a_scene_file_must_be_sealed(copy: Path, plain: Path, tmp_path: Path) -> None:
     text = '[[archives]]\npath = "{}"\n'
     scene = tmp_path / "scene.toml"
-    box = (
-        '[[effects]]\nkind = "through"\nboxes = [{name = "door", low = [0, 0, 0], high = [0.3, 0.3, 0.3]}]\n'
-    )
+    box = '[[effects]]\neffect = "through"\nboxes = [{name = "door", low = [0, 0, 0], high = [0.3, 0.3, 0.3]}]\n'
     for effects in ("", box):
-        scene.write_text(f"version = 1\n{text.format(copy)}{effects}")
+        scene.write_text(f"format = 1\n{text.format(copy)}{effects}")
         Scene.open(scene, archive_key=key_file(tmp_path)).close()
         with pytest.raises(FormatError, match="not the seal"):
             Scene.open(scene, archive_key=key_file(tmp_path, OTHER_KEY))
-        scene.write_text(f"version = 1\n{text.format(copy)}{text.format(plain)}{effects}")
+        scene.write_text(f"format = 1\n{text.format(copy)}{text.format(plain)}{effects}")
         with pytest.raises(FormatError, match=r"archives\[1\].*not found, expected the seal"):
             Scene.open(scene, archive_key=key_file(tmp_path))
 

@@ -148,6 +148,19 @@ def test_a_seal_that_is_none_is_refused(what: str, copy: Path, plain: Path) -> N
     Archive(copy).close()
 
 
+@pytest.mark.parametrize("with_key", [False, True])
+def test_a_level_in_place_of_its_archive_is_refused(with_key: bool, copy: Path, tmp_path: Path) -> None:
+    """Its seal is good, but its points are few: it would call poses clear that are not."""
+    key = key_file(tmp_path) if with_key else None
+    with pytest.raises(FormatError, match="a level of detail, expected an archive"):
+        Scene.open(copy / "level", archive_key=key)
+    shutil.move(copy / "level", tmp_path / "level")
+    shutil.rmtree(copy)
+    shutil.move(tmp_path / "level", copy)
+    with pytest.raises(FormatError, match="a level of detail, expected an archive"):
+        Scene.open(copy, archive_key=key)
+
+
 @pytest.mark.parametrize("level", [False, True])
 @pytest.mark.parametrize("part", [0, 1])
 def test_a_record_with_another_digest_is_corrupt(part: int, level: bool, copy: Path) -> None:

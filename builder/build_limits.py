@@ -141,6 +141,8 @@ def record_bytes_a_point(config: BuildConfig) -> int:
         intensity="intensity" in config.keep,
         radius_class=config.models != {"mean"},
         normal="normal" in config.keep,
+        rgb="rgb" in config.keep,
+        classification="classification" in config.keep,
     )
     return 2 * row.itemsize + math.ceil(NODES_A_FULL_LEAF * RECORD_BYTES_A_NODE / config.leaf)
 

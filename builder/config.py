@@ -16,6 +16,9 @@ DEFAULT_VOXEL = 8.0
 DEFAULT_CELL_POINTS = 1024
 # A cell is built at once: with more points, one part of a dense voxel would exceed --memory.
 MAX_CELL_POINTS = 1 << 20
+# Columns of the points that a build can keep; the last are those that the scans may have.
+SCAN_COLUMNS = ("intensity", "rgb", "classification")
+KEPT_COLUMNS = ("scan", "normal", *SCAN_COLUMNS)
 CELL_KINDS = ("octree", "balanced")
 
 
@@ -97,7 +100,7 @@ class BuildConfig:
     jobs: number of worker processes; 0: one per core.  memory_bytes: bound on the memory of the
     passes.
     level: also write a level of detail (schemas/archive/level.py).
-    keep: extra columns, among "scan", "intensity" and "normal".
+    keep: extra columns, among KEPT_COLUMNS.
     normal_reach: radius of the neighbourhood from which a normal is estimated [m]
     (schemas/kernels/normal_codes.py), if normals are kept.
     strict: a non-finite point fails the build.
@@ -180,9 +183,9 @@ class BuildConfig:
             (self.jobs >= 0, f"--jobs {self.jobs}", "0 (all cores) or more"),
             (self.memory_bytes >= 64 << 20, f"--memory {self.memory_bytes} bytes", "at least 64MB"),
             (
-                self.keep <= {"scan", "intensity", "normal"},
+                self.keep <= set(KEPT_COLUMNS),
                 f"--keep {','.join(sorted(self.keep))}",
-                "scan, intensity, normal, separated by commas",
+                f"{', '.join(KEPT_COLUMNS)}, separated by commas",
             ),
             (
                 0 < self.normal_reach <= MAX_NORMAL_REACH,

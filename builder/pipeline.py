@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from .build_limits import (
     SCRATCH_BYTES_A_POINT,
     readers_that_fit,
 )
-from .config import BuildConfig
+from .config import SCAN_COLUMNS, BuildConfig
 from .passes.build_shards import Shard, build_shards
 from .passes.dataset_header import archive_id, make_header
 from .passes.level_pass import write_level
@@ -67,6 +68,7 @@ class BuildSummary(NamedTuple):
     faults: faults of the scans that were left out.
     already: whether the archive with the same scans and options existed, so that nothing was built.
     warnings: lines about scans in the archive that are probably wrong.
+    columns: kept column of the scans -> number of points whose scan has it; the others have zeros.
     """
 
     archive: Path
@@ -87,6 +89,7 @@ class BuildSummary(NamedTuple):
     faults: tuple[str, ...]
     already: bool = False
     warnings: tuple[str, ...] = ()
+    columns: Mapping[str, int] = MappingProxyType({})
 
 
 def build_archive(
@@ -117,7 +120,7 @@ def build_archive(
     target = Path(target)
     build = Transaction("build", target, building_folder(target), config, progress)
     with made_parents(target), locked(target), build.machine_errors():
-        inputs = open_input_files(paths, config.spacing)
+        inputs = open_input_files(paths, config.spacing, config.keep)
         what = describe_build(inputs, config)
         recover(target)
         if not config.overwrite and not config.fresh and _is_whole(inputs, build):
@@ -126,7 +129,7 @@ def build_archive(
                 header, voxels, shards = archive.header, len(archive.voxels), archive.shard_count()
             facts = [ScanFacts(scan) for item in inputs for scan in item.scans]
             found = _warn(facts, config, warn)
-            return _summary(build, header, voxels, shards, begin, found, already=True)
+            return _summary(build, header, inputs, voxels, shards, begin, found, already=True)
         check_target(target, config.overwrite)
         with build_directory(target, what, fresh=config.fresh) as build_dir:
             header, built, found = _build(inputs, what, build_dir, build, warn)
@@ -134,7 +137,7 @@ def build_archive(
             check_interrupt()
             with build.timed("publish"):
                 publish_folder(build_dir.archive, target, config.overwrite)
-    return _summary(build, header, sum(len(s.rows) for s in built), len(built), begin, found)
+    return _summary(build, header, inputs, sum(len(s.rows) for s in built), len(built), begin, found)
 
 
 def _build(
@@ -317,6 +320,7 @@ def _is_whole(inputs: Sequence[InputFile], build: Transaction) -> bool:
 def _summary(
     build: Transaction,
     header: Header,
+    inputs: Sequence[InputFile],
     voxels: int,
     shards: int,
     begin: float,
@@ -351,7 +355,19 @@ def _summary(
         faults=tuple(s.fault for s in header.sources if s.fault),
         already=already,
         warnings=(*warnings, *coincident_sources(header.sources)),
+        columns=_column_counts(header, inputs, build.config),
     )
+
+
+def _column_counts(header: Header, inputs: Sequence[InputFile], config: BuildConfig) -> dict[str, int]:
+    """Return `BuildSummary.columns`."""
+    points = {(source.path, source.index): source.count for source in header.sources}
+    scans = [scan for item in inputs for scan in item.scans]
+    return {
+        name: sum(points.get((str(scan.path), scan.index), 0) for scan in scans if name in scan.columns)
+        for name in SCAN_COLUMNS
+        if name in config.keep
+    }
 
 
 def _run_bytes_a_point(config: BuildConfig) -> int:

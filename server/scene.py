@@ -10,6 +10,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from ..schemas.archive.seal import read_archive_key
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
 from ..schemas.wire.key_expressions import User, check_name
@@ -26,7 +27,7 @@ from .avatars.client_avatars import check_owner
 from .observability.request_stats import RequestStats
 from .queries.context.query_context import SceneData
 from .residency.voxel_cache import VoxelCache
-from .residency.voxel_store import OpenStore, VoxelStore
+from .residency.voxel_store import OpenStore
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag
 from .scene_interface import EVERYBODY, AvatarLimits, list_avatars
@@ -37,6 +38,7 @@ from .scenes.scene_archives import (
     is_scene_file,
     open_archives,
     read_avatars,
+    sealed_store,
 )
 from .scenes.scene_questions import SceneQuestions
 from .simulation.local_session import LocalSession
@@ -91,6 +93,7 @@ class Scene(SceneQuestions):
         radius_model: str | None = None,
         read_points: ReadPoints | None = None,
         coarse_bytes: int | None = None,
+        archive_key: str | Path | None = None,
     ) -> "Scene":
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
 
@@ -105,21 +108,26 @@ class Scene(SceneQuestions):
         `add_avatar`.
         coarse_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
         tolerance before voxels are loaded; None: a sixteenth, 0: none.
+        archive_key: file with the key with which all archives must be sealed, now and at each
+        reload; refused with `open_store`. None: do not look at seals (`solidcloud seal`).
         Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
         invalid scene file or a budget that is too small.
         """
         path = Path(path)
+        key = None if archive_key is None else read_archive_key(Path(archive_key))
+        if key is not None and open_store is not None:
+            raise BadRequestError(f"{path}: expected one of open_store and archive_key")
         if is_scene_file(path):
             if open_store is not None or radius_model is not None:
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
-            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes)
+            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes, key)
         metrics = RequestStats()
         archive = PlacedArchive.open(
             path,
             name,
             budget_bytes=budget_bytes,
             policy=policy,
-            open_store=open_store or VoxelStore,
+            open_store=open_store or sealed_store(key),
             radius_model=radius_model,
             took=metrics.loaded,
             coarse_bytes=coarse_bytes,
@@ -135,17 +143,18 @@ class Scene(SceneQuestions):
         policy: str,
         read_points: ReadPoints | None,
         coarse_bytes: int | None,
+        key: bytes | None,
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
         file = read_scene(path)
         name = name or scene_name(file, path)
-        found = find_archives(file, path)
+        found = find_archives(file, path, key)
         avatars = read_avatars(file, path, read_points)
         own = {each.info.name: (each.points, each.info.radius) for each in avatars}
         metrics = RequestStats()
         with ExitStack() as stack:
             archives = open_archives(
-                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes
+                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes, key
             )
             for archive in archives:
                 stack.callback(archive.close)

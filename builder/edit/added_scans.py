@@ -121,7 +121,7 @@ def spool_added(change: Change, surveys: list[Survey]) -> tuple[float, int]:
     units = [
         SpoolUnit(
             survey.scan, number, part.start, part.stop, part.count, header.lattice, change.config, dtype, folder,
-            f"new-{number:06d}-{part.start:012d}", most,
+            f"new-{number:06d}-{part.start:012d}", most, survey.brightest,
         )
         for number, survey in enumerate(surveys, first)
         for part in survey.parts

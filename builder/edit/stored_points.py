@@ -101,10 +101,10 @@ class CappedUnit(NamedTuple):
 
 
 def stored_column(record: DecompressedRecord, name: str, rows: NDArray[np.int64]) -> NDArray:
-    """Return a column (m,) of some points of a record, whose dtype must have it."""
+    """Return a column (m,) or (m, 3) of some points of a record, whose dtype must have it."""
     kind, at = record.dtype.fields[name][:2]  # type: ignore[index]  # its dtype has fields
     planes = record.planes[at : at + kind.itemsize]
-    return np.ascontiguousarray(planes[:, rows].T).view(kind).reshape(-1)
+    return np.ascontiguousarray(planes[:, rows].T).view(kind.base).reshape(-1, *kind.shape)
 
 
 class _Points(NamedTuple):

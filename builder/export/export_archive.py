@@ -26,6 +26,9 @@ from ..run.executor import Progress, Silent
 from ..voxel.record_points import PointBlock, iter_points, read_columns, record_columns, stored_columns
 from .export_contents import Contents
 
+# Properties of a colour in PLY.
+_CHANNELS = ("red", "green", "blue")
+
 FORMATS = ("laz", "las", "ply", "vtkhdf")
 
 
@@ -45,7 +48,7 @@ class ExportSummary(NamedTuple):
 
 
 class Writer(Protocol):
-    """Writer of points (m, 3) int64 [lattice], the same as float64 [m], and their columns (m,)."""
+    """Writer of points (m, 3) int64 [lattice], the same as float64 [m], and their columns, (m,) or (m, 3)."""
 
     def append(
         self, lattice: NDArray[np.int64], world: NDArray[np.float64], columns: dict[str, NDArray]
@@ -221,10 +224,12 @@ class _VtkWriter:
 class _PlyWriter:
     """Binary PLY file of doubles; a context manager. The number of vertices is known in advance."""
 
-    _TYPES = {"<f4": "float", "<u2": "ushort"}  # noqa: RUF012  never changed
+    _TYPES = {"<f4": "float", "<u2": "ushort", "|u1": "uchar"}  # noqa: RUF012  never changed
 
     def __init__(self, path: Path, contents: Contents) -> None:
-        fields = [(axis, "<f8") for axis in "xyz"] + [(n, k.str) for n, k in contents.columns.items()]
+        fields = [(axis, "<f8") for axis in "xyz"]
+        for name, kind in contents.columns.items():
+            fields += [(each, kind.base.str) for each in (_CHANNELS if name == "rgb" else (name,))]
         self._dtype = np.dtype(fields)
         names = "".join(f"property {self._TYPES.get(kind, 'double')} {name}\n" for name, kind in fields)
         head = f"ply\nformat binary_little_endian 1.0\nelement vertex {contents.points}\n{names}end_header\n"
@@ -245,7 +250,11 @@ class _PlyWriter:
         for axis, name in enumerate("xyz"):
             rows[name] = world[:, axis]
         for name, column in columns.items():
-            rows[name] = column
+            if name == "rgb":
+                for channel, values in zip(_CHANNELS, column.T, strict=True):
+                    rows[channel] = values
+            else:
+                rows[name] = column
         self._file.write(rows.data)
 
 

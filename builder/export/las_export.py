@@ -1,9 +1,12 @@
-"""Export to LAS and LAZ, version 1.4, point format 6.
+"""Export to LAS and LAZ, version 1.4, point format 6, with colours 7.
 
 Coordinates are integers of the lattice step. A reader computes X * scale + offset. With the step as
 scale and the origin as offset, this is how the world coordinates of an archive are computed, exact
 to the last bit. If 32 bits do not hold the lattice coordinates, the offset is shifted by whole
 steps. A coordinate may then differ in its last bits, but it still rounds to the same lattice point.
+
+LAS has 16 bits in each channel of a colour. A channel c is written as 257 c, so that 255 is white
+for readers that follow the standard, and so that the high byte is c.
 """
 
 import re
@@ -42,7 +45,7 @@ class LasWriter:
         """
         self.notes: list[str] = []
         self._lattice, self._first = lattice, _first_steps(lattice, contents)
-        header = laspy.LasHeader(point_format=6, version="1.4")
+        header = laspy.LasHeader(point_format=7 if "rgb" in contents.columns else 6, version="1.4")
         header.scales = np.full(3, lattice.step)
         header.offsets = lattice.to_world(self._first[None])[0]
         header.generating_software = "solidcloud export"
@@ -81,6 +84,11 @@ class LasWriter:
             record[EXACT_INTENSITY] = columns["intensity"]
         elif "intensity" in columns:
             record["intensity"] = columns["intensity"].astype(np.uint16)
+        if "rgb" in columns:
+            for name, channel in zip(("red", "green", "blue"), columns["rgb"].T, strict=True):
+                record[name] = channel.astype(np.uint16) * 257
+        if "classification" in columns:
+            record["classification"] = columns["classification"]
         self._writer.write_points(record)
 
 

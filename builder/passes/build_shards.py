@@ -116,6 +116,8 @@ def build_shard(unit: ShardUnit) -> Shard:
     classes = None if unit.config.models == {"mean"} else _ClassCounts(unit)
     path = unit.folder / shard_name(unit.number, unit.generation)
     version = 4 if "normal" in unit.config.keep else 1 if classes is None else 2
+    if unit.config.keep & {"rgb", "classification"}:
+        version = 5
     rows, checksum = write_shard(path, unit.number, unit.archive_id, _voxels(unit, classes), version=version)
     counts, capped = (
         (np.zeros(RADIUS_CLASSES, np.int64), 0) if classes is None else (classes.of, classes.capped)

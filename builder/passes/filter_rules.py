@@ -9,7 +9,7 @@ Three rules, each exact in integers of the lattice:
 - `outliers (R, COUNT)`: leave out a point if fewer than COUNT other distinct points lie within R.
 - `thin STEP`: of each cube of STEP, rounded to whole lattice steps, keep one point: the one nearest
   to the centre of the cube; among equally near ones the first in Morton order within the cube, then
-  by scan and intensity. If STEP is the lattice step, exact duplicates become one point. Every point
+  by scan, intensity, colour and class. If STEP is the lattice step, exact duplicates become one point. Every point
   left out lies less than sqrt(3) STEP from the point kept in its cube.
 
 `moving` and `outliers` both examine all points as scanned, so neither depends on the other. A point

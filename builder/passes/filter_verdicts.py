@@ -162,6 +162,7 @@ def _best(points: NearPoints, grid: Grid, edge: int) -> NDArray[np.int64]:
             _codes_of(inside),
             points.scans,
             points.intensities,
+            points.looks,
         )
     )
 

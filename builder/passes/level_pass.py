@@ -18,7 +18,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.archive_writer import write_index, write_shard
 from ...schemas.archive.codec import encode_voxel
 from ...schemas.archive.index import SHARD_FOLDER, Header, Source, shard_name
-from ...schemas.archive.level import LEVEL_FOLDER, level_id, open_level, squared_covers
+from ...schemas.archive.level import LEVEL_COLUMNS, LEVEL_FOLDER, level_id, open_level, squared_covers
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel import VoxelData
 from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_coordinates, voxel_keys
@@ -140,7 +140,6 @@ def _level_header(header: Header, steps: int, rows: NDArray, counts: list[NDArra
         high=(base + rows["high"]).max(axis=0),
         radius_sample=0,
         scan_index=False,
-        intensity=False,
         models=("mean",),
         radius_counts=np.sum(counts, axis=0, dtype=np.int64),
         radius_capped=0,
@@ -149,6 +148,7 @@ def _level_header(header: Header, steps: int, rows: NDArray, counts: list[NDArra
         radius_now=None,
         normal_reach=0.0,
         is_level=True,
+        is_sealed=False,
     )
 
 
@@ -172,7 +172,8 @@ def _write_shard(unit: _Unit) -> _Written:
 
 def _make_voxels(archive: Archive, row: int, halvings: int, config: BuildConfig) -> list[LevelVoxel]:
     """Make the level of the voxel of an index row. Raise CorruptError."""
-    record, squares = archive.open_voxel(row, columns=()), squared_covers(archive.header.lattice.step)
+    squares = squared_covers(archive.header.lattice.step)
+    record = archive.open_voxel(row, columns=LEVEL_COLUMNS)
     with archive.locating(row):
         return level_voxels(record, archive.coordinates[row], halvings, squares, config)
 

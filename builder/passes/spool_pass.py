@@ -29,15 +29,18 @@ from ..kernels.points.spool_rows import (
 )
 from ..resume.kept_work import BuildDirectory, RunsIntact, Work, discard_damaged_runs, run_unfinished
 from ..resume.transaction import Transaction
+from ..sources.common.colours import eight_bits
 from ..sources.common.scan import Scan, ScanBlock
+from ..spool.point_order import packed_look, unpack_look
 from ..spool.run_files import KEYS_SUFFIX, RUN_SUFFIX, RunSums, new_run, ranks, write_directory
 from .survey_pass import Survey
 
 # Bytes per point in a spooling worker: voxel number, code, and a copy of the code in sorted order.
 # With intensity also its bits, a copy of them, and, for a run in one voxel, order, sorted codes and
-# ranks.
+# ranks. With colour or class the same of these, and ranks of 64 bits.
 SPOOL_BYTES_A_POINT = 20
 SPOOL_BYTES_A_POINT_WITH_INTENSITY = 52
+SPOOL_BYTES_A_POINT_WITH_LOOK = 84
 # In addition: one block being read and one being written.
 SPOOL_BYTES = 48 << 20
 # Least points of a run, whatever the memory: gathering a voxel from many small runs is slow.
@@ -54,6 +57,7 @@ class SpoolUnit:
     count: usable points according to the survey.
     dtype: of the rows; it may include a scan_index that the filters need and the archive omits.
     folder, name: of the runs.  run_points: points per run.
+    brightest: greatest channel of the scan's colours, see `eight_bits`.
     """
 
     scan: Scan
@@ -67,6 +71,7 @@ class SpoolUnit:
     folder: Path
     name: str
     run_points: int
+    brightest: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +103,11 @@ def load_spooled(noted: dict[str, Any]) -> Spooled:
 
 def run_points(memory_bytes: int, dtype: np.dtype) -> int:
     """Return the points that a run may have if a worker may hold `memory_bytes`."""
-    with_intensity = "intensity" in (dtype.names or ())
-    each = SPOOL_BYTES_A_POINT_WITH_INTENSITY if with_intensity else SPOOL_BYTES_A_POINT
+    each, names = SPOOL_BYTES_A_POINT, dtype.names or ()
+    if "intensity" in names:
+        each = SPOOL_BYTES_A_POINT_WITH_INTENSITY
+    if "rgb" in names or "classification" in names:
+        each = SPOOL_BYTES_A_POINT_WITH_LOOK
     return max(MIN_RUN_POINTS, (memory_bytes - SPOOL_BYTES) // each)
 
 
@@ -144,7 +152,7 @@ def usable(block: ScanBlock) -> ScanBlock:
     if usable_bounds(block.xyz, MAX_COORDINATE, np.empty(3), np.empty(3)) == len(block.xyz):
         return block
     good = (np.abs(block.xyz) <= MAX_COORDINATE).all(axis=1)  # false for NaN
-    return ScanBlock(block.xyz[good], None if block.intensity is None else block.intensity[good])
+    return block.taken(np.asarray(good))
 
 
 class _RunBuffer:
@@ -160,6 +168,9 @@ class _RunBuffer:
         # The content sums identify a point by the columns that the archive keeps.
         self.scan_named = "scan" in unit.config.keep
         self.bits = np.empty(capacity, np.uint32) if "intensity" in names else None
+        with_look = "rgb" in names or "classification" in names
+        self.looks = np.empty(capacity, np.uint32) if with_look else None
+        self.brightest = unit.brightest
         self.sums, self.moved_max = np.zeros(3, np.uint64), 0.0
         self._room(1 << 14)
 
@@ -184,12 +195,16 @@ class _RunBuffer:
         """Take points of a block from point `begin` on; return how many were taken."""
         end = min(len(block.xyz), begin + self.capacity - self.size)
         to = slice(self.size, self.size + end - begin)
-        more = np.empty((self.scan_named + (self.bits is not None), end - begin), np.uint64)
+        kept: list[NDArray[np.unsignedinteger]] = []
         if self.scan_named:
-            more[0] = self.number
+            kept.append(np.full(end - begin, self.number, np.uint64))
         if self.bits is not None:
             self.bits[to] = intensity_bits(block, begin, end)
-            more[-1] = self.bits[to]
+            kept.append(self.bits[to])
+        if self.looks is not None:
+            self.looks[to] = self._looks(block, begin, end)
+            kept.append(self.looks[to])
+        more = np.array(kept, np.uint64).reshape(len(kept), end - begin)
         done, moved, lowest, highest = place_points(
             np.ascontiguousarray(block.xyz[begin:end]),
             np.array(self.lattice.origin),
@@ -211,6 +226,17 @@ class _RunBuffer:
         self.moved_max = max(self.moved_max, moved)
         return done
 
+    def _looks(self, block: ScanBlock, begin: int, end: int) -> NDArray[np.uint32]:
+        """Return the looks (point_order.py) of points [begin, end), 0 for what the source lacks."""
+        names, rgb, classes = self.dtype.names or (), None, None
+        if block.rgb is not None and "rgb" in names:
+            rgb = eight_bits(block.rgb[begin:end], self.brightest)
+        if block.classification is not None and "classification" in names:
+            classes = block.classification[begin:end]
+        return (
+            np.zeros(end - begin, np.uint32) if rgb is None and classes is None else packed_look(rgb, classes)
+        )
+
     def write(self, path: Path) -> RunSums:
         """Sort the points, write them as the run `path` and forget them.
 
@@ -224,16 +250,14 @@ class _RunBuffer:
         place = np.empty(voxels, np.int64)
         place[order] = starts[:-1]
         codes = np.empty(size, np.uint64)
-        bits = None
-        if self.bits is not None:
-            bits = np.empty(size, np.uint32)
-            scatter(numbers, self.bits[:size], place.copy(), bits)
+        bits, looks = (self._by_voxel(column, place) for column in (self.bits, self.looks))
         scatter(numbers, self.codes[:size], place, codes)
         for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
             check_interrupt()
-            sort_voxel(codes[begin:end], None if bits is None else bits[begin:end])
+            columns = (None if column is None else column[begin:end] for column in (bits, looks))
+            sort_voxel(codes[begin:end], *columns)
         with new_run(path) as file:
-            for rows in self._rows(codes, bits):
+            for rows in self._rows(codes, bits, looks):
                 check_interrupt()
                 file.write(rows.view(np.uint8).data)
         directory = write_directory(path, self.keys[:voxels][order], starts)
@@ -241,7 +265,19 @@ class _RunBuffer:
         self._room(len(self.keys))
         return [*file.sums, *directory]
 
-    def _rows(self, codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> Iterator[NDArray]:
+    def _by_voxel(
+        self, column: NDArray[np.uint32] | None, place: NDArray[np.int64]
+    ) -> NDArray[np.uint32] | None:
+        """Return a column in the order of the voxels. place: where each voxel begins."""
+        if column is None:
+            return None
+        found = np.empty(self.size, np.uint32)
+        scatter(self.numbers[: self.size], column[: self.size], place.copy(), found)
+        return found
+
+    def _rows(
+        self, codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None, looks: NDArray[np.uint32] | None
+    ) -> Iterator[NDArray]:
         """Yield the rows of sorted codes, WRITTEN_ROWS at a time, each overwritten by the next."""
         rows = np.empty(min(len(codes), WRITTEN_ROWS), self.dtype)
         if self.with_scan:
@@ -251,6 +287,8 @@ class _RunBuffer:
             fill_local(codes[begin:end], rows["local"])
             if bits is not None:
                 rows["intensity"][: end - begin] = bits[begin:end].view(np.float32)
+            if looks is not None:
+                unpack_look(looks[begin:end], rows[: end - begin])
             yield rows[: end - begin]
 
 
@@ -266,19 +304,29 @@ def intensity_bits(block: ScanBlock, begin: int, end: int) -> NDArray[np.uint32]
     return np.where(np.isnan(intensity), np.float32(np.nan), intensity).astype(np.float32).view(np.uint32)
 
 
-def sort_voxel(codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None) -> None:
-    """Sort the codes (n,) of a voxel in place, and with them the bits of their intensities.
+def sort_voxel(
+    codes: NDArray[np.uint64], bits: NDArray[np.uint32] | None, looks: NDArray[np.uint32] | None = None
+) -> None:
+    """Sort the codes (n,) of a voxel in place, and with them the bits of their intensities and looks.
 
-    The intensities order equal codes.
+    The intensities, then the looks, order equal codes.
     """
-    if bits is None:
+    if bits is None and looks is None:
         codes.sort()
         return
     order = np.argsort(codes)
     codes[:] = codes[order]
     if (codes[1:] == codes[:-1]).any():
-        order_ties(codes, order, ranks(bits))
-    bits[:] = bits[order]
+        first = None if bits is None else ranks(bits)
+        if looks is None:
+            order_ties(codes, order, first)
+        else:
+            order_ties(
+                codes, order, looks if first is None else first.astype(np.uint64) << np.uint64(32) | looks
+            )
+    for column in (bits, looks):
+        if column is not None:
+            column[:] = column[order]
 
 
 def spool_scans(
@@ -309,6 +357,7 @@ def spool_scans(
                 folder,
                 name,
                 most,
+                survey.brightest,
             )
             units.append((f"spool/{name}", unit))
     notes = [build_dir.journal.read_entry(f"spool/{note.stem}") for note in folder.glob("*.json")]

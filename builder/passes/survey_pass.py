@@ -21,6 +21,7 @@ from ..kernels.points.spool_rows import usable_bounds
 from ..resume.kept_work import BuildDirectory, Work, run_unfinished
 from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
+from ..sources.common.colours import brightest
 from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
 from ..sources.scan_files import InputFile
 
@@ -54,6 +55,11 @@ class Survey:
     parts: "tuple[Part, ...]" = ()
 
     @property
+    def brightest(self) -> float:
+        """Return the greatest channel of the scan's colours, see `eight_bits`."""
+        return max((part.brightest for part in self.parts), default=0.0)
+
+    @property
     def dropped(self) -> dict[str, int]:
         """Return the points left out, by reason. These include non-finite and too distant ones."""
         found = sum((Counter(part.dropped) for part in self.parts), Counter[str]())
@@ -71,6 +77,7 @@ class Part:
     """Result for a range of a scan. dropped: reason -> points that the reader left out.
 
     fault: why it could not be read to its end, or "".
+    brightest: greatest channel of its colours, if they are kept.
     """
 
     start: int
@@ -81,6 +88,7 @@ class Part:
     not_finite: int
     dropped: dict[str, int]
     fault: str
+    brightest: float = 0.0
 
 
 class RangeUnit(NamedTuple):
@@ -112,11 +120,12 @@ def survey_range(unit: RangeUnit) -> Part:
     """Read a range of a scan once. A faulty scan is a result; only transient errors are raised."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     count = seen = 0
-    fault = ""
+    fault, greatest = "", 0.0
     try:
         for block in unit.scan.blocks(start=unit.start, stop=unit.stop):
             count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
             seen += len(block.xyz)
+            greatest = max(greatest, brightest(block.rgb))
     except ScanError as error:
         raise_transient(error, unit.scan.path)
         fault = str(error)
@@ -129,6 +138,7 @@ def survey_range(unit: RangeUnit) -> Part:
         seen - count,
         dict(unit.scan.dropped),
         fault,
+        greatest,
     )
 
 

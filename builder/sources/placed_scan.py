@@ -91,14 +91,16 @@ class PlacedScan(Scan):
             bounds=None if bounds is None else self._bounds(bounds),
         )
         self.units, self.up, self.crs, self.seekable = units, up, inner.crs, inner.seekable
+        self.columns = inner.columns
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         return self._read_range(block_points, 0, None)
 
     def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
+        self._inner.wanted = self.wanted
         for block in self._inner.blocks(block_points, start, stop):
             self.dropped = self._inner.dropped
-            yield ScanBlock(apply_pose(self._given, self._turned(block.xyz)), block.intensity)
+            yield block._replace(xyz=apply_pose(self._given, self._turned(block.xyz)))
         self.dropped = self._inner.dropped
 
     def _turned(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ reading past the first, and from small scans without declared bounds (coincident
 import importlib
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -199,20 +199,23 @@ def _inspect_file(path: Path, with_sha256: bool) -> tuple[list[ScanEntry], list[
             digest,
             fault=scan.fault,
             warnings=tuple(filter(None, [coincident_scan(scan)])),
+            columns=tuple(sorted(scan.columns)),
         )
         for scan in scans
     ]
     return entries, scans
 
 
-def open_input_files(paths: Sequence[Path], spacing: float | None = None) -> list[InputFile]:
+def open_input_files(
+    paths: Sequence[Path], spacing: float | None = None, wanted: Set[str] = frozenset()
+) -> list[InputFile]:
     """Open what a build reads: files, folders and lists of scans (.toml).
 
-    Scans are placed in metres with z up. spacing: of sampled meshes [m].  A file that cannot be
-    opened is kept with its fault, so that all faults are named together. Raise ScanError for a path
-    that does not exist and a folder without scans, BadRequestError for a broken list and for a scan
-    that is named twice, OSError if a file cannot be opened for a transient reason
-    (transient_errors.py).
+    Scans are placed in metres with z up. spacing: of sampled meshes [m]. wanted: columns that the
+    scans deliver, see `Scan`. A file that cannot be opened is kept with its fault, so that all
+    faults are named together. Raise ScanError for a path that does not exist and a folder without
+    scans, BadRequestError for a broken list and for a scan that is named twice, OSError if a file
+    cannot be opened for a transient reason (transient_errors.py).
     """
     found: list[InputFile] = []
     for path in map(Path, paths):
@@ -227,6 +230,8 @@ def open_input_files(paths: Sequence[Path], spacing: float | None = None) -> lis
             files.setdefault(entry.path, []).append(entry)
         found += [_open_input(file, entries, spacing) for file, entries in files.items()]
     _check_once((item.path, index) for item in found for index in [scan.index for scan in item.scans] or [0])
+    for scan in (scan for item in found for scan in item.scans):
+        scan.wanted = frozenset(wanted)
     return found
 
 

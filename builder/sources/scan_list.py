@@ -50,7 +50,7 @@ class ScanEntry:
     pose: (4, 4), or None.  units, up: keys of METRES and TURNS.  scale: additional factor.
     crs: text of the coordinate reference system, or "".  sha256: of the file, "" if not requested.
     use: whether a build reads the scan.  fault: why it cannot be read, or "".
-    warnings: what looks wrong, one line each; not written to a list.
+    warnings: what looks wrong, one line each.  columns: see `Scan`. Both are not written to a list.
     """
 
     path: Path
@@ -67,6 +67,7 @@ class ScanEntry:
     use: bool = True
     fault: str = ""
     warnings: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
 
 
 def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:

@@ -3,7 +3,7 @@
 A run consists of two files that share only their name:
 
 - `NAME.run`: packed rows, see `spool_dtype`, sorted by (voxel key, Morton code in the voxel,
-  scan_index, intensity);
+  scan_index, intensity, rgb, classification);
 - `NAME.keys`: its directory, uint64 words: the keys of its voxels, ascending, then the first row of
   each voxel, then the total number of rows. `s` voxels take `2 s + 1` words.
 
@@ -26,6 +26,7 @@ from ...schemas.process.new_file import new_file
 from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS, content_sum
 from ..kernels.points.octree_cells import voxel_codes
+from .point_order import sort_keys
 
 RUN_SUFFIX = ".run"
 KEYS_SUFFIX = ".keys"
@@ -41,9 +42,13 @@ def spool_dtype(config: BuildConfig) -> np.dtype:
     fields: list[tuple[Any, ...]] = [("local", "<i4", (3,))]
     if "scan" in config.keep:
         fields.append(("scan_index", "<u2"))
-    if "intensity" in config.keep:
-        fields.append(("intensity", "<f4"))
-    return np.dtype(fields)
+    return np.dtype(fields + _scan_columns(config))
+
+
+def _scan_columns(config: BuildConfig) -> list[tuple[Any, ...]]:
+    """Return the fields of a row that hold what the scans say of a point."""
+    kinds: list[tuple[Any, ...]] = [("intensity", "<f4"), ("rgb", "u1", (3,)), ("classification", "u1")]
+    return [kind for kind in kinds if kind[0] in config.keep]
 
 
 def filter_dtype(config: BuildConfig) -> np.dtype:
@@ -51,16 +56,13 @@ def filter_dtype(config: BuildConfig) -> np.dtype:
 
     It always has the scan number, which the filters need and count by, whatever columns are kept.
     """
-    names = spool_dtype(config).names or ()
     fields: list[tuple[Any, ...]] = [("local", "<i4", (3,)), ("scan_index", "<u2")]
-    if "intensity" in names:
-        fields.append(("intensity", "<f4"))
-    return np.dtype(fields)
+    return np.dtype(fields + _scan_columns(config))
 
 
 def canonical_columns(rows: NDArray) -> tuple[NDArray, ...]:
     """Return the sort keys of rows within a Morton code, least significant first (np.lexsort)."""
-    return tuple(rows[name] for name in ("intensity", "scan_index") if name in (rows.dtype.names or ()))
+    return sort_keys({name: rows[name] for name in rows.dtype.names or ()})
 
 
 def ranks(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:

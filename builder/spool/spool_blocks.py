@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_coordinates, voxel_keys
 from ...schemas.kernels.morton import morton_decode
 from ..kernels.neighbours.filter_counts import cell_numbers
+from .point_order import packed_look
 from .spool import Spool
 
 # Most points in memory at a time, of a voxel and of its surroundings. Memory depends on it; results
@@ -50,20 +51,26 @@ class NearPoints(NamedTuple):
     """Points near a block.
 
     positions: (n, 3) int32 from a base.  scans: (n,) int64.  intensities: (n,) float32.
+    looks: (n,) uint32, see `packed_look`.
     """
 
     positions: NDArray[np.int32]
     scans: NDArray[np.int64]
     intensities: NDArray[np.float32]
+    looks: NDArray[np.uint32]
 
     @classmethod
     def of(cls, rows: NDArray, shift: NDArray[np.int64]) -> "NearPoints":
         """Make points of rows, with `shift` (3,) added to their positions in the voxel."""
         names = rows.dtype.names or ()
+        looks = [rows[name] if name in names else None for name in ("rgb", "classification")]
         return cls(
             rows["local"] + shift.astype(np.int32),
             rows["scan_index"].astype(np.int64),
             rows["intensity"].copy() if "intensity" in names else np.zeros(len(rows), np.float32),
+            packed_look(*looks)
+            if any(look is not None for look in looks)
+            else np.zeros(len(rows), np.uint32),
         )
 
     def taken(self, which: NDArray) -> "NearPoints":

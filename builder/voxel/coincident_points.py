@@ -13,11 +13,12 @@ from ...schemas.archive.voxel import Nodes
 from ...schemas.kernels.morton import morton_decode
 from ..config import BuildConfig
 from ..kernels.trees.pack_tree import max_nodes, node_counts
+from ..spool.point_order import packed_look
 from ..spool.run_files import ranks
 from .voxel_octree import CellTrees, build_trees
 
-# Greater than every key; keys have 48 bits.
-_END = np.uint64(0xFFFFFFFFFFFFFFFF)
+# Greater than every key.
+_END = (1 << 64, 0)
 
 
 def heap_place(code: int) -> NDArray[np.int32]:
@@ -54,7 +55,7 @@ def heap_trees(code: int, points: int, config: BuildConfig) -> CellTrees:
 class _Run:
     """State of a run during the merge.
 
-    rows: its rows in memory, in order; None at its end.  keys: (n,) uint64, see `_order_keys`.
+    rows: its rows in memory, in order; None at its end.  keys: (n, 2) uint64, see `_order_keys`.
     """
 
     def __init__(self, windows: Iterator[NDArray]) -> None:
@@ -65,15 +66,21 @@ class _Run:
     def _read(self) -> None:
         rows = next(self._windows, None)
         self.rows = rows
-        self.keys = np.array([_END]) if rows is None else _order_keys(rows)
+        self.keys = np.empty((0, 2), np.uint64) if rows is None else _order_keys(rows)
 
-    def take(self, bound: np.uint64) -> tuple[NDArray, NDArray[np.uint64]]:
+    def key(self, at: int) -> tuple[int, int]:
+        """Return the key of the first (0) or last (-1) row in memory; _END at the run's end."""
+        return (int(self.keys[at, 0]), int(self.keys[at, 1])) if len(self.keys) else _END
+
+    def take(self, bound: tuple[int, int]) -> tuple[NDArray, NDArray[np.uint64]]:
         """Return the rows in memory whose key is at most `bound`, and their keys.
 
         Then advance past them.
         """
         assert self.rows is not None
-        cut = int(np.searchsorted(self.keys, bound, "right"))
+        high, low = np.uint64(bound[0]), np.uint64(bound[1])
+        begin, end = (int(np.searchsorted(self.keys[:, 0], high, side)) for side in ("left", "right"))
+        cut = begin + int(np.searchsorted(self.keys[begin:end, 1], low, "right"))
         taken = self.rows[:cut], self.keys[:cut]
         if cut == len(self.keys):
             self._read()
@@ -89,26 +96,29 @@ def merge_runs(runs: Sequence[Iterator[NDArray]]) -> Iterator[NDArray]:
     each.
     """
     held = [_Run(windows) for windows in runs]
-    first, last = (np.array([run.keys[at] for run in held], np.uint64) for at in (0, -1))
+    first, last = ([run.key(at) for run in held] for at in (0, -1))
     # No unread row precedes the least of the last rows in memory.
-    while (bound := last.min()) != _END:
+    while (bound := min(last)) != _END:
         parts = []
-        for i in np.flatnonzero(first <= bound).tolist():
+        for i in [i for i, key in enumerate(first) if key <= bound]:
             parts.append(held[i].take(bound))
-            first[i], last[i] = held[i].keys[0], held[i].keys[-1]
+            first[i], last[i] = held[i].key(0), held[i].key(-1)
         keys = np.concatenate([keys for _, keys in parts])
         # Rows with equal keys are identical.
-        yield np.concatenate([rows for rows, _ in parts])[np.argsort(keys, kind="stable")]
+        yield np.concatenate([rows for rows, _ in parts])[np.lexsort((keys[:, 1], keys[:, 0]))]
 
 
 def _order_keys(rows: NDArray) -> NDArray[np.uint64]:
-    """Return integers (n,) that sort as the rows of one lattice position do.
+    """Return pairs of integers (n, 2) that sort as the rows of one lattice position do.
 
     The order is that of `canonical_columns` (run_files.py).
     """
-    keys = np.zeros(len(rows), np.uint64)
-    if "scan_index" in (rows.dtype.names or ()):
-        keys |= rows["scan_index"].astype(np.uint64) << np.uint64(32)
-    if "intensity" in (rows.dtype.names or ()):
-        keys |= ranks(np.ascontiguousarray(rows["intensity"]).view(np.uint32)).astype(np.uint64)
+    keys, names = np.zeros((len(rows), 2), np.uint64), rows.dtype.names or ()
+    if "scan_index" in names:
+        keys[:, 0] |= rows["scan_index"].astype(np.uint64) << np.uint64(32)
+    if "intensity" in names:
+        keys[:, 0] |= ranks(np.ascontiguousarray(rows["intensity"]).view(np.uint32)).astype(np.uint64)
+    looks = [rows[name] if name in names else None for name in ("rgb", "classification")]
+    if any(look is not None for look in looks):
+        keys[:, 1] = packed_look(*looks)
     return keys

@@ -98,10 +98,8 @@ def build_dense(
     scratch: folder for unnamed files, of about 9 bytes per point and 12 more at times.
     classify: computes the radius classes of a part; None: no radius classes.
     """
-    names = [name for name in OPTIONAL_COLUMNS[:2] if name in (spool.dtype.names or ())]
-    dtype = point_dtype(
-        scan_index="scan_index" in names, intensity="intensity" in names, radius_class=classify is not None
-    )
+    kept = {name: name in (spool.dtype.names or ()) for name in OPTIONAL_COLUMNS}
+    dtype = point_dtype(**{**kept, "radius_class": classify is not None})
     with CellSpill(scratch, dtype) as spill:
         for part in plan_parts(spool, key, config):
             codes_of = range(part[0].code, part[-1].code_end)

@@ -9,18 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.codec import DecompressedRecord
+from ...schemas.archive.level import LEVEL_COLUMNS
 from ...schemas.archive.voxel import MAX_LEAF, VoxelData, link_nodes, top_shift
 from ...schemas.archive.voxel_grid import voxel_keys
 from ..config import BuildConfig
 from ..kernels.points.octree_cells import voxel_codes
 from ..kernels.points.representatives import Runs, choose_representatives, empty_runs, enclose_runs
-from ..kernels.points.voxel_records import Leaves, link_parents
+from ..kernels.points.voxel_records import link_parents
 from ..kernels.trees.bounding_sphere import ceil_sqrt
-from .record_points import leaves_of, voxel_points
+from .record_points import leaves_of, read_columns, voxel_points
 from .voxel_octree import VoxelPoints, build_voxel
 
 # Greatest stored radius, in a node's unit.
 _MAX_RADIUS = (1 << 16) - 1
+
+
+def _kept(record: DecompressedRecord) -> list[str]:
+    """Return the columns of a record that its level has too."""
+    return [name for name in LEVEL_COLUMNS if name in (record.dtype.names or ())]
 
 
 class LevelVoxel(NamedTuple):
@@ -40,6 +46,7 @@ def level_voxels(
 ) -> list[LevelVoxel]:
     """Make the voxels of the level of one voxel, in ascending order of their keys.
 
+    record: with LEVEL_COLUMNS, if the archive has them.
     coordinate: (3,) of the voxel.  halvings: how often its edge is halved for the level.
     squares: `squared_covers` of the lattice.
     """
@@ -75,7 +82,7 @@ def _level_voxels(
         which = np.flatnonzero(keys == key) if halvings else np.arange(found)
         corner = parts[which[0]] * steps - coordinate * record.voxel_steps
         own = Runs._make(np.ascontiguousarray(column[which]) for column in runs)
-        voxel = _enclosing_voxel(leaves, own, corner, key, steps, config)
+        voxel = _enclosing_voxel(record, own, corner, key, steps, config)
         if voxel is None:
             return None
         made.append(voxel)
@@ -83,11 +90,16 @@ def _level_voxels(
 
 
 def _enclosing_voxel(
-    leaves: Leaves, runs: Runs, corner: NDArray[np.int64], key: int, steps: int, config: BuildConfig
+    record: DecompressedRecord,
+    runs: Runs,
+    corner: NDArray[np.int64],
+    key: int,
+    steps: int,
+    config: BuildConfig,
 ) -> LevelVoxel | None:
     """Build a voxel of a level and enlarge its bounds; return None if a radius exceeds 16 bits.
 
-    leaves, runs: of the voxel of the archive.  corner: (3,) of the level's voxel in it.  steps: the
+    record, runs: of the voxel of the archive.  corner: (3,) of the level's voxel in it.  steps: the
     edge of the level's voxel.
     """
     # Of representatives at one position, the one of the largest cover radius remains.
@@ -96,7 +108,9 @@ def _enclosing_voxel(
     order = np.lexsort((-runs.classes.astype(np.int16), codes))
     first = order[np.append(True, codes[order[1:]] != codes[order[:-1]])]
     local, places = np.ascontiguousarray(within[first]), codes[first]
-    points = VoxelPoints(local, radius_class=runs.classes[first])
+    leaves = leaves_of(record)
+    rows = leaves.first[runs.node[first]].astype(np.int64) + runs.chosen[first]
+    points = VoxelPoints(local, radius_class=runs.classes[first], **read_columns(record, _kept(record), rows))
     voxel = build_voxel(key, points, steps, config)
     links = link_nodes(voxel)
     stored = voxel_points(voxel, links)

@@ -17,6 +17,8 @@ BLOCK_POINTS = 1 << 16
 _COLUMNS: dict[str, tuple[str, np.dtype]] = {
     "scan": ("scan_index", np.dtype("<u2")),
     "intensity": ("intensity", np.dtype("<f4")),
+    "rgb": ("rgb", np.dtype(("u1", (3,)))),
+    "classification": ("classification", np.dtype("u1")),
 }
 # Larger than every lattice coordinate.
 _EVERYWHERE = np.array([[-(1 << 62)] * 3, [1 << 62] * 3], np.int64)
@@ -58,8 +60,8 @@ def spheres_of(record: DecompressedRecord) -> NodeSpheres:
 
 def stored_columns(header: Header) -> dict[str, np.dtype]:
     """Return the stored columns of an archive that can be exported, by their name in `--keep`."""
-    kept = {"scan": header.scan_index, "intensity": header.intensity}
-    return {name: kind for name, (_, kind) in _COLUMNS.items() if kept[name]}
+    kept = header.point_dtype.names or ()
+    return {name: kind for name, (field, kind) in _COLUMNS.items() if field in kept}
 
 
 def record_columns(columns: Iterable[str]) -> list[str]:
@@ -70,7 +72,7 @@ def record_columns(columns: Iterable[str]) -> list[str]:
 def read_columns(
     record: DecompressedRecord, columns: Iterable[str], rows: NDArray[np.int64]
 ) -> dict[str, NDArray]:
-    """Return columns of some points of a record, by name. rows: (m,), see `PointBlock`.
+    """Return columns (m,) or (m, 3) of some points of a record, by name. rows: (m,), see `PointBlock`.
 
     The record must have these columns.
     """
@@ -79,7 +81,7 @@ def read_columns(
         field, kind = _COLUMNS[name]
         at = record.dtype.fields[field][1]  # type: ignore[index]  # its dtype has fields
         raw = np.stack([record.planes[at + i][rows] for i in range(kind.itemsize)], axis=1)
-        found[name] = np.ascontiguousarray(raw).view(kind)[:, 0]
+        found[name] = np.ascontiguousarray(raw).view(kind.base).reshape(-1, *kind.shape)
     return found
 
 

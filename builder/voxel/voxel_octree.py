@@ -16,6 +16,7 @@ from ..kernels.points.octree_cells import is_ascending, merge_order, split_octre
 from ..kernels.trees.bounding_sphere import MOMENTS
 from ..kernels.trees.build_tree import EXTREMES, build_cells, copy_runs, leaf_rows
 from ..kernels.trees.pack_tree import max_nodes
+from ..spool.point_order import sort_keys
 from .balance_cells import balance_cells, packed_heights, raise_trees, tree_height, tree_limits
 from .top_hierarchy import HIGHEST, pack_top
 
@@ -26,7 +27,7 @@ class VoxelPoints(NamedTuple):
     local: (n, 3) int32 [voxel steps].  scan_index: (n,) uint16 or None.  intensity: (n,) float32 or
     None.
     radius_class: (n,) uint8 or None.  normal: (n,) uint16 or None. These two are the same for equal
-    points.
+    points.  rgb: (n, 3) uint8 or None.  classification: (n,) uint8 or None.
     """
 
     local: NDArray[np.int32]
@@ -34,6 +35,8 @@ class VoxelPoints(NamedTuple):
     intensity: NDArray[np.float32] | None = None
     radius_class: NDArray[np.uint8] | None = None
     normal: NDArray[np.uint16] | None = None
+    rgb: NDArray[np.uint8] | None = None
+    classification: NDArray[np.uint8] | None = None
 
 
 class BuiltVoxel(NamedTuple):
@@ -58,14 +61,14 @@ def canonical(points: VoxelPoints) -> tuple[VoxelPoints, NDArray[np.uint64]]:
     codes = voxel_codes(points.local)
     if is_ascending(codes):
         return _with_ties_sorted(points, codes), codes
-    columns = [c for c in (points.intensity, points.scan_index) if c is not None]
+    columns = sort_keys(points._asdict())
     order = np.lexsort((*columns, codes)) if columns else np.argsort(codes, kind="stable")
     return _taken(points, order), codes[order]
 
 
 def _with_ties_sorted(points: VoxelPoints, codes: NDArray[np.uint64]) -> VoxelPoints:
     """Sort points of equal codes by their columns. The points are in Morton order."""
-    columns = [c for c in (points.intensity, points.scan_index) if c is not None]
+    columns = sort_keys(points._asdict())
     if not columns:
         return points
     same = np.append(codes[1:] == codes[:-1], False)
@@ -80,11 +83,7 @@ def gather_voxel(parts: list[NDArray]) -> VoxelPoints:
     """Merge several sorted arrays of spool rows into points in Morton order."""
     rows = np.concatenate(parts)
     names = rows.dtype.names or ()
-    points = VoxelPoints(
-        np.ascontiguousarray(rows["local"]),
-        np.ascontiguousarray(rows["scan_index"]) if "scan_index" in names else None,
-        np.ascontiguousarray(rows["intensity"]) if "intensity" in names else None,
-    )
+    points = VoxelPoints(**{name: np.ascontiguousarray(rows[name]) for name in names})
     if len(parts) == 1:
         return points
     starts = np.cumsum([0, *map(len, parts)])

@@ -9,6 +9,7 @@ import os
 import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -23,18 +24,19 @@ from .codec import (
     RecordShape,
     decompress_record,
     decompress_tree,
-    point_dtype,
 )
 from .index import (
     DATASETS,
     FORMAT_VERSIONS,
     INDEX_NAME,
+    RECORD_DIGEST,
     SHARD_FOLDER,
     SHARD_NAME,
     index_digest,
     read_header,
 )
 from .index_limits import check_columns, check_layout, check_voxels
+from .seal import check_seal, frames_digest
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
 
@@ -48,17 +50,21 @@ class Archive:
 
     header: see Header.  voxels: the index's rows, sorted by key.
     is_as_stored: whether the points are those of the folder, which its level describes.
+    key: of the seal with which the archive was checked, or None.
     coordinates: (v, 3) int64, voxel coordinates.
     """
 
     is_as_stored = True
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: str | os.PathLike[str], key: bytes | None = None) -> None:
         """Open the archive in `folder`.
 
+        key: refuse an archive that is not sealed with this key, and records that are not those
+        sealed (seal.py); None: do not look at seals.
         Raises FormatError or CorruptError naming the file and the fault.
         """
-        self.folder = Path(folder)
+        self.folder, self.key = Path(folder), key
+        self._digests: NDArray[np.uint8] | None = None
         self._descriptors: list[int] = []
         while True:
             index = self._index_identity()
@@ -86,15 +92,15 @@ class Archive:
                 f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
             )
         try:
-            archive_id, columns = read_index(path)
-            self.header = read_header(archive_id, columns)
+            found = read_index(path)
+            columns = found.columns
+            if self.key is not None:
+                has_digests = RECORD_DIGEST in columns
+                check_seal(self.folder, self.key, found.version, found.digest, has_digests=has_digests)
+                self._digests = columns[RECORD_DIGEST]
+            self.header = read_header(found.archive_id, columns)
             self.voxels = columns["voxels"]
-            self._shape_dtype = point_dtype(
-                scan_index=self.header.scan_index,
-                intensity=self.header.intensity,
-                radius_class=self.header.radius_class,
-                normal=self.header.normals,
-            )
+            self._shape_dtype = self.header.point_dtype
             self._shards = [
                 (bytes(name).decode("ascii", "replace"), int(size)) for name, size in columns["shards"]
             ]
@@ -172,7 +178,24 @@ class Archive:
 
         Raises CorruptError, naming file, voxel and dataset, if a frame is not the one in the index.
         """
-        return self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
+        frames = self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
+        if self._digests is not None:
+            self._check_digest(row, 0, frames[:2])
+            self._check_digest(row, 1, frames[2:])
+        return frames
+
+    def _check_digest(self, row: int, part: int, frames: tuple[bytes, ...]) -> None:
+        """Compare the hierarchy (part 0) or the points (1) of a voxel with its digest.
+
+        Raises CorruptError.
+        """
+        assert self._digests is not None
+        if not np.array_equal(frames_digest(frames), self._digests[row, part]):
+            raise CorruptError(
+                f"{self.where(row)}: {('cells and nodes', 'points')[part]} that are not those sealed: fetch the shard "
+                "again",
+                (self.shard_path(int(self.voxels["shard"][row])),),
+            )
 
     def _read_frame(self, row: int, i: int) -> bytes:
         """Read the frame of dataset `i` of a voxel, as `read_frames` does."""
@@ -235,6 +258,8 @@ class Archive:
         Raises CorruptError naming the location.
         """
         cells, nodes = self._read_frame(row, 0), self._read_frame(row, 1)
+        if self._digests is not None:
+            self._check_digest(row, 0, (cells, nodes))
         with self.locating(row):
             return decompress_tree(
                 cells,
@@ -290,8 +315,17 @@ def _number_attribute(file: h5py.File, name: str, dtype: str, shape: tuple[int, 
     return np.asarray(file.attrs[name])
 
 
-def read_index(path: Path) -> tuple[bytes, dict[str, NDArray]]:
-    """Return the archive's id and every dataset of an index, checked with `check_columns`.
+class FoundIndex(NamedTuple):
+    """Content of an index. digest: `index_digest` of the datasets."""
+
+    version: int
+    archive_id: bytes
+    columns: dict[str, NDArray]
+    digest: bytes
+
+
+def read_index(path: Path) -> FoundIndex:
+    """Return an index with every dataset, checked with `check_columns`.
 
     Datasets that link elsewhere, or that claim more bytes than the file has, are refused. Raises
     FormatError or CorruptError naming the file, ValueError for an invalid number, and any error of
@@ -334,9 +368,10 @@ def read_index(path: Path) -> tuple[bytes, dict[str, NDArray]]:
                 )
             columns[name] = dataset[()]
         archive_id = _number_attribute(file, "archive_id", "|u1", (16,)).tobytes()
-        if index_digest(archive_id, columns) != _number_attribute(file, "sha256", "|u1", (32,)).tobytes():
+        digest = index_digest(archive_id, columns)
+        if digest != _number_attribute(file, "sha256", "|u1", (32,)).tobytes():
             raise CorruptError(
                 f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
             )
     check_columns(version, columns)
-    return archive_id, columns
+    return FoundIndex(version, archive_id, columns, digest)

@@ -58,22 +58,22 @@ NODE_DTYPE = np.dtype(
 CELL_EXPANSION = Expansion(1 << 20, 256)
 NODE_EXPANSION = Expansion(1 << 24, 256)
 
-# Optional columns of the points, in the order of their fields in a row.
-OPTIONAL_COLUMNS = ("scan_index", "intensity", "radius_class", "normal")
+# Optional columns of the points, in the order of their fields in a row: type and shape.
+_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "scan_index": ("<u2", ()),
+    "intensity": ("<f4", ()),
+    "radius_class": ("u1", ()),
+    "normal": ("<u2", ()),
+    "rgb": ("u1", (3,)),
+    "classification": ("u1", ()),
+}
+OPTIONAL_COLUMNS = tuple(_COLUMNS)
 
 
-def point_dtype(*, scan_index: bool, intensity: bool, radius_class: bool, normal: bool = False) -> np.dtype:
-    """Return the row dtype of the points dataset: x, y, z and the optional columns."""
-    fields: list[tuple] = [("xyz", "<u2", (3,))]
-    if scan_index:
-        fields.append(("scan_index", "<u2"))
-    if intensity:
-        fields.append(("intensity", "<f4"))
-    if radius_class:
-        fields.append(("radius_class", "u1"))
-    if normal:
-        fields.append(("normal", "<u2"))
-    return np.dtype(fields)
+def point_dtype(**kept: bool) -> np.dtype:
+    """Return the row dtype of the points dataset: x, y, z and those of OPTIONAL_COLUMNS that are true."""
+    assert kept.keys() <= _COLUMNS.keys(), kept
+    return np.dtype([("xyz", "<u2", (3,)), *((n, *kind) for n, kind in _COLUMNS.items() if kept.get(n))])
 
 
 def voxel_point_dtype(voxel: VoxelData) -> np.dtype:
@@ -303,7 +303,7 @@ class DecompressedRecord(NamedTuple):
         points = np.empty((self.planes.shape[1], 3), np.uint16)
         lanes_to_points(lanes, self.tree, self.nodes.count, points)
         kept = {
-            field: column_of(self.planes, self.dtype, field)
+            field: np.ascontiguousarray(column_of(self.planes, self.dtype, field).T)
             for field in OPTIONAL_COLUMNS
             if field in (self.dtype.names or ())
         }

@@ -10,13 +10,15 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .codec import point_dtype
+from .index_texts import read_texts
 from .radius_model import RADIUS_CLASSES
+from .seal import DIGEST_BYTES
 from .voxel_grid import Lattice
 
 # Names of an archive's files, and of the datasets of each record in a shard.
@@ -26,6 +28,11 @@ SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
 DATASETS = ("cells", "nodes", "points")
 # Versions that this software reads. It writes the lowest version that can represent the header.
 FORMAT_VERSIONS = (1, 2, 3, 4, 5)
+
+# The dataset that a seal adds, whose values are no function of the header; and the version it needs.
+RECORD_DIGEST, SEALED_VERSION = "record_digest", 5
+# Most flags of the dataset `columns`; an index without the last columns has fewer.
+COLUMN_FLAGS = 7
 
 SHARD_DTYPE = np.dtype([("name", "S24"), ("bytes", "<u8")])
 # One row per voxel, sorted by key.
@@ -122,6 +129,8 @@ class Header:
     it equals `radius`, and if the radius was given.
     normal_reach: points within this distance determine a normal [m] (kernels/normal_codes.py); 0:
     no normals are stored.  is_level: whether the points and classes are those of a level (level.py).
+    rgb, classification: whether the points have these columns.  is_sealed: whether the index has
+    digests of its records (seal.py).
     """
 
     archive_id: bytes
@@ -150,6 +159,9 @@ class Header:
     radius_now: RadiusNow | None = None
     normal_reach: float = 0.0
     is_level: bool = False
+    rgb: bool = False
+    classification: bool = False
+    is_sealed: bool = False
 
     @property
     def radius_class(self) -> bool:
@@ -162,10 +174,24 @@ class Header:
         return self.normal_reach > 0
 
     @property
+    def point_dtype(self) -> np.dtype:
+        """Return the row dtype of the points dataset."""
+        return point_dtype(
+            scan_index=self.scan_index,
+            intensity=self.intensity,
+            radius_class=self.radius_class,
+            normal=self.normals,
+            rgb=self.rgb,
+            classification=self.classification,
+        )
+
+    @property
     def format_version(self) -> int:
         """Return the lowest format version that can represent this header."""
-        if self.is_level or self.normals:
-            return 5 if self.is_level else 4
+        if self.is_level or self.rgb or self.classification or self.is_sealed:
+            return 5
+        if self.normals:
+            return 4
         if self.generation:
             return 3
         return 2 if self.radius_class else 1
@@ -199,12 +225,10 @@ def _texts(header: Header) -> bytes:
 
 def _point_columns(header: Header) -> list[bool]:
     """Return a flag for each optional column of the points (`columns` in FORMAT.md)."""
-    flags = [header.scan_index, header.intensity]
-    if header.is_level:
-        return flags
-    if header.radius_class or header.normals:
-        flags += ["local" in header.models, "border" in header.models]
-    return [*flags, True] if header.normals else flags
+    classes = ["local" in header.models, "border" in header.models]
+    flags = [header.scan_index, header.intensity, *classes, header.normals, header.rgb, header.classification]
+    # As many as are needed, so that archives without the later columns keep their bytes.
+    return flags[: next((n for n, last in ((7, flags[5:]), (5, flags[4:5]), (4, classes)) if any(last)), 2)]
 
 
 def _radius_now(header: Header) -> list[float]:
@@ -257,6 +281,7 @@ INDEX_COLUMNS = {
     "texts": IndexColumn(_U1, (-1,), lambda header: np.frombuffer(_texts(header), _U1)),
     "shards": IndexColumn(SHARD_DTYPE, (-1,)),
     "voxels": IndexColumn(VOXEL_DTYPE, (-1,)),
+    RECORD_DIGEST: IndexColumn(_U1, (-1, 2, DIGEST_BYTES), requires="is_sealed"),
 }
 
 
@@ -265,6 +290,7 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
 
     voxels: VOXEL_DTYPE rows sorted by key.
     shards: name and bytes of each, in the order of their numbers.
+    A sealed archive's digests are not among them.
     """
     tables = {
         "shards": np.array([(name.encode(), size) for name, size in shards], SHARD_DTYPE),
@@ -273,7 +299,8 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
     columns = {}
     for name, column in INDEX_COLUMNS.items():
         if column.values is None:
-            columns[name] = tables[name]
+            if name in tables:
+                columns[name] = tables[name]
         elif not column.requires or getattr(header, column.requires):
             value = np.asarray(column.values(header), column.dtype)
             # Any other array keeps its shape, so that a reader refuses a wrong one.
@@ -290,66 +317,12 @@ def index_digest(archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
     return digest.digest()
 
 
-_Count = Annotated[int, msgspec.Meta(ge=0)]
-
-
-class _SourceTexts(msgspec.Struct):
-    """Texts of one source; see `Source`."""
-
-    path: str
-    index: _Count
-    format: str
-    sha256: str
-    skipped: dict[str, _Count]
-    fault: str
-    crs: str = ""
-    units: str = "m"
-    up: str = "z"
-    unknown: int | None = None
-    one_place: bool = False
-
-
-class _Texts(msgspec.Struct):
-    """Content of `texts`; see `_texts`."""
-
-    lattice_source: Literal["sources", "given", "default"]
-    radius_model: Literal["mean", "given"]
-    options: dict[str, Any]
-    sources: list[_SourceTexts]
-
-
-def _no_number(name: str) -> NoReturn:
-    """Refuse NaN and infinity, which Python's JSON parser accepts as numbers."""
-    raise ValueError(f"texts with {name}: expected JSON")
-
-
-def _read_texts(columns: dict[str, NDArray]) -> _Texts:
-    """Parse `texts` and compare it with the other datasets. Raises ValueError."""
-    try:
-        texts = msgspec.convert(
-            json.loads(columns["texts"].tobytes(), parse_constant=_no_number), _Texts, strict=True
-        )
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise ValueError(f"texts: {error}") from error
-    sources, boxes = len(texts.sources), len(columns["unknown"])
-    if sources != len(columns["source_pose"]):
-        raise ValueError(f"texts of {sources} sources: expected {len(columns['source_pose'])}")
-    rows = [s.unknown for s in texts.sources if s.unknown is not None and s.unknown != -1]
-    if len(set(rows)) < len(rows) or not all(0 <= row < boxes for row in rows):
-        raise ValueError(f"sources with boxes {rows} of {boxes}: expected distinct boxes, or -1")
-    if any(s.unknown == -1 for s in texts.sources) and not columns["unknown_everywhere"][0]:
-        raise ValueError(
-            "unknown_everywhere 0: expected 1, because a source with unknown bounds was left out"
-        )
-    return texts
-
-
 def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
     """Make the header from the index's datasets, which `check_columns` has checked.
 
     Raises ValueError.
     """
-    texts = _read_texts(columns)
+    texts = read_texts(columns)
     counts = columns["source_count"]
     sources = tuple(
         Source(
@@ -364,8 +337,9 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         generation = int(columns["generation"][0])
         radius, error, sample = (float(v) for v in columns["radius_now"])
         now = RadiusNow(radius, error, int(sample)) if sample else None
-    held = columns["columns"].astype(bool).tolist()
-    models = ("mean", *(name for name, here in zip(("local", "border"), held[2:], strict=False) if here))
+    flags = columns["columns"].astype(bool)
+    held = np.pad(flags, (0, COLUMN_FLAGS - len(flags))).tolist()
+    models = ("mean", *(name for name, here in zip(("local", "border"), held[2:4], strict=True) if here))
     counts, capped = np.zeros(RADIUS_CLASSES), 0
     if "radius_counts" in columns:
         counts, capped = columns["radius_counts"], int(columns["radius_capped"][0])
@@ -396,4 +370,7 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         radius_now=now,
         normal_reach=float(columns["normal_reach"][0]) if "normal_reach" in columns else 0.0,
         is_level="level" in columns,
+        rgb=held[5],
+        classification=held[6],
+        is_sealed=RECORD_DIGEST in columns,
     )

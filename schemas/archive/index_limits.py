@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .codec import CELL_DTYPE, CELL_EXPANSION, NODE_DTYPE, NODE_EXPANSION
-from .index import INDEX_COLUMNS
+from .index import COLUMN_FLAGS, INDEX_COLUMNS, RECORD_DIGEST, SEALED_VERSION
 from .normal_reach import MAX_NORMAL_REACH
 from .voxel import MAX_DEGREE, MAX_LEAF, MAX_LEVELS, MIN_DEGREE
 from .voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, voxel_coordinates
@@ -108,13 +108,21 @@ def _check_lattice(columns: dict[str, NDArray]) -> None:
 def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
     """Check the point columns, the datasets that they require, and the resulting format version."""
     kept = _numbers(columns, "columns", 0, 1)
-    classes, normals, later = len(kept) > 2 and any(kept[2:4]), len(kept) == 5, "generation" in columns
-    if len(kept) not in (2, 4, 5) or (len(kept) == 4 and not classes) or (normals and not kept[4]):
-        _refuse("columns", kept, "2 flags, 4 with radius classes, 5 with normals")
-    is_level = "level" in columns
-    if is_level and (kept != [0, 0] or columns["level"][0] != 1):
-        _refuse("level and columns", [*columns["level"].tolist(), *kept], "1, and no column")
+    classes, normals, later = any(kept[2:4]), any(kept[4:5]), "generation" in columns
+    colours, is_level = any(kept[5:]), "level" in columns
+    if len(kept) != (COLUMN_FLAGS if colours else 5 if normals else 4 if classes else 2):
+        _refuse(
+            "columns", kept, "2 flags, 4 with radius classes, 5 with normals, 7 with rgb or classification"
+        )
+    if is_level and (kept[0] or classes or normals or columns["level"][0] != 1):
+        _refuse(
+            "level and columns",
+            [*columns["level"].tolist(), *kept],
+            "1, and no column but intensity, rgb, classification",
+        )
+    is_sealed = RECORD_DIGEST in columns
     held = {
+        "is_sealed": is_sealed,
         "radius_class": classes or is_level,
         "normals": normals,
         "generation": later,
@@ -124,7 +132,17 @@ def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
         _refuse("datasets", [name for name in _OPTIONAL if name in columns], f"those of columns {kept}")
     if normals and not 0 < (reach := float(columns["normal_reach"][0])) <= MAX_NORMAL_REACH:
         _refuse("normal_reach", reach, f"above 0, at most {MAX_NORMAL_REACH:g}")
-    expected = 5 if is_level else 4 if normals else 3 if later else 2 if classes else 1
+    expected = (
+        SEALED_VERSION
+        if is_level or colours or is_sealed
+        else 4
+        if normals
+        else 3
+        if later
+        else 2
+        if classes
+        else 1
+    )
     if version != expected:
         _refuse("format_version", version, f"{expected}, from the datasets")
     degree, leaf = columns["tree"].tolist()
@@ -190,6 +208,8 @@ def check_voxels(columns: dict[str, NDArray], point_bytes: int) -> None:
         or key[-1] >= 1 << 63
     ):
         _refuse("voxels", "is inconsistent", "ascending keys of 63 bits, shards that exist")
+    if RECORD_DIGEST in columns and len(columns[RECORD_DIGEST]) != len(voxels):
+        _refuse(RECORD_DIGEST, f"of {len(columns[RECORD_DIGEST])} voxels", f"those of {len(voxels)}")
     _check_frames(voxels, sizes[voxels["shard"]])
     _check_rows(columns, point_bytes)
     _check_bounds(columns)

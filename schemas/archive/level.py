@@ -25,6 +25,8 @@ from .voxel_grid import voxel_keys
 
 # Folder of the level, inside the folder of its archive.
 LEVEL_FOLDER = "level"
+# Columns of the points that representatives keep, if the archive has them: what a viewer shows.
+LEVEL_COLUMNS = ("intensity", "rgb", "classification")
 # Cover radius of each class [micrometres]: 8 mm times powers of the square root of 2, so that
 # rounding up adds at most 41 %, in the same table for every archive. No representative stands for
 # points farther away than the last.
@@ -69,19 +71,21 @@ def cover_units() -> NDArray[np.int64]:
 def open_level(archive: Archive) -> Archive | None:
     """Open the level of an archive; return None if there is none, or only that of other points.
 
+    The level of an archive that was opened with a key must be sealed with it.
     Raises FormatError or CorruptError, naming the file, for a level that cannot be read, or that
     does not describe the voxels of the archive.
     """
     folder = archive.folder / LEVEL_FOLDER
     if not archive.is_as_stored or not (folder / INDEX_NAME).is_file():
         return None
-    level = Archive(folder)
+    level = Archive(folder, archive.key)
     header, described = level.header, archive.header
     if header.archive_id != level_id(described):
         level.close()
         return None
     same = (
         header.is_level
+        and all(getattr(header, name) == getattr(described, name) for name in LEVEL_COLUMNS)
         and _covers_voxels(level, archive)
         and np.array_equal(header.unknown, described.unknown)
         and header.unknown_everywhere == described.unknown_everywhere
@@ -89,7 +93,7 @@ def open_level(archive: Archive) -> Archive | None:
     if not same:
         level.close()
         raise FormatError(
-            f"{folder}: does not describe the voxels of its archive, expected the same lattice, voxels and "
+            f"{folder}: does not describe the voxels of its archive, expected the same lattice, voxels, columns and "
             "unknown regions: delete this folder, which is not needed"
         )
     return level

@@ -51,7 +51,7 @@ class VtkPoints:
         self._points = self._make("Points", np.dtype("<f8"), (3,))
         data = self._root.create_group("PointData", track_times=False)
         self._columns = {
-            name: self._make(f"{data.name}/{name}", kind.newbyteorder("<"), ())
+            name: self._make(f"{data.name}/{name}", kind.base.newbyteorder("<"), kind.shape)
             for name, kind in columns.items()
         }
 
@@ -71,7 +71,7 @@ class VtkPoints:
         )
 
     def append(self, points: NDArray[np.float64], columns: Mapping[str, NDArray]) -> None:
-        """Append points (m, 3) [m] and all columns (m,). Raises OSError if a write failed."""
+        """Append points (m, 3) [m] and all columns, (m,) or (m, 3). Raises OSError if a write failed."""
         for dataset, rows in [(self._points, points), *((d, columns[n]) for n, d in self._columns.items())]:
             begin = len(dataset)
             dataset.resize(begin + len(rows), axis=0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
-from ...schemas.errors import BadRequestError
+from ...schemas.errors import BadRequestError, FormatError
 from ...schemas.wire.warming_parts import MOTION, PARTS
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.level_of_detail import open_level_data, with_level
@@ -73,8 +73,13 @@ class ArchiveGeneration:
         coarse_bytes: of it for the level; None: see `open_level_store`.
         number: of this generation.  took: called with the duration of each load [s].
         radius_model: the default; None: the archive's single radius. Raise BadRequestError for one
-        that the archive does not store.
+        that the archive does not store, FormatError for a level of detail, whose points are not all.
         """
+        if store.archive.header.is_level:
+            raise FormatError(
+                f"{store.archive.folder}: a level of detail, expected an archive: give the folder of its archive, or "
+                "restore it"
+            )
         self.store, self.number = store, number
         self.kept: dict[str, Any] = {}
         self.ended = threading.Event()

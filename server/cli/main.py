@@ -31,6 +31,7 @@ from .commands import plan_command as plan
 from .commands import query_command as query
 from .commands import replay_command as replay
 from .commands import scene_command as scene
+from .commands import seal_command as seal
 from .commands import serve_command as serve
 from .commands import top_command as top
 from .commands.command_options import print_error
@@ -62,6 +63,7 @@ for verb in (
     info_validate.info,
     info_validate.validate,
     level.level,
+    seal.seal,
     serve.serve,
     accuracy.accuracy,
     query.query,

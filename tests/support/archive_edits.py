@@ -91,7 +91,7 @@ def content(folder: Path) -> dict[int, dict[str, bytes]]:
             }
             columns |= {
                 name: getattr(voxel, name).tobytes()
-                for name in ("points", "intensity", "radius_class")
+                for name in ("points", "intensity", "radius_class", "rgb", "classification")
                 if getattr(voxel, name) is not None
             }
             if voxel.scan_index is not None:

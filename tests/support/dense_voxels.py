@@ -12,7 +12,7 @@ from solidcloud.schemas.archive.voxel_grid import Lattice
 from written_runs import write_run
 
 KEY = 0x1C0000000000000  # voxel (0, 0, 0)
-COLUMNS = {"scan_index": "<u2", "intensity": "<f4"}
+COLUMNS = {"scan_index": ("<u2",), "intensity": ("<f4",), "rgb": ("u1", (3,)), "classification": ("u1",)}
 
 
 def spooled(folder: Path, rows: NDArray, steps: int, cuts: list[int]) -> Spool:
@@ -27,10 +27,10 @@ def spooled(folder: Path, rows: NDArray, steps: int, cuts: list[int]) -> Spool:
 def rows_of(points: NDArray[np.int32], *names: str) -> NDArray:
     """Return rows of the spool with some of the columns, with few different values in each."""
     rng = np.random.default_rng(5)
-    rows = np.zeros(len(points), [("local", "<i4", (3,)), *((name, COLUMNS[name]) for name in names)])
+    rows = np.zeros(len(points), [("local", "<i4", (3,)), *((name, *COLUMNS[name]) for name in names)])
     rows["local"] = points
     for name in names:
-        rows[name] = rng.integers(0, 3, len(points))
+        rows[name] = rng.integers(0, 3, rows[name].shape)
     return rows
 
 

@@ -52,12 +52,14 @@ def forge(folder: Path, change: Callable[[Columns], None]) -> None:
 
 def row_types(columns: Columns) -> tuple[np.dtype, np.dtype, np.dtype]:
     """Return the row types of the cells, nodes and points of an archive."""
-    kept = columns["columns"].tolist()
+    scan, intensity, local, border, normal, rgb, classes = np.pad(columns["columns"], (0, 7))[:7].tolist()
     points = point_dtype(
-        scan_index=bool(kept[0]),
-        intensity=bool(kept[1]),
-        radius_class="level" in columns or (len(kept) > 2 and any(kept[2:4])),
-        normal=len(kept) > 4,
+        scan_index=bool(scan),
+        intensity=bool(intensity),
+        radius_class="level" in columns or bool(local or border),
+        normal=bool(normal),
+        rgb=bool(rgb),
+        classification=bool(classes),
     )
     return CELL_DTYPE, NODE_DTYPE, points
 

@@ -66,6 +66,8 @@ def kept(n: int, seed: int) -> dict[str, np.ndarray]:
         "scan_index": rng.integers(0, 2**16, n).astype(np.uint16),
         "intensity": bits.view(np.float32),
         "radius_class": rng.integers(0, RADIUS_CLASSES, n).astype(np.uint8),
+        "rgb": rng.integers(0, 256, (n, 3)).astype(np.uint8),
+        "classification": rng.integers(0, 256, n).astype(np.uint8),
     }
 
 

@@ -160,7 +160,7 @@ def write_e57(path: Path, scans: list[dict], crs: str = "") -> Path:
     """Write an E57 of scans.
 
     scans: dicts with the keys columns (name -> array), and optionally rotation, translation, bounds
-    (2, 3), scaled.
+    (2, 3), scaled, limits (name -> number, of the colours).
     scaled: name -> (scale, offset) of columns written as scaled integers; the array holds the
     decoded
     values.
@@ -194,6 +194,11 @@ def write_e57(path: Path, scans: list[dict], crs: str = "") -> Path:
             pose.set("translation", numbers(list("xyz"), scan["translation"]))
         if "rotation" in scan or "translation" in scan:
             node.set("pose", pose)
+        if "limits" in scan:
+            limits = libe57.StructureNode(image)
+            for name, value in scan["limits"].items():
+                limits.set(name, libe57.IntegerNode(image, value, 0, 65535))
+            node.set("colorLimits", limits)
         if "bounds" in scan:
             names = [f"{axis}{end}" for end in ("Minimum", "Maximum") for axis in "xyz"]
             node.set("cartesianBounds", numbers(names, np.ravel(scan["bounds"])))
@@ -204,6 +209,8 @@ def write_e57(path: Path, scans: list[dict], crs: str = "") -> Path:
                 kind = libe57.ScaledIntegerNode(image, 0, -(2**31), 2**31 - 1, scale, offset)
             elif column.dtype == np.int8:
                 kind = libe57.IntegerNode(image, 0, 0, 2)
+            elif column.dtype.kind == "u":
+                kind = libe57.IntegerNode(image, 0, 0, int(np.iinfo(column.dtype).max))
             elif column.dtype == np.float32:
                 kind = libe57.FloatNode(image, 0.0, libe57.FloatPrecision.E57_SINGLE)
             else:

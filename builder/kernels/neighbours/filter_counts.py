@@ -175,7 +175,7 @@ def other_scans(
 
 
 @nb.njit(nogil=True, cache=True)
-def best_of_cells(order, cells, away, ranks, scans, intensities):
+def best_of_cells(order, cells, away, ranks, scans, intensities, looks):
     """Return the index of the best point of each cell: (c,) int64, cells ascending.
 
     order: (n,) int64, n >= 1, sorts the points by cell.
@@ -184,8 +184,9 @@ def best_of_cells(order, cells, away, ranks, scans, intensities):
     ranks: (n,) uint64.
     scans: (n,) int64.
     intensities: (n,) float32.
-    The least away is best, then the least rank, scan and intensity, NaN last; of equals the first
-    in `order`.
+    looks: (n,) uint32.
+    The least away is best, then the least rank, scan, intensity, NaN last, and look; of equals the
+    first in `order`.
     """
     n = order.shape[0]
     best = np.empty(n, np.int64)
@@ -209,6 +210,12 @@ def best_of_cells(order, cells, away, ranks, scans, intensities):
         elif intensities[i] < intensities[held] or (
             np.isnan(intensities[held]) and not np.isnan(intensities[i])
         ):
+            held = i
+        elif intensities[i] > intensities[held] or (
+            np.isnan(intensities[i]) and not np.isnan(intensities[held])
+        ):
+            continue
+        elif looks[i] < looks[held]:
             held = i
     best[count] = held
     return best[: count + 1].copy()

@@ -15,6 +15,7 @@ class Runs(NamedTuple):
 
     xyz: (r, 3) int32, the representative [voxel steps].  classes: (r,) uint8, its cover class.
     node: (r,) int32, the leaf node.  begin, end: (r,) uint8, the run in the leaf node.
+    chosen: (r,) uint8, the place of the representative in the leaf node.
     """
 
     xyz: NDArray[np.int32]
@@ -22,6 +23,7 @@ class Runs(NamedTuple):
     node: NDArray[np.int32]
     begin: NDArray[np.uint8]
     end: NDArray[np.uint8]
+    chosen: NDArray[np.uint8]
 
 
 def empty_runs(count: int) -> Runs:
@@ -30,6 +32,7 @@ def empty_runs(count: int) -> Runs:
         np.empty((count, 3), np.int32),
         np.empty(count, np.uint8),
         np.empty(count, np.int32),
+        np.empty(count, np.uint8),
         np.empty(count, np.uint8),
         np.empty(count, np.uint8),
     )
@@ -121,7 +124,7 @@ def _put(runs, at, lanes, chosen, corner, node, begin, end, farthest, squares):
     for k in range(3):
         runs.xyz[at, k] = np.int32(corner[k] + np.int64(lanes[k, chosen]))
     runs.classes[at], runs.node[at] = np.uint8(own), np.int32(node)
-    runs.begin[at], runs.end[at] = np.uint8(begin), np.uint8(end)
+    runs.begin[at], runs.end[at], runs.chosen[at] = np.uint8(begin), np.uint8(end), np.uint8(chosen)
 
 
 @nb.njit(nogil=True, cache=True)

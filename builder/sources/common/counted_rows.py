@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check_interrupt
+from .colours import INTENSITY, RGB, whole_bytes
 from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
 from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, split_row
 
@@ -43,11 +44,13 @@ class CountedRows(Scan):
 
         start, line: byte and line number of the first row.
         columns: numbers in each row. With 4 or 7 columns the fourth is an intensity (x y z i, x y z
-        i r g b); with 6 it is red.
+        i r g b); with 6 it is red. Colours are from 0 to 255.
         """
         super().__init__(path, format, index=index, declared_count=count, pose=pose)
         self._start, self._line, self._columns = start, line, columns
         self._zeros_are_no_return = zeros_are_no_return
+        intensity, rgb = columns in (4, 7), columns in (6, 7)
+        self.columns = frozenset([INTENSITY] * intensity + [RGB] * rgb)
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         count = self.declared_count or 0
@@ -75,7 +78,11 @@ class CountedRows(Scan):
                 self.dropped[NO_RETURN] = self.dropped.get(NO_RETURN, 0) + lost
                 rows = rows[hit]
         xyz = apply_pose(self.pose, np.ascontiguousarray(rows[:, :3]))
-        return ScanBlock(xyz, rows[:, 3].astype(np.float32) if self._columns in (4, 7) else None)
+        return ScanBlock(
+            xyz,
+            rows[:, 3].astype(np.float32) if self._columns in (4, 7) else None,
+            whole_bytes(rows[:, self._columns - 3 :]) if self.delivers(RGB) else None,
+        )
 
 
 def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> int:

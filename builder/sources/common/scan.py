@@ -66,10 +66,18 @@ class ScanBlock(NamedTuple):
 
     xyz: (n, 3) float64, world frame [m], with the scan's pose applied; may hold non-finite values.
     intensity: (n,) float32 in the source's own unit, or None where the source has none.
+    rgb: (n, 3) uint8, uint16 or float32 as the file has them (`eight_bits` of colours.py converts).
+    classification: (n,) uint8. Both are None where the source has none or they are not wanted.
     """
 
     xyz: NDArray[np.float64]
     intensity: NDArray[np.float32] | None
+    rgb: NDArray[Any] | None = None
+    classification: NDArray[np.uint8] | None = None
+
+    def taken(self, which: NDArray[np.bool_]) -> "ScanBlock":
+        """Return the selected points."""
+        return ScanBlock._make(None if column is None else column[which] for column in self)
 
 
 class Scan(ABC):
@@ -91,6 +99,8 @@ class Scan(ABC):
     "z", "y" or "x". Both are what the format prescribes, or the usual value where it prescribes
     none. blocks() does not convert coordinates.
     crs: the coordinate reference system's text, or "".
+    columns: columns that the points have besides coordinates: "intensity", "rgb", "classification".
+    wanted: columns, of the last two, that blocks() delivers; set before a scan is read.
     fault: error found in this scan's header while other scans of the file are readable; or "".
     """
 
@@ -98,6 +108,8 @@ class Scan(ABC):
     units = "m"
     up = "z"
     crs = ""
+    columns: frozenset[str] = frozenset()
+    wanted: frozenset[str] = frozenset()
     fault = ""
 
     def __init__(
@@ -119,6 +131,10 @@ class Scan(ABC):
         self.lattice = lattice
         self.bounds = bounds
         self.dropped: dict[str, int] = {}
+
+    def delivers(self, column: str) -> bool:
+        """Return whether blocks() delivers "rgb" or "classification"."""
+        return column in self.columns and column in self.wanted
 
     def blocks(
         self, block_points: int = BLOCK_POINTS, start: int = 0, stop: int | None = None

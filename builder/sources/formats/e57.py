@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.errors import ScanError
+from ..common.colours import INTENSITY, RGB, whole_bytes
 from ..common.scan import (
     BOUNDS_MARGIN,
     BrokenScan,
@@ -31,6 +32,10 @@ from .e57_xml import check_e57, check_xml, xml_of
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 INVALID_STATE = "invalid state"
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+COLOURS = ("colorRed", "colorGreen", "colorBlue")
+INVALID_COLOUR = "isColorInvalid"
+# Greatest range of a channel that its type, without limits in the header, is believed to have.
+MOST_COLOURS = 1 << 16
 
 LONGEST_CRS = 1 << 16  # several times longer than any real text; a longer one is truncated
 
@@ -41,6 +46,10 @@ class _Fields(NamedTuple):
     coordinates: tuple[str, ...]
     invalid_state: str | None
     intensity: str | None
+    # Red, green and blue with the least and greatest value of each, or (); and what marks a colour
+    # as invalid.
+    colours: tuple[tuple[str, float, float], ...]
+    invalid_colour: str | None
 
 
 class E57Scan(Scan):
@@ -57,6 +66,7 @@ class E57Scan(Scan):
     ) -> None:
         super().__init__(path, "e57", index=index, declared_count=count, pose=pose, bounds=bounds)
         self._fields = fields
+        self.columns = frozenset([INTENSITY] * bool(fields.intensity) + [RGB] * bool(fields.colours))
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         if not self.declared_count:
@@ -69,6 +79,10 @@ class E57Scan(Scan):
                 arrays[self._fields.intensity] = np.empty(block_points, np.float32)
             if self._fields.invalid_state:
                 arrays[self._fields.invalid_state] = np.empty(block_points, np.int8)
+            if self.delivers(RGB):
+                arrays |= {name: np.empty(block_points, np.float64) for name, _, _ in self._fields.colours}
+                if self._fields.invalid_colour:
+                    arrays[self._fields.invalid_colour] = np.empty(block_points, np.int8)
             buffers = libe57.VectorSourceDestBuffer()
             for name, array in arrays.items():
                 # True, True: convert the stored type to the array's type, and scaled integers to
@@ -106,8 +120,24 @@ class E57Scan(Scan):
             xyz = _cartesian(xyz)
         # Copy the intensity: the reader fills the same array again.
         return ScanBlock(
-            apply_pose(self.pose, xyz), columns[fields.intensity][valid].copy() if fields.intensity else None
+            apply_pose(self.pose, xyz),
+            columns[fields.intensity][valid].copy() if fields.intensity else None,
+            self._colours(columns, valid) if self.delivers(RGB) else None,
         )
+
+    def _colours(self, columns: dict[str, NDArray[Any]], valid: Any) -> NDArray[np.uint8]:
+        """Return the colours (n, 3) of valid points, scaled from the limits in the header to 0 to 255."""
+        fields = self._fields
+        rgb = np.stack(
+            [
+                whole_bytes((columns[name][valid] - low) / (high - low) * 255)
+                for name, low, high in fields.colours
+            ],
+            axis=1,
+        )
+        if fields.invalid_colour:
+            rgb[columns[fields.invalid_colour][valid] != 0] = 0
+        return rgb
 
 
 def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,6 +214,8 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
         coordinates,
         invalid_state if invalid_state in names else None,
         "intensity" if "intensity" in names else None,
+        _colour_limits(node, prototype) if names.issuperset(COLOURS) else (),
+        INVALID_COLOUR if INVALID_COLOUR in names else None,
     )
     numbers = {name: _number(node, *name.split("/")) for name in (*_POSE_NUMBERS, *_BOUNDS_NUMBERS)}
     pose = _pose(path, index, numbers)
@@ -198,6 +230,27 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
             "fetch the file again, it is truncated or damaged",
         )
     return E57Scan(path, index, count, pose, _bounds(numbers, pose), fields)
+
+
+def _colour_limits(node: Any, prototype: Any) -> tuple[tuple[str, float, float], ...]:
+    """Return the channels of a scan's colours, each with its least and greatest value.
+
+    These are the limits that the header states; else those of the channel's type; else 0 to 1 for
+    floating-point numbers and 0 to 255 for others.
+    """
+    found = []
+    for name in COLOURS:
+        low, high = (_number(node, "colorLimits", name + end) for end in ("Minimum", "Maximum"))
+        kind = prototype[name]
+        if low is None or high is None or not low < high:
+            if hasattr(kind, "scaledValue") or not hasattr(kind, "minimum"):
+                low, high = 0.0, 255.0
+            else:
+                low, high = float(kind.minimum()), float(kind.maximum())
+            if not (np.isfinite([low, high]).all() and low < high and high - low <= MOST_COLOURS):
+                low, high = 0.0, 1.0 if hasattr(kind, "isDouble") or "Float" in type(kind).__name__ else 255.0
+        found.append((name, low, high))
+    return tuple(found)
 
 
 _QUATERNION = tuple(f"pose/rotation/{name}" for name in "wxyz")

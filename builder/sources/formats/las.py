@@ -2,8 +2,11 @@
 
 COPC is LAZ with an index, which is not needed to read every point. The header is read here: laspy
 2.7, given a file of 14 kB that claims 10^9 variable length records, creates an object for each of
-them and never returns. Only the coordinates and the intensity of a point are read; they come first
-in every point record format.
+them and never returns. Only the coordinates and the intensity of a point are read, which come first
+in every point record format; and its colour and its class if they are wanted.
+
+The standard has 16 bits in each channel of a colour, but many files hold 8-bit values there. A file
+none of whose channels exceeds 255 is taken for one of these, as other programs do (colours.py).
 """
 
 import struct
@@ -15,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import blocking_interrupts
+from ..common.colours import CLASSIFICATION, INTENSITY, RGB
 from ..common.scan import (
     BLOCK_BYTES,
     Scan,
@@ -34,6 +38,11 @@ HEADER_BYTES = 227
 # Sizes of the point record formats 0 to 10 [LAS 1.4 R15, tables 7 to 17]; extra bytes may follow
 # each.
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+# Offset of red, green and blue in the formats that have them, and of the class: its low five bits
+# up to format 5, a byte of its own from 6 on.
+RGB_OFFSETS = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
+CLASS_OFFSETS, CLASS_BITS = (15, 16), 0x1F
+FIRST_WHOLE_CLASS = 6
 # Maximum bytes before the points. Real files have kilobytes there (a coordinate system, names of
 # extra bytes); waveform tables, the largest known content, stay below 16 KiB.
 LONGEST_PREAMBLE = 16 << 20
@@ -91,13 +100,21 @@ class LasScan(SeekableScan):
         )
         self._start = header.offset_to_points
         self._laszip = laszip
-        self._record = np.dtype(
-            {
-                "names": ["x", "y", "z", "intensity"],
-                "formats": ["<i4", "<i4", "<i4", "<u2"],
-                "offsets": [0, 4, 8, 12],
-                "itemsize": header.record_bytes,
-            }
+        self._point_format, self._record_bytes = header.point_format, header.record_bytes
+        has_rgb = header.point_format in RGB_OFFSETS
+        self.columns = frozenset([INTENSITY, CLASSIFICATION] + [RGB] * has_rgb)
+
+    @property
+    def _record(self) -> np.dtype[np.void]:
+        """Return the layout of a record, with the fields that are read."""
+        fields = [("x", "<i4", 0), ("y", "<i4", 4), ("z", "<i4", 8), ("intensity", "<u2", 12)]
+        if self.delivers(CLASSIFICATION):
+            fields.append((CLASSIFICATION, "u1", CLASS_OFFSETS[self._point_format >= FIRST_WHOLE_CLASS]))
+        if self.delivers(RGB):
+            fields.append((RGB, "(3,)<u2", RGB_OFFSETS[self._point_format]))
+        names, formats, offsets = (list(column) for column in zip(*fields, strict=True))
+        return np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": self._record_bytes}  # type: ignore[call-overload]  # a layout
         )
 
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
@@ -116,12 +133,17 @@ class LasScan(SeekableScan):
     ) -> Iterator[NDArray[np.void]]:
         """Yield the records [start, stop) of a LAZ file, (n,); the next block overwrites them."""
         lazrs = reader_library("lazrs", self.path)
-        # Skip unused layers (formats 6 to 10): colours, times, angles.
-        wanted = lazrs.DecompressionSelection(
+        # Skip unused layers (formats 6 to 10): times, angles.
+        layers = (
             lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
             | lazrs.SELECTIVE_DECOMPRESS_Z
             | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
         )
+        if self.delivers(RGB):
+            layers |= lazrs.SELECTIVE_DECOMPRESS_RGB
+        if self.delivers(CLASSIFICATION):
+            layers |= lazrs.SELECTIVE_DECOMPRESS_CLASSIFICATION
+        wanted = lazrs.DecompressionSelection(layers)
         with blocking_interrupts():
             source: Any = LazTail(lazrs, file, self._start, self._laszip, start) if start else file
             # Decompress serially: the builder already runs one process per core.
@@ -158,7 +180,15 @@ class LasScan(SeekableScan):
                 column = xyz[:, axis]
                 np.multiply(record[name], lattice.scale[axis], out=column)
                 column += lattice.offset[axis]
-        return ScanBlock(xyz, record["intensity"].astype(np.float32))
+        classes = record[CLASSIFICATION].copy() if self.delivers(CLASSIFICATION) else None
+        if classes is not None and self._point_format < FIRST_WHOLE_CLASS:
+            classes &= CLASS_BITS
+        return ScanBlock(
+            xyz,
+            record["intensity"].astype(np.float32),
+            record[RGB].copy() if self.delivers(RGB) else None,
+            classes,
+        )
 
 
 def open_las(path: Path) -> list[Scan]:

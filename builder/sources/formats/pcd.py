@@ -1,6 +1,8 @@
 """PCD reader, the format of the Point Cloud Library: ASCII, binary or compressed.
 
-Only the fields x, y, z and intensity are read. Organised clouds store directions without a return
+Only the fields x, y, z and intensity are read, and colour (rgb or rgba) and class (label,
+classification) if they are wanted. A colour is one number, 0xRRGGBB in an integer or in the bits of
+a float. Organised clouds store directions without a return
 as NaN points in their grid; these are dropped as NO_RETURN.
 
 VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
@@ -15,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.colours import CLASS_NAMES, CLASSIFICATION, INTENSITY, RGB, whole_bytes
 from ..common.scan import (
     BLOCK_BYTES,
     INTENSITY_NAMES,
@@ -35,6 +38,9 @@ from ..common.text_rows import is_number, number_rows
 LONGEST_HEADER = 1 << 16
 KINDS = ("ascii", "binary", "binary_compressed")
 TYPES = {("F", 4): "<f4", ("F", 8): "<f8", **{(t, n): f"<{t.lower()}{n}" for t in "IU" for n in (1, 2, 4, 8)}}
+# Column of a scan -> names of its field; and the types in which a field packs a colour.
+COLUMN_NAMES = {INTENSITY: INTENSITY_NAMES, RGB: ("rgb", "rgba"), CLASSIFICATION: CLASS_NAMES}
+PACKED = (("F", 4), ("U", 4), ("I", 4))
 # Maximum decompressed bytes per compressed byte: a reference of three bytes stands for at most 264
 # [LZF].
 MAX_EXPANSION = 88
@@ -45,17 +51,19 @@ class _Field(NamedTuple):
 
     offset: bytes from the start of the record.
     column: number of its first value in a text row.
+    is_packed: whether it is a colour in one number.
     """
 
     offset: int
     column: int
     type: str
+    is_packed: bool = False
 
 
 class _Header(NamedTuple):
-    """Header of a PCD file. fields: x, y, z, and the intensity where there is one."""
+    """Header of a PCD file. fields: of x, y, z and the columns of `Scan.columns`, by name."""
 
-    fields: tuple[_Field, ...]
+    fields: dict[str, _Field]
     record_bytes: int
     columns: int
     points: int
@@ -64,17 +72,42 @@ class _Header(NamedTuple):
     start: int  # byte offset of the data
     lines: int  # number of header lines
 
+    @property
+    def column_names(self) -> frozenset[str]:
+        """Return `Scan.columns`."""
+        return frozenset(self.fields) - set("xyz")
 
-def _block(scan: Scan, columns: list[NDArray[Any]]) -> ScanBlock:
-    """Build a block from the columns x, y, z and optionally intensity, (n,) each; drops NaN points."""
-    xyz = np.stack(columns[:3], axis=1, dtype=np.float64, casting="unsafe")
-    intensity = columns[3].astype(np.float32) if len(columns) > 3 else None
+
+def _read_fields(scan: Scan, header: _Header) -> dict[str, _Field]:
+    """Return the fields that are read."""
+    return {
+        n: field for n, field in header.fields.items() if n in ("x", "y", "z", INTENSITY) or scan.delivers(n)
+    }
+
+
+def _block(scan: Scan, columns: dict[str, NDArray[Any]]) -> ScanBlock:
+    """Build a block from the columns that are read, (n,) each, by name; drops NaN points."""
+    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1, dtype=np.float64, casting="unsafe")
+    block = ScanBlock(
+        xyz,
+        columns[INTENSITY].astype(np.float32) if INTENSITY in columns else None,
+        _unpack_rgb(columns[RGB]) if RGB in columns else None,
+        whole_bytes(columns[CLASSIFICATION]) if CLASSIFICATION in columns else None,
+    )
     hit = np.asarray(~np.isnan(xyz).any(axis=1))
     lost = len(hit) - int(np.count_nonzero(hit))
     if lost:
         scan.dropped[NO_RETURN] = scan.dropped.get(NO_RETURN, 0) + lost
-        xyz, intensity = xyz[hit], None if intensity is None else intensity[hit]
-    return ScanBlock(apply_pose(scan.pose, xyz), intensity)
+        block = block.taken(hit)
+    return block._replace(xyz=apply_pose(scan.pose, block.xyz))
+
+
+def _unpack_rgb(packed: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return colours (n, 3) from numbers 0xAARRGGBB (n,), integers or the bits of float32."""
+    bits = packed.view(np.uint32) if packed.dtype.kind == "f" else packed.astype(np.uint32)
+    return np.stack([bits >> np.uint32(shift) & np.uint32(255) for shift in (16, 8, 0)], axis=1).astype(
+        np.uint8
+    )
 
 
 class BinaryPcd(SeekableScan):
@@ -82,23 +115,22 @@ class BinaryPcd(SeekableScan):
 
     def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
-        self._header = header
+        self._header, self.columns = header, header.column_names
 
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
-        header = self._header
-        names = "xyzi"[: len(header.fields)]
+        header, fields = self._header, _read_fields(self, self._header)
         record = np.dtype(
             {
-                "names": list(names),
-                "formats": [field.type for field in header.fields],
-                "offsets": [field.offset for field in header.fields],
+                "names": list(fields),
+                "formats": [field.type for field in fields.values()],
+                "offsets": [field.offset for field in fields.values()],
                 "itemsize": header.record_bytes,
             }
         )
         with self.path.open("rb") as file:
             file.seek(header.start + start * header.record_bytes)
             for records in read_records(file, self.path, record, stop - start, block_points, "points"):
-                yield _block(self, [records[name] for name in names])
+                yield _block(self, {name: np.ascontiguousarray(records[name]) for name in fields})
 
 
 class CompressedPcd(Scan):
@@ -107,7 +139,7 @@ class CompressedPcd(Scan):
     def __init__(self, path: Path, header: _Header, past: int) -> None:
         """Create the scan; past is the offset of the first byte after the compressed data."""
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
-        self._header, self._past = header, past
+        self._header, self._past, self.columns = header, past, header.column_names
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         from .pcd_lzf import LzfStream  # loads the kernels
@@ -116,24 +148,35 @@ class CompressedPcd(Scan):
         with self.path.open("rb") as file:
             # Decode once to find where the last column begins, then decode all columns side by
             # side, each from its start.
+            fields = _read_fields(self, header)
             streams: dict[int, LzfStream] = {}
             stream, at = LzfStream(self.path, header.start + 8, self._past), 0
-            for field in sorted(header.fields):
+            for field in sorted(fields.values()):
                 # A field of several values stores the values of one point together: read the first
                 # of each.
                 stream.skip(file, field.offset * header.points - at)
                 at = field.offset * header.points
                 streams[field.offset] = stream.fork()
-            sizes = [np.dtype(field.type).itemsize for field in header.fields]
+            sizes = {name: np.dtype(field.type).itemsize for name, field in fields.items()}
             for start in range(0, header.points, block_points):
                 count = min(block_points, header.points - start)
                 yield _block(
                     self,
-                    [
-                        streams[field.offset].read(file, count * size).view(field.type)
-                        for field, size in zip(header.fields, sizes, strict=True)
-                    ],
+                    {
+                        name: streams[field.offset].read(file, count * sizes[name]).view(field.type)
+                        for name, field in fields.items()
+                    },
                 )
+
+
+def _number(rows: NDArray[np.float64], field: _Field) -> NDArray[Any]:
+    """Return one field of rows of text; a packed colour as float32 or an integer."""
+    values = rows[:, field.column]
+    if not field.is_packed:
+        return values
+    if field.type == "<f4":
+        return np.ascontiguousarray(values, np.float32)
+    return np.clip(np.nan_to_num(values), -(1 << 31), (1 << 32) - 1).astype(np.int64)
 
 
 class AsciiPcd(Scan):
@@ -141,12 +184,13 @@ class AsciiPcd(Scan):
 
     def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
-        self._header = header
+        self._header, self.columns = header, header.column_names
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header, seen = self._header, 0
         if not header.points:
             return
+        fields = _read_fields(self, header)
         with self.path.open("rb") as file:
             file.seek(header.start)
             for rows in number_rows(
@@ -156,7 +200,7 @@ class AsciiPcd(Scan):
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
                     part = rows[start : start + block_points]
-                    yield _block(self, [part[:, field.column] for field in header.fields])
+                    yield _block(self, {name: _number(part, field) for name, field in fields.items()})
         if seen < header.points:
             raise _truncated(self.path, f"{seen} points", f"the {header.points} its header declares")
 
@@ -243,11 +287,14 @@ def _read_header(file: BufferedReader, path: Path) -> _Header:
     record_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
     if not 0 < record_bytes <= BLOCK_BYTES:
         raise refuse("COUNT", f"records of at most {BLOCK_BYTES} bytes")
-    wanted = [*"xyz", *(n for n in INTENSITY_NAMES if names.count(n) == 1 and counts[names.index(n)] == 1)]
-    fields = []
-    for name in wanted[:4]:
-        k = names.index(name)
-        offset = sum(size * count for size, count in zip(sizes[:k], counts[:k], strict=True))
-        fields.append(_Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]]))
+    fields: dict[str, _Field] = {}
+    for column, called in {**{axis: (axis,) for axis in "xyz"}, **COLUMN_NAMES}.items():
+        for name in called:
+            if names.count(name) != 1 or counts[k := names.index(name)] != 1 or column in fields:
+                continue
+            if column == RGB and (types[k], sizes[k]) not in PACKED:
+                continue
+            offset = sum(size * count for size, count in zip(sizes[:k], counts[:k], strict=True))
+            fields[column] = _Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]], column == RGB)
     pose = quaternion_pose(path, 0, place[3:], place[:3])
-    return _Header(tuple(fields), record_bytes, sum(counts), width * height, pose, kind, file.tell(), lines)
+    return _Header(fields, record_bytes, sum(counts), width * height, pose, kind, file.tell(), lines)

@@ -7,11 +7,12 @@ one and ASCII vertices into one array of the size that the header claims.
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, stack_channels, whole_bytes
 from ..common.scan import (
     INTENSITY_NAMES,
     Scan,
@@ -38,6 +39,14 @@ class _Header(NamedTuple):
     lines: int  # number of header lines
     ascii: bool
     intensity: str | None  # the property's name
+    rgb: tuple[str, ...]  # names of red, green and blue, or ()
+    classification: str | None
+
+    @property
+    def columns(self) -> frozenset[str]:
+        """Return `Scan.columns`."""
+        held = {INTENSITY: self.intensity, RGB: self.rgb, CLASSIFICATION: self.classification}
+        return frozenset(name for name, here in held.items() if here)
 
 
 class BinaryPly(SeekableScan):
@@ -45,7 +54,7 @@ class BinaryPly(SeekableScan):
 
     def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)
-        self._header = header
+        self._header, self.columns = header, header.columns
 
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         header = self._header
@@ -54,7 +63,7 @@ class BinaryPly(SeekableScan):
             for record in read_records(
                 file, self.path, header.record, stop - start, block_points, "vertices"
             ):
-                yield _block(record, header.intensity)
+                yield _block(self, record, header)
 
 
 def _skip_lines(file: BinaryIO, lines: int) -> None:
@@ -68,7 +77,7 @@ class AsciiPly(Scan):
 
     def __init__(self, path: Path, header: _Header) -> None:
         super().__init__(path, "ply", declared_count=header.points)
-        self._header = header
+        self._header, self.columns = header, header.columns
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header = self._header
@@ -92,17 +101,31 @@ class AsciiPly(Scan):
             ):
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
-                    yield _block(rows.view(row)[start : start + block_points, 0], header.intensity)
+                    yield _block(self, rows.view(row)[start : start + block_points, 0], header)
         if seen < header.points:
             raise _truncated(self.path, seen, header.points)
 
 
-def _block(record: NDArray[np.void], intensity: str | None) -> ScanBlock:
+def _block(scan: Scan, record: NDArray[np.void], header: _Header) -> ScanBlock:
     """Convert vertex records to a block."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("xyz"):
         xyz[:, axis] = record[name]
-    return ScanBlock(xyz, record[intensity].astype(np.float32) if intensity else None)
+    rgb = classes = None
+    if scan.delivers(RGB):
+        # Numbers of a text have the types that the header declares.
+        rgb = stack_channels([_as_declared(record[name], header.record[name]) for name in header.rgb])
+    if scan.delivers(CLASSIFICATION):
+        classes = whole_bytes(record[header.classification])
+    intensity = record[header.intensity].astype(np.float32) if header.intensity else None
+    return ScanBlock(xyz, intensity, rgb, classes)
+
+
+def _as_declared(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return numbers in the type that the header declares, limited to its range."""
+    if kind.kind == "f" or values.dtype == kind:
+        return values
+    return np.clip(np.nan_to_num(values), np.iinfo(kind).min, np.iinfo(kind).max).astype(kind)
 
 
 def open_ply(path: Path) -> list[Scan]:
@@ -178,4 +201,8 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             "check the program that wrote this file",
         )
     intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
-    return _Header(record, count, start, skip, len(lines), ply.text, intensity)
+    colours, of_class = find_columns(record.names)
+    return _Header(
+        record, count, start, skip, len(lines), ply.text, intensity,
+        tuple(record.names[at] for at in colours), None if of_class is None else record.names[of_class],
+    )  # fmt: skip

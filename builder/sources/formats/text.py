@@ -12,6 +12,8 @@ The first lines of the file determine the layout:
   needs no header: its fourth column is the intensity where its rows have 4 or 7 numbers (x y z i, x
   y z i r g b); with 6 the fourth is red. In any other file without a header a fourth column may
   mean anything and is ignored.
+- Colour and class are the columns that the header names red, green, blue (or r, g, b) and
+  classification (or class, label), and the last three numbers of a PTS row of 6 or 7.
 """
 
 from collections.abc import Iterator
@@ -20,6 +22,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
+from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, whole_bytes
 from ..common.scan import INTENSITY_NAMES, Scan, ScanBlock, library_errors, scan_error
 from ..common.text_rows import LONGEST_LINE, is_number, number_rows, split_row
 
@@ -36,6 +39,8 @@ class _Layout(NamedTuple):
     delimiter: str | None
     xyz: tuple[int, int, int]  # column numbers
     intensity: int | None
+    rgb: tuple[int, ...]  # column numbers, or ()
+    classification: int | None
     points: int | None  # the count that the first line declares
 
 
@@ -46,6 +51,13 @@ class TextScan(Scan):
         """Create the scan; layout is None for a file without rows."""
         super().__init__(path, "text", declared_count=layout.points if layout else 0)
         self._layout = layout
+        if layout is not None:
+            held = {
+                INTENSITY: layout.intensity is not None,
+                RGB: bool(layout.rgb),
+                CLASSIFICATION: layout.classification is not None,
+            }
+            self.columns = frozenset(name for name, here in held.items() if here)
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         if self._layout is None:
@@ -63,7 +75,11 @@ class TextScan(Scan):
                     intensity = None
                     if layout.intensity is not None:
                         intensity = part[:, layout.intensity].astype(np.float32)
-                    yield ScanBlock(np.ascontiguousarray(part[:, layout.xyz]), intensity)
+                    rgb = part[:, layout.rgb].astype(np.float32) if self.delivers(RGB) else None
+                    classes = None
+                    if self.delivers(CLASSIFICATION):
+                        classes = whole_bytes(part[:, layout.classification])
+                    yield ScanBlock(np.ascontiguousarray(part[:, layout.xyz]), intensity, rgb, classes)
         if layout.points is not None and seen != layout.points:
             raise scan_error(
                 self.path,
@@ -105,7 +121,12 @@ def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
             count = int(fields[0])
         elif any(map(is_number, fields)):
             return _layout_of(
-                path, fields, delimiter, _Layout(start, line, 0, None, (0, 1, 2), None, count), names, comment
+                path,
+                fields,
+                delimiter,
+                _Layout(start, line, 0, None, (0, 1, 2), None, (), None, count),
+                names,
+                comment,
             )
         elif names is None:
             names = (line, text)
@@ -138,8 +159,12 @@ def _layout_of(
     layout = found._replace(columns=len(fields), delimiter=delimiter)
     called = _split_names(names[1] if names else comment)
     if names is None and (len(called) != len(fields) or not {"x", "y", "z"} <= set(called)):
-        pts_intensity = path.suffix.lower() == ".pts" and len(fields) in (4, 7)
-        return layout._replace(intensity=3 if pts_intensity else None)
+        if path.suffix.lower() != ".pts":
+            return layout
+        n = len(fields)
+        return layout._replace(
+            intensity=3 if n in (4, 7) else None, rgb=(n - 3, n - 2, n - 1) if n in (6, 7) else ()
+        )
     if len(called) != len(fields) or any(called.count(axis) != 1 for axis in "xyz"):
         line, text = names or (0, comment)
         raise scan_error(
@@ -149,7 +174,13 @@ def _layout_of(
             "correct that line",
         )
     intensity = next((called.index(name) for name in INTENSITY_NAMES if name in called), None)
-    return layout._replace(xyz=(called.index("x"), called.index("y"), called.index("z")), intensity=intensity)
+    rgb, classification = find_columns(called)
+    return layout._replace(
+        xyz=(called.index("x"), called.index("y"), called.index("z")),
+        intensity=intensity,
+        rgb=rgb,
+        classification=classification,
+    )
 
 
 def _split_names(text: str) -> list[str]:

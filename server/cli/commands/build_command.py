@@ -56,7 +56,10 @@ def build(
         typer.Option(help="Sample meshes at this spacing [m]; default: take their vertices."),
     ] = None,
     keep: Annotated[
-        str, typer.Option(help="Columns to keep, separated by commas: scan, intensity, normal.")
+        str,
+        typer.Option(
+            help="Columns to keep, separated by commas: scan, intensity, rgb, classification, normal."
+        ),
     ] = "",
     normal_reach: Annotated[
         float,
@@ -192,7 +195,12 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
     with Archive(output) as archive:
         short = summarize_archive(archive)
     if as_json:
-        print_json({**summary._asdict(), "archive": str(summary.archive), "summary": short.as_json()})
+        plain = {
+            "archive": str(summary.archive),
+            "columns": dict(summary.columns),
+            "summary": short.as_json(),
+        }
+        print_json({**summary._asdict(), **plain})
     else:
         print_build(summary)
         print_summary(short)

@@ -1,6 +1,7 @@
 """`solidcloud inspect`: list scans by their headers, and write a scan list for a build."""
 
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -80,12 +81,13 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
         "use": entry.use,
         "fault": entry.fault,
         "warnings": list(entry.warnings),
+        "columns": list(entry.columns),
     }
 
 
 def _lines(entries: "list[ScanEntry]") -> list[str]:
     """Format entries as a table, one line each. The path is last because it may be long."""
-    head = ("format", "points", "low corner", "high corner", "scanner at", "", "scan")
+    head = ("format", "points", "low corner", "high corner", "scanner at", "", "columns", "scan")
     rows = [head, *(_row(entry) for entry in entries)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
     lines = []
@@ -102,7 +104,11 @@ def _lines(entries: "list[ScanEntry]") -> list[str]:
     broken = sum(bool(entry.fault) for entry in entries)
     more = f" and those of {open_ended} scans that do not declare a count" if open_ended else ""
     faults = f", {broken} broken" if broken else ""
-    return [*lines, f"{len(entries)} scans in {files} files{faults}: {known:,} points{more}"]
+    counts = Counter[str]()
+    for entry in entries:
+        counts.update(dict.fromkeys(entry.columns, entry.count or 0))
+    held = "".join(f"; {name} of {count:,}" for name, count in sorted(counts.items()))
+    return [*lines, f"{len(entries)} scans in {files} files{faults}: {known:,} points{more}{held}"]
 
 
 def _row(entry: "ScanEntry") -> tuple[str, ...]:
@@ -118,6 +124,7 @@ def _row(entry: "ScanEntry") -> tuple[str, ...]:
         high,
         "" if entry.pose is None else _place(entry.pose[:3, 3].tolist()),
         ", ".join(other),
+        ", ".join(entry.columns),
         name,
     )
 

@@ -39,7 +39,10 @@ def plan(
     jobs: Annotated[int, typer.Option(help="Worker processes; 0: one per core.")] = 0,
     memory: Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")] = "2GB",
     keep: Annotated[
-        str, typer.Option(help="Columns to keep, separated by commas: scan, intensity, normal.")
+        str,
+        typer.Option(
+            help="Columns to keep, separated by commas: scan, intensity, rgb, classification, normal."
+        ),
     ] = "",
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out broken scans.")] = False,
     measure: Annotated[

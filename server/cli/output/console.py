@@ -70,6 +70,8 @@ def _build_facts(summary: "BuildSummary") -> Iterator[tuple[str, str]]:
         share = summary.level_bytes / max(summary.bytes, 1)
         yield "level", f"level of detail, {bytes_text(summary.level_bytes)}, {share:.1%} of the archive"
     yield "points", f"{summary.points:,} in {summary.voxels:,} voxels, {summary.shards} shards"
+    for name, count in summary.columns.items():
+        yield name, f"of {count:,} points" + ("" if count == summary.points else ", zeros for the others")
     yield (
         "lattice",
         (

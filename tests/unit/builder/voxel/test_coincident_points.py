@@ -21,7 +21,16 @@ from solidcloud.schemas.kernels.morton import morton_code
 PLACE = (77, 5, 901)
 CODE = int(morton_code(*(np.uint64(x) for x in PLACE)))
 BOTH = ("scan_index", "intensity")
-DTYPE = np.dtype([("local", "<i4", (3,)), ("scan_index", "<u2"), ("intensity", "<f4")])
+ALL = (*BOTH, "rgb", "classification")
+DTYPE = np.dtype(
+    [
+        ("local", "<i4", (3,)),
+        ("scan_index", "<u2"),
+        ("intensity", "<f4"),
+        ("rgb", "u1", (3,)),
+        ("classification", "u1"),
+    ]
+)
 
 
 def heap_of(count: int, *, scans: int = 1 << 16, names: tuple[str, ...] = BOTH) -> NDArray:
@@ -36,6 +45,8 @@ def heap_of(count: int, *, scans: int = 1 << 16, names: tuple[str, ...] = BOTH) 
         rows["intensity"][::3] = rng.choice(
             np.array([0, -1, 1e-40, np.inf, -np.inf, np.nan], np.float32), len(rows[::3])
         )
+    for name in {"rgb", "classification"} & set(names):
+        rows[name] = rng.choice(np.array([0, 1, 255], np.uint8), rows[name].shape)
     return rows
 
 
@@ -49,7 +60,9 @@ def windows(rows: NDArray, most: int) -> Iterator[NDArray]:
     return (rows[at : at + most] for at in range(0, len(rows), most))
 
 
-@pytest.mark.parametrize("names", [BOTH, ("scan_index",), ("intensity",), ()], ids=",".join)
+@pytest.mark.parametrize(
+    "names", [ALL, BOTH, ("scan_index",), ("intensity",), ("rgb",), ("classification",), ()], ids=",".join
+)
 @pytest.mark.parametrize("scans", [3, 1 << 16])
 def test_runs_are_merged_in_canonical_order(names: tuple[str, ...], scans: int) -> None:
     rows = heap_of(3000, scans=scans, names=names)

@@ -32,14 +32,15 @@ def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("steps", [1000, 200_000])
 def test_a_voxel_built_in_parts_is_the_voxel(kind: str, steps: int, tmp_path: Path) -> None:
     points = make_steps(kind, 3, 1500, steps)
-    names = ("scan_index", "intensity") if kind in ("corner", "duplicates") else ()
+    names = {
+        "corner": ("scan_index", "intensity"), "duplicates": tuple(COLUMNS), "noise": ("classification",)
+    }.get(kind, ())  # fmt: skip
     rows = rows_of(points, *names)
     config = BuildConfig(cell_points=40, leaf=8, degree=3, with_slab=kind != "pillar")
     classify = hashed if kind == "corner" else None
     whole = VoxelPoints(
-        points, *(rows[name] if name in names else None for name in COLUMNS),
-        hashed(points, range(0)) if classify else None,
-    )  # fmt: skip
+        points, radius_class=hashed(points, range(0)) if classify else None, **{n: rows[n] for n in names}
+    )
     spool = spooled(tmp_path / "spool", rows, steps, [400, 900])
     built = build_dense(KEY, spool, config, bytes(16), tmp_path, classify)
     assert_same(decoded(built, steps), build_voxel(KEY, whole, steps, config))

@@ -43,8 +43,12 @@ def test_classes_are_read_into_lanes_and_those_there_are_none_of_refused() -> No
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("stored", [(), ("intensity",), ("scan_index", "radius_class"), OPTIONAL_COLUMNS])
-@pytest.mark.parametrize("wanted", [(), ("radius_class",), ("scan_index", "intensity"), OPTIONAL_COLUMNS])
+@pytest.mark.parametrize(
+    "stored", [(), ("intensity",), ("scan_index", "radius_class"), ("rgb",), OPTIONAL_COLUMNS]
+)
+@pytest.mark.parametrize(
+    "wanted", [(), ("radius_class",), ("scan_index", "intensity"), ("rgb",), OPTIONAL_COLUMNS]
+)
 def test_columns_that_are_not_wanted_are_not_held(stored: tuple[str, ...], wanted: tuple[str, ...]) -> None:
     points = make_steps("noise", 3, 200, 1000)
     columns = {name: column for name, column in kept(200, 8).items() if name in stored}

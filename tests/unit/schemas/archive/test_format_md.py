@@ -107,6 +107,30 @@ def test_format_md_reads_and_names_an_archive_with_radius_classes(tmp_path: Path
         assert re.search(rf"\b{radius}\b", text), radius
 
 
+def test_format_md_reads_and_names_an_archive_with_colours_and_its_level() -> None:
+    names: dict[str, Callable] = {}
+    exec(compile(worked_example(), str(FORMAT), "exec"), names)
+    folder = Path(__file__).resolve().parents[3] / "golden" / "archive-5"
+    world, rows = names["read_archive"](folder)
+    coloured = np.loadtxt(folder.parent / "scan-3.xyz", skiprows=1)[:, [0, 1, 2, *range(4, 8)]]
+    known = {tuple(row) for row in coloured.tolist()} | {(*row, 0, 0, 0, 0) for row in world.tolist()}
+    found = np.column_stack([world, rows["rgb"], rows["classification"]])
+    assert {(*map(lambda x: round(x, 3), row[:3]), *row[3:]) for row in found.tolist()} <= {
+        (*map(lambda x: round(x, 3), row[:3]), *row[3:]) for row in known
+    }
+    assert np.count_nonzero(found[:, 3:].any(axis=1)) >= 140
+    level, representatives = names["read_archive"](folder / "level")
+    assert 0 < len(level) < len(world)
+    chosen = np.column_stack([level, representatives["rgb"], representatives["classification"]])
+    assert {tuple(row) for row in chosen.tolist()} <= {tuple(row) for row in found.tolist()}
+    text = FORMAT.read_text()
+    for root in (folder, folder / "level"):
+        with h5py.File(root / "index.h5") as index, h5py.File(root / "shards" / shard_name(0)) as shard:
+            assert index.attrs["format_version"] == shard.attrs["format_version"] == 5
+            for name in (*index, *rows.dtype.names):
+                assert f"`{name}`" in text, name
+
+
 def test_format_md_reads_and_names_an_archive_of_several_generations() -> None:
     names: dict[str, Callable] = {}
     exec(compile(worked_example(), str(FORMAT), "exec"), names)

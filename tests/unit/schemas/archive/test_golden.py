@@ -22,7 +22,7 @@ GOLDEN = Path(__file__).resolve().parents[3] / "golden"
 
 
 # The archives of each format version, and how many of the scans went into them.
-SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-4": 3}
+SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-4": 3, "archive-5": 4}
 NORMAL_REACH = {"archive-4": 0.3}
 
 
@@ -78,17 +78,25 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
             cells = np.column_stack([data.cells.low, data.cells.log2_size])
             assert cells.tolist() == voxel["cells"]
             assert (None if data.normal is None else data.normal.tolist()) == voxel.get("normals")
+            assert (None if data.rgb is None else data.rgb.tolist()) == voxel.get("rgb")
+            assert (None if data.classification is None else data.classification.tolist()) == voxel.get(
+                "classes"
+            )
 
 
 def golden_points(folder: Path) -> np.ndarray:
-    """Lattice point, scan and intensity of every point of an archive, (n, 5), in an order of their own."""
+    """Lattice point, scan and intensity of every point of an archive, (n, 5), in an order of their own.
+
+    With colours, these and the class follow, (n, 9).
+    """
     rows = []
     with Archive(folder) as archive:
         for row in range(len(archive.voxels)):
             voxel, links = archive.read_voxel(row)
             local = voxel_points(voxel, links)
             lattice = local + archive.coordinates[row] * archive.header.lattice.voxel_steps
-            rows.append(np.column_stack([lattice, voxel.scan_index, voxel.intensity]))
+            more = [c for c in (voxel.rgb, voxel.classification) if c is not None]
+            rows.append(np.column_stack([lattice, voxel.scan_index, voxel.intensity, *more]))
     table = np.concatenate(rows)
     return table[np.lexsort(table.T)]
 
@@ -148,7 +156,10 @@ def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: d
         steps = np.rint((rows[:, :3] - [512345, 5612345, -0.25]) * 1000)
         lows.append(steps.min(axis=0))
         if count:  # not removed
-            tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3]]))
+            more = np.zeros((len(rows), 4 if name == "archive-5" else 0))
+            if rows.shape[1] == 8:
+                more = rows[:, 4:]
+            tables.append(np.column_stack([steps, np.full(len(rows), number), rows[:, 3], more]))
     table = np.concatenate(tables)
     table[:, :3] -= np.min(lows[:built], axis=0)
     assert np.array_equal(golden_points(GOLDEN / name), table[np.lexsort(table.T)])
@@ -162,6 +173,8 @@ def test_a_build_today_gives_the_golden_points_and_cells(
         voxel=1.0, resolution=0.001, leaf=8, degree=3, cell_points=40, keep=frozenset({"scan", "intensity"}), jobs=1,
         models=frozenset(expected.get("models", ["mean"])),
     )  # fmt: skip
+    if name == "archive-5":
+        config = replace(config, keep=config.keep | {"rgb", "classification"})
     if name in NORMAL_REACH:
         config = replace(config, keep=config.keep | {"normal"}, normal_reach=NORMAL_REACH[name])
     scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]

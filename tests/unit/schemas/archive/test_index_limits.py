@@ -110,6 +110,8 @@ CHANGES: dict[str, tuple[Change, str]] = {
     "three flags": (other("columns", np.array([1, 1, 0], "u1")), "columns .*expected 2 flags"),
     "four flags without classes": (other("columns", np.array([1, 1, 0, 0], "u1")), "columns .*expected 2 flags"),
     "five flags without normals": (other("columns", np.array([1, 1, 0, 0, 0], "u1")), "columns .*expected 2 flags"),
+    "seven flags without colours": (other("columns", np.array([1, 1, 0, 0, 0, 0, 0], "u1")), "columns .*expected 2"),
+    "colours of another version": (other("columns", np.array([1, 1, 0, 0, 0, 1, 0], "u1")), "format_version 1.*5"),
     "classes that are not there": (other("columns", np.array([1, 1, 1, 0], "u1")), "datasets .*those of columns"),
     "a later generation in part": (other("generation", np.array([1], "<u4")), "datasets .*those of columns"),
     "a later version": (

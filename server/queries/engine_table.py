@@ -29,11 +29,12 @@ from ..residency.coarse_bounds import drop_clear_pairs
 from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import EXACT, QueryBudget
+from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, check_request
 from .context.unloaded_voxels import bound_missing
 from .distance import distance
 from .objects import objects
+from .raycast import ask_level as bound_by_level
 from .raycast import raycast
 from .resident_fast_path import collide_fast
 from .sweep import sweep
@@ -117,6 +118,12 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             np.zeros((3, 1), np.uint32),
             EXACT,
         )
+    if part == RAYCAST.name and data.level is not None:
+        spent = CostCounter(0.0, data.residency, data.broad.keys)
+        origin = np.zeros((1, 3), np.int64)
+        bound_by_level(data.level, origin, samples["directions"], 1 << 20, EXACT, spent)
+    if part == WITHIN.name and data.level is not None:  # the level is asked as by an avatar of one point
+        run(DISTANCE, EXACT)
     if part == COLLIDE.name and data.coarse is not None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
         reach = check_request(data, avatar, pose, data.radius_units)

@@ -120,7 +120,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @njit_no_refcount
-def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys):
+def _search(scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
     near: exact units, as in VoxelLists. A bound of a node holds for its children; no bound
@@ -145,12 +145,12 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
     rows[0], depth = base, 1
     bounds[0] = max(_below_node(words, base, x, y, z, np.inf)[0], near * per_unit + error)
     nearest = math.sqrt(np.float64(limit))
+    allowed = max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0
     while depth > 0:
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        far = bound > nearest - (tolerance if best.square[i] >= 0 else 0.0)
-        if far or spent >= visits or stopped(scene.stop):
+        if bound > nearest - allowed or spent >= visits or stopped(scene.stop):
             if bound <= nearest:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
@@ -159,6 +159,7 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
             tests += LANES
             limit = _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit)
             nearest = math.sqrt(np.float64(limit))
+            allowed = max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0
             continue
         spent += ints[row + COUNT] & COUNTED
         begin = depth
@@ -188,12 +189,12 @@ def _search(scene, voxel, at_units, i, near, tolerance, visits, best, limit, row
 
 
 @nb.njit(nogil=True, cache=True)
-def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits, best):
+def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share, visits, best):
     """Search for the scan points nearest to k query points, along their lists.
 
     Each search runs up to the first voxel that is not held.
-    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. Other arguments as in
-    `rays.follow_rays`.
+    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS.  share: of the distance of
+    the point found, allowed beside the tolerance. Other arguments as in `rays.follow_rays`.
     """
     rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for i in range(cursor.shape[0]):
@@ -203,7 +204,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
             nearest = math.sqrt(np.float64(limit)) * (1.0 + 2.0**-52)
-            far = near > nearest - (tolerance if best.square[i] >= 0 else 0.0)
+            far = near > nearest - (max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0)
             if far or best.counts[1, i] >= visits or stopped(scene.stop):
                 if near <= nearest:
                     best.unseen[i] = min(best.unseen[i], near)
@@ -216,6 +217,6 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, visits
                 best.unseen[i] = min(best.unseen[i], near)
             else:
                 limit = _search(
-                    scene, voxel, at_units, i, near, tolerance, visits, best, limit, rows, bounds, keys
+                    scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys
                 )  # fmt: skip
             cursor[i] = at + 1

@@ -63,7 +63,7 @@ def distance(
     def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
         if len(data.arrays.radius_deficit) > 1:  # the level does not know the radius of its points
             return np.zeros(len(which), bool)
-        of_level = search_level(level, avatar, array[which], reach_units, budget, spent)
+        of_level = _search_level(level, avatar, array[which], reach_units, budget, spent)
         settled = _settled(of_level, reach_units, budget)
         for column, own in zip(found, of_level.pairs, strict=True):
             column[which[settled]] = own[settled]
@@ -132,7 +132,7 @@ def _pairs(
     return nearest, counts, around
 
 
-class LevelDistances(NamedTuple):
+class _LevelDistances(NamedTuple):
     """Result of a search of the level for k poses.
 
     pairs: the nearest representatives; their `missing_bound` is `lower` in steps.
@@ -149,14 +149,14 @@ class LevelDistances(NamedTuple):
     reach: VoxelsInReach
 
 
-def search_level(
+def _search_level(
     level: LevelOfDetail,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
     reach_units: int,
     budget: QueryBudget,
     spent: CostCounter,
-) -> LevelDistances:
+) -> _LevelDistances:
     """Search the level of a scene with a single radius under poses (k, 4, 4)."""
     exact, own = level_budget(budget), spent.of_level(level.covers.residency)
     covered, _, reach = _pairs(level.covers, avatar, poses, reach_units, exact, own)
@@ -173,7 +173,7 @@ def search_level(
     pairs.deficit[:] = 0
     pairs.missing_bound[:] = lower / level.covers.arrays.units_per_step * (1.0 - 1e-12)
     radii = reach.units - reach_units - covers + scene
-    return LevelDistances(pairs, nearest, lower, radii, reach)
+    return _LevelDistances(pairs, nearest, lower, radii, reach)
 
 
 def _lengths(pairs: NearestPairs) -> NDArray[np.float64]:
@@ -182,7 +182,7 @@ def _lengths(pairs: NearestPairs) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(square), np.float64)
 
 
-def _settled(found: LevelDistances, reach_units: int, budget: QueryBudget) -> NDArray[np.bool_]:
+def _settled(found: _LevelDistances, reach_units: int, budget: QueryBudget) -> NDArray[np.bool_]:
     """Return which poses (k,) the level answers within the tolerance, or without any pair in reach."""
     with np.errstate(invalid="ignore"):  # no pair within reach: inf - inf, or no share of inf
         allowed = np.fmax(budget.between_bounds * UNITS_PER_METRE, budget.relative * found.lower)
@@ -206,7 +206,7 @@ def _with_level_distances(
     array, reach_units = kernel_poses(poses)[which], to_units(reach, "reach")
     spent = CostCounter(0.0, data.residency, data.broad.keys)
     level = stoppable(data.level, budget)
-    found = asked(lambda: search_level(level, avatar, array, reach_units, budget, spent))
+    found = asked(lambda: _search_level(level, avatar, array, reach_units, budget, spent))
     if found is None:
         return answers
     if data.nothing_clear:

@@ -1,7 +1,7 @@
 """Query `within`: the scan point nearest to each query point."""
 
+import math
 import time
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,17 +9,15 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
-from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import VoxelLists
 from ..kernels.rays.rays import ClosestHits
-from ..kernels.rays.within_point import search_points
-from .context.front_to_back import make_best, make_origins, search_front_to_back, verdict_and_bounds
+from ..kernels.rays.within_point import bound_points, search_points
+from .context.front_to_back import make_origins, search_front_to_back, verdict_and_bounds
 from .context.level_hits import HitsByLevel, LevelHits, found_units
-from .context.level_of_detail import without_radii
+from .context.level_of_detail import level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import LevelOfDetail, SceneData, to_units
-from .distance import search_level
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT) -> WithinAnswers:
@@ -32,40 +30,17 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
     nearest one by as much as it allows. Raise BadRequestError.
     """
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    world, units = make_origins(data, points, "points")
+    _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
         raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
-    tolerance = budget.between_bounds * UNITS_PER_METRE
-    # Nothing nearer than a share 1 / (1 + e) of a distance: this leaves it within e of the nearest.
-    share = budget.relative / (1.0 + budget.relative) * (1.0 - 1e-12)
-
-    def kernel(
-        first: int,
-        last: int,
-        lists: VoxelLists,
-        cursor: NDArray[np.int64],
-        held: NDArray[np.bool_],
-        best: ClosestHits,
-    ) -> None:
-        search_points(
-            units[first:last],
-            reach_units,
-            lists,
-            cursor,
-            held,
-            data.arrays,
-            tolerance,
-            share,
-            budget.visits,
-            best,
-        )
 
     def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> LevelHits:
-        return ask_level(data, level, world[which], units[which], reach_units, budget, spent)
+        return ask_level(level, data.radius_units, units[which], reach_units, budget, spent)
 
-    level = HitsByLevel(data, len(units), reach_units, budget, (tolerance, budget.relative), ask)
-    best = search_front_to_back(data, units, None, reach_units, 0, budget, kernel, spent, level)
+    allowed = budget.between_bounds * UNITS_PER_METRE, budget.relative
+    level = HitsByLevel(data, len(units), reach_units, budget, allowed, ask)
+    best = _nearest(data, units, reach_units, budget, spent, level)
     verdict, lower, upper, exact = verdict_and_bounds(found_units(best), best.unseen, reach_units)
     cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
     touched = best.square >= 0
@@ -81,33 +56,63 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
     )  # fmt: skip
 
 
-def ask_level(
+def _nearest(
     data: SceneData,
+    units: NDArray[np.int64],
+    reach_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+    level: HitsByLevel | None = None,
+) -> ClosestHits:
+    """Return the scan points nearest to points (k, 3)."""
+    tolerance = budget.between_bounds * UNITS_PER_METRE
+    # Nothing nearer than 1 / (1 + e) of a distance: this leaves it within the share e of the nearest.
+    share = budget.relative / (1.0 + budget.relative) * (1.0 - 1e-12)
+
+    def kernel(
+        first: int,
+        last: int,
+        lists: VoxelLists,
+        cursor: NDArray[np.int64],
+        held: NDArray[np.bool_],
+        best: ClosestHits,
+    ) -> None:
+        part = units[first:last]
+        search_points(
+            part, reach_units, lists, cursor, held, data.arrays, tolerance, share, budget.visits, best
+        )
+
+    return search_front_to_back(data, units, None, reach_units, 0, budget, kernel, spent, level)
+
+
+def ask_level(
     level: LevelOfDetail,
-    world: NDArray[np.float64],
+    radius_units: int,
     units: NDArray[np.int64],
     reach_units: int,
     budget: QueryBudget,
     spent: CostCounter,
 ) -> LevelHits:
-    """Bound the distances of points from the scene by those from its level, as of an avatar of one point.
+    """Bound the distances of points (n, 3) from a scene by those from its level.
 
-    world, units: (n, 3) points, world [m] and exact units.
+    radius_units: of the scene's largest sphere, for which the level's cover spheres are made.
     """
-    poses = np.tile(np.eye(4), (len(world), 1, 1))
-    poses[:, :3, 3] = world
-    bare = without_radii(level, data.radius_units)
-    near = min(reach_units, MAX_REACH_UNITS - bare.covers.radius_units)
-    found = search_level(bare, _one_point(), poses, near, budget, spent)
-    best = make_best(len(world))
-    best.lattice[:] = found.pairs.pair[:, :3]
-    away = np.rint(best.lattice * data.arrays.units_per_step).astype(np.int64) - units
-    square = (away * away).sum(axis=1)
-    near_enough = (found.pairs.square >= 0) & (square <= reach_units**2)
-    best.square[near_enough] = square[near_enough]
-    return LevelHits(best, found.lower)
+    exact, own = level_budget(budget), spent.of_level(level.covers.residency)
+    covers, least = level.covers, float(level.covers.radius_units - radius_units)
 
+    def bound(
+        first: int,
+        last: int,
+        lists: VoxelLists,
+        cursor: NDArray[np.int64],
+        held: NDArray[np.bool_],
+        best: ClosestHits,
+    ) -> None:
+        bound_points(units[first:last], reach_units, least, lists, cursor, held, covers.arrays, best)
 
-@cache
-def _one_point() -> AvatarModel:
-    return make_avatar(np.zeros((1, 3)), 0.0)
+    # Points of the scene may lie outside of the boxes around their representatives.
+    covered = search_front_to_back(covers, units, None, reach_units + math.ceil(least), 0, exact, bound, own)
+    best = _nearest(level.points, units, reach_units, exact, own)
+    spent.add_level(own)
+    lower = np.minimum(covered.value - 1.0, covered.unseen - least)
+    return LevelHits(best, np.maximum(lower, 0.0))

@@ -123,16 +123,16 @@ def test_bounds_hold_and_are_close_enough(
 
 
 @pytest.mark.case(
-    41, "a dense wall: rays and points within 10 cm need no voxel, nor do rays that miss; all are right"
+    41, "a dense wall: rays and points within 20 cm need no voxel, nor do rays that miss; all are right"
 )
 @pytest.mark.interpreted
 def test_a_dense_wall_is_hit_without_its_voxels(tmp_path: Path, rng: np.random.Generator) -> None:
     wall = rng.uniform(0, 1, (6000, 3)) * [2.0, 0.003, 2.0]
-    case = archive_cases.build(tmp_path, wall, radius=0.1, voxel=1.0)
+    case = archive_cases.build(tmp_path, wall, radius=0.15, voxel=1.0)
     origins = np.array([(x, -1.0, z) for x in (0.5, 1.0, 1.5) for z in (0.5, 1.0)])
     across, along = np.tile([0.0, 1.0, 0.0], (6, 1)), np.tile([1.0, 0.0, 0.0], (6, 1))
     with Scene.open(case.archive) as scene:
-        loose = scene.raycast(origins, across, 5.0, tolerance=0.15)
+        loose = scene.raycast(origins, across, 5.0, tolerance=0.2)
         near = scene.within(origins, 2.0, tolerance=0.1)
         missed = scene.raycast(origins + np.array([0.0, 0.8, 0.0]), along, 5.0, tolerance=0.1)
         share = scene.within(origins, 2.0, relative_tolerance=0.1)
@@ -144,4 +144,4 @@ def test_a_dense_wall_is_hit_without_its_voxels(tmp_path: Path, rng: np.random.G
     for found, right in ((loose, exact), (near, true), (share, true)):
         assert (found.verdict == Verdict.CONTACT).all() and not found.exact.any()
         assert (found.lower <= right.distance).all() and (right.distance <= found.upper).all()
-        assert (found.upper - found.lower <= 0.15 + ROUNDED).all()
+        assert (found.upper - found.lower <= 0.2 + ROUNDED).all()

@@ -65,18 +65,6 @@ def with_level(data: SceneData, level: LevelData | None) -> SceneData:
     return data._replace(level=LevelOfDetail(covers, points, level.settles_exact))
 
 
-def without_radii(level: LevelOfDetail, radius_units: int) -> LevelOfDetail:
-    """Return the level of the same scene if its points had no radii.
-
-    radius_units: of the scene's largest sphere, for which the level was made.
-    """
-    covers, points = level.covers, level.points
-    return level._replace(
-        covers=covers._replace(radius_units=covers.radius_units - radius_units),
-        points=points._replace(radius_units=0),
-    )
-
-
 class SettledPoses:
     """Poses of one request that its scene's level settles.
 

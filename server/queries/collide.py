@@ -113,19 +113,33 @@ def _level_verdicts(
 
     CLEAR and CONTACT are those of the scene, EARLY is a pair within margin plus tolerance.
     """
-    exact, own = level_budget(budget), spent.of_level(level.covers.residency)
     verdict = np.full(len(poses), UNKNOWN, np.uint8)
-    covered, _, reach = _verdicts(level.covers, avatar, poses, margin_units, exact, own)
-    lost = in_unknown(reach.boxes, level.covers.unknown, level.covers.nothing_clear)
-    clear = (covered == CLEAR) & ~lost
+    clear = clear_by_level(level, avatar, poses, margin_units, budget, spent)
     verdict[clear] = CLEAR
     left = np.flatnonzero(~clear)
     if len(left):
+        exact, own = level_budget(budget), spent.of_level(level.covers.residency)
         within = margin_units + budget.tolerance_units
         touched, _, _ = _verdicts(level.points, avatar, poses[left], within, exact, own)
         verdict[left[touched == CONTACT]] = EARLY if budget.tolerance_units else CONTACT
-    spent.add_level(own)
+        spent.add_level(own)
     return verdict
+
+
+def clear_by_level(
+    level: LevelOfDetail,
+    avatar: AvatarModel,
+    poses: NDArray[np.float64],
+    margin_units: int,
+    budget: QueryBudget,
+    spent: CostCounter,
+) -> NDArray[np.bool_]:
+    """Return which poses (k,) the level proves clear of the scene."""
+    own = spent.of_level(level.covers.residency)
+    covered, _, reach = _verdicts(level.covers, avatar, poses, margin_units, level_budget(budget), own)
+    spent.add_level(own)
+    lost = in_unknown(reach.boxes, level.covers.unknown, level.covers.nothing_clear)
+    return np.asarray((covered == CLEAR) & ~lost)
 
 
 def _with_level_verdicts(

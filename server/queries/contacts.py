@@ -42,8 +42,11 @@ from ..kernels.core.node_overlap import STACK
 from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
+from .collide import clear_by_level
+from .context.level_of_detail import SettledPoses, asked, stoppable
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
+    LevelOfDetail,
     SceneData,
     as_held,
     find_proved_reach,
@@ -88,8 +91,10 @@ def contacts(
     The deepest pair has the least |a - b| - r_a - r_b, with r_b of the scan point's own sphere,
     compared exactly and not by the rounded figure. Each of several coincident points forms a pair.
     Ties are ordered by scan point, avatar centre, avatar row, scan number.
-    budget: a budget may leave pairs out; `exact` is then false, and the listed pairs are in contact
-    but may not be the deepest. A tolerance has no effect: it cannot end a count earlier.
+    budget: a budget may leave pairs out; `exact` is then false, the pairs counted are the least
+    number, and the listed ones are in contact but may not be the deepest. With a tolerance, and
+    where voxels are late, the scene's level of detail may prove a pose clear without them; pairs
+    are counted exactly all the same, because a count cannot end early (DESIGN.md, "Tolerance").
     The verdict is CONTACT if a pair was found; otherwise CLEAR, or UNKNOWN if not everything in
     reach was examined. Raise BadRequestError, BadTransformError, TooLargeError.
     """
@@ -99,7 +104,13 @@ def contacts(
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
     spent = CostCounter(begin, data.residency, data.broad.keys)
-    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
+
+    def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return clear_by_level(level, avatar, array[which], margin_units, budget, spent)
+
+    by_level = SettledPoses(data, array, budget, ask)
+    other_units = data.radius_units + margin_units
+    reach = find_proved_reach(data, avatar, array, other_units, budget, spent, by_level.drop)
     k = len(array)
     tally = ContactResults(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
@@ -107,7 +118,7 @@ def contacts(
     memory = _empty_memory(limit)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        asked = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MAX_CELLS)
+        options = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MAX_CELLS)
         parts = list(pieces(reach, data.residency, budget.share, budget.stop))
         for number, (which, rows, part) in enumerate(parts):
             # A pose that is split over several pieces is alone in each, and the pieces are
@@ -116,13 +127,20 @@ def contacts(
                 number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
             )
             if budget.spent:
-                memory = _gather(data, avatar, array, part, which, asked, closes, budget, memory, tally)
+                memory = _gather(data, avatar, array, part, which, options, closes, budget, memory, tally)
                 continue
             with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
-                memory = _gather(seen, avatar, array, part, which, asked, closes, budget, memory, tally)
+                memory = _gather(seen, avatar, array, part, which, options, closes, budget, memory, tally)
             spent.add(held)
     columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
+    verdict, exact = columns["verdict"], columns["exact"]
+    late = np.flatnonzero((verdict == Verdict.UNKNOWN) & (columns["voxels_missing"] > 0))
+    if data.level is not None and budget.deadline < math.inf and len(late) and not budget.stop:
+        level = stoppable(data.level, budget)
+        clear = asked(lambda: ask(level, late))
+        if clear is not None and not data.nothing_clear:
+            verdict[late[clear]], exact[late[clear]] = Verdict.CLEAR, True
     return ContactsAnswers(**columns, **spent.fields())
 
 
@@ -167,7 +185,7 @@ def _gather(
     poses: NDArray[np.float64],
     part: VoxelsInReach,
     which: NDArray[np.int64],
-    asked: ContactOptions,
+    options: ContactOptions,
     closes: bool,
     budget: QueryBudget,
     memory: ContactState,
@@ -182,9 +200,9 @@ def _gather(
     pause = SIZE_VISITS if budget.deadline == math.inf else SLICE_VISITS
     while memory.cursor[0] < len(which):
         if budget.spent:
-            asked = asked._replace(visits=-1)
+            options = options._replace(visits=-1)
         memory = gather_contacts(
-            poses, avatar.arrays, data.arrays, part, which, asked, closes, pause, memory, tally
+            poses, avatar.arrays, data.arrays, part, which, options, closes, pause, memory, tally
         )
         _check_room(memory)
     return memory

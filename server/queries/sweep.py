@@ -16,9 +16,9 @@ from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
-from .context.level_of_detail import asked, level_budget, stoppable
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
+from .sweep_by_level import DEFAULT_TOLERANCE, SweepsByLevel, cold_motions
 
 # Motions of one kernel call if there is a deadline, which is checked between calls.
 _PER_CALL = 64
@@ -106,7 +106,7 @@ def sweep(
     pose_from: ArrayLike,
     pose_to: ArrayLike,
     margin: float = 0.0,
-    tolerance: float = 1e-6,
+    tolerance: float = DEFAULT_TOLERANCE,
     budget: QueryBudget = EXACT,
 ) -> SweepAnswers:
     """Find the first contact of the avatar with the scene on the screw motion between two poses.
@@ -124,16 +124,27 @@ def sweep(
     distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
     A motion that is clear with a budget of visits is clear with a larger one. A contact found may
     be lost with a larger budget, which may be spent on an unresolved place before it.
-    Where voxels are late, the scene's level of detail may prove more of a motion clear.
+    If the budget has a tolerance, or where voxels are late, the scene's level of detail is asked
+    before they are loaded: how far the motion is clear, and whether a contact is near enough to
+    that place.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget)
+
+    def ask(
+        scene: SceneData,
+        begin: NDArray[np.float64],
+        end: NDArray[np.float64],
+        within: float,
+        own: QueryBudget,
+    ) -> SweepAnswers:
+        return _sweep(scene, avatar, begin, end, margin, within, own, None)
+
+    level = SweepsByLevel(data, max(tolerance, budget.tolerance), budget, ask)
+    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, level)
     which = np.flatnonzero((answers.verdict == Verdict.UNKNOWN) & (answers.voxels_missing > 0))
-    if data.level is None or budget.deadline == np.inf or not len(which) or budget.stop or data.nothing_clear:
+    if budget.deadline == np.inf or not len(which) or budget.stop:
         return answers
-    covers = stoppable(data.level, budget).covers
-    first, last = kernel_poses(pose_from)[which], kernel_poses(pose_to)[which]
-    found = asked(lambda: _sweep(covers, avatar, first, last, margin, tolerance, level_budget(budget)))
+    found = level.find_clear(kernel_poses(pose_from)[which], kernel_poses(pose_to)[which])
     if found is None:
         return answers
     lower, verdict, exact = answers.lower.copy(), answers.verdict.copy(), answers.exact.copy()
@@ -151,8 +162,9 @@ def _sweep(
     margin: float,
     tolerance: float,
     budget: QueryBudget,
+    level: SweepsByLevel | None,
 ) -> SweepAnswers:
-    """Answer `sweep` from the voxels of the scene alone."""
+    """Answer `sweep` from the voxels of the scene, and before they are loaded from its level."""
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
@@ -165,6 +177,7 @@ def _sweep(
     k = len(first)
     other_units = data.radius_units + to_units(margin, "margin")
     scales, units, loose = _check(data, avatar, first, last, other_units)
+    world = first, last
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
@@ -179,6 +192,7 @@ def _sweep(
     starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
     which = np.arange(k)
     asked: set[int] = set()  # rows loaded to prove the index
+    by_level: NDArray[np.bool_] = np.zeros(k, bool)  # motions about which the level was asked
     # A round plans the next segment of each unfinished motion, loads the voxels that only the index
     # excludes, and advances the motions through the segment's voxels, piece by piece.
     while len(which):
@@ -191,6 +205,15 @@ def _sweep(
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
             continue
+        if level is not None and level.before_loads:
+            cold = cold_motions(data, starts, rows, by_level)
+            if len(cold):
+                by_level[cold] = True
+                progress.at[:] = begun
+                settled = level.settle(cold, *world, progress, proved, tolerance)
+                progress.witness[settled] -= origin
+                which = np.setdiff1d(which, settled)
+                continue
         if unproved and bounds.unsettled(rows[:needed], unproved).any():
             # By the boxes of the index some may be out of reach, which changes the segments.
             by_index = progress._replace(

@@ -13,21 +13,13 @@ import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged_distance import judge_collide, judge_distance
+from levels_in_memory import level_bytes
 from point_clouds import KINDS, TREES, cloud
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.scene import Scene
 
 MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0.5")
 TOLERANCES = (0.0, 2.0**-26, 3e-3, 0.05, 0.4, 20.0)
-
-
-def level_bytes(folder: Path) -> int:
-    """The bytes of all voxels of the level of an archive in memory."""
-    with Scene.open(folder, coarse_bytes=1 << 26) as scene, scene.archives[0].take() as opened:
-        level = opened._level
-        assert level is not None and level.fits
-        return sum(ArenaBuffer.rounded(int(size)) for size in level.store.sizes)
 
 
 @pytest.mark.case(

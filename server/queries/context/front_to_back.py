@@ -8,6 +8,7 @@ the cache's budget.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from ...kernels.core.voxel_tree import VoxelLists, VoxelTree, list_voxels
 from ...kernels.rays.rays import ClosestHits
 from ...residency.index_proof import ENTRIES_AT_ONCE
 from ...runtime.stop_flag import StopFlag
+from .level_hits import HitsByLevel, found_units
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, prove
 
@@ -80,6 +82,7 @@ def search_front_to_back(
     budget: QueryBudget,
     kernel: Callable[..., Any],
     spent: CostCounter,
+    level: HitsByLevel | None = None,
 ) -> ClosestHits:
     """Answer k rays (direction (k, 3)) or query points (direction None) in rounds.
 
@@ -87,6 +90,7 @@ def search_front_to_back(
     radius of a voxel.
     kernel(begin, end, lists, cursor, held, best) searches as far as the held voxels allow; see
     `kernels.rays.follow_rays`.
+    level: asked about rays whose next voxel is not resident, and about those that a deadline left.
     `unseen` of the result bounds what a deadline left unfinished. Add the cost to `spent`.
     """
     k = len(at_units)
@@ -108,6 +112,8 @@ def search_front_to_back(
             part.unseen[:] = 0.0
         cursor = lists.starts[:-1].copy()
         looked: NDArray[np.bool_] = np.zeros(len(data.arrays.where), bool)
+        settled: NDArray[np.bool_] = np.zeros(end - begin, bool)
+        clear_until = np.zeros(end - begin)
         while (open_ := cursor < lists.starts[1:]).any():
             if budget.spent:
                 part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
@@ -118,11 +124,23 @@ def search_front_to_back(
                 # boxes, and finally examine the voxels that they exclude.
                 doubts = lists
                 _forget(part)
+                settled[:], clear_until[:] = False, 0.0
+                if level is not None:
+                    level.forget(begin, end)
                 lists = _list(data, index_tree, *ways, reach_units, radius_units, part)
                 if data.nothing_clear:
                     part.unseen[:] = 0.0
                 cursor = lists.starts[:-1].copy()
                 continue
+            if level is not None and level.before_loads and (data.arrays.where[rows, 0] < 0).any():
+                ahead = np.flatnonzero(open_)
+                cold = ahead[data.arrays.where[lists.rows[cursor[ahead]], 0] < 0]
+                done = level.settle(begin, cold, part)
+                settled[done] = True
+                cursor[done] = lists.starts[done + 1]
+                clear_until[:] = level.clear_until[begin:end]
+                if len(done) + _pass_clear(data, lists, cursor, cold, clear_until, *ways, radius_units):
+                    continue
             held = np.zeros(len(looked), bool)
             held[rows] = True
             with data.residency.hold(
@@ -133,8 +151,12 @@ def search_front_to_back(
             spent.add(found, int(looked[rows].sum()))
             looked |= held
         if doubts is not None:
-            _settle_doubts(data, doubts, lists, part, reach_units, budget, spent)
+            clear_until[settled] = np.inf
+            beyond = partial(_leaves_after, data, *ways, radius_units, clear_until)
+            _settle_doubts(data, doubts, lists, part, beyond, reach_units, budget, spent)
         best.counts[:, begin:end] = part.counts
+    if level is not None and not budget.stop:
+        level.bound_late(best)
     if data.nothing_clear:  # a load may have proved the index wrong
         best.unseen[:] = 0.0
     return best
@@ -171,6 +193,7 @@ def _settle_doubts(
     doubts: VoxelLists,
     lists: VoxelLists,
     part: ClosestHits,
+    beyond: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]],
     reach_units: int,
     budget: QueryBudget,
     spent: CostCounter,
@@ -178,13 +201,13 @@ def _settle_doubts(
     """Load the voxels that only the index excludes, unless something was found before their cells.
 
     doubts: voxels that rays or points reach by proved boxes and cells.  lists: those reached by the
-    index, already examined. A voxel that cannot be read is counted as missing in `part`. If the
-    budget's stop flag is set, everything in `part` is unknown.
+    index, already examined.  beyond: function of rays and rows, `_leaves_after`. A voxel that cannot
+    be read is counted as missing in `part`. If the budget's stop flag is set, everything in `part` is
+    unknown.
     """
     proved, v = data.bounds.proved, len(data.bounds.proved)
-    found = np.where(part.square >= 0, np.sqrt(np.maximum(part.square, 0)), part.value)
-    until = np.minimum(np.minimum(found, part.unseen), reach_units)
-    open_ = _open_doubts(doubts, until, proved, budget.stop)
+    until = np.minimum(np.minimum(found_units(part), part.unseen), reach_units)
+    open_ = _open_doubts(doubts, until, proved, beyond, budget.stop)
     if budget.stop:
         part.unseen[:] = 0.0
         return
@@ -208,11 +231,16 @@ def _settle_doubts(
 
 
 def _open_doubts(
-    doubts: VoxelLists, until: NDArray[np.float64], proved: NDArray[np.bool_], stop: StopFlag
+    doubts: VoxelLists,
+    until: NDArray[np.float64],
+    proved: NDArray[np.bool_],
+    beyond: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]],
+    stop: StopFlag,
 ) -> NDArray[np.int64]:
     """Return the entries of `doubts`, ascending, with an unproved voxel no farther than `until`.
 
-    until: (k,) of each ray [exact units].  stop: once it is set, the result may be incomplete.
+    until: (k,) of each ray [exact units].  beyond: `_leaves_after`, of rays and rows.  stop: once it
+    is set, the result may be incomplete.
     """
     entries, found = int(doubts.starts[-1]), [np.empty(0, np.int64)]
     for begin in range(0, entries, ENTRIES_AT_ONCE):
@@ -221,8 +249,70 @@ def _open_doubts(
         end = min(begin + ENTRIES_AT_ONCE, entries)
         at = begin + np.flatnonzero(~proved[doubts.rows[begin:end]])
         ray = np.searchsorted(doubts.starts, at, side="right") - 1
-        found.append(at[doubts.near[at] <= until[ray]])
+        near = doubts.near[at] <= until[ray]
+        at, ray = at[near], ray[near]
+        found.append(at[beyond(ray, doubts.rows[at])])
     return np.concatenate(found)
+
+
+def _leaves_after(
+    data: SceneData,
+    at_units: NDArray[np.int64],
+    direction: NDArray[np.float64] | None,
+    radius_units: int,
+    clear_until: NDArray[np.float64],
+    ray: NDArray[np.int64],
+    rows: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Return whether rays leave the cells of voxels, grown by the largest sphere, where they may be hit.
+
+    clear_until: (k,) of each ray, nothing is hit before [exact units]; inf: anywhere.
+    ray, rows: (n,), pairs of ray and voxel. Nothing of a cell is farther from a point than this
+    either, but cells around a point are rare: a cell counts unless it is clear everywhere.
+    """
+    clear = clear_until[ray]
+    after = clear < np.inf
+    if direction is None:
+        return after
+    arrays = data.arrays
+    which = np.flatnonzero(after & (clear > 0.0))
+    at = at_units[ray[which]] / arrays.units_per_step
+    along = direction[ray[which]]
+    low = (arrays.coordinates[rows[which]] * arrays.voxel_steps).astype(np.float64)
+    grow = (
+        radius_units / arrays.units_per_step + 2.0 + np.abs(at).max(axis=1, initial=0.0)[:, None] * 2.0**-40
+    )
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        ends = np.maximum((low - grow - at) / along, (low + arrays.voxel_steps + grow - at) / along)
+    last = np.where(along == 0.0, np.inf, ends).min(axis=1) * (1.0 + 1e-9)
+    after[which] = last * arrays.units_per_step >= clear[which]
+    return after
+
+
+def _pass_clear(
+    data: SceneData,
+    lists: VoxelLists,
+    cursor: NDArray[np.int64],
+    cold: NDArray[np.int64],
+    clear_until: NDArray[np.float64],
+    at_units: NDArray[np.int64],
+    direction: NDArray[np.float64] | None,
+    radius_units: int,
+) -> int:
+    """Move cursors of the rays `cold` past voxels that they leave before anything can be hit.
+
+    These voxels become the first of the remaining ones in `lists`. Return their number.
+    """
+    if direction is None:
+        return 0
+    left = lists.starts[cold + 1] - cursor[cold]
+    ray = np.repeat(cold, left)
+    at = np.repeat(cursor[cold] - np.cumsum(left) + left, left) + np.arange(len(ray))
+    kept = _leaves_after(data, at_units, direction, radius_units, clear_until, ray, lists.rows[at])
+    order = at[np.lexsort((at, kept, ray))]
+    lists.rows[at], lists.near[at] = lists.rows[order], lists.near[order]
+    np.add.at(cursor, ray[~kept], 1)
+    return int((~kept).sum())
 
 
 def _next_rows(

@@ -172,6 +172,10 @@ AnyEffect = (
 ORDER = (
     "objects", "crowd", "stop", "sweep", "slide", "step", "ground", "proximity", "contacts", "uncertainty",
 )  # fmt: skip
+# Version of the rules by which effects move an avatar; a log states that of its frames. A change that
+# gives other poses from the same motion commands increases it. 2: normals of contacts at edges
+# (server/simulation/world/contact_normal.py).
+MOTION_VERSION = 2
 # Effects needed for safety: never skipped, whatever a frame's budget.
 NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})
 

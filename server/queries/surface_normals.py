@@ -5,6 +5,8 @@ take seconds, and those of the few points touched in a frame take some microseco
 """
 
 from collections import OrderedDict
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,13 +15,15 @@ from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.errors import CorruptError
 from ...schemas.kernels.normal_codes import NO_NORMAL, decode_normal
 from ..kernels.core.scene_arrays import LANES
-from ..kernels.rays.stored_normals import NOT_ESTIMATED, code_at, find_voxel, stored_code_at
+from ..kernels.rays.stored_normals import NOT_ESTIMATED, code_at, find_voxel, highest_near, stored_code_at
 from ..residency.voxel_store import VoxelStore
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .context.query_context import SceneData, with_stop
 
 # Memory for normals, as a share of the budget for voxels, in addition to it.
 SHARE = 1 / 32
+
+_Found = TypeVar("_Found")
 
 
 def warm(data: SceneData) -> None:
@@ -28,6 +32,7 @@ def warm(data: SceneData) -> None:
     find_voxel(data.broad.keys, nowhere.voxel_steps, 0, 0, 0)
     code_at(nowhere, 0, 0, 0, 0, 1, np.empty(0, np.uint16))
     stored_code_at(nowhere, 0, 0, 0, 0, data.keeps_scan)
+    highest_near(nowhere, 0, 0, 0, 0, 1, np.empty((0, 3)), np.empty(0))
     decode_normal(int(NOT_ESTIMATED) << 8 | 1)
 
 
@@ -91,29 +96,64 @@ class Normals:
 
         stop: ends a wait for a load. Raise CorruptError, StoppedError.
         """
+        square = self._square(reach)
+
+        def look(row: int, x: int, y: int, z: int) -> int:
+            return self._look(row, x, y, z, square)
+
+        return self._at_point(cloud, look, int(NO_NORMAL), stop)
+
+    def highest(
+        self, cloud: ArrayLike, directions: NDArray[np.float64], reach: float, stop: StopFlag = NO_STOP
+    ) -> NDArray[np.float64]:
+        """Return how high the points near a scan point lie along directions (k,) [m].
+
+        The points are those that form its surface: of its voxel, within reach.
+        directions: (k, 3) unit. Other arguments and errors as for `at`.
+        """
+        square = self._square(reach)
+        heights = np.zeros(len(directions))
+
+        def look(row: int, x: int, y: int, z: int) -> int:
+            return int(highest_near(self._data.arrays, row, x, y, z, square, directions, heights))
+
+        self.visits += self._at_point(cloud, look, 0, stop)
+        return heights * self._data.arrays.step
+
+    def _square(self, reach: float) -> int:
+        """Return the square of a reach [steps^2]. Raise BadRequestError."""
         square = self._squares.get(reach)
         if square is None:
             square = squared_reach(reach, self._data.arrays.step, self._most_points)
             self._squares[reach] = square
+        return square
+
+    def _at_point(
+        self, cloud: ArrayLike, look: Callable[[int, int, int, int], _Found], nothing: _Found, stop: StopFlag
+    ) -> _Found:
+        """Return `look` of the row of a point's voxel, resident during the call, and the lattice point.
+
+        nothing: returned where there is no voxel. Raise CorruptError, StoppedError.
+        """
         step = self._data.arrays.step
         place = np.asarray(cloud, np.float64).tolist()
         # Lattice.to_lattice without arrays: both round half to even.
         x, y, z = (round((c - o) / step) for c, o in zip(place, self._origin, strict=True))
         row = find_voxel(self._data.broad.keys, self._data.arrays.voxel_steps, x, y, z)
         if row < 0:
-            return int(NO_NORMAL)
+            return nothing
         residency = self._data.residency
         with residency.frozen():
             if self._data.arrays.where[row, 0] >= 0:
                 residency.use([row])
-                return self._look(row, x, y, z, square)
+                return look(row, x, y, z)
         with residency.hold([row], stop=stop) as held:
             if held.late:
                 raise StoppedError
             if held.faults:
                 raise CorruptError(held.faults[0])
             with residency.frozen():
-                return self._look(row, x, y, z, square)
+                return look(row, x, y, z)
 
     def _look(self, row: int, x: int, y: int, z: int, square: int) -> int:
         """Return `code` of a lattice point in a voxel that stays resident during the call."""

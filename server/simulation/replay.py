@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...schemas.errors import BadRequestError, ErrorCode, SolidcloudError
+from ...schemas.scene.effect_table import MOTION_VERSION
 from ...schemas.wire.encoding import decode_request
 from ...schemas.wire.key_expressions import User
 from ...schemas.wire.motion_messages import Wish
@@ -74,14 +75,16 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
 
     Each frame skips the effects that the logged one skipped, because that depended on a clock. The
     replay ends where the log's scene was reloaded. Raises the errors of reading the records, and
-    BadRequestError for a log whose avatars are not those of the scene.
+    BadRequestError for a log of other rules of motion, or whose avatars are not those of the scene.
     """
     avatars = _LoggedAvatars(simulation)
     opened: list[int] | None = None
     frames = turns = different = 0
     first: TurnDifference | None = None
     for record in records:
-        if isinstance(record, AvatarPoints):
+        if isinstance(record, Begin):
+            check_motion(record)
+        elif isinstance(record, AvatarPoints):
             avatars.known[record.digest] = record
         elif isinstance(record, Entered):
             avatars.enter(record)
@@ -165,7 +168,8 @@ def archives_of(simulation: Simulation) -> list[tuple[str, int]]:
 def begin_of(simulation: Simulation, path: Path) -> Begin:
     """Return the first record of a scene's log. path: of its archive or scene file."""
     file = path.read_bytes() if path.is_file() else b""
-    return Begin(simulation.scene.name, str(path.resolve()), file, archives_of(simulation))
+    archives = archives_of(simulation)
+    return Begin(simulation.scene.name, str(path.resolve()), file, archives, MOTION_VERSION)
 
 
 @contextmanager
@@ -183,11 +187,22 @@ def recorded(scene: ServedScene, path: Path, log: Path) -> Iterator[None]:
             simulation.record(None)
 
 
-def check_same(begin: Begin, simulation: Simulation, path: Path) -> bool:
-    """Return whether a scene's file is that of the log. Raises BadRequestError for other archives.
+def check_motion(begin: Begin) -> None:
+    """Raise BadRequestError if a log is of other rules of motion: it would give other poses."""
+    if begin.motion != MOTION_VERSION:
+        raise BadRequestError(
+            f"the log was recorded under version {begin.motion} of the rules of motion: expected "
+            f"{MOTION_VERSION}: replay it with the version of solidcloud that recorded it"
+        )
 
-    path: of the archive or scene file.
+
+def check_same(begin: Begin, simulation: Simulation, path: Path) -> bool:
+    """Return whether a scene's file is that of the log.
+
+    path: of the archive or scene file. Raises BadRequestError for other archives, or other rules of
+    motion.
     """
+    check_motion(begin)
     found = archives_of(simulation)
     if [tuple(each) for each in begin.archives] != found:
         raise BadRequestError(

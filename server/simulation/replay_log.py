@@ -39,12 +39,14 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
 
     scene: its name.  path: of the archive or scene file.  file: bytes of the scene file; empty for
     an archive.  archives: id, hexadecimal, and generation of each.
+    motion: version of the rules of motion (schemas/scene/effect_table.py); logs without it are of 1.
     """
 
     scene: str
     path: str
     file: bytes
     archives: list[tuple[str, int]]
+    motion: int = 1
 
 
 class AvatarPoints(msgspec.Struct, frozen=True, tag="points"):

@@ -1,4 +1,4 @@
-"""Normal at a scan point of a resident voxel, from the neighbours in the voxel's tree.
+"""Normal at a scan point of a resident voxel, and heights of its neighbours, from the voxel's tree.
 
 schemas/kernels/normal_codes.py has the definition. Spheres prune with integers that float64 holds
 exactly; integers decide each point.
@@ -165,3 +165,53 @@ def stored_code_at(scene, voxel, x, y, z, with_scan):
     if lane < 0:
         return NO_NORMAL, visits
     return scene.halves[normal_run(scene.where, voxel, scene.block_words, with_scan) + lane], visits
+
+
+@nb.njit(nogil=True, cache=True)
+def highest_near(scene, voxel, x, y, z, square, directions, heights):
+    """Find how high a resident voxel's points near a lattice point lie along directions.
+
+    scene, x, y, z, square: as for `code_at`.  directions: (k, 3) unit, float64.  heights: (k,),
+    set to the greatest height over the points within reach, relative to the point [steps]; 0 if
+    there are none. Returns the nodes visited.
+    """
+    heights[:] = 0.0
+    if scene.where[voxel, 0] < 0:
+        return 0
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    x -= scene.coordinates[voxel, 0] * scene.voxel_steps
+    y -= scene.coordinates[voxel, 1] * scene.voxel_steps
+    z -= scene.coordinates[voxel, 2] * scene.voxel_steps
+    reach = np.sqrt(np.float64(square)) * (1.0 + 2.0**-50)
+    rows = np.empty(STACK, np.int64)
+    base, visits = scene.where[voxel, 0], 0
+    rows[0], depth = base, 1
+    while depth > 0:
+        depth -= 1
+        row = rows[depth]
+        visits += 1
+        dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
+        both = (reach + words[row + 3]) * (1.0 + 2.0**-50)
+        if dx * dx + dy * dy + dz * dz > both * both * (1.0 + 2.0**-50):
+            continue
+        first = np.int64(ints[row + FIRST])
+        count = np.int64(ints[row + COUNT] & COUNTED)
+        if first >= 0:
+            for child in range(first, first + count):
+                rows[depth] = base + child * ROW_WORDS
+                depth += 1
+            continue
+        block = ~first
+        block_at = scene.where[voxel, 1] + block * scene.block_words
+        lane_at = scene.where[voxel, 2] + block * 3 * LANES
+        ox, oy, oz = ints[block_at] - x, ints[block_at + 1] - y, ints[block_at + 2] - z
+        for j in range(count):
+            px = ox + np.int64(halves[lane_at + j])
+            py = oy + np.int64(halves[lane_at + LANES + j])
+            pz = oz + np.int64(halves[lane_at + 2 * LANES + j])
+            if px * px + py * py + pz * pz > square:
+                continue
+            for k in range(directions.shape[0]):
+                height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]
+                heights[k] = max(heights[k], height)
+    return visits

@@ -26,6 +26,7 @@ from ....schemas.scene.effect_table import Ground, Slide, Stop
 from ....schemas.wire.answers import Verdict
 from ...queries.surface_normals import warm
 from ..world.collision_world import World
+from ..world.contact_normal import contact_normal, warm_patch
 from ..world.frame import Frame, Hit, Vec, translated
 from ..world.vectors import dot, norm
 
@@ -163,7 +164,7 @@ class SlideRunner:
         """Return the unit normal (3,) of a touched plane, stored in the hit; None if unknown."""
         if hit.verdict == Verdict.UNKNOWN or hit.avatar is None or hit.cloud is None:
             return None
-        normal: Vec | None = frame.world.normal(hit, self.normal_reach)
+        normal = contact_normal(frame, hit, self.normal_reach)
         if normal is None:
             out = hit.avatar - hit.cloud
             across = norm(out)
@@ -230,5 +231,6 @@ def make(effect: Slide, world: World) -> SlideRunner:
     slope = next((each.slope for each in world.file.effects if isinstance(each, Ground)), None)
     with world as seen:
         warm(seen[0].data)
+    warm_patch()
     skin = next(each.skin for each in world.file.effects if isinstance(each, Stop))
     return SlideRunner(effect.surfaces, effect.normal_reach, skin, slope, world)

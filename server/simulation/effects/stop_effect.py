@@ -25,6 +25,7 @@ from ..world.frame import (
     pushes_on,
     record_hit,
     translated,
+    with_point,
 )
 from ..world.vectors import dot, norm
 
@@ -64,6 +65,7 @@ def move_if_clear(frame: Frame, to: Pose) -> Hit | None:
         if frame.verdict == Verdict.CONTACT:
             frame.verdict = Verdict.CLEAR
         return None
+    hit = with_point(frame, to, hit._replace(fraction=1.0))._replace(fraction=0.0)
     record_hit(frame, hit)
     return hit
 

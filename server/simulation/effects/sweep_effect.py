@@ -17,6 +17,7 @@ from ..world.frame import (
     record_hit,
     settle_before,
     skin_fraction,
+    with_point,
 )
 
 # Limit of pushes of obstacles in one motion.
@@ -46,6 +47,7 @@ class SweepRunner:
             if hit is None:
                 frame.pose = to
                 return None
+            hit = with_point(frame, to, hit)
             settle_before(frame, to, hit.fraction - skin_fraction(frame, to, hit, self.skin), hit.fraction)
             if not pushes_on(frame, hit, to):
                 break

@@ -7,7 +7,7 @@ directly.
 
 import threading
 from collections import OrderedDict
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,18 +18,18 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
-from ...archives.archive_generation import ArchiveGeneration
 from ...archives.placed_archive import PlacedArchive
-from ...archives.rigid_transform import rotate_vectors, transform_points, transform_poses
+from ...archives.rigid_transform import rotate_vectors, transform_points
 from ...avatars.avatar_model import AvatarModel
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
-from ...queries.context.query_context import SceneData, with_stop
+from ...queries.context.query_context import with_stop
 from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from ...scene_interface import EVERYBODY
 from .frame import Hit, Pose, Vec
+from .held_archive import HeldArchive, normals_of, swept_in_world, to_archive, to_world, touched_in_archive
 from .least_answer import comes_first, merge_distances, merge_swept
 from .vectors import min_height, unit_vector
 
@@ -41,14 +41,6 @@ _NO_ORIGIN = np.zeros(3)
 # If the points near a touched one form no surface, because the scan is sparse, the reach of its
 # normal is multiplied by this factor.
 SPARSE_FACTOR = 3.0
-
-
-class HeldArchive(NamedTuple):
-    """Archive generation that a thread holds. data: with the scene's radius model."""
-
-    opened: ArchiveGeneration
-    data: SceneData
-    placed: PlacedArchive
 
 
 class _Held(threading.local):
@@ -152,7 +144,7 @@ class World:
         """
         with self as seen:
             for each in seen:
-                each.opened.record_user(user, avatar, _to_archive(each, pose)[None], around)
+                each.opened.record_user(user, avatar, to_archive(each, pose)[None], around)
 
     def _probe(self, avatar: AvatarModel) -> ResidentQueries:
         """Return this thread's `ResidentQueries` of an avatar."""
@@ -173,7 +165,7 @@ class World:
         found, probe = Verdict.CLEAR, self._probe(avatar)
         with self as seen:
             for each in seen:
-                verdict, visits = probe.collide(each.data, _to_archive(each, pose), budget)
+                verdict, visits = probe.collide(each.data, to_archive(each, pose), budget)
                 self.count(visits, verdict == Verdict.UNKNOWN)
                 if verdict == Verdict.CONTACT:
                     return verdict
@@ -203,11 +195,11 @@ class World:
             found: SweepResult | None = None
             for number, each in enumerate(seen):
                 swept = probe.sweep(
-                    each.data, _to_archive(each, pose_from), _to_archive(each, pose_to), tolerance, budget
+                    each.data, to_archive(each, pose_from), to_archive(each, pose_to), tolerance, budget
                 )
                 self.count(swept.visits, swept.unknown)
                 if not self._alone:
-                    swept = _swept_in_world(swept, each, number)
+                    swept = swept_in_world(swept, each, number)
                 found = swept if found is None else merge_swept(found, swept)
         assert found is not None
         return found
@@ -244,12 +236,12 @@ class World:
         depth = np.inf
         with self as seen:
             for number, each in enumerate(seen):
-                answers = contacts(each.data, avatar, _to_archive(each, pose)[None], 1, budget=budget)
+                answers = contacts(each.data, avatar, to_archive(each, pose)[None], 1, budget=budget)
                 self._count_of(answers)
                 if len(answers.signed_distance):
                     value = float(answers.signed_distance[0])
                     own, cloud = (
-                        _to_world(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
+                        to_world(each, place) for place in (answers.avatar_point[0], answers.cloud_point[0])
                     )
                     if found is None or comes_first(value, (cloud, own), depth, (found.cloud, found.avatar)):
                         depth, found = value, Hit(0.0, Verdict.CONTACT, own, cloud, "", number)
@@ -275,7 +267,7 @@ class World:
                 value = float(answers.distance[0])
                 if value > least or value == np.inf:
                     continue
-                cloud = _to_world(each, answers.cloud_point[0])
+                cloud = to_world(each, answers.cloud_point[0])
                 if found is None or comes_first(value, (cloud,), least, (found.cloud,)):
                     least = value
                     found = Hit(0.0, Verdict(int(answers.verdict[0])), None, cloud, "", number)
@@ -291,7 +283,7 @@ class World:
         found: DistanceAnswers | None = None
         with self as seen:
             for each in seen:
-                answers = distance_fast(each.data, avatar, _to_archive(each, pose), reach, budget)
+                answers = distance_fast(each.data, avatar, to_archive(each, pose), reach, budget)
                 self._count_of(answers)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
@@ -318,7 +310,7 @@ class World:
         with self as seen:
             for each in seen:
                 answers = contacts(
-                    each.data, avatar, _to_archive(each, pose)[None], limit, margin, cluster_distance, budget
+                    each.data, avatar, to_archive(each, pose)[None], limit, margin, cluster_distance, budget
                 )
                 self._count_of(answers)
                 if each.placed.pose is not None:
@@ -341,44 +333,31 @@ class World:
         held = self._held
         with self as seen:
             each = seen[hit.archive]
-            kept = each.opened.kept
-            normals = kept.get("normals")
-            if normals is None:
-                # Imported here: only some effects need normals.
-                from ...queries.surface_normals import Normals
-
-                normals = kept.setdefault("normals", Normals(each.opened.store, each.data))
-            pose, inverse = each.placed.pose, each.placed.inverse
-            way = hit.avatar - hit.cloud
-            place = hit.cloud
-            if inverse is not None:
-                place, way = transform_points(inverse, place[None])[0], rotate_vectors(inverse, way[None])[0]
+            normals, pose = normals_of(each), each.placed.pose
+            place, way = touched_in_archive(each, hit.cloud, (hit.avatar - hit.cloud)[None])
             try:
-                found: Vec | None = normals.at(place, way, reach, held.stop)
+                found: Vec | None = normals.at(place, way[0], reach, held.stop)
                 if found is None:
-                    found = normals.at(place, way, min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH), held.stop)
+                    farther = min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH)
+                    found = normals.at(place, way[0], farther, held.stop)
             except CorruptError:
                 held.unknown = True
                 return None
             return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
 
+    def highest(self, hit: Hit, directions: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+        """Return how high the scan points around a touched one lie along directions (k,) [m].
 
-def _to_archive(seen: HeldArchive, pose: Pose) -> Pose:
-    """Return a pose of the world in an archive's frame."""
-    inverse = seen.placed.inverse
-    return pose if inverse is None else transform_poses(inverse, pose[None])[0]
-
-
-def _to_world(seen: HeldArchive, place: NDArray[np.float64]) -> Vec:
-    """Return a point (3,) of an archive in the world frame."""
-    pose = seen.placed.pose
-    return place if pose is None else transform_points(pose, place[None])[0]
-
-
-def _swept_in_world(swept: SweepResult, seen: HeldArchive, number: int) -> SweepResult:
-    """Return an archive's answer about a motion, in the world frame."""
-    if swept.avatar is None or swept.cloud is None:
-        return swept._replace(archive=number)
-    return swept._replace(
-        archive=number, avatar=_to_world(seen, swept.avatar), cloud=_to_world(seen, swept.cloud)
-    )
+        hit: of the scan.  directions: (k, 3) unit.  reach: as for `normal`.
+        """
+        assert hit.cloud is not None
+        held = self._held
+        with self as seen:
+            each = seen[hit.archive]
+            place, ways = touched_in_archive(each, hit.cloud, directions)
+            try:
+                found: NDArray[np.float64] = normals_of(each).highest(place, ways, reach, held.stop)
+            except CorruptError:
+                held.unknown = True
+                return np.zeros(len(directions))
+        return found

@@ -36,6 +36,8 @@ class Hit(NamedTuple):
     what: "" for the scene, otherwise the name of the object or user.
     archive: index among the scene's archives; -1 if the hit is not of the scan.
     normal: (3,) unit, of the touched surface, towards the avatar; None if it was not estimated.
+    point: (3,) centre of the avatar's touching sphere, avatar frame [m]; None if the hit is not of
+    the scan, or did not end a motion.
     """
 
     fraction: float
@@ -45,6 +47,7 @@ class Hit(NamedTuple):
     what: str = ""
     archive: int = -1
     normal: Vec | None = None
+    point: Vec | None = None
 
 
 class Obstacle(Protocol):
@@ -234,6 +237,19 @@ def max_displacement(frame: Frame, to: Pose) -> float:
     return norm(center) + frobenius_norm(turn) * float(avatar.arrays.radius[0])
 
 
+def with_point(frame: Frame, to: Pose, hit: Hit) -> Hit:
+    """Return the hit that ended a motion from frame.pose to a pose; one of the scan with its `point`."""
+    if hit.archive < 0 or hit.avatar is None:
+        return hit
+    return hit._replace(point=_touching_point(frame, to, hit, hit.avatar))
+
+
+def _touching_point(frame: Frame, to: Pose, hit: Hit, place: Vec) -> Vec:
+    """Return a place (3,) [m] at the time of a hit, in the avatar's frame."""
+    there, _ = frame.world.between(frame.body.avatar, frame.pose, to, min(hit.fraction, 1.0))
+    return rotate_back(there, place - there[:3, 3])
+
+
 def skin_fraction(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
     """Return the share of the motion by which to stop before `hit`.
 
@@ -245,9 +261,8 @@ def skin_fraction(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
     if hit.avatar is None or hit.cloud is None:
         return skin / way
     out = hit.avatar - hit.cloud
-    there, _ = frame.world.between(frame.body.avatar, frame.pose, to, min(hit.fraction, 1.0))
-    # The point that touches, in the avatar's frame, and its displacement.
-    point = rotate_back(there, hit.avatar - there[:3, 3])
+    point = hit.point if hit.point is not None else _touching_point(frame, to, hit, hit.avatar)
+    # The displacement of the point that touches.
     goes = (to[:3, 3] - frame.pose[:3, 3]) + rotate(to[:3, :3] - frame.pose[:3, :3], point)
     length, speed = norm(out), norm(goes)
     if speed <= 1e-9 * way:

@@ -113,6 +113,27 @@ def test_normals_are_those_of_numpy(tmp_path: Path, kind: str) -> None:
     assert none > 10 or kind in ("plane", "corner", "pillar", "one point")
 
 
+@pytest.mark.parametrize("kind", ["corner", "noise"])
+def test_heights_over_a_point_are_those_of_all_points_of_its_voxel(tmp_path: Path, kind: str) -> None:
+    case = build(tmp_path, kind)
+    directions = np.array([[0.0, 0.0, 1.0], [0.6, -0.8, 0.0], [-0.48, 0.6, -0.64]])
+    with asked(case.archive) as (opened, normals):
+        header = opened.store.archive.header
+        lattice = naive.lattice_of(case.points, header.lattice.origin, header.lattice.step)
+        voxel = lattice // header.lattice.voxel_steps
+        square = int(np.rint((REACH / header.lattice.step) ** 2))
+        several = 0
+        for at, own in list(zip(lattice, voxel, strict=True))[:: max(1, COUNT // 60)]:
+            near = naive_normals.neighbours(lattice[(voxel == own).all(axis=1)], at, square)
+            place = at * header.lattice.step + np.array(header.lattice.origin)
+            found = normals.highest(place, directions, REACH)
+            expected = (near @ directions.T).max(axis=0) * header.lattice.step
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+            several += len(near) > 3
+        assert several > 10
+        assert not normals.highest(np.full(3, 1e3), directions, REACH).any(), "there is no voxel"
+
+
 def test_the_side_is_the_one_that_is_asked_for(tmp_path: Path) -> None:
     case = build(tmp_path, "corner")
     sides = 0

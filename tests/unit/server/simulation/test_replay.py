@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from fake_server import floor_simulation
 from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.scene.effect_table import MOTION_VERSION
 from solidcloud.schemas.wire.key_expressions import User
 from solidcloud.schemas.wire.motion_messages import Moved, Wish
 from solidcloud.server.scene_interface import FrameCommand
@@ -25,6 +26,7 @@ from solidcloud.server.simulation.replay_log import (
 pytestmark = pytest.mark.interpreted
 
 AL, BO, CY = User("a", "al"), User("b", "bo"), User("a", "cy")
+BEGIN = Begin("floor", "", b"", [], MOTION_VERSION)
 POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 
 
@@ -57,7 +59,7 @@ def log(tmp_path):
     for user in (AL, BO, CY):
         simulation.scene.add_avatar(user.avatar, POINTS, 0.125, client=user.client)
     users = [AL, BO, CY, User("d", "unknown")]
-    with FrameLog(path, Begin("floor", "", b"", [])) as frames:
+    with FrameLog(path, BEGIN) as frames:
         simulation.record(frames)
         for number in range(60):
             turns = []
@@ -154,7 +156,7 @@ def test_a_refusal_that_is_none_now_is_a_difference(log):
 def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
     simulation, path = simulated(), tmp_path / "log"
     simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
-    with FrameLog(path, Begin("floor", "", b"", [])) as frames:
+    with FrameLog(path, BEGIN) as frames:
         simulation.record(frames)
         for number in range(4):
             simulation._pipeline.reloads = int(number == 3)
@@ -166,6 +168,18 @@ def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
 
 
 def test_an_avatar_that_is_not_in_the_log_is_an_error():
-    records: list[Record] = [Begin("floor", "", b"", []), Entered(AL, b"?")]
+    records: list[Record] = [BEGIN, Entered(AL, b"?")]
     with pytest.raises(BadRequestError, match="avatar 'al': its points are not in the log"):
+        replay(simulated(), records)
+
+
+def test_a_log_of_other_rules_of_motion_is_not_replayed(log):
+    """A log of the first version has no field `motion`; its poses would not come out again."""
+    old = b"\x85\xa4type\xa5begin\xa5scene\xa5floor\xa4path\xa0\xa4file\xc4\x00\xa8archives\x90"
+    begin = msgspec.msgpack.decode(old, type=Begin)
+    assert begin.motion == 1
+    records = [begin, *list(read_log(log))[1:]]
+    with pytest.raises(
+        BadRequestError, match=f"under version 1 of the rules of motion: expected {MOTION_VERSION}"
+    ):
         replay(simulated(), records)

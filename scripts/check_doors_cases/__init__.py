@@ -1,0 +1,1 @@
+"""Cases of scripts/check_doors: walls with doors, walks at them, and an ideal disc as the judge."""

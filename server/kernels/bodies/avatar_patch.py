@@ -1,0 +1,72 @@
+"""Patch of an avatar's surface around a touched point: how far it extends along directions.
+
+Distances are float64 sums of products in a fixed order, so that every machine finds the same
+heights. The sums for the normal are integers.
+"""
+
+import numpy as np
+
+from ....schemas.archive.voxel import MAX_LEVELS
+from ....schemas.kernels import compiling as nb
+
+# Steps per metre of the differences that are summed for a normal: with a reach of a metre, the sums
+# over eight million points fit 63 bits.
+PATCH_STEPS = 1 << 20
+SUMS = 10
+# Nodes still to examine: an avatar's tree has at most eight children a node.
+_STACK = 8 * MAX_LEVELS
+# A node farther than the reach by this share has no point in reach, whatever was rounded.
+_ROUNDED = 1.0 + 1e-9
+
+
+@nb.njit(nogil=True, cache=True)
+def lowest_heights(avatar, point, reach, directions, heights, sums):
+    """Find how low an avatar's points near one of them lie along directions.
+
+    avatar: Avatar.  point: (3,) a place on it, avatar frame [m].  reach: inclusive [m].
+    directions: (k, 3) unit, avatar frame.  heights: (k,), set to the least height over the points
+    within reach, relative to `point` [m]; 0 if there are none.
+    sums: (10,) int64, set to the sums for `normal_code` (schemas/kernels/normal_codes.py), in
+    1 / PATCH_STEPS of a metre.
+    """
+    x, y, z = point[0], point[1], point[2]
+    square = reach * reach
+    rows = np.empty(_STACK, np.int64)
+    heights[:] = 0.0
+    sums[:] = 0
+    rows[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        row = rows[depth]
+        dx, dy, dz = avatar.center[row, 0] - x, avatar.center[row, 1] - y, avatar.center[row, 2] - z
+        both = (reach + avatar.radius[row]) * _ROUNDED
+        if dx * dx + dy * dy + dz * dz > both * both:
+            continue
+        first, count = np.int64(avatar.first[row]), np.int64(avatar.count[row])
+        if first >= 0:
+            for child in range(first, first + count):
+                rows[depth] = child
+                depth += 1
+            continue
+        for j in range(count):
+            px = avatar.points[~first, 0, j] - x
+            py = avatar.points[~first, 1, j] - y
+            pz = avatar.points[~first, 2, j] - z
+            if px * px + py * py + pz * pz > square:
+                continue
+            for k in range(directions.shape[0]):
+                height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]
+                heights[k] = min(heights[k], height)
+            ix = np.int64(np.rint(px * PATCH_STEPS))
+            iy = np.int64(np.rint(py * PATCH_STEPS))
+            iz = np.int64(np.rint(pz * PATCH_STEPS))
+            sums[0] += 1
+            sums[1] += ix
+            sums[2] += iy
+            sums[3] += iz
+            sums[4] += ix * ix
+            sums[5] += iy * iy
+            sums[6] += iz * iz
+            sums[7] += iy * iz
+            sums[8] += iz * ix
+            sums[9] += ix * iy

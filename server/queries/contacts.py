@@ -42,6 +42,7 @@ from ..kernels.core.node_overlap import STACK
 from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
+from .context.late_voxels import drop_proved_voxels
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -99,7 +100,8 @@ def contacts(
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
     spent = CostCounter(begin, data.residency, data.broad.keys)
-    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
+    proved = drop_proved_voxels(data, avatar, array, margin_units, budget)
+    reach = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent, proved)
     k = len(array)
     tally = ContactResults(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)

@@ -4,6 +4,7 @@ Normals are estimated one point at a time: all normals of a voxel of half a mill
 take seconds, and those of the few points touched in a frame take some microseconds each.
 """
 
+import math
 from collections import OrderedDict
 
 import numpy as np
@@ -65,7 +66,13 @@ class Normals:
             )
 
     def at(
-        self, cloud: ArrayLike, toward: ArrayLike, reach: float, stop: StopFlag = NO_STOP
+        self,
+        cloud: ArrayLike,
+        toward: ArrayLike,
+        reach: float,
+        stop: StopFlag = NO_STOP,
+        *,
+        waits: bool = True,
     ) -> NDArray[np.float64] | None:
         """Return the unit normal (3,) of the surface at a scan point, on the side of `toward`.
 
@@ -74,11 +81,11 @@ class Normals:
         cloud: (3,) the point, world [m], within half a lattice step.
         toward: (3,) any length; if it is 0 or lies in the surface, the side is arbitrary.
         reach: points within this distance of the point form its surface [m].
-        stop: ends a wait for a load.
+        stop: ends a wait for a load.  waits: if False, do not load the point's voxel.
         Raise BadRequestError for an invalid reach, CorruptError for an unreadable voxel,
-        StoppedError.
+        StoppedError, also for a voxel that is not in memory if it may not be loaded.
         """
-        code = self.code(cloud, reach, stop)
+        code = self.code(cloud, reach, stop, waits=waits)
         if code == NO_NORMAL:
             return None
         x, y, z = decode_normal(code)
@@ -86,10 +93,10 @@ class Normals:
         side = -1.0 if x * a + y * b + z * c < 0.0 else 1.0
         return np.array([side * x, side * y, side * z])
 
-    def code(self, cloud: ArrayLike, reach: float, stop: StopFlag = NO_STOP) -> int:
+    def code(self, cloud: ArrayLike, reach: float, stop: StopFlag = NO_STOP, *, waits: bool = True) -> int:
         """Return the code of the normal (schemas/kernels/normal_codes.py); NO_NORMAL if there is none.
 
-        stop: ends a wait for a load. Raise CorruptError, StoppedError.
+        stop, waits: as for `at`. Raise CorruptError, StoppedError.
         """
         square = self._squares.get(reach)
         if square is None:
@@ -107,7 +114,7 @@ class Normals:
             if self._data.arrays.where[row, 0] >= 0:
                 residency.use([row])
                 return self._look(row, x, y, z, square)
-        with residency.hold([row], stop=stop) as held:
+        with residency.hold([row], math.inf if waits else -math.inf, stop=stop) as held:
             if held.late:
                 raise StoppedError
             if held.faults:

@@ -19,6 +19,7 @@ from ..runtime.stop_flag import StopFlag
 from .context.level_of_detail import asked, level_budget, stoppable
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
+from .late_sweep import AbsentVoxels, Motions, clear_until
 
 # Motions of one kernel call if there is a deadline, which is checked between calls.
 _PER_CALL = 64
@@ -124,10 +125,12 @@ def sweep(
     distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
     A motion that is clear with a budget of visits is clear with a larger one. A contact found may
     be lost with a larger budget, which may be spent on an unresolved place before it.
-    Where voxels are late, the scene's level of detail may prove more of a motion clear.
+    Where voxels are late, the scene's level of detail may prove more of a motion clear. With a
+    budget that does not wait for loads, late_sweep.py bounds the motion by absent voxels.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget)
+    absent = None if budget.late is None else AbsentVoxels()
+    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, absent)
     which = np.flatnonzero((answers.verdict == Verdict.UNKNOWN) & (answers.voxels_missing > 0))
     if data.level is None or budget.deadline == np.inf or not len(which) or budget.stop or data.nothing_clear:
         return answers
@@ -151,8 +154,13 @@ def _sweep(
     margin: float,
     tolerance: float,
     budget: QueryBudget,
+    absent: AbsentVoxels | None = None,
 ) -> SweepAnswers:
-    """Answer `sweep` from the voxels of the scene alone."""
+    """Answer `sweep` from the voxels of the scene alone.
+
+    absent: collects the voxels that are not in memory and bounds the motions by them; None: these
+    are loaded.
+    """
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
@@ -191,7 +199,7 @@ def _sweep(
         if needed > len(rows):
             rows = np.empty(2 * needed, np.int64)
             continue
-        if unproved and bounds.unsettled(rows[:needed], unproved).any():
+        if unproved and absent is None and bounds.unsettled(rows[:needed], unproved).any():
             # By the boxes of the index some may be out of reach, which changes the segments.
             by_index = progress._replace(
                 at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
@@ -211,7 +219,10 @@ def _sweep(
                 continue
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # unused here
-        around = VoxelsInReach(scales, units, starts, rows, boxes, outside)
+        near = starts, rows
+        if absent is not None:
+            near = absent.set_aside(starts, rows, data.arrays.where)
+        around = VoxelsInReach(scales, units, *near, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
             chunk = len(part) if budget.deadline == np.inf else _PER_CALL
             if budget.stop:
@@ -234,6 +245,19 @@ def _sweep(
     # Beyond the place where a motion was stopped, nothing is known.
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
+    if absent is not None and absent.rows and not absent.restricted:
+        motions = Motions(first, last, scales, units, loose, box)
+        clear = clear_until(
+            data, avatar, motions, absent, budget,
+            lambda covers, own: _sweep(covers, avatar, pose_from, pose_to, margin, tolerance, budget, own),
+        )  # fmt: skip
+        counts[0][clear < until] += np.uint32(len(absent.rows))
+        proved = np.minimum(proved, clear)
+        if (clear < 1.0).any() or (progress.upper < np.inf).any():
+            # What else is near decides in which interval a contact is found.
+            budget.lacked(len(absent.rows))
+            with residency.hold(sorted(absent.rows), budget.loads_until()) as held:
+                spent.add(held)  # their loads are owed
     lost = np.empty(k)
     find_unknown_regions(
         box,

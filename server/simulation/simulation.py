@@ -28,13 +28,23 @@ from ...schemas.errors import (
 from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
-from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest, State, Wish
+from ...schemas.wire.motion_messages import (
+    BOUNDS,
+    FRAME_SECONDS,
+    WAIT,
+    Moved,
+    MoveRequest,
+    State,
+    Wish,
+    checked_late,
+)
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import QueryBudget
+from ..queries.context.query_budget import LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
+from .body_record import BodyRecord, record_of, take_record
 from .world.frame import Body, Pose, Vec
 from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
@@ -79,6 +89,7 @@ class Recorder(Protocol):
         turns: Sequence[FrameCommand],
         outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
+        kept: Sequence["BodyRecord | None"],
     ) -> None: ...
     def reloaded(self, generation: int) -> None: ...
 
@@ -144,14 +155,15 @@ class Simulation:
         pose_to: Any,
         seconds: float = FRAME_SECONDS,
         *,
+        late: str = WAIT,
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
         """Move avatar `name` from one pose towards another for one frame; keep no state.
 
         pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world, rigid.
-        seconds: duration of the frame [s].  stop: ends the frame early: the avatar stays, and its
-        verdict is unknown.
+        seconds: duration of the frame [s].  late: as in `MoveRequest`.  stop: ends the frame early:
+        the avatar stays, and its verdict is unknown.
         Raises BadRequestError, BadTransformError, UnknownAvatarError.
         """
         request = MoveRequest(
@@ -159,13 +171,14 @@ class Simulation:
             pose_from=one_pose(pose_from, "pose_from")[None],
             pose_to=one_pose(pose_to, "pose_to")[None],
             seconds=float(seconds),
+            late=checked_late(late),
         )
         user = User(client, name)
         begin = check_rigid(request.pose_from[0].copy(), "pose_from")
         target = check_rigid(request.pose_to[0], "pose_to")
         body = _make_body(user, self.scene.avatar(name, client), begin)
         try:
-            return self._pipeline.run(body, target, request.seconds, QueryBudget(stop=stop))
+            return self._pipeline.run(body, target, request.seconds, _frame_budget(request.late, stop))
         except StoppedError:
             left = norm(target[:3, 3] - begin[:3, 3])
             return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
@@ -176,6 +189,7 @@ class Simulation:
         now: float | None = None,
         skips: Sequence[Collection[str]] | None = None,
         stops: Sequence[StopFlag] | None = None,
+        kept: Sequence[BodyRecord | None] | None = None,
     ) -> list[FrameResult]:
         """Simulate one frame: the motion commands of `turns`, in order. Return their outcomes.
 
@@ -187,37 +201,47 @@ class Simulation:
         fit the frame's budget.
         stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
         ExpiredError.
+        kept: for each turn, a recorded result that is taken without a simulation; None: none.
         """
         with self._frame:
             if now is not None:
                 self._remove([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
             self._frames += 1
-            outcomes, opened = [], []
+            outcomes, opened, records = [], [], []
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
                 stop = NO_STOP if stops is None else stops[number]
+                budget = _frame_budget(turn.wish.late, stop)
+                given = None if kept is None else kept[number]
                 used: list[bytes] = []
                 with recording_avatars(used):
-                    state = self._simulate_turn(turn, now, skip, stop)
+                    state = self._simulate_turn(turn, now, skip, budget, given)
                 there = self._present.get(turn.user)
                 about = b"".join(used) if there is None else there.body.avatar.digest
                 outcomes.append(FrameResult(turn.user, state, about))
                 opened.append(() if there is None else there.body.generations)
+                lacked = budget.late is not None and budget.late.count > 0 and isinstance(state, State)
+                records.append(record_of(there.body, self._bodies) if lacked and there else None)
             if self._recorder is not None:
-                self._recorder.frame(self._frames, turns, outcomes, opened)
+                self._recorder.frame(self._frames, turns, outcomes, opened, records)
             return outcomes
 
     def _simulate_turn(
-        self, turn: FrameCommand, now: float | None, skip: Collection[str] | None, stop: StopFlag
+        self,
+        turn: FrameCommand,
+        now: float | None,
+        skip: Collection[str] | None,
+        budget: QueryBudget,
+        given: BodyRecord | None,
     ) -> State | SolidcloudError:
         """Simulate the frame of one user; return its state, or the error of a refused command."""
         begin = time.perf_counter()
         try:
-            moved = self._simulate_command(turn.user, turn.wish, now, skip, stop)
+            moved = self._simulate_command(turn.user, turn.wish, now, skip, budget, given)
         except SolidcloudError as error:
             return error
         except StoppedError:
-            return ExpiredError(f"{stop.reason}: the user stays where it was")
+            return ExpiredError(f"{budget.stop.reason}: the user stays where it was")
         except Exception as error:  # the frames of the other users must continue
             log.exception("a frame of %s in %s", _public_name(turn.user), self.scene.name)
             return InternalError(f"{type(error).__name__} in the server: see the server's log")
@@ -232,7 +256,13 @@ class Simulation:
         )
 
     def _simulate_command(
-        self, user: User, command: Wish, now: float | None, skip: Collection[str] | None, stop: StopFlag
+        self,
+        user: User,
+        command: Wish,
+        now: float | None,
+        skip: Collection[str] | None,
+        budget: QueryBudget,
+        given: BodyRecord | None,
     ) -> Moved:
         """Move a user by one command; a new user enters with it, unless the command is refused."""
         there = self._present.get(user)
@@ -245,8 +275,11 @@ class Simulation:
                     raise BadRequestError(
                         f"{self.scene.name}: a wish moves objects: this scene has no objects"
                     )
-                undo.callback(self._bodies.place_objects(command.objects, stop))
-            moved = self._pipeline.run(present.body, target, seconds, QueryBudget(stop=stop), skip=skip)
+                undo.callback(self._bodies.place_objects(command.objects, budget.stop))
+            if given is None:
+                moved = self._pipeline.run(present.body, target, seconds, budget, skip=skip)
+            else:
+                moved = take_record(given, present.body, self._pipeline.world, self._bodies)
             undo.pop_all()
         present.time = command.time
         present.heard = present.heard if now is None else now
@@ -324,6 +357,11 @@ class Simulation:
         if self._recorder is not None:
             with self._frame:
                 self._recorder.reloaded(generation)
+
+
+def _frame_budget(late: str, stop: StopFlag) -> QueryBudget:
+    """Return the budget of a frame's queries. late: as in `Wish`."""
+    return QueryBudget(stop=stop, late=LateVoxels() if late == BOUNDS else None)
 
 
 def frame_seconds(command: Wish, before: float | None) -> float:

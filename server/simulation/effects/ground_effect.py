@@ -211,7 +211,7 @@ class GroundRunner:
         """Return the horizontal unit vector (3,) away from a steep surface; None if unknown."""
         if hit.avatar is None or hit.cloud is None:
             return None
-        out = frame.world.normal(hit, self._normal_reach)
+        out = frame.world.normal(hit, self._normal_reach, frame.budget)
         if out is None:
             out = hit.avatar - hit.cloud
         level = out - dot(out, frame.world.up) * frame.world.up
@@ -250,9 +250,14 @@ class GroundRunner:
         deep = feet - world.lowest_height() + _FALL_MARGIN
         if deep <= reach:
             return False
+        lacked = frame.lacked
         swept = world.sweep(
             avatar, frame.pose, translated(frame.pose, -deep * up), _FALL_TOLERANCE, frame.budget
         )
+        if frame.lacked > lacked and not (swept.verdict == Verdict.CONTACT and swept.exact):
+            # Whether it would land is not known until the voxels below are in memory: it waits there.
+            record_hit(frame, Hit(0.0, Verdict.UNKNOWN, None, None, unloaded=True))
+            return False
         if swept.verdict != Verdict.CONTACT:
             return bool(swept.verdict == Verdict.UNKNOWN)
         # The rim of a hole, or the ledge behind, stops the parts above the feet, which are wider.
@@ -273,7 +278,7 @@ class GroundRunner:
                 return stood[1]  # reuse the last ground: estimating a normal takes half a sweep's time
         up, out = frame.world.up, hit.avatar - hit.cloud
         length = norm(out)
-        normal: Vec | None = frame.world.normal(hit, self._normal_reach)
+        normal: Vec | None = frame.world.normal(hit, self._normal_reach, frame.budget)
         if normal is None:
             normal = out / length if length > 0.0 else up
         rises = dot(normal, up)
@@ -289,6 +294,7 @@ class GroundRunner:
         top = frame.world.normal(
             hit._replace(avatar=inner.cloud + up, cloud=inner.cloud, archive=inner.archive),
             self._normal_reach,
+            frame.budget,
         )
         return top if top is not None and dot(top, up) >= self._walkable else None
 

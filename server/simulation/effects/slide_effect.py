@@ -163,7 +163,7 @@ class SlideRunner:
         """Return the unit normal (3,) of a touched plane, stored in the hit; None if unknown."""
         if hit.verdict == Verdict.UNKNOWN or hit.avatar is None or hit.cloud is None:
             return None
-        normal: Vec | None = frame.world.normal(hit, self.normal_reach)
+        normal: Vec | None = frame.world.normal(hit, self.normal_reach, frame.budget)
         if normal is None:
             out = hit.avatar - hit.cloud
             across = norm(out)

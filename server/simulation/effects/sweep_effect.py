@@ -50,7 +50,7 @@ class SweepRunner:
             if not pushes_on(frame, hit, to):
                 break
         if hit is not None:
-            record_hit(frame, hit)
+            record_hit(frame, hit, to)
         return hit
 
 

@@ -27,7 +27,7 @@ from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import SceneData, with_stop
 from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
 from ...queries.within import within
-from ...runtime.stop_flag import NO_STOP, StopFlag
+from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
 from .frame import Hit, Pose, Vec
 from .least_answer import comes_first, merge_distances, merge_swept
@@ -135,8 +135,11 @@ class World:
         """Return the node visits of all queries of this thread."""
         return self._held.visits
 
-    def _count_of(self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers) -> None:
+    def _count_of(
+        self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers, budget: QueryBudget
+    ) -> None:
         """Add the cost of one row of answers."""
+        budget.lacked(len(answers.late))
         unknown = answers.verdict[0] == Verdict.UNKNOWN
         self.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]) or unknown)
 
@@ -245,7 +248,7 @@ class World:
         with self as seen:
             for number, each in enumerate(seen):
                 answers = contacts(each.data, avatar, _to_archive(each, pose)[None], 1, budget=budget)
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 if len(answers.signed_distance):
                     value = float(answers.signed_distance[0])
                     own, cloud = (
@@ -271,7 +274,7 @@ class World:
                     else transform_points(each.placed.inverse, place[None])[0]
                 )
                 answers = within(each.data, there[None], reach, budget)
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 value = float(answers.distance[0])
                 if value > least or value == np.inf:
                     continue
@@ -292,7 +295,7 @@ class World:
         with self as seen:
             for each in seen:
                 answers = distance_fast(each.data, avatar, _to_archive(each, pose), reach, budget)
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
                         answers,
@@ -320,7 +323,7 @@ class World:
                 answers = contacts(
                     each.data, avatar, _to_archive(each, pose)[None], limit, margin, cluster_distance, budget
                 )
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 if each.placed.pose is not None:
                     columns = ("avatar_point", "cloud_point", "cluster_avatar", "cluster_cloud")
                     carried = {
@@ -330,7 +333,7 @@ class World:
                 found.append(answers)
         return found
 
-    def normal(self, hit: Hit, reach: float) -> Vec | None:
+    def normal(self, hit: Hit, reach: float, budget: QueryBudget = EXACT) -> Vec | None:
         """Return the unit normal (3,) of the touched surface, towards the avatar, or None.
 
         reach: distance within which points form the surface of the touched one [m]. If they form
@@ -353,11 +356,19 @@ class World:
             place = hit.cloud
             if inverse is not None:
                 place, way = transform_points(inverse, place[None])[0], rotate_vectors(inverse, way[None])[0]
+            waits = budget.late is None
             try:
-                found: Vec | None = normals.at(place, way, reach, held.stop)
+                found: Vec | None = normals.at(place, way, reach, held.stop, waits=waits)
                 if found is None:
-                    found = normals.at(place, way, min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH), held.stop)
+                    farther = min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH)
+                    found = normals.at(place, way, farther, held.stop, waits=waits)
             except CorruptError:
+                held.unknown = True
+                return None
+            except StoppedError:
+                if waits or held.stop:
+                    raise
+                budget.lacked(1)  # it was evicted since it was touched
                 held.unknown = True
                 return None
             return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]

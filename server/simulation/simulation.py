@@ -201,7 +201,8 @@ class Simulation:
         fit the frame's budget.
         stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
         ExpiredError.
-        kept: for each turn, a recorded result that is taken without a simulation; None: none.
+        kept: for a replay: for each turn, a recorded result that is taken without a simulation, or
+        None. All others wait for voxels.
         """
         with self._frame:
             if now is not None:
@@ -211,7 +212,8 @@ class Simulation:
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
                 stop = NO_STOP if stops is None else stops[number]
-                budget = _frame_budget(turn.wish.late, stop)
+                # In a replay, a frame without a record lacked nothing: it gives what a wait would give.
+                budget = _frame_budget(turn.wish.late if kept is None else WAIT, stop)
                 given = None if kept is None else kept[number]
                 used: list[bytes] = []
                 with recording_avatars(used):

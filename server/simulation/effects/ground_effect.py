@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....schemas.scene.effect_table import Ground, Slide, Step, Sweep
+from ....schemas.scene.effect_table import Ground, Slide, Step
+from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import GroundReport
 from ...queries.surface_normals import warm
@@ -67,8 +68,6 @@ _ROUNDING = 0.005
 # A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
 # tolerance of that sweep [m].
 _FALL_MARGIN, _FALL_TOLERANCE = 0.1, 1e-2
-# Tolerance without `sweep` [m].
-_TOLERANCE = 1e-5
 
 
 class GroundSearch(NamedTuple):
@@ -315,7 +314,7 @@ def make(effect: Ground, world: World) -> GroundRunner:
     declared = {type(each): each for each in world.file.effects}
     with world as seen:
         warm(seen[0].data)
-    step, sweep, slide = declared.get(Step), declared.get(Sweep), declared.get(Slide)
+    step, slide = declared.get(Step), declared.get(Slide)
     sliding = None
     if isinstance(slide, Slide):
         # Imported here, so that scenes without `slide` do not import it.
@@ -326,6 +325,6 @@ def make(effect: Ground, world: World) -> GroundRunner:
         effect,
         world.up,
         step.height if isinstance(step, Step) else 0.0,
-        sweep.tolerance if isinstance(sweep, Sweep) else _TOLERANCE,
+        sweep_tolerance(world.file),
         sliding,
     )

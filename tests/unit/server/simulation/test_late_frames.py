@@ -33,13 +33,19 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room")
     archive = effect_rooms.build(folder, effect_rooms.room(SIZE), voxel=1.0).archive
     # A user that waits for compilers is silent for too long, and enters anew at its next command.
-    with opened(archive, folder, WALKING) as scene, blocked_loads(scene), scene.session("person", late="bounds") as user:
+    with (
+        opened(archive, folder, WALKING) as scene,
+        blocked_loads(scene),
+        scene.session("person", late="bounds") as user,
+    ):
         wishes(user, [effect_rooms.at(0, 0, 0), effect_rooms.at(SIZE, 0, 0)])
     return archive
 
 
 @contextmanager
-def opened(archive: Path, folder: Path, effects: tuple[str, ...] = EFFECTS, **options: int) -> Iterator[Scene]:
+def opened(
+    archive: Path, folder: Path, effects: tuple[str, ...] = EFFECTS, **options: int
+) -> Iterator[Scene]:
     """Open the scene of an archive with effects, and the avatars."""
     path = folder / f"{len(list(folder.iterdir()))}.toml"
     path.write_text(scene_text(archive, effects))
@@ -78,7 +84,7 @@ def corners(count: int, seed: int, height: float | None = None) -> list[Floats]:
 
 
 def test_a_frame_returns_while_every_load_is_blocked(room: Path, tmp_path: Path) -> None:
-    with opened(room, tmp_path) as scene, blocked_loads(scene) as gate:
+    with opened(room, tmp_path) as scene, blocked_loads(scene) as gate:  # noqa: SIM117
         with scene.session("body", late="bounds") as session:
             session.wish(pose=effect_rooms.at(0, 0, 0), time=0.0)
             session.wish(pose=effect_rooms.at(SIZE, 0, 0), time=1 / 30)
@@ -107,9 +113,10 @@ def test_no_path_crosses_the_scan_with_a_tiny_cache(
     with Scene.open(room) as scene:
         largest = int(scene.archives[0].take().store.sizes.max())
     lacked = 0
-    with opened(room, tmp_path) as judge, opened(
-        room, tmp_path, effects, budget_bytes=3 * largest + (1 << 14), coarse_bytes=level
-    ) as scene:
+    with (
+        opened(room, tmp_path) as judge,
+        opened(room, tmp_path, effects, budget_bytes=3 * largest + (1 << 14), coarse_bytes=level) as scene,
+    ):
         name = "person" if "ground" in effects else "body"
         for seed in range(4):
             start = effect_rooms.at(0, 0, -0.4 if "ground" in effects else 0.0)
@@ -143,7 +150,7 @@ def test_it_arrives_where_a_frame_that_waits_does(room: Path, tmp_path: Path, po
 
 def test_nobody_falls_through_a_floor_that_is_not_loaded(room: Path, tmp_path: Path) -> None:
     above = -SIZE / 2 + effect_rooms.RADIUS + 0.3
-    with opened(room, tmp_path, WALKING) as scene, blocked_loads(scene) as gate:
+    with opened(room, tmp_path, WALKING) as scene, blocked_loads(scene) as gate:  # noqa: SIM117
         with scene.session("person", late="bounds") as session:
             states = wishes(session, [effect_rooms.at(0, 0, above)] * 20)
             assert all(state.pose[0, 2, 3] == states[0].pose[0, 2, 3] for state in states[1:])

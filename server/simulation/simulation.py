@@ -6,7 +6,6 @@ poses, bit for bit: a clock is read only to report how long a frame took.
 """
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -23,9 +22,8 @@ from ...schemas.errors import (
     ExpiredError,
     InternalError,
     SolidcloudError,
-    UnknownAvatarError,
 )
-from ...schemas.scene.scene_file import SceneFile, Spawn
+from ...schemas.scene.scene_file import SceneFile
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
 from ...schemas.wire.motion_messages import (
@@ -45,20 +43,19 @@ from ..queries.context.query_budget import LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
 from .body_record import BodyRecord, record_of, take_record
-from .world.frame import Body, Pose, Vec
-from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
+from .motion_commands import first_pose, frame_seconds, target_pose
+from .world.frame import Body, Pose
+from .world.vectors import norm, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
     from .effects.effect_pipeline import Pipeline
     from .world.bodies import Bodies
+    from .world.collision_world import World
 
 log = logging.getLogger(__name__)
 
 # A user that has sent no motion command for this long is removed with its body [s].
 SILENT_SECONDS = 30.0
-# Limit on the duration of a frame: after a longer pause, a viewer continues as after a short one
-# [s].
-LONGEST_FRAME = 0.1
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
 
@@ -142,6 +139,11 @@ class Simulation:
     def users(self) -> list[User]:
         """Return the users that are present."""
         return list(self._present)
+
+    @property
+    def world(self) -> "World":
+        """Return the world that the frames query."""
+        return self._pipeline.world
 
     def record(self, recorder: Recorder | None) -> None:
         """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""
@@ -281,7 +283,7 @@ class Simulation:
             if given is None:
                 moved = self._pipeline.run(present.body, target, seconds, budget, skip=skip)
             else:
-                moved = take_record(given, present.body, self._pipeline.world, self._bodies)
+                moved = take_record(given, present.body, self.world, self._bodies)
             undo.pop_all()
         present.time = command.time
         present.heard = present.heard if now is None else now
@@ -364,50 +366,6 @@ class Simulation:
 def _frame_budget(late: str, stop: StopFlag) -> QueryBudget:
     """Return the budget of a frame's queries. late: as in `Wish`."""
     return QueryBudget(stop=stop, late=LateVoxels() if late == BOUNDS else None)
-
-
-def frame_seconds(command: Wish, before: float | None) -> float:
-    """Return how long the frame of a motion command lasts [s].
-
-    before: time of the user's previous command, on its clock; None: it is the first.
-    """
-    if before is None:
-        return FRAME_SECONDS
-    return min(max(command.time - before, 0.0), LONGEST_FRAME)
-
-
-def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
-    """Return the target pose (4, 4) of a motion command given at `pose`. up: (3,) unit vector.
-
-    A velocity applies for the duration of the frame.
-    """
-    if command.velocity is None:
-        return check_rigid(command.pose[0], "pose")
-    there = pose.copy()
-    there[:3, 3] += np.array(command.velocity) * seconds
-    if command.turn and seconds:
-        there[:3, :3] = orthonormalize(multiply(rotation_matrix(up, command.turn * seconds), pose))
-    return there
-
-
-def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
-    """Return the pose at which users enter."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
-    pose[:3, 3] = spawn.position
-    return pose
-
-
-def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
-    """Return the pose at which a user enters with its first command.
-
-    Raise UnknownAvatarError if neither the scene's spawn nor the command gives one.
-    """
-    if spawn is not None:
-        return spawn_pose(spawn, up)
-    if command.velocity is not None:
-        raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
-    return check_rigid(command.pose[0].copy(), "pose")
 
 
 def _make_body(user: User, avatar: AvatarModel, pose: Pose) -> Body:

@@ -109,3 +109,46 @@ def _go(scene: Scene, walk: Floats, late: str) -> tuple[Floats, Floats, Floats]:
             due = max(due + FRAME_SECONDS, time.perf_counter())
             time.sleep(due - time.perf_counter() if due > time.perf_counter() else 0.0)
     return np.array(poses), np.array(times), np.array(stopped, float)
+
+
+class FrameVisits(NamedTuple):
+    """Cost of frames by the tolerance of their sweeps [m].
+
+    visits: of nodes, a frame.  apart_mm: farthest distance from the place with the first tolerance.
+    """
+
+    tolerance: float
+    frames: int
+    visits: float
+    apart_mm: float
+
+
+def tolerance_visits(
+    archive: Path, avatar: Floats, walk: Floats, tolerances: tuple[float, ...], folder: Path
+) -> list[FrameVisits]:
+    """Move an avatar along the poses (k, 4, 4) of a walk with each tolerance, all in memory.
+
+    folder: receives scene files.
+    """
+    rows: list[FrameVisits] = []
+    first = None
+    for tolerance in tolerances:
+        target = folder / f"tolerance-{tolerance:g}.toml"
+        with new_file(target) as file:
+            file.write(scene_text(archive, tolerance).encode())
+        with Scene.open(target) as scene:
+            scene.add_avatar(AVATAR, avatar)
+            world = scene.simulation.world
+            before, places, pose = world.visits, np.empty((len(walk), 3)), walk[0]
+            with scene.session(AVATAR) as session:
+                for at, wanted in enumerate(walk):
+                    session.wish(pose=towards(pose, wanted), time=at * FRAME_SECONDS)
+                    state = session.latest()
+                    assert state is not None
+                    pose = state.pose[0]
+                    places[at] = pose[:3, 3]
+            visits = (world.visits - before) / len(walk)
+        first = places if first is None else first
+        apart = float(np.linalg.norm(places - first, axis=1).max()) * 1e3
+        rows.append(FrameVisits(tolerance, len(walk), visits, apart))
+    return rows

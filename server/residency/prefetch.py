@@ -237,6 +237,7 @@ class Prefetcher:
             for cache in self._caches:
                 owed = cache.take_owed()
                 if owed is not None:
+                    row = owed if cache is residency else -1
                     cache.load_in_background(owed, lambda _: True, owed=True)
                     return True
             while queue:
@@ -251,7 +252,8 @@ class Prefetcher:
                 return True
         except Exception:  # for example out of memory: a request for the voxel reports it
             log.exception("a prefetch failed")
-            self._failed[row] = self._clock()
+            if row >= 0:
+                self._failed[row] = self._clock()
             return True
         return False
 

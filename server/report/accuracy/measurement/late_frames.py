@@ -26,6 +26,7 @@ class FrameWalk(NamedTuple):
     the level of detail; otherwise for voxels and level, by default.  late: of the session.
     effects: of the scene.  frames: number.
     slow: frames longer than FRAME_SECONDS.  longest_ms, median_ms: of a frame.
+    longest_cpu_ms, median_cpu_ms: of the processor for a frame, which other programs delay less.
     stopped: share of the frames that ended at voxels not in memory.
     behind: farthest distance from the pose of the walk at that time [m].
     false_clear: frames whose pose touches the scan; with continuous motion alone, also those whose
@@ -41,6 +42,8 @@ class FrameWalk(NamedTuple):
     slow: int
     longest_ms: float
     median_ms: float
+    longest_cpu_ms: float
+    median_cpu_ms: float
     stopped: float
     behind: float
     false_clear: int
@@ -77,7 +80,7 @@ def late_walk(
             scene.add_avatar(AVATAR, avatar)
             scene.simulation.warm()
             drop_cache(archive)
-            poses, times, stopped = _go(scene, walk, late)
+            poses, times, used, stopped = _go(scene, walk, late)
         verdict = judge.collide(AVATAR, poses).verdict
         swept = judge.sweep(AVATAR, poses[:-1], poses[1:]).verdict
     crossed = verdict[1:] == Verdict.CONTACT
@@ -86,29 +89,31 @@ def late_walk(
     behind = float(np.linalg.norm(poses[1:, :3, 3] - walk[:, :3, 3], axis=1).max())
     return FrameWalk(
         share, memory, coarse, late, "+".join(effects), len(times), int((times > FRAME_SECONDS).sum()),
-        float(times.max()) * 1e3, float(np.median(times)) * 1e3, float(stopped.mean()), behind,
+        float(times.max()) * 1e3, float(np.median(times)) * 1e3,
+        float(used.max()) * 1e3, float(np.median(used)) * 1e3, float(stopped.mean()), behind,
         int((crossed & (verdict[:-1] == Verdict.CLEAR)).sum()),
     )  # fmt: skip
 
 
-def _go(scene: Scene, walk: Floats, late: str) -> tuple[Floats, Floats, Floats]:
-    """Return the poses (k + 1, 4, 4), the duration (k,) of each frame [s], and whether it ended at
-    voxels not in memory (k,).
+def _go(scene: Scene, walk: Floats, late: str) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the poses (k + 1, 4, 4), and of each frame (k,) its duration, its processor time [s], and
+    whether it ended at voxels not in memory.
     """
-    poses, times, stopped = [walk[0]], [], []
+    poses, times, used, stopped = [walk[0]], [], [], []
     with scene.session(AVATAR, late=late) as session:
         due = time.perf_counter()
         for at, target in enumerate(walk):
-            begin = time.perf_counter()
+            begin, own = time.perf_counter(), time.thread_time()
             session.wish(pose=towards(poses[-1], target), time=at * FRAME_SECONDS)
             times.append(time.perf_counter() - begin)
+            used.append(time.thread_time() - own)
             state = session.latest()
             assert state is not None
             poses.append(state.pose[0])
             stopped.append(any(touched.unloaded for touched in state.touched))
             due = max(due + FRAME_SECONDS, time.perf_counter())
             time.sleep(due - time.perf_counter() if due > time.perf_counter() else 0.0)
-    return np.array(poses), np.array(times), np.array(stopped, float)
+    return np.array(poses), np.array(times), np.array(used), np.array(stopped, float)
 
 
 class FrameVisits(NamedTuple):

@@ -21,7 +21,7 @@ from ..schemas.errors import BadRequestError, BusyError, InternalError, Solidclo
 from ..schemas.wire import key_expressions
 from ..schemas.wire.answers import Cost, Part, Verdict
 from ..schemas.wire.encoding import decode_answer, encode
-from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest
+from ..schemas.wire.motion_messages import FRAME_SECONDS, WAIT, Moved, MoveRequest, checked_late
 from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_path_parameters
 from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.question_table import QUESTIONS
@@ -228,18 +228,28 @@ class Client(QueryMethods):
         with self._lock:
             self.unanswered += count
 
-    def move(self, name: str, pose_from: Any, pose_to: Any, seconds: float = FRAME_SECONDS) -> Moved:
+    def move(
+        self,
+        name: str,
+        pose_from: Any,
+        pose_to: Any,
+        seconds: float = FRAME_SECONDS,
+        *,
+        late: str = WAIT,
+    ) -> Moved:
         """Return the pose that an avatar reaches from one pose to another in a frame.
 
         pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world.
-        The scene's effects apply, and nothing is stored. seconds: duration of the frame. If no
-        server answers, the result is `pose_from` with the verdict `UNKNOWN`.
+        The scene's effects apply, and nothing is stored. seconds: duration of the frame.
+        late: "wait" for voxels that are not in memory, or answer by "bounds": WIRE.md, "Sessions".
+        If no server answers, the result is `pose_from` with the verdict `UNKNOWN`.
         """
         request = MoveRequest(
             avatar=name,
             pose_from=one_pose(pose_from, "pose_from")[None],
             pose_to=one_pose(pose_to, "pose_to")[None],
             seconds=float(seconds),
+            late=checked_late(late),
         )
         payload = self._connection.ask_about("move", encode(request), [name])
         if payload is None:
@@ -303,15 +313,17 @@ class Client(QueryMethods):
         if not complete:
             yield missing(total)
 
-    def session(self, avatar: str) -> ClientSession:
+    def session(self, avatar: str, *, late: str = WAIT) -> ClientSession:
         """Return a session of an avatar of this client or of the scene, for a `with`.
 
         It sends motion commands and receives the resulting states. The server simulates the scene's
         effects. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
+        late: what frames do about voxels that are not in memory: "wait" until they are loaded, or
+        go only as far as "bounds" of these voxels prove the way clear.
         """
         connection = self._connection
         connection.check_open()
         key_expressions.check_name(avatar, "avatar of a session")
         with self._lock:
             numbers = self._numbers.setdefault(avatar, CommandNumbers())
-        return ClientSession(connection, self.name, avatar, numbers)
+        return ClientSession(connection, self.name, avatar, numbers, checked_late(late))

@@ -14,7 +14,7 @@ from ..schemas.archive.seal import read_archive_key
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
 from ..schemas.wire.key_expressions import User, check_name
-from ..schemas.wire.motion_messages import FRAME_SECONDS, Moved
+from ..schemas.wire.motion_messages import FRAME_SECONDS, WAIT, Moved, checked_late
 from ..schemas.wire.requests import AddAvatarRequest, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
@@ -313,6 +313,7 @@ class Scene(SceneQuestions):
         pose_to: ArrayLike,
         seconds: float = FRAME_SECONDS,
         *,
+        late: str = WAIT,
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
@@ -320,17 +321,21 @@ class Scene(SceneQuestions):
 
         pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world.
         seconds: duration of the frame. Nothing is stored. See `Simulation.move`.
+        late: "wait" for voxels that are not in memory, or answer by "bounds": WIRE.md, "Sessions".
         """
-        return self.simulation.move(name, pose_from, pose_to, seconds, client=client, stop=stop)
+        return self.simulation.move(name, pose_from, pose_to, seconds, late=late, client=client, stop=stop)
 
-    def session(self, avatar: str, *, client: str = "") -> LocalSession:
+    def session(self, avatar: str, *, late: str = WAIT, client: str = "") -> LocalSession:
         """Return a session of an avatar of the client or of the scene, for a `with`.
 
         It takes motion commands and returns the resulting states. Each command is simulated in a
         separate frame. avatar: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
+        late: what frames do about voxels that are not in memory: "wait" until they are loaded, or
+        go only as far as "bounds" of these voxels prove the way clear.
         """
         check_owner(client)
-        return LocalSession(self.simulation, User(client, check_name(avatar, "avatar of a session")))
+        user = User(client, check_name(avatar, "avatar of a session"))
+        return LocalSession(self.simulation, user, checked_late(late))
 
     def plot(
         self,

@@ -21,7 +21,7 @@ from .archive import Archive
 from .index import INDEX_NAME, Header
 from .radius_model import RADIUS_CLASSES
 from .units import UNITS_PER_METRE
-from .voxel_grid import voxel_keys
+from .voxel_grid import Lattice, voxel_keys
 
 # Folder of the level, inside the folder of its archive.
 LEVEL_FOLDER = "level"
@@ -99,10 +99,15 @@ def open_level(archive: Archive) -> Archive | None:
     return level
 
 
+def halvings_between(level: Lattice, archive: Lattice) -> int:
+    """Return how often the edge of an archive's voxels is halved for those of its level."""
+    return (archive.voxel_steps // level.voxel_steps).bit_length() - 1
+
+
 def _covers_voxels(level: Archive, archive: Archive) -> bool:
     """Return whether the voxels of a level divide those of its archive, and leave none of them out."""
     ours, theirs = level.header.lattice, archive.header.lattice
-    halvings = (theirs.voxel_steps // ours.voxel_steps).bit_length() - 1
+    halvings = halvings_between(ours, theirs)
     if ours.voxel_steps << max(halvings, 0) != theirs.voxel_steps or ours[:2] != theirs[:2]:
         return False
     described = np.unique(voxel_keys(level.coordinates >> halvings))

@@ -20,6 +20,10 @@ import msgspec
 # import order would decide whether the JSON Schema contains 10.0 or 10.
 MAX_REACH = 10
 
+# Largest tolerance of frames [m], and the least one of their sweeps: it is far below `skin`, so that
+# it never shows.
+MAX_TOLERANCE, LEAST_TOLERANCE = 0.1, 1e-5
+
 Length = Annotated[float, msgspec.Meta(ge=0, le=MAX_REACH)]
 Near = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Degrees = Annotated[float, msgspec.Meta(ge=0, lt=90)]
@@ -49,11 +53,11 @@ class Sweep(Effect, frozen=True, tag="sweep"):
     """Continuous motion: the avatar passes through nothing between two frames.
 
     tolerance: how far any avatar point may move between the last pose known to be clear and the
-    first contact [m].
+    first contact [m]; omitted: the file's `tolerance`, at least 1e-5.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
-    tolerance: Annotated[float, msgspec.Meta(gt=0, le=0.1)] = 1e-5
+    tolerance: Annotated[float, msgspec.Meta(gt=0, le=MAX_TOLERANCE)] | None = None
 
 
 class Slide(Effect, frozen=True, tag="slide"):

@@ -18,7 +18,7 @@ from ..archive.rigid_pose import gram, rigid_fault
 from ..archive.voxel_grid import MAX_COORDINATE
 from ..errors import BadRequestError
 from ..wire.key_expressions import check_name
-from .effect_table import AnyEffect, Stop, Through, Vector, effect_name
+from .effect_table import LEAST_TOLERANCE, MAX_TOLERANCE, AnyEffect, Stop, Sweep, Through, Vector, effect_name
 from .toml_faults import MAX_BYTES, decode, format_value, suggestion, toml_error
 
 SUFFIX = ".toml"
@@ -118,6 +118,7 @@ class SceneFile(_Part, frozen=True):
     format: 1.  up: against gravity; any length but zero.
     radius_model: of the scan's spheres, stored in all archives; omitted: each archive's single
     radius.
+    tolerance: distance by which contact may be early in frames [m]: see `sweep_tolerance`.
     effects: in any order; the server runs them in a fixed order.
     """
 
@@ -126,11 +127,22 @@ class SceneFile(_Part, frozen=True):
     name: SceneName | None = None
     up: Vector = (0.0, 0.0, 1.0)
     radius_model: str | None = None
+    tolerance: Annotated[float, msgspec.Meta(ge=0, le=MAX_TOLERANCE)] = 0.0
     avatars: list[AvatarItem] = []
     objects: list[ObjectItem] = []
     spawn: Spawn | None = None
     limits: SceneLimits = SceneLimits()
     effects: list[AnyEffect] = msgspec.field(default_factory=lambda: [Stop()])
+
+
+def sweep_tolerance(scene: SceneFile) -> float:
+    """Return the tolerance of the sweeps of a scene's frames [m].
+
+    Contact of a pose is never early: an avatar that stands within the tolerance of a floor could
+    not move any more.
+    """
+    given = next((each.tolerance for each in scene.effects if isinstance(each, Sweep)), None)
+    return max(scene.tolerance, LEAST_TOLERANCE) if given is None else given
 
 
 def scene_of(archive: str) -> SceneFile:

@@ -6,7 +6,7 @@ if the scene does not declare the effect.
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Literal, cast, get_args
 
 import msgspec
 import numpy as np
@@ -22,6 +22,10 @@ from .requests import Count, Length, Name, Request, check_one_pose
 
 Vector = tuple[float, float, float]
 
+# What a frame does about voxels that are not in memory: wait until they are loaded, or bound them.
+Late = Literal["wait", "bounds"]
+WAIT, BOUNDS = get_args(Late)
+
 # Default duration of a frame, 30 of which make a second [s].
 FRAME_SECONDS = 1 / 30
 
@@ -32,12 +36,14 @@ class MoveRequest(Request, frozen=True, kw_only=True):
     avatar: the name under which it was added.
     pose_from, pose_to: (1, 4, 4) float64, avatar to world, rigid.
     seconds: duration of the frame, which gravity depends on, at most 10 [s].
+    late: what the frame does about voxels that are not in memory.
     """
 
     avatar: Name
     pose_from: Poses
     pose_to: Poses
     seconds: Length = FRAME_SECONDS
+    late: Late = "wait"
 
     def __post_init__(self) -> None:
         Request.__post_init__(self)
@@ -57,6 +63,7 @@ class Wish(Request, frozen=True, kw_only=True):
     pose: (1, 4, 4) float64, avatar to world, rigid.  velocity: world [m/s].
     turn: about the scene's up axis [rad/s], with velocity.
     objects: poses (4, 4) row-major of the scene's objects that this user moves.
+    late: what the frame does about voxels that are not in memory.
     """
 
     seq: Count
@@ -65,6 +72,7 @@ class Wish(Request, frozen=True, kw_only=True):
     velocity: Vector | None = None
     turn: float = 0.0
     objects: dict[str, list[list[float]]] = msgspec.field(default_factory=dict)
+    late: Late = "wait"
 
     def __post_init__(self) -> None:
         Request.__post_init__(self)
@@ -85,6 +93,13 @@ def _check_finite(what: str, numbers: Iterable[float]) -> None:
     for number in numbers:
         if not math.isfinite(number):
             raise BadRequestError(f"{what} holds {number}: expected finite numbers")
+
+
+def checked_late(late: str) -> Late:
+    """Return `late` of a session or a move. Raise BadRequestError for another value."""
+    if late not in get_args(Late):
+        raise BadRequestError(f"late is {late!r}: expected {' or '.join(map(repr, get_args(Late)))}")
+    return cast(Late, late)
 
 
 def motion_fields(pose: Any, velocity: Any) -> tuple[Poses, Vector | None]:
@@ -116,12 +131,14 @@ class Touched(msgspec.Struct, frozen=True, omit_defaults=True):
     place: of the scan point, world [m].  normal: the contact normal, where estimated.
     what: "" for the scene, else the object or user.
     unknown: whether the motion stopped at data that could not be examined, and not at a contact.
+    unloaded: whether that is so because voxels are not in memory yet: a later frame may go on.
     """
 
     place: Vector
     normal: Vector | None = None
     what: str = ""
     unknown: bool = False
+    unloaded: bool = False
 
 
 class GroundReport(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -218,6 +235,7 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     ground, proximity, contacts, uncertainty, objects, crowd: the report of each effect.
     unknown: whether the frame needed data that could not be examined. With it, any of these fields
     might differ.
+    unloaded: part of `left` that was not carried out because voxels are not in memory yet [m].
     `repr` and `str` are one line, such as "at (1.25, 0.5, 0): clear, 0.1 m left".
     """
 
@@ -235,6 +253,7 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     objects: ObjectsReport | None = None
     crowd: CrowdReport | None = None
     unknown: bool = False
+    unloaded: float = 0.0
 
     def __repr__(self) -> str:
         """Return the position reached, its verdict and what stopped the motion."""
@@ -242,6 +261,8 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
         parts = [f"at ({at}): {VERDICT_NAMES.get(self.verdict, self.verdict)}"]
         if self.left:
             parts.append(f"{self.left:.4g} m left")
+        if self.unloaded:
+            parts.append(f"{self.unloaded:.4g} m not in memory yet")
         if self.touched:
             parts.append(f"{len(self.touched)} obstacle{'s' * (len(self.touched) != 1)}")
         if self.skipped:

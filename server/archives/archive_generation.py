@@ -140,6 +140,7 @@ class ArchiveGeneration:
             prefetch=ahead,
             idle=fill,
             running_requests=lambda: (opened := weak()) is not None and opened._readers > 1,
+            level=None if self._level is None else self._level.residency,
         )
         figure = make_scene_data(store.archive, residency, bounds, coarse)
         level = None
@@ -147,6 +148,7 @@ class ArchiveGeneration:
             level = open_level_data(
                 self._level.store.archive,
                 self._level.residency,
+                store.archive,
                 settles_exact=ahead or is_coarse,
             )
 

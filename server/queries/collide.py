@@ -16,6 +16,7 @@ from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from .context.anytime_search import collide_bounded
+from .context.late_voxels import drop_proved_voxels
 from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
@@ -58,6 +59,8 @@ def collide(
         return np.asarray(found[which] != UNKNOWN)
 
     by_level, coarse = SettledPoses(data, array, budget, ask), drop_clear_voxels(data, avatar, array)
+    if budget.late is not None:
+        coarse = drop_proved_voxels(data, avatar, array, margin_units, budget)
     verdict, counts, reach = _verdicts(
         data, avatar, array, margin_units, budget, spent, lambda reach: by_level.drop(coarse(reach))
     )

@@ -43,6 +43,7 @@ from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .collide import clear_by_level
+from .context.late_voxels import drop_proved_voxels
 from .context.level_of_detail import SettledPoses, asked, stoppable
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
@@ -109,8 +110,11 @@ def contacts(
         return clear_by_level(level, avatar, array[which], margin_units, budget, spent)
 
     by_level = SettledPoses(data, array, budget, ask)
+    proved = drop_proved_voxels(data, avatar, array, margin_units, budget)
     other_units = data.radius_units + margin_units
-    reach = find_proved_reach(data, avatar, array, other_units, budget, spent, by_level.drop)
+    reach = find_proved_reach(
+        data, avatar, array, other_units, budget, spent, lambda reach: by_level.drop(proved(reach))
+    )
     k = len(array)
     tally = ContactResults(
         np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)

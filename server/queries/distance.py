@@ -19,6 +19,7 @@ from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.anytime_search import TOLERANCE_SLACK, distance_bounded
+from .context.late_voxels import drop_proved_voxels
 from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
 from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
 from .context.query_context import (
@@ -70,7 +71,10 @@ def distance(
         return settled
 
     by_level = SettledPoses(data, array, budget, ask)
-    nearest, counts, around = _pairs(data, avatar, array, reach_units, budget, spent, by_level.drop)
+    settled = by_level.drop
+    if budget.late is not None:
+        settled = drop_proved_voxels(data, avatar, array, reach_units, budget)
+    nearest, counts, around = _pairs(data, avatar, array, reach_units, budget, spent, settled)
     for column, own in zip(nearest, found, strict=True):
         column[by_level.settled] = own[by_level.settled]
     if len(avatar.points):

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.nearest.nearest_by_scan import NearestPerScan, nearest_by_scan
+from .context.late_voxels import drop_proved_voxels
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     SceneData,
@@ -60,7 +61,8 @@ def separation_per_scan(
     margin_units = to_units(margin, "margin")
     units = data.radius_units + margin_units
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    reach = find_proved_reach(data, avatar, poses, units, budget, spent)
+    proved = drop_proved_voxels(data, avatar, poses, margin_units, budget)
+    reach = find_proved_reach(data, avatar, poses, units, budget, spent, proved)
     if not len(avatar.points):
         return ScanSeparations({}, True)
     nearer = NearestPerScan(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))

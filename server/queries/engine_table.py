@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.wire.answers import SweepAnswers
 from ...schemas.wire.question_rules import Question
@@ -23,13 +23,13 @@ from ...schemas.wire.question_table import (
     SWEEP,
     WITHIN,
 )
-from ...schemas.wire.warming_parts import BUDGETS
+from ...schemas.wire.warming_parts import BUDGETS, MOTION
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..residency.coarse_bounds import drop_clear_pairs
 from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import EXACT, CostCounter, QueryBudget
+from .context.query_budget import EXACT, CostCounter, LateVoxels, QueryBudget
 from .context.query_context import SceneData, check_request
 from .context.unloaded_voxels import bound_missing
 from .distance import distance
@@ -125,8 +125,24 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             bound_rays_by_level(data.level, origin, samples["directions"], 1 << 20, EXACT, spent)
         else:
             bound_points_by_level(data.level, data.radius_units, origin, 1 << 20, EXACT, spent)
+    if part == MOTION:
+        _warm_late(data, avatar, pose)
     if part == COLLIDE.name and data.coarse is not None:
         # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
         reach = check_request(data, avatar, pose, data.radius_units)
         nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
         drop_clear_pairs(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
+
+
+def _warm_late(data: SceneData, avatar: AvatarModel, pose: NDArray[np.float64]) -> None:
+    """Run the queries of frames that do not wait, as if no voxel were in memory.
+
+    With the level of detail, and without it.
+    """
+    nowhere = data._replace(arrays=data.arrays._replace(where=np.full_like(data.arrays.where, -1)))
+    aside = pose.copy()
+    aside[0, 0, 3] += 0.01
+    for each in (nowhere, nowhere._replace(level=None)):
+        budget = QueryBudget(late=LateVoxels())
+        collide(each, avatar, pose, 0.0, budget)
+        sweep(each, avatar, pose, aside, budget=budget)

@@ -263,6 +263,7 @@ class ResidentQueries:
             if needed >= 0:
                 return _VERDICTS[int(verdict[0])], int(counts[1, 0])
         answers = collide(data, self.avatar, pose[None], budget=budget)
+        budget.lacked(len(answers.late))
         return _VERDICTS[answers.verdict[0]], int(answers.node_visits[0])
 
     def between(self, origin: Vec, pose_from: Pose, pose_to: Pose, fraction: float) -> tuple[Pose, bool]:

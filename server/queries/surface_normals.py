@@ -4,6 +4,7 @@ Normals are estimated one point at a time: all normals of a voxel of half a mill
 take seconds, and those of the few points touched in a frame take some microseconds each.
 """
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import TypeVar
@@ -70,7 +71,13 @@ class Normals:
             )
 
     def at(
-        self, cloud: ArrayLike, toward: ArrayLike, reach: float, stop: StopFlag = NO_STOP
+        self,
+        cloud: ArrayLike,
+        toward: ArrayLike,
+        reach: float,
+        stop: StopFlag = NO_STOP,
+        *,
+        waits: bool = True,
     ) -> NDArray[np.float64] | None:
         """Return the unit normal (3,) of the surface at a scan point, on the side of `toward`.
 
@@ -79,11 +86,11 @@ class Normals:
         cloud: (3,) the point, world [m], within half a lattice step.
         toward: (3,) any length; if it is 0 or lies in the surface, the side is arbitrary.
         reach: points within this distance of the point form its surface [m].
-        stop: ends a wait for a load.
+        stop: ends a wait for a load.  waits: if False, do not load the point's voxel.
         Raise BadRequestError for an invalid reach, CorruptError for an unreadable voxel,
-        StoppedError.
+        StoppedError, also for a voxel that is not in memory if it may not be loaded.
         """
-        code = self.code(cloud, reach, stop)
+        code = self.code(cloud, reach, stop, waits=waits)
         if code == NO_NORMAL:
             return None
         x, y, z = decode_normal(code)
@@ -91,20 +98,26 @@ class Normals:
         side = -1.0 if x * a + y * b + z * c < 0.0 else 1.0
         return np.array([side * x, side * y, side * z])
 
-    def code(self, cloud: ArrayLike, reach: float, stop: StopFlag = NO_STOP) -> int:
+    def code(self, cloud: ArrayLike, reach: float, stop: StopFlag = NO_STOP, *, waits: bool = True) -> int:
         """Return the code of the normal (schemas/kernels/normal_codes.py); NO_NORMAL if there is none.
 
-        stop: ends a wait for a load. Raise CorruptError, StoppedError.
+        stop, waits: as for `at`. Raise CorruptError, StoppedError.
         """
         square = self._square(reach)
 
         def look(row: int, x: int, y: int, z: int) -> int:
             return self._look(row, x, y, z, square)
 
-        return self._at_point(cloud, look, int(NO_NORMAL), stop)
+        return self._at_point(cloud, look, int(NO_NORMAL), stop, waits=waits)
 
     def highest(
-        self, cloud: ArrayLike, directions: NDArray[np.float64], reach: float, stop: StopFlag = NO_STOP
+        self,
+        cloud: ArrayLike,
+        directions: NDArray[np.float64],
+        reach: float,
+        stop: StopFlag = NO_STOP,
+        *,
+        waits: bool = True,
     ) -> NDArray[np.float64]:
         """Return how high the points near a scan point lie along directions (k,) [m].
 
@@ -117,7 +130,7 @@ class Normals:
         def look(row: int, x: int, y: int, z: int) -> int:
             return int(highest_near(self._data.arrays, row, x, y, z, square, directions, heights))
 
-        self.visits += self._at_point(cloud, look, 0, stop)
+        self.visits += self._at_point(cloud, look, 0, stop, waits=waits)
         return heights * self._data.arrays.step
 
     def _square(self, reach: float) -> int:
@@ -129,7 +142,13 @@ class Normals:
         return square
 
     def _at_point(
-        self, cloud: ArrayLike, look: Callable[[int, int, int, int], _Found], nothing: _Found, stop: StopFlag
+        self,
+        cloud: ArrayLike,
+        look: Callable[[int, int, int, int], _Found],
+        nothing: _Found,
+        stop: StopFlag,
+        *,
+        waits: bool,
     ) -> _Found:
         """Return `look` of the row of a point's voxel, resident during the call, and the lattice point.
 
@@ -147,7 +166,7 @@ class Normals:
             if self._data.arrays.where[row, 0] >= 0:
                 residency.use([row])
                 return look(row, x, y, z)
-        with residency.hold([row], stop=stop) as held:
+        with residency.hold([row], math.inf if waits else -math.inf, stop=stop) as held:
             if held.late:
                 raise StoppedError
             if held.faults:

@@ -18,6 +18,7 @@ from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
+from .late_sweep import AbsentVoxels, Motions, clear_until
 from .sweep_by_level import DEFAULT_TOLERANCE, SweepsByLevel, cold_motions
 
 # Motions of one kernel call if there is a deadline, which is checked between calls.
@@ -126,7 +127,8 @@ def sweep(
     be lost with a larger budget, which may be spent on an unresolved place before it.
     If the budget has a tolerance, or where voxels are late, the scene's level of detail is asked
     before they are loaded: how far the motion is clear, and whether a contact is near enough to
-    that place.
+    that place. With a budget that does not wait for loads, late_sweep.py bounds the motion by absent
+    voxels.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
 
@@ -139,8 +141,9 @@ def sweep(
     ) -> SweepAnswers:
         return _sweep(scene, avatar, begin, end, margin, within, own, None)
 
+    absent = None if budget.late is None else AbsentVoxels()
     level = SweepsByLevel(data, max(tolerance, budget.tolerance), budget, ask)
-    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, level)
+    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, level, absent)
     which = np.flatnonzero((answers.verdict == Verdict.UNKNOWN) & (answers.voxels_missing > 0))
     if budget.deadline == np.inf or not len(which) or budget.stop:
         return answers
@@ -163,8 +166,13 @@ def _sweep(
     tolerance: float,
     budget: QueryBudget,
     level: SweepsByLevel | None,
+    absent: AbsentVoxels | None = None,
 ) -> SweepAnswers:
-    """Answer `sweep` from the voxels of the scene, and before they are loaded from its level."""
+    """Answer `sweep` from the voxels of the scene, and before they are loaded from its level.
+
+    absent: collects the voxels that are not in memory and bounds the motions by them; None: these
+    are loaded.
+    """
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
         raise BadRequestError(f"tolerance {tolerance!r}: expected zero or a positive length in metres")
@@ -214,7 +222,7 @@ def _sweep(
                 progress.witness[settled] -= origin
                 which = np.setdiff1d(which, settled)
                 continue
-        if unproved and bounds.unsettled(rows[:needed], unproved).any():
+        if unproved and absent is None and bounds.unsettled(rows[:needed], unproved).any():
             # By the boxes of the index some may be out of reach, which changes the segments.
             by_index = progress._replace(
                 at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
@@ -234,7 +242,10 @@ def _sweep(
                 continue
         progress.lower[which] = progress.end[which]
         boxes = np.empty((k, 2, 3))  # unused here
-        around = VoxelsInReach(scales, units, starts, rows, boxes, outside)
+        near = starts, rows
+        if absent is not None:
+            near = absent.set_aside(starts, rows, data.arrays.where)
+        around = VoxelsInReach(scales, units, *near, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
             chunk = len(part) if budget.deadline == np.inf else _PER_CALL
             if budget.stop:
@@ -257,6 +268,19 @@ def _sweep(
     # Beyond the place where a motion was stopped, nothing is known.
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
+    if absent is not None and absent.rows and not absent.restricted:
+        motions = Motions(first, last, scales, units, loose, box)
+        clear = clear_until(
+            data, avatar, motions, absent, budget,
+            lambda covers, own: _sweep(covers, avatar, pose_from, pose_to, margin, tolerance, budget, None, own),
+        )  # fmt: skip
+        counts[0][clear < until] += np.uint32(len(absent.rows))
+        proved = np.minimum(proved, clear)
+        if (clear < 1.0).any() or (progress.upper < np.inf).any():
+            # What else is near decides in which interval a contact is found.
+            budget.lacked(len(absent.rows))
+            with residency.hold(sorted(absent.rows), budget.loads_until()) as held:
+                spent.add(held)  # their loads are owed
     lost = np.empty(k)
     find_unknown_regions(
         box,

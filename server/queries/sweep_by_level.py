@@ -40,7 +40,10 @@ class SweepsByLevel:
         self._level = None if level is None else stoppable(level, budget)
         # Frames simulate with the tolerance of their effects: what is in memory must not matter there.
         self._toleranced = budget.tolerance > DEFAULT_TOLERANCE
-        self.before_loads = level is not None and (self._toleranced or level.settles_exact)
+        # A budget that does not wait for loads bounds absent voxels instead (late_sweep.py).
+        self.before_loads = (
+            level is not None and budget.late is None and (self._toleranced or level.settles_exact)
+        )
         self._budget, self._ask = budget, ask
         self._within = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST)
 

@@ -64,6 +64,7 @@ class Prefetcher:
         idle: Callable[[], bool] | None = None,
         running_requests: Callable[[], bool] | None = None,
         clock: Callable[[], float] = time.perf_counter,
+        level: VoxelCache | None = None,
     ) -> None:
         """Make a prefetcher without a thread.
 
@@ -72,6 +73,7 @@ class Prefetcher:
         does some milliseconds of work.
         running_requests: returns whether requests are running; the first plan waits for them.
         clock: returns the time [s].
+        level: cache of the level of detail, whose owed loads are done before those of `residency`.
         """
         self._residency, self._tracks, self._clock, self._prefetch = residency, tracks, clock, prefetch
         self._work = threading.Event()
@@ -83,7 +85,9 @@ class Prefetcher:
         self._running_requests = running_requests  # None once a plan was made
         self._first_seen = math.inf
         self._failed: dict[int, float] = {}  # row -> time; a request for the voxel tries again
-        residency.on_owed = self._owed
+        self._caches = [residency] if level is None else [level, residency]
+        for cache in self._caches:
+            cache.on_owed = self._owed
 
     def __enter__(self) -> Self:
         """Return the prefetcher itself."""
@@ -97,7 +101,8 @@ class Prefetcher:
         """Stop loading, and wait for the thread."""
         with self._lock:
             self._stopped, thread = True, self._thread
-        self._residency.on_owed = None
+        for cache in self._caches:
+            cache.on_owed = None
         self._work.set()
         self._urgent.set()
         if thread is not None and thread is not threading.current_thread():
@@ -229,11 +234,12 @@ class Prefetcher:
         """Load one voxel; return False if there is none to load."""
         residency, row = self._residency, -1
         try:
-            owed = residency.take_owed()
-            if owed is not None:
-                row = owed
-                residency.load_in_background(row, lambda _: True, owed=True)
-                return True
+            for cache in self._caches:
+                owed = cache.take_owed()
+                if owed is not None:
+                    row = owed if cache is residency else -1
+                    cache.load_in_background(owed, lambda _: True, owed=True)
+                    return True
             while queue:
                 row, at = queue.popleft()
                 if residency.is_resident(row) or self._clock() < self._failed.get(row, -math.inf) + SILENCE:
@@ -246,7 +252,8 @@ class Prefetcher:
                 return True
         except Exception:  # for example out of memory: a request for the voxel reports it
             log.exception("a prefetch failed")
-            self._failed[row] = self._clock()
+            if row >= 0:
+                self._failed[row] = self._clock()
             return True
         return False
 

@@ -19,16 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import CorruptError, MisleadingIndexError
-from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
 from .arena import ArenaBuffer
 from .eviction import EvictionPolicy, make_policy
 from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
-from .voxel_states import BackgroundLoad, HeldVoxels, Hold, VoxelStates, voxel_sizes
+from .voxel_states import BackgroundLoad, CacheFacts, HeldVoxels, Hold, VoxelStates, voxel_sizes
 from .voxel_store import VoxelStore
 
 
-class VoxelCache:
+class VoxelCache(CacheFacts):
     """Resident voxels of one scene. Thread-safe.
 
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
@@ -73,54 +72,6 @@ class VoxelCache:
         self._turns = LoadTurns()
         self._waiting_requests = 0  # number of requests that wait
 
-    @property
-    def kept(self) -> frozenset[int]:
-        """Return the rows at users' positions; others are evicted before them."""
-        return self._states.kept
-
-    @kept.setter
-    def kept(self, rows: frozenset[int]) -> None:
-        self._states.kept = rows
-
-    @property
-    def resident(self) -> int:
-        """Return the number of voxels resident or being loaded."""
-        return len(self._states.allocator.offsets)
-
-    @property
-    def resident_bytes(self) -> int:
-        """Return the bytes of the voxels resident or being loaded."""
-        return self._states.allocator.used_bytes
-
-    @property
-    def evictions(self) -> int:
-        """Return the number of voxels evicted to make room for others."""
-        return self._states.allocator.evictions
-
-    def counters(self) -> Counters:
-        """Return the statistics of the cache."""
-        with self._lock:
-            allocator = self._states.allocator
-            return self.stats.counters(allocator.evictions, allocator.moved_bytes)
-
-    def load_times(self) -> list[float]:
-        """Return the durations of the last loads [s], unordered."""
-        with self._lock:
-            return list(self.stats.times)
-
-    def recent(self) -> list[int]:
-        """Return the index rows of the resident voxels, in order of eviction."""
-        with self._lock:
-            return [row for row in self.policy.victims() if row not in self._states.loading]
-
-    def is_resident(self, row: int) -> bool:
-        """Return whether a voxel is resident or being loaded."""
-        return row in self._states.allocator.offsets
-
-    def bytes_of(self, rows: Sequence[int]) -> int:
-        """Return the bytes that these voxels take when resident."""
-        return sum(self._sizes[row] for row in rows)
-
     def hold(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
     ) -> Hold:
@@ -129,7 +80,8 @@ class VoxelCache:
         Together they must fit in the budget. Unreadable voxels stay at -1 in `where` and are named
         in the result's faults; all others are resident.
         deadline: on time.perf_counter()'s clock [s]. Voxels that are not resident by then are
-        `late`. No load begins after it; a load that has begun is finished.
+        `late`. No load begins after it; a load that has begun is finished. -inf: no load is begun
+        or waited for, and nothing is evicted.
         scan: the voxels are used in passing and should not displace those that others use
         repeatedly (eviction.py).
         stop: setting it has the effect of the deadline.
@@ -153,6 +105,8 @@ class VoxelCache:
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
     ) -> HeldVoxels:
         """Begin a hold; the caller must call `release` unless this raises."""
+        if deadline == -math.inf:
+            return self._acquire_resident(rows, scan)
         begin = time.perf_counter()
         many = len(self._states.missing(rows)) > LOADS_WITHOUT_TURN
         turn = self._take_turn(deadline, stop) if many else None
@@ -161,6 +115,19 @@ class VoxelCache:
         finally:
             if turn is not None:
                 self._turns.give_back(turn)
+
+    def _acquire_resident(self, rows: Sequence[int], scan: bool) -> HeldVoxels:
+        """Begin a hold on the voxels that are resident; the loads of the others are owed."""
+        with self._changed:
+            self._states.pin(rows)
+            there, faults, late = self._states.sort_out(rows)
+            self.use(there, scan=scan)
+            self.stats.late += len(late)
+            if self.on_owed is not None:
+                self._states.owed.update(dict.fromkeys(late))
+        if late:
+            self._notify_owed()
+        return HeldVoxels(len(there), 0, faults, late)
 
     def _take_turn(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
         """Wait for a turn to load; `_waiting_requests` counts the request meanwhile."""

@@ -3,6 +3,7 @@
 A request holds voxels with a `Hold`, made by `VoxelCache.hold`; `HeldVoxels` is its result.
 """
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
+from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import StopFlag
 from .allocator import VoxelAllocator
 from .arena import ArenaBuffer
@@ -166,6 +168,17 @@ class VoxelStates:
         loading = [row for row in rows if row in self.loading]
         return not loading or any(row in self.abandoned for row in loading)
 
+    def sort_out(self, rows: Sequence[int]) -> tuple[list[int], tuple[str, ...], tuple[int, ...]]:
+        """Return the resident rows, the faults of unreadable ones, and the rows that are late."""
+        there, faults, late = [], [], []
+        for row in rows:
+            fault = self.fault(row)
+            if fault:
+                faults.append(fault)
+            else:
+                (there if self.is_resident(row) else late).append(row)
+        return there, tuple(faults), tuple(late)
+
     # --- pins ---
 
     def pin(self, rows: Sequence[int]) -> None:
@@ -277,3 +290,64 @@ class VoxelStates:
         assert all(count > 0 for count in self.pins.values())
         assert self.stats.fresh <= offsets
         self.stats.check()
+
+
+class CacheFacts:
+    """What a cache states about its voxels: the read-only part of `VoxelCache`.
+
+    policy, stats: see `VoxelCache`. The rest is set by it.
+    """
+
+    stats: CacheStats
+    policy: EvictionPolicy
+    _states: VoxelStates
+    _sizes: list[int]
+    _lock: threading.RLock
+
+    @property
+    def kept(self) -> frozenset[int]:
+        """Return the rows at users' positions; others are evicted before them."""
+        return self._states.kept
+
+    @kept.setter
+    def kept(self, rows: frozenset[int]) -> None:
+        self._states.kept = rows
+
+    @property
+    def resident(self) -> int:
+        """Return the number of voxels resident or being loaded."""
+        return len(self._states.allocator.offsets)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Return the bytes of the voxels resident or being loaded."""
+        return self._states.allocator.used_bytes
+
+    @property
+    def evictions(self) -> int:
+        """Return the number of voxels evicted to make room for others."""
+        return self._states.allocator.evictions
+
+    def counters(self) -> Counters:
+        """Return the statistics of the cache."""
+        with self._lock:
+            allocator = self._states.allocator
+            return self.stats.counters(allocator.evictions, allocator.moved_bytes)
+
+    def load_times(self) -> list[float]:
+        """Return the durations of the last loads [s], unordered."""
+        with self._lock:
+            return list(self.stats.times)
+
+    def recent(self) -> list[int]:
+        """Return the index rows of the resident voxels, in order of eviction."""
+        with self._lock:
+            return [row for row in self.policy.victims() if row not in self._states.loading]
+
+    def is_resident(self, row: int) -> bool:
+        """Return whether a voxel is resident or being loaded."""
+        return row in self._states.allocator.offsets
+
+    def bytes_of(self, rows: Sequence[int]) -> int:
+        """Return the bytes that these voxels take when resident."""
+        return sum(self._sizes[row] for row in rows)

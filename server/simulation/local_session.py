@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from ...schemas.errors import BadRequestError, BusyError, SolidcloudError
 from ...schemas.wire.key_expressions import User
-from ...schemas.wire.motion_messages import State, Wish, motion_fields, object_poses
+from ...schemas.wire.motion_messages import Late, State, Wish, motion_fields, object_poses
 from ..scene_interface import FrameCommand, LatestState
 from .simulation import Simulation
 
@@ -23,9 +23,9 @@ _MAX_STATES = 1024
 class LocalSession:
     """One avatar's session, made by `Scene.session`. A context manager, thread-safe."""
 
-    def __init__(self, simulation: Simulation, user: User) -> None:
-        """Create a session; entering it begins it."""
-        self._simulation, self._user = simulation, user
+    def __init__(self, simulation: Simulation, user: User, late: Late = "wait") -> None:
+        """Create a session; entering it begins it. late: of its motion commands, as in `Wish`."""
+        self._simulation, self._user, self._late = simulation, user, late
         self._commands = threading.Lock()  # held for a frame, so that states come in the order of commands
         self._changed = threading.Condition()
         self._states: deque[State | SolidcloudError] = deque(maxlen=_MAX_STATES)
@@ -93,6 +93,7 @@ class LocalSession:
                 velocity=speed,
                 turn=float(turn),
                 objects=moved,
+                late=self._late,
             )
             self._seq = wish.seq
             (outcome,) = self._simulation.step([FrameCommand(self._user, wish)], now)

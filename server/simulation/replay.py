@@ -14,6 +14,7 @@ import numpy as np
 
 from ...schemas.errors import BadRequestError, ErrorCode, SolidcloudError
 from ...schemas.scene.effect_table import MOTION_VERSION
+from ...schemas.wire.answers import Verdict
 from ...schemas.wire.encoding import decode_request
 from ...schemas.wire.key_expressions import User
 from ...schemas.wire.motion_messages import Wish
@@ -48,6 +49,8 @@ class TurnDifference(NamedTuple):
         if self.logged.error or self.found.error:
             return f"{where}: logged {_describe(self.logged)}, replayed {_describe(self.found)}"
         logged, found = np.frombuffer(self.logged.pose), np.frombuffer(self.found.pose)
+        if self.logged.pose == self.found.pose:
+            return f"{where}: the pose, logged as clear with voxels not in memory, touches the scan"
         at = int(np.flatnonzero(logged.view(np.int64) != found.view(np.int64))[0])
         return (
             f"{where}: pose[{at // 4}, {at % 4}] logged {float(logged[at])!r}, replayed {float(found[at])!r}"
@@ -61,6 +64,9 @@ class Replayed(NamedTuple):
     different: number of turns whose result differs.  first: the first such turn.
     reloaded: the frame before which the replay ended, because the log's scene was reloaded there;
     None if it was not.
+    taken: number of turns whose result was taken from the log, because it depended on voxels that
+    were not in memory. Such a turn is different if its pose was logged as clear and touches the
+    scan.
     """
 
     frames: int
@@ -68,18 +74,20 @@ class Replayed(NamedTuple):
     different: int
     first: TurnDifference | None
     reloaded: int | None
+    taken: int = 0
 
 
 def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
     """Simulate the frames of a log, with a new simulation of the same scene.
 
-    Each frame skips the effects that the logged one skipped, because that depended on a clock. The
-    replay ends where the log's scene was reloaded. Raises the errors of reading the records, and
+    Each frame skips the effects that the logged one skipped, because that depended on a clock. A
+    result that depended on voxels not in memory is taken from the log (body_record.py). The replay
+    ends where the log's scene was reloaded. Raises the errors of reading the records, and
     BadRequestError for a log of other rules of motion, or whose avatars are not those of the scene.
     """
     avatars = _LoggedAvatars(simulation)
     opened: list[int] | None = None
-    frames = turns = different = 0
+    frames = turns = different = taken = 0
     first: TurnDifference | None = None
     for record in records:
         if isinstance(record, Begin):
@@ -97,11 +105,12 @@ def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
             for logged in record.said:
                 opened = opened or logged.opened
                 if logged.opened not in ([], opened):
-                    return Replayed(frames, turns, different, first, record.number)
+                    return Replayed(frames, turns, different, first, record.number, taken)
+            taken += sum(logged.kept is not None for logged in record.said)
             frames, turns = frames + 1, turns + len(record.turns)
             for difference in _differences(simulation, record):
                 different, first = different + 1, first or difference
-    return Replayed(frames, turns, different, first, None)
+    return Replayed(frames, turns, different, first, None, taken)
 
 
 def _differences(simulation: Simulation, record: FrameRecord) -> list[TurnDifference]:
@@ -112,11 +121,13 @@ def _differences(simulation: Simulation, record: FrameRecord) -> list[TurnDiffer
     ended = StopFlag()
     ended.set("ended early when it was logged")
     stops = [ended if logged.error == ErrorCode.EXPIRED else NO_STOP for logged in record.said]
-    outcomes = simulation.step(turns, skips=[logged.skipped for logged in record.said], stops=stops)
+    skips, kept = [logged.skipped for logged in record.said], [logged.kept for logged in record.said]
+    outcomes = simulation.step(turns, skips=skips, stops=stops, kept=kept)
     return [
         TurnDifference(record.number, outcome.user, logged, found)
         for outcome, logged in zip(outcomes, record.said, strict=True)
         if ((found := turn_result(outcome)).pose, found.error) != (logged.pose, logged.error)
+        or (logged.kept is not None and getattr(outcome.state, "verdict", None) == Verdict.CONTACT)
     ]
 
 

@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ from ...schemas.wire.encoding import encode
 from ...schemas.wire.key_expressions import User
 from ..avatars.avatar_model import AvatarModel
 from ..scene_interface import FrameCommand, FrameResult
+from .body_record import BodyRecord, pose_bytes
 
 log = logging.getLogger(__name__)
 
@@ -87,12 +88,14 @@ class TurnResult(msgspec.Struct, frozen=True, array_like=True):
 
     pose: (4, 4) float64, little-endian; b"" if refused.  error: code.  skipped: skipped effects.
     opened: number of reloads of each archive when the user last moved; empty if it never moved.
+    kept: the body after a frame that lacked voxels and did not wait for them; None for all others.
     """
 
     pose: bytes
     error: str = ""
     skipped: list[str] = []
     opened: list[int] = []
+    kept: BodyRecord | None = None
 
 
 class FrameRecord(msgspec.Struct, frozen=True, tag="frame"):
@@ -109,16 +112,14 @@ _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)
 
 
-def turn_result(outcome: FrameResult, opened: Sequence[int] = ()) -> TurnResult:
-    """Return the logged form of an outcome. opened: number of reloads of each archive."""
+def turn_result(
+    outcome: FrameResult, opened: Sequence[int] = (), kept: BodyRecord | None = None
+) -> TurnResult:
+    """Return the logged form of an outcome. opened, kept: as in `TurnResult`."""
     if isinstance(outcome.state, SolidcloudError):
         return TurnResult(b"", str(outcome.state.code))
-    return TurnResult(pose_bytes(outcome.state.pose), "", list(outcome.state.skipped), list(opened))
-
-
-def pose_bytes(pose: Any) -> bytes:
-    """Return the logged form of a pose (4, 4): its float64 bytes, little-endian."""
-    return np.ascontiguousarray(pose, "<f8").tobytes()
+    skipped = list(outcome.state.skipped)
+    return TurnResult(pose_bytes(outcome.state.pose), "", skipped, list(opened), kept)
 
 
 class FrameLog:
@@ -185,10 +186,11 @@ class FrameLog:
         turns: Sequence[FrameCommand],
         outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
+        kept: Sequence[BodyRecord | None],
     ) -> None:
-        """Record one frame. opened: for each turn, the number of reloads of each archive."""
+        """Record one frame. opened, kept: for each turn, as in `TurnResult`."""
         commands = [(turn.user, encode(turn.wish)) for turn in turns]
-        results = [turn_result(*each) for each in zip(outcomes, opened, strict=True)]
+        results = [turn_result(*each) for each in zip(outcomes, opened, kept, strict=True)]
         self._write(FrameRecord(number, commands, results))
 
     def _write(self, record: Record) -> None:

@@ -6,7 +6,6 @@ poses, bit for bit: a clock is read only to report how long a frame took.
 """
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -23,32 +22,40 @@ from ...schemas.errors import (
     ExpiredError,
     InternalError,
     SolidcloudError,
-    UnknownAvatarError,
 )
-from ...schemas.scene.scene_file import SceneFile, Spawn
+from ...schemas.scene.scene_file import SceneFile
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
-from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, MoveRequest, State, Wish
+from ...schemas.wire.motion_messages import (
+    BOUNDS,
+    FRAME_SECONDS,
+    WAIT,
+    Moved,
+    MoveRequest,
+    State,
+    Wish,
+    checked_late,
+)
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
-from ..queries.context.query_budget import QueryBudget
+from ..queries.context.query_budget import LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
-from .world.frame import Body, Pose, Vec
-from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
+from .body_record import BodyRecord, record_of, take_record
+from .motion_commands import first_pose, frame_seconds, target_pose
+from .world.frame import Body, Pose
+from .world.vectors import norm, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
     from .effects.effect_pipeline import Pipeline
     from .world.bodies import Bodies
+    from .world.collision_world import World
 
 log = logging.getLogger(__name__)
 
 # A user that has sent no motion command for this long is removed with its body [s].
 SILENT_SECONDS = 30.0
-# Limit on the duration of a frame: after a longer pause, a viewer continues as after a short one
-# [s].
-LONGEST_FRAME = 0.1
 # Client of the avatars of `warm`; no real client has this name.
 _WARM = "*warm"
 
@@ -79,6 +86,7 @@ class Recorder(Protocol):
         turns: Sequence[FrameCommand],
         outcomes: Sequence[FrameResult],
         opened: Sequence[Sequence[int]],
+        kept: Sequence["BodyRecord | None"],
     ) -> None: ...
     def reloaded(self, generation: int) -> None: ...
 
@@ -132,6 +140,11 @@ class Simulation:
         """Return the users that are present."""
         return list(self._present)
 
+    @property
+    def world(self) -> "World":
+        """Return the world that the frames query."""
+        return self._pipeline.world
+
     def record(self, recorder: Recorder | None) -> None:
         """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""
         with self._frame:
@@ -144,14 +157,15 @@ class Simulation:
         pose_to: Any,
         seconds: float = FRAME_SECONDS,
         *,
+        late: str = WAIT,
         client: str = "",
         stop: StopFlag = NO_STOP,
     ) -> Moved:
         """Move avatar `name` from one pose towards another for one frame; keep no state.
 
         pose_from, pose_to: (4, 4) or (1, 4, 4) float64, avatar to world, rigid.
-        seconds: duration of the frame [s].  stop: ends the frame early: the avatar stays, and its
-        verdict is unknown.
+        seconds: duration of the frame [s].  late: as in `MoveRequest`.  stop: ends the frame early:
+        the avatar stays, and its verdict is unknown.
         Raises BadRequestError, BadTransformError, UnknownAvatarError.
         """
         request = MoveRequest(
@@ -159,13 +173,14 @@ class Simulation:
             pose_from=one_pose(pose_from, "pose_from")[None],
             pose_to=one_pose(pose_to, "pose_to")[None],
             seconds=float(seconds),
+            late=checked_late(late),
         )
         user = User(client, name)
         begin = check_rigid(request.pose_from[0].copy(), "pose_from")
         target = check_rigid(request.pose_to[0], "pose_to")
         body = _make_body(user, self.scene.avatar(name, client), begin)
         try:
-            return self._pipeline.run(body, target, request.seconds, QueryBudget(stop=stop))
+            return self._pipeline.run(body, target, request.seconds, _frame_budget(request.late, stop))
         except StoppedError:
             left = norm(target[:3, 3] - begin[:3, 3])
             return Moved(pose=begin[None], verdict=int(Verdict.UNKNOWN), left=left, unknown=True)
@@ -176,6 +191,7 @@ class Simulation:
         now: float | None = None,
         skips: Sequence[Collection[str]] | None = None,
         stops: Sequence[StopFlag] | None = None,
+        kept: Sequence[BodyRecord | None] | None = None,
     ) -> list[FrameResult]:
         """Simulate one frame: the motion commands of `turns`, in order. Return their outcomes.
 
@@ -187,37 +203,49 @@ class Simulation:
         fit the frame's budget.
         stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
         ExpiredError.
+        kept: for a replay: for each turn, a recorded result that is taken without a simulation, or
+        None. All others wait for voxels.
         """
         with self._frame:
             if now is not None:
                 self._remove([u for u, there in self._present.items() if now - there.heard > SILENT_SECONDS])
             self._frames += 1
-            outcomes, opened = [], []
+            outcomes, opened, records = [], [], []
             for number, turn in enumerate(turns):
                 skip = None if skips is None else skips[number]
                 stop = NO_STOP if stops is None else stops[number]
+                # In a replay, a frame without a record lacked nothing: it gives what a wait would give.
+                budget = _frame_budget(turn.wish.late if kept is None else WAIT, stop)
+                given = None if kept is None else kept[number]
                 used: list[bytes] = []
                 with recording_avatars(used):
-                    state = self._simulate_turn(turn, now, skip, stop)
+                    state = self._simulate_turn(turn, now, skip, budget, given)
                 there = self._present.get(turn.user)
                 about = b"".join(used) if there is None else there.body.avatar.digest
                 outcomes.append(FrameResult(turn.user, state, about))
                 opened.append(() if there is None else there.body.generations)
+                lacked = budget.late is not None and budget.late.count > 0 and isinstance(state, State)
+                records.append(record_of(there.body, self._bodies) if lacked and there else None)
             if self._recorder is not None:
-                self._recorder.frame(self._frames, turns, outcomes, opened)
+                self._recorder.frame(self._frames, turns, outcomes, opened, records)
             return outcomes
 
     def _simulate_turn(
-        self, turn: FrameCommand, now: float | None, skip: Collection[str] | None, stop: StopFlag
+        self,
+        turn: FrameCommand,
+        now: float | None,
+        skip: Collection[str] | None,
+        budget: QueryBudget,
+        given: BodyRecord | None,
     ) -> State | SolidcloudError:
         """Simulate the frame of one user; return its state, or the error of a refused command."""
         begin = time.perf_counter()
         try:
-            moved = self._simulate_command(turn.user, turn.wish, now, skip, stop)
+            moved = self._simulate_command(turn.user, turn.wish, now, skip, budget, given)
         except SolidcloudError as error:
             return error
         except StoppedError:
-            return ExpiredError(f"{stop.reason}: the user stays where it was")
+            return ExpiredError(f"{budget.stop.reason}: the user stays where it was")
         except Exception as error:  # the frames of the other users must continue
             log.exception("a frame of %s in %s", _public_name(turn.user), self.scene.name)
             return InternalError(f"{type(error).__name__} in the server: see the server's log")
@@ -232,7 +260,13 @@ class Simulation:
         )
 
     def _simulate_command(
-        self, user: User, command: Wish, now: float | None, skip: Collection[str] | None, stop: StopFlag
+        self,
+        user: User,
+        command: Wish,
+        now: float | None,
+        skip: Collection[str] | None,
+        budget: QueryBudget,
+        given: BodyRecord | None,
     ) -> Moved:
         """Move a user by one command; a new user enters with it, unless the command is refused."""
         there = self._present.get(user)
@@ -245,8 +279,11 @@ class Simulation:
                     raise BadRequestError(
                         f"{self.scene.name}: a wish moves objects: this scene has no objects"
                     )
-                undo.callback(self._bodies.place_objects(command.objects, stop))
-            moved = self._pipeline.run(present.body, target, seconds, QueryBudget(stop=stop), skip=skip)
+                undo.callback(self._bodies.place_objects(command.objects, budget.stop))
+            if given is None:
+                moved = self._pipeline.run(present.body, target, seconds, budget, skip=skip)
+            else:
+                moved = take_record(given, present.body, self.world, self._bodies)
             undo.pop_all()
         present.time = command.time
         present.heard = present.heard if now is None else now
@@ -326,48 +363,9 @@ class Simulation:
                 self._recorder.reloaded(generation)
 
 
-def frame_seconds(command: Wish, before: float | None) -> float:
-    """Return how long the frame of a motion command lasts [s].
-
-    before: time of the user's previous command, on its clock; None: it is the first.
-    """
-    if before is None:
-        return FRAME_SECONDS
-    return min(max(command.time - before, 0.0), LONGEST_FRAME)
-
-
-def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
-    """Return the target pose (4, 4) of a motion command given at `pose`. up: (3,) unit vector.
-
-    A velocity applies for the duration of the frame.
-    """
-    if command.velocity is None:
-        return check_rigid(command.pose[0], "pose")
-    there = pose.copy()
-    there[:3, 3] += np.array(command.velocity) * seconds
-    if command.turn and seconds:
-        there[:3, :3] = orthonormalize(multiply(rotation_matrix(up, command.turn * seconds), pose))
-    return there
-
-
-def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
-    """Return the pose at which users enter."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
-    pose[:3, 3] = spawn.position
-    return pose
-
-
-def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
-    """Return the pose at which a user enters with its first command.
-
-    Raise UnknownAvatarError if neither the scene's spawn nor the command gives one.
-    """
-    if spawn is not None:
-        return spawn_pose(spawn, up)
-    if command.velocity is not None:
-        raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
-    return check_rigid(command.pose[0].copy(), "pose")
+def _frame_budget(late: str, stop: StopFlag) -> QueryBudget:
+    """Return the budget of a frame's queries. late: as in `Wish`."""
+    return QueryBudget(stop=stop, late=LateVoxels() if late == BOUNDS else None)
 
 
 def _make_body(user: User, avatar: AvatarModel, pose: Pose) -> Body:

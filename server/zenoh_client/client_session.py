@@ -25,7 +25,7 @@ from ...schemas.errors import (
 )
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_answer, encode
-from ...schemas.wire.motion_messages import State, Wish, motion_fields, object_poses
+from ...schemas.wire.motion_messages import Late, State, Wish, motion_fields, object_poses
 from ...schemas.wire.scene_messages import ErrorReply
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
@@ -79,12 +79,19 @@ class ClientSession:
     """
 
     def __init__(
-        self, connection: ServerConnection, scene: str, avatar: str, numbers: CommandNumbers
+        self,
+        connection: ServerConnection,
+        scene: str,
+        avatar: str,
+        numbers: CommandNumbers,
+        late: Late = "wait",
     ) -> None:
         """Make a session; entering it begins it.
 
-        numbers: of motion commands, increasing over all sessions of this avatar.
+        numbers: of motion commands, increasing over all sessions of this avatar.  late: of its
+        motion commands, as in `Wish`.
         """
+        self._late = late
         self._connection, self._scene, self._avatar, self._numbers = connection, scene, avatar, numbers
         self._session, self._user = connection.session, self._present_user()
         self._states = StateQuery(
@@ -217,6 +224,7 @@ class ClientSession:
                 velocity=speed,
                 turn=float(turn),
                 objects=moved,
+                late=self._late,
             )
             self._publish(wish)
             self._sent, self._time = self._published, wish.time

@@ -59,7 +59,9 @@ _OTHERS = {
     "move": _Operation(
         MoveRequest,
         "",
-        lambda s, r, c, stop: s.move(r.avatar, r.pose_from, r.pose_to, r.seconds, client=c, stop=stop),
+        lambda s, r, c, stop: s.move(
+            r.avatar, r.pose_from, r.pose_to, r.seconds, late=r.late, client=c, stop=stop
+        ),
     ),
     "path": _Operation(
         PathRequest,

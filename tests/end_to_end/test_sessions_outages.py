@@ -154,6 +154,6 @@ def test_a_killed_server_leaves_a_log_that_replays(endpoint, tmp_path):
         process.kill()
     records = list(read_log(log))
     found = replay(floor_simulation(), records)
-    assert found == (200, 200, 0, None, None)
+    assert found == (200, 200, 0, None, None, 0)
     last = [record for record in records if isinstance(record, FrameRecord)][-1]
     assert last.said[0].pose == session.latest().pose.tobytes()

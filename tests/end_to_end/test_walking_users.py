@@ -230,7 +230,7 @@ def test_objects_that_users_move_are_moved_the_same_in_a_replay(archive: Path, t
                 moved.update(outcome.state.objects.poses)
     assert set(moved) == {"door", "crate"} and moved["crate"][0][3] > 0.3, "it was pushed"
     with Scene.open(path, read_points=np.loadtxt) as scene:  # not warmed: warming leaves no trace
-        assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None)
+        assert replay(scene.simulation, read_log(log)) == (60, 120, 0, None, None, 0)
 
 
 def records_of(whole: bytes) -> Iterator[tuple[int, int]]:

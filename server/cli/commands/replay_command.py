@@ -43,6 +43,8 @@ def replay(
         print_json({**found._asdict(), "first": first})
         return int(found.different > 0)
     print(f"{found.frames} frames, {found.turns} turns: {found.different or 'none'} different")
+    if found.taken:
+        print(f"{found.taken} turns taken from the log: they depended on voxels that were not in memory")
     if found.first is not None:
         print(f"first: {found.first}")
     if found.reloaded is not None:

@@ -109,6 +109,12 @@ def _head(begin: SceneContent) -> Iterator[str]:
         "Default: the radius stored in each archive."
     )
     yield f"#radius_model = {toml_value(begin.models[-1] if begin.models else 'mean')}"
+    yield ""
+    yield from _comment(
+        "Distance by which contact may be early in frames, 0 to 0.1: the default of the `tolerance` of `sweep`. "
+        "Poses are exact: an avatar at rest is never stopped by it."
+    )
+    yield "#tolerance = 0.0"
     if not begin.effects:
         yield ""
         yield from _comment("No effects: nothing stops an avatar. Remove this line to declare effects below.")

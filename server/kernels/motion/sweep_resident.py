@@ -136,3 +136,14 @@ def pose_between(pose_from, pose_to, fraction, box, origin, pose):
         pose[r, 3] = there + origin[r]
         same &= pose[r, 3] - origin[r] == there
     return same
+
+
+@nb.njit(nogil=True, cache=True)
+def motion_bounds(pose_from, pose_to, box):
+    """Return speed and slip of a motion (screw_motion.py) relative to the origin at zero.
+
+    speed: upper bound of the distance that any avatar point moves per unit of t [m].  slip: upper
+    bound of the error of a placed point [m].
+    """
+    motion = make_motion(pose_from, pose_to, box, np.zeros(3))
+    return motion.speed, motion.slip

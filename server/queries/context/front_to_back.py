@@ -98,6 +98,7 @@ def search_front_to_back(
     bounds = data.bounds
     tree, index_tree = bounds.trees()
     batch = BATCH if budget.deadline == math.inf else TIMED_BATCH
+    until = budget.deadline if budget.late is None else -math.inf
     for begin in range(0, k, batch):
         end = min(begin + batch, k)
         if budget.spent:
@@ -143,9 +144,7 @@ def search_front_to_back(
                     continue
             held = np.zeros(len(looked), bool)
             held[rows] = True
-            with data.residency.hold(
-                rows.tolist(), budget.deadline, scan=budget.scan, stop=budget.stop
-            ) as found:
+            with data.residency.hold(rows.tolist(), until, scan=budget.scan, stop=budget.stop) as found:
                 held[list(found.late)] = False  # another thread may be writing them
                 kernel(begin, end, lists, cursor, held, part)
             spent.add(found, int(looked[rows].sum()))

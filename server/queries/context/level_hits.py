@@ -60,7 +60,8 @@ class HitsByLevel:
         """
         level = None if data.nothing_clear else data.level
         self._level = None if level is None else stoppable(level, budget)
-        self.before_loads = level is not None and (max(allowed) > 0.0 or level.settles_exact)
+        wanted = max(allowed) > 0.0 or (level is not None and level.settles_exact)
+        self.before_loads = level is not None and wanted and budget.late is None
         self._late = budget.deadline < math.inf
         self._asked = np.zeros(k, bool)
         self.clear_until = np.zeros(k)

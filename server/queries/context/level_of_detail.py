@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.archive import Archive
-from ....schemas.archive.level import cover_units
+from ....schemas.archive.level import cover_units, halvings_between
+from ....schemas.archive.voxel_grid import voxel_keys
 from ....schemas.errors import BadRequestError, TooLargeError
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...residency.voxel_cache import VoxelCache
@@ -34,17 +35,24 @@ class LevelData(NamedTuple):
     """Opened level, before a radius model is chosen.
 
     data: of its archive.  occurs: (32,) bool, cover classes that a representative has.
-    settles_exact: see `LevelOfDetail`.
+    settles_exact, parents: see `LevelOfDetail`.
     """
 
     data: SceneData
     occurs: NDArray[np.bool_]
     settles_exact: bool
+    parents: NDArray[np.int64]
 
 
-def open_level_data(archive: Archive, residency: VoxelCache, *, settles_exact: bool) -> LevelData:
-    """Return the data of a level whose voxels `residency` holds."""
-    return LevelData(make_scene_data(archive, residency), archive.header.radius_counts > 0, settles_exact)
+def open_level_data(
+    archive: Archive, residency: VoxelCache, described: Archive, *, settles_exact: bool
+) -> LevelData:
+    """Return the data of a level whose voxels `residency` holds. described: the archive of the level."""
+    halvings = halvings_between(archive.header.lattice, described.header.lattice)
+    keys = voxel_keys(archive.coordinates >> halvings)
+    parents = np.searchsorted(described.voxels["key"], keys)
+    occurs = archive.header.radius_counts > 0
+    return LevelData(make_scene_data(archive, residency), occurs, settles_exact, parents)
 
 
 def with_level(data: SceneData, level: LevelData | None) -> SceneData:
@@ -62,7 +70,7 @@ def with_level(data: SceneData, level: LevelData | None) -> SceneData:
     points = level.data._replace(
         arrays=own._replace(radius_deficit=np.zeros(1, np.int64)), radius_units=smallest
     )
-    return data._replace(level=LevelOfDetail(covers, points, level.settles_exact))
+    return data._replace(level=LevelOfDetail(covers, points, level.settles_exact, level.parents))
 
 
 class SettledPoses:
@@ -87,8 +95,9 @@ class SettledPoses:
         self._asked = np.zeros(len(poses), bool)
         self._where = data.residency.where
         level = data.level
-        toleranced = budget.tolerance > 0 or budget.relative > 0
-        self._level = level if level is not None and (toleranced or level.settles_exact) else None
+        wanted = level is not None and (budget.tolerance > 0 or budget.relative > 0 or level.settles_exact)
+        # A frame that does not wait has no voxels in reach that the level proves clear (late_voxels.py).
+        self._level = level if wanted and budget.late is None else None
         if self._level is not None:
             self._level = stoppable(self._level, budget)
         self._ask = ask

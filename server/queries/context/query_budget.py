@@ -37,6 +37,19 @@ GRACE = 0.05
 LEAST_RELATIVE = 1e-3
 
 
+class LateVoxels:
+    """Voxels that a frame needs and does not wait for, because they are not in memory.
+
+    count: number of voxels, counted by each query of the frame that lacks them. 0: all answers are
+    those of a frame that waits.
+    """
+
+    __slots__ = ("count",)
+
+    def __init__(self) -> None:
+        self.count = 0
+
+
 class QueryBudget(NamedTuple):
     """Limits on the cost of one request.
 
@@ -51,6 +64,8 @@ class QueryBudget(NamedTuple):
     share: share of the cache for the voxels held at a time. If not all fit, work counts depend on
     it; verdicts never do.
     stop: ends the work early once it is set; what was not examined by then is unknown.
+    late: None: voxels that are not in memory are loaded. Otherwise no load is waited for: such
+    voxels are bounded (late_voxels.py), their loads are owed, and they are counted here.
     """
 
     tolerance: float = 0.0
@@ -60,6 +75,7 @@ class QueryBudget(NamedTuple):
     share: float = 1.0
     stop: StopFlag = NO_STOP
     relative: float = 0.0
+    late: LateVoxels | None = None
 
     @property
     def limited(self) -> bool:
@@ -82,11 +98,21 @@ class QueryBudget(NamedTuple):
         return bool(self.stop) or (self.deadline < math.inf and time.perf_counter() >= self.deadline)
 
     def loads_until(self) -> float:
-        """Return the deadline of loads that begin now, on the same clock [s]; inf if none."""
+        """Return the deadline of loads that begin now, on the same clock [s]; inf if none.
+
+        -inf: no load begins, and none is waited for.
+        """
+        if self.late is not None:
+            return -math.inf
         if self.deadline == math.inf:
             return math.inf
         now = time.perf_counter()
         return now + (self.deadline - now) * LOAD_SHARE
+
+    def lacked(self, voxels: int) -> None:
+        """Count voxels that a query of a frame lacked, if it does not wait for them."""
+        if self.late is not None:
+            self.late.count += voxels
 
 
 EXACT = QueryBudget()

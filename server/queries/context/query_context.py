@@ -73,11 +73,13 @@ class LevelOfDetail(NamedTuple):
     points: the same with the scene's smallest spheres: a contact with one is a contact of the
     scene.
     settles_exact: whether requests without a tolerance use the level too.
+    parents: (lv,) int64, for each voxel of the level, the row of the scene's voxel that it divides.
     """
 
     covers: "SceneData"
     points: "SceneData"
     settles_exact: bool
+    parents: NDArray[np.int64]
 
 
 class SceneData(NamedTuple):
@@ -258,7 +260,7 @@ def prove(data: SceneData, rows: Sequence[int], budget: QueryBudget, spent: Cost
     """
     residency = data.residency
     for part in parts_that_fit(residency, rows, int(residency.buffer.total_bytes * budget.share)):
-        if budget.spent:
+        if budget.spent or budget.late is not None:
             return
         with residency.hold(part, budget.loads_until(), scan=True, stop=budget.stop) as held:
             pass
@@ -282,6 +284,8 @@ def find_proved_reach(
     bounds, stop = data.bounds, budget.stop
     unproved = bounds.unproved
     reach = settled(check_request(data, avatar, poses, other_units))
+    if budget.late is not None:  # what is not proved is not in memory: it is bounded by its cell
+        return reach
     doubted = bounds.rows_to_prove(reach, unproved, stop)
     if not doubted:
         return reach

@@ -20,7 +20,8 @@ from .query_context import SceneData
 
 # Pairs of pose and voxel bounded by nodes after a deadline: some microseconds each.
 MAX_LATE_PAIRS = 1024
-_NO_COARSE = CoarseArrays(
+# Coarse bounds of no voxel.
+NO_COARSE = CoarseArrays(
     np.empty(0, np.float32), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.int32)
 )
 
@@ -62,7 +63,7 @@ def bound_missing(
         return part
     # When a deadline has passed, no more time is spent on nodes than on the load of a voxel.
     hurried = budget.deadline < np.inf and part.starts[-1] > MAX_LATE_PAIRS
-    coarse = _NO_COARSE if data.coarse is None or hurried else data.coarse.arrays
+    coarse = NO_COARSE if data.coarse is None or hurried else data.coarse.arrays
     starts, rows = np.empty_like(part.starts), np.empty(max(1, int(part.starts[-1])), np.int64)
     split_missing(
         poses,

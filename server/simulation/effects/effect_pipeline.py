@@ -198,22 +198,25 @@ def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
     for hit in hits:
         place = _vector(there if hit.cloud is None else hit.cloud)
         normal = None if hit.normal is None else _vector(hit.normal)
-        found[hit.what, place] = Touched(place, normal, hit.what, hit.verdict == Verdict.UNKNOWN)
+        unknown = hit.verdict == Verdict.UNKNOWN
+        found[hit.what, place] = Touched(place, normal, hit.what, unknown, hit.unloaded)
     return list(found.values())[:_MAX_TOUCHED]
 
 
 def _moved(frame: Frame, unknown: bool) -> Moved:
     """Return the answer for a frame. unknown: as in `Moved`."""
     x, y, z = frame.remaining.tolist()
+    left = (x * x + y * y + z * z) ** 0.5
     return Moved(
         pose=frame.pose[None].copy(),
         verdict=int(frame.verdict),
-        left=(x * x + y * y + z * z) ** 0.5,
+        left=left,
         touched=_touched(frame.hits, frame.pose[:3, 3]) if frame.hits else [],
         simulated=frame.simulated,
         skipped=frame.skipped,
         **frame.reports,
         unknown=unknown,
+        unloaded=min(left, max(hit.rest for hit in frame.hits)) if frame.hits else 0.0,
     )
 
 

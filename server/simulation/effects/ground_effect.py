@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....schemas.scene.effect_table import Ground, Slide, Step, Sweep
+from ....schemas.scene.effect_table import Ground, Slide, Step
+from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import GroundReport
 from ...queries.surface_normals import warm
@@ -67,8 +68,6 @@ _ROUNDING = 0.005
 # A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
 # tolerance of that sweep [m].
 _FALL_MARGIN, _FALL_TOLERANCE = 0.1, 1e-2
-# Tolerance without `sweep` [m].
-_TOLERANCE = 1e-5
 
 
 class GroundSearch(NamedTuple):
@@ -211,7 +210,7 @@ class GroundRunner:
         """Return the horizontal unit vector (3,) away from a steep surface; None if unknown."""
         if hit.avatar is None or hit.cloud is None:
             return None
-        out = frame.world.normal(hit, self._normal_reach)
+        out = frame.world.normal(hit, self._normal_reach, frame.budget)
         if out is None:
             out = hit.avatar - hit.cloud
         level = out - dot(out, frame.world.up) * frame.world.up
@@ -250,9 +249,14 @@ class GroundRunner:
         deep = feet - world.lowest_height() + _FALL_MARGIN
         if deep <= reach:
             return False
+        lacked = frame.lacked
         swept = world.sweep(
             avatar, frame.pose, translated(frame.pose, -deep * up), _FALL_TOLERANCE, frame.budget
         )
+        if frame.lacked > lacked and not (swept.verdict == Verdict.CONTACT and swept.exact):
+            # Whether it would land is not known until the voxels below are in memory: it waits there.
+            record_hit(frame, Hit(0.0, Verdict.UNKNOWN, None, None, unloaded=True))
+            return False
         if swept.verdict != Verdict.CONTACT:
             return bool(swept.verdict == Verdict.UNKNOWN)
         # The rim of a hole, or the ledge behind, stops the parts above the feet, which are wider.
@@ -273,7 +277,7 @@ class GroundRunner:
                 return stood[1]  # reuse the last ground: estimating a normal takes half a sweep's time
         up, out = frame.world.up, hit.avatar - hit.cloud
         length = norm(out)
-        normal: Vec | None = frame.world.normal(hit, self._normal_reach)
+        normal: Vec | None = frame.world.normal(hit, self._normal_reach, frame.budget)
         if normal is None:
             normal = out / length if length > 0.0 else up
         rises = dot(normal, up)
@@ -289,6 +293,7 @@ class GroundRunner:
         top = frame.world.normal(
             hit._replace(avatar=inner.cloud + up, cloud=inner.cloud, archive=inner.archive),
             self._normal_reach,
+            frame.budget,
         )
         return top if top is not None and dot(top, up) >= self._walkable else None
 
@@ -309,7 +314,7 @@ def make(effect: Ground, world: World) -> GroundRunner:
     declared = {type(each): each for each in world.file.effects}
     with world as seen:
         warm(seen[0].data)
-    step, sweep, slide = declared.get(Step), declared.get(Sweep), declared.get(Slide)
+    step, slide = declared.get(Step), declared.get(Slide)
     sliding = None
     if isinstance(slide, Slide):
         # Imported here, so that scenes without `slide` do not import it.
@@ -320,6 +325,6 @@ def make(effect: Ground, world: World) -> GroundRunner:
         effect,
         world.up,
         step.height if isinstance(step, Step) else 0.0,
-        sweep.tolerance if isinstance(sweep, Sweep) else _TOLERANCE,
+        sweep_tolerance(world.file),
         sliding,
     )

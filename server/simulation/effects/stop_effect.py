@@ -8,7 +8,8 @@ hot-reloaded) first escapes. The candidates are the displacement of the motion c
 not lead deeper into the deepest contact, and displacements of up to MAX_ESCAPE along the contact
 normal and upwards, shortest first. The first with a clear end is taken. The way to it is not
 tested, because an avatar in a wall has no clear side to stay on. If no end is clear, the avatar
-stays, and the verdict reports the contact.
+stays, and the verdict reports the contact. It also stays if its pose or a candidate is unknown
+because voxels are not in memory yet, for a frame that does not wait for them.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
@@ -66,7 +67,7 @@ def move_if_clear(frame: Frame, to: Pose) -> Hit | None:
             frame.verdict = Verdict.CLEAR
         return None
     hit = with_point(frame, to, hit._replace(fraction=1.0))._replace(fraction=0.0)
-    record_hit(frame, hit)
+    record_hit(frame, hit, to)
     return hit
 
 
@@ -76,9 +77,15 @@ def escape_contact(frame: Frame) -> None:
     frame.clear = hit is None
     if hit is None:
         return
+    if hit.unloaded:
+        record_hit(frame, hit)  # it may be clear: nothing pushes it before that is known
+        return
     for way in _escape_displacements(frame, hit):
-        pose = translated(frame.pose, way)
-        if is_clear(frame, pose):
+        pose, lacked = translated(frame.pose, way), frame.lacked
+        clear = is_clear(frame, pose)
+        if frame.lacked > lacked and not clear:
+            break  # a frame that waits might take this one
+        if clear:
             frame.pose, frame.clear = pose, True
             return
     frame.verdict = hit.verdict

@@ -6,6 +6,7 @@ the pose clear if the pose is one of the sweep's bit for bit; otherwise `collide
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
+from ....schemas.scene.scene_file import sweep_tolerance
 from ..world.collision_world import World
 from ..world.frame import (
     Frame,
@@ -52,11 +53,11 @@ class SweepRunner:
             if not pushes_on(frame, hit, to):
                 break
         if hit is not None:
-            record_hit(frame, hit)
+            record_hit(frame, hit, to)
         return hit
 
 
 def make(effect: Sweep, world: World) -> SweepRunner:
     """Create the effect of a scene."""
     skin = next(each.skin for each in world.file.effects if isinstance(each, Stop))
-    return SweepRunner(skin, effect.tolerance)
+    return SweepRunner(skin, sweep_tolerance(world.file))

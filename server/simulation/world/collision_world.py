@@ -26,7 +26,7 @@ from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import with_stop
 from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
 from ...queries.within import within
-from ...runtime.stop_flag import NO_STOP, StopFlag
+from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
 from .frame import Hit, Pose, Vec
 from .held_archive import HeldArchive, normals_of, swept_in_world, to_archive, to_world, touched_in_archive
@@ -127,8 +127,11 @@ class World:
         """Return the node visits of all queries of this thread."""
         return self._held.visits
 
-    def _count_of(self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers) -> None:
+    def _count_of(
+        self, answers: ContactsAnswers | DistanceAnswers | WithinAnswers, budget: QueryBudget
+    ) -> None:
         """Add the cost of one row of answers."""
+        budget.lacked(len(answers.late))
         unknown = answers.verdict[0] == Verdict.UNKNOWN
         self.count(int(answers.node_visits[0]), int(answers.voxels_missing[0]) or unknown)
 
@@ -237,7 +240,7 @@ class World:
         with self as seen:
             for number, each in enumerate(seen):
                 answers = contacts(each.data, avatar, to_archive(each, pose)[None], 1, budget=budget)
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 if len(answers.signed_distance):
                     value = float(answers.signed_distance[0])
                     own, cloud = (
@@ -263,7 +266,7 @@ class World:
                     else transform_points(each.placed.inverse, place[None])[0]
                 )
                 answers = within(each.data, there[None], reach, budget)
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 value = float(answers.distance[0])
                 if value > least or value == np.inf:
                     continue
@@ -284,7 +287,7 @@ class World:
         with self as seen:
             for each in seen:
                 answers = distance_fast(each.data, avatar, to_archive(each, pose), reach, budget)
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(
                         answers,
@@ -312,7 +315,7 @@ class World:
                 answers = contacts(
                     each.data, avatar, to_archive(each, pose)[None], limit, margin, cluster_distance, budget
                 )
-                self._count_of(answers)
+                self._count_of(answers, budget)
                 if each.placed.pose is not None:
                     columns = ("avatar_point", "cloud_point", "cluster_avatar", "cluster_cloud")
                     carried = {
@@ -322,7 +325,7 @@ class World:
                 found.append(answers)
         return found
 
-    def normal(self, hit: Hit, reach: float) -> Vec | None:
+    def normal(self, hit: Hit, reach: float, budget: QueryBudget = EXACT) -> Vec | None:
         """Return the unit normal (3,) of the touched surface, towards the avatar, or None.
 
         reach: distance within which points form the surface of the touched one [m]. If they form
@@ -335,29 +338,47 @@ class World:
             each = seen[hit.archive]
             normals, pose = normals_of(each), each.placed.pose
             place, way = touched_in_archive(each, hit.cloud, (hit.avatar - hit.cloud)[None])
+            waits = budget.late is None
             try:
-                found: Vec | None = normals.at(place, way[0], reach, held.stop)
+                found: Vec | None = normals.at(place, way[0], reach, held.stop, waits=waits)
                 if found is None:
                     farther = min(SPARSE_FACTOR * reach, MAX_NORMAL_REACH)
-                    found = normals.at(place, way[0], farther, held.stop)
+                    found = normals.at(place, way[0], farther, held.stop, waits=waits)
             except CorruptError:
+                held.unknown = True
+                return None
+            except StoppedError:
+                if waits or held.stop:
+                    raise
+                budget.lacked(1)  # it was evicted since it was touched
                 held.unknown = True
                 return None
             return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
 
-    def highest(self, hit: Hit, directions: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    def highest(
+        self, hit: Hit, directions: NDArray[np.float64], reach: float, budget: QueryBudget = EXACT
+    ) -> NDArray[np.float64]:
         """Return how high the scan points around a touched one lie along directions (k,) [m].
 
-        hit: of the scan.  directions: (k, 3) unit.  reach: as for `normal`.
+        hit: of the scan.  directions: (k, 3) unit.  reach, budget: as for `normal`. Return 0 where the
+        points are not in memory, or cannot be read.
         """
         assert hit.cloud is not None
-        held = self._held
+        held, waits = self._held, budget.late is None
         with self as seen:
             each = seen[hit.archive]
             place, ways = touched_in_archive(each, hit.cloud, directions)
             try:
-                found: NDArray[np.float64] = normals_of(each).highest(place, ways, reach, held.stop)
+                found: NDArray[np.float64] = normals_of(each).highest(
+                    place, ways, reach, held.stop, waits=waits
+                )
             except CorruptError:
+                held.unknown = True
+                return np.zeros(len(directions))
+            except StoppedError:
+                if waits or held.stop:
+                    raise
+                budget.lacked(1)
                 held.unknown = True
                 return np.zeros(len(directions))
         return found

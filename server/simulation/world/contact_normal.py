@@ -39,7 +39,7 @@ def contact_normal(frame: Frame, hit: Hit, reach: float) -> Vec | None:
     hit: ended a motion of the frame.  reach: points within this distance of the touched ones form
     the surfaces [m].
     """
-    smoothed: Vec | None = frame.world.normal(hit, reach)
+    smoothed: Vec | None = frame.world.normal(hit, reach, frame.budget)
     if hit.archive < 0 or hit.avatar is None or hit.cloud is None:
         return smoothed
     out = hit.avatar - hit.cloud
@@ -64,7 +64,7 @@ def _best(frame: Frame, hit: Hit, reach: float, smoothed: Vec | None, pair: Vec)
         own = rotate(frame.pose, np.array(decode_normal(code)))
         normals.append(-own if dot(own, pair) < 0.0 else own)
         lowest += _lowest(frame, hit, reach, normals[-1:])[0]
-    highest = frame.world.highest(hit, np.array(normals), reach).tolist()
+    highest = frame.world.highest(hit, np.array(normals), reach, frame.budget).tolist()
     excess = [max(-low, high) for low, high in zip(lowest, highest, strict=True)]
     return normals[excess.index(min(excess))]
 

@@ -38,6 +38,8 @@ class Hit(NamedTuple):
     normal: (3,) unit, of the touched surface, towards the avatar; None if it was not estimated.
     point: (3,) centre of the avatar's touching sphere, avatar frame [m]; None if the hit is not of
     the scan, or did not end a motion.
+    unloaded: whether it is UNKNOWN because voxels are not in memory.
+    rest: length of the motion that was left [m], if `unloaded`.
     """
 
     fraction: float
@@ -48,6 +50,8 @@ class Hit(NamedTuple):
     archive: int = -1
     normal: Vec | None = None
     point: Vec | None = None
+    unloaded: bool = False
+    rest: float = 0.0
 
 
 class Obstacle(Protocol):
@@ -147,6 +151,11 @@ class Frame:
     reports: dict[str, Any] = field(default_factory=dict)
     effect_state: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def lacked(self) -> int:
+        """Return how often queries of this frame lacked a voxel; always 0 if it waits for voxels."""
+        return 0 if self.budget.late is None else self.budget.late.count
+
 
 # Function that moves from `frame.pose` towards a pose as far as nothing is touched, sets frame.pose
 # and returns the hit that ended the motion, or None.
@@ -183,13 +192,13 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
 
 def find_first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
     """Return the first hit of the motion from frame.pose to a pose with scene or obstacles."""
-    avatar, found = frame.body.avatar, None
+    avatar, found, lacked = frame.body.avatar, None, frame.lacked
     swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget)
     if swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT
         if sure and not swept.exact:
             sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
-        found = Hit(swept.lower, Verdict.UNKNOWN, None, None)
+        found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
         if sure:
             found = Hit(swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive)
     for obstacle in frame.obstacles:
@@ -201,12 +210,12 @@ def find_first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
 
 def find_touched(frame: Frame, pose: Pose) -> Hit | None:
     """Return a hit with fraction 0 if a pose touches something or is unknown, or None."""
-    avatar = frame.body.avatar
+    avatar, lacked = frame.body.avatar, frame.lacked
     verdict = frame.world.collide(avatar, pose, frame.budget)
     if verdict == Verdict.CONTACT:
         return frame.world.deepest(avatar, pose, frame.budget) or Hit(0.0, verdict, None, None)
     if verdict == Verdict.UNKNOWN:
-        return Hit(0.0, verdict, None, None)
+        return Hit(0.0, verdict, None, None, unloaded=frame.lacked > lacked)
     return next((hit for each in frame.obstacles if (hit := each.touches(avatar, pose))), None)
 
 
@@ -292,8 +301,10 @@ def pushes_on(frame: Frame, hit: Hit, to: Pose) -> bool:
     return bool(hit.what) and any(obstacle.give_way(frame, hit, to) for obstacle in frame.obstacles)
 
 
-def record_hit(frame: Frame, hit: Hit) -> None:
-    """Record the hit that ended a motion."""
+def record_hit(frame: Frame, hit: Hit, to: Pose | None = None) -> None:
+    """Record the hit that ended a motion. to: pose that the motion led to, by the motion command."""
+    if hit.unloaded and to is not None:
+        hit = hit._replace(rest=norm(to[:3, 3] - frame.pose[:3, 3]))
     frame.hits.append(hit)
     if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
         frame.verdict = Verdict.UNKNOWN

@@ -171,6 +171,27 @@ def test_an_owed_load_that_raises_is_not_prefetched_soon_after() -> None:
     table.residency.check()
 
 
+def test_owed_loads_of_the_level_come_first() -> None:
+    store = FakeStore([1] * 2)
+    level = VoxelCache(store, 2 * BLOCK)  # type: ignore[arg-type]
+    table = Table([1] * 3, 3, level=level)
+    table.store.gate.clear()
+    store.gate.clear()
+    with table.prefetcher:
+        with table.residency.hold([0, 1], -np.inf) as held:
+            assert held.late == (0, 1)
+        assert table.store.wait_for_load(0, PATIENCE)
+        with level.hold([0, 1], -np.inf) as held:
+            assert held.late == (0, 1)
+        table.store.gate.set()
+        assert store.wait_for_load(0, PATIENCE) and table.store.loads == {0: 1}
+        store.gate.set()
+        assert until(lambda: table.resident() == [0, 1] and level.resident == 2)
+    assert table.residency.on_owed is None and level.on_owed is None
+    table.residency.check()
+    level.check()
+
+
 @pytest.mark.parametrize("fault", ["corrupt", "unreadable", "out of memory"])
 def test_a_load_that_fails_leaves_nothing_and_the_next_goes_on(fault: str) -> None:
     table = Table([1] * 3, 3)

@@ -46,6 +46,34 @@ def test_after_the_deadline_no_load_is_begun() -> None:
     assert take(residency, [0, 1, 2], deadline=0.0) == HeldVoxels(3, 0, ()), "what is there is not late"
 
 
+def test_who_does_not_wait_gets_what_is_there_and_evicts_nothing() -> None:
+    store = FakeStore([1] * 4)
+    residency = VoxelCache(store, 2 * BLOCK)
+    take(residency, [1])
+    take(residency, [3])
+    woken: list[int] = []
+    residency.on_owed = lambda: woken.append(1)
+    store.gate.clear()  # a load would block
+    with residency.hold([0, 1, 2, 3], -np.inf) as held:
+        assert held == HeldVoxels(2, 0, (), (0, 2)), "more than fit together may be asked for"
+        assert residency.resident == 2 and residency._states.pins == {0: 1, 1: 1, 2: 1, 3: 1}
+    assert store.loads == {1: 1, 3: 1} and woken == [1]
+    assert [residency.take_owed() for _ in range(3)] == [0, 2, None]
+    assert not residency._states.pins
+    residency.check()
+
+
+def test_who_does_not_wait_is_told_of_faults() -> None:
+    store = FakeStore([1] * 2)
+    store.faults[1] = "corrupt"
+    residency = VoxelCache(store, 2 * BLOCK)
+    with residency.hold([1]) as held:
+        assert held.faults
+    with residency.hold([0, 1], -np.inf) as held:
+        assert held.late == (0,) and len(held.faults) == 1
+    residency.check()
+
+
 def test_a_deadline_of_ages_is_waited_for() -> None:
     """Longer than a lock can be waited for: `budget_ms` has no upper end."""
     store = FakeStore([1])

@@ -85,7 +85,7 @@ def test_the_same_wishes_give_the_same_poses(log):
     assert sum(isinstance(record, AvatarPoints) for record in records) == 2
     found = replay(simulated(), records)
     turns = sum(len(record.turns) for record in records if isinstance(record, FrameRecord))
-    assert found == (60, turns, 0, None, None)
+    assert found == (60, turns, 0, None, None, 0)
     codes = {said.error for record in records if isinstance(record, FrameRecord) for said in record.said}
     assert codes == {"", "bad_transform", "unknown_avatar", "busy"}
 
@@ -164,7 +164,7 @@ def test_a_replay_ends_where_the_scene_was_reloaded(tmp_path):
             simulation.step([FrameCommand(AL, wish)])
             if number == 1:
                 simulation.scene.reload()
-    assert replay(simulated(), read_log(path)) == (3, 3, 0, None, 4)
+    assert replay(simulated(), read_log(path)) == (3, 3, 0, None, 4, 0)
 
 
 def test_an_avatar_that_is_not_in_the_log_is_an_error():

@@ -181,7 +181,7 @@ def estimate(scene: SceneStats, config: BuildConfig, rates: Rates, target: Path 
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, config.voxel, rates)
     jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
-    bytes_of = {"scan": 0.2, "intensity": 2.0, "normal": 1.2, "rgb": 2.0, "classification": 0.2}
+    bytes_of = {"scan": 0.2, "intensity": 2.0, "normal": 1.2, "rgb": 2.5, "classification": 0.2}
     measured = set() if scene.packed is None else {"scan", "intensity"}
     columns = sum(bytes_of[name] for name in config.keep - measured) + (config.models != {"mean"})
     each = columns + (rates.bytes_a_point(pitch / step) if scene.packed is None else scene.packed)

@@ -143,3 +143,19 @@ def test_a_real_ptx_file_has_the_colours_of_its_rows() -> None:
     rows = rows[(rows[:, :3] != 0).any(axis=1)]
     assert np.array_equal(read_scan(path).rgb, rows[:, 4:])
     assert len(np.unique(rows[:, 4:], axis=0)) > 1
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="SOLIDCLOUD_SCANS names no folder with format_samples")
+def test_real_las_and_e57_files_have_the_colours_that_their_libraries_read() -> None:
+    import laspy
+    import pye57
+
+    las = laspy.read(REAL.parent / "cupola_las" / "r2.las")
+    found = read_scan(REAL.parent / "cupola_las" / "r2.las")
+    words = np.stack([las.red, las.green, las.blue], axis=1)
+    assert words.max() > 255 and np.array_equal(found.rgb, words >> 8)
+    assert np.array_equal(found.classes, las.classification)
+    path = REAL.parent / "pumpA.e57"
+    columns = pye57.E57(str(path)).read_scan(0, colors=True, ignore_missing_fields=True)
+    channels = [columns[name] for name in ("colorRed", "colorGreen", "colorBlue")]
+    assert np.array_equal(read_scan(path).rgb, np.stack(channels, axis=1))

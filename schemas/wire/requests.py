@@ -74,7 +74,7 @@ class QuestionRequest(Request, frozen=True, kw_only=True):
     [m]; 0: exact.
     relative_tolerance: allowed distance between the bounds of a distance, as a share of the distance
     between the centres; if it is above 0, a millimetre is allowed at any distance. Only `distance`
-    uses it.
+    and `within` use it.
     budget_ms: time for loading and computing together [ms]; null: no limit.
     budget_visits: node visits per pose (ray, point, motion); null: no limit.
     radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an

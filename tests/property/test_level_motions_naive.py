@@ -28,11 +28,6 @@ def said(answers: Any) -> dict[str, Any]:
     return {name: str(value.tolist()) for name, value in columns.items()}  # NaN differs from itself
 
 
-@pytest.mark.case(
-    42,
-    "sweeps and contacts in 12 scenes from an empty cache on: first contacts within the tolerance, counts exact",
-    compiled_only="it opens a hundred scenes",
-)
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -101,7 +96,6 @@ def test_what_a_level_settles_is_true(
             assert said(kept.contacts("avatar", poses, 5, margin, radius_model=model)) == said(counted)
 
 
-@pytest.mark.case(42, "a dense wall: motions that miss it or end within 10 cm of it need no voxel")
 @pytest.mark.interpreted
 def test_motions_towards_a_dense_wall_need_no_voxel(tmp_path: Path, rng: np.random.Generator) -> None:
     wall = rng.uniform(0, 1, (6000, 3)) * [2.0, 0.003, 2.0]

@@ -52,12 +52,6 @@ def scene_options(tolerance: float, model: str | None) -> dict[str, Any]:
     return {"radius_model": model, **({"tolerance": tolerance} if tolerance else {})}
 
 
-@pytest.mark.case(
-    41,
-    "rays and points in 15 scenes, seven tolerances, radii per point: brute force, in memory, from an empty cache on, "
-    "and with the level alone in memory",
-    compiled_only="it opens hundreds of scenes",
-)
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -122,9 +116,6 @@ def test_bounds_hold_and_are_close_enough(
                     assert alone.residency.resident == 0
 
 
-@pytest.mark.case(
-    41, "a dense wall: rays and points within 20 cm need no voxel, nor do rays that miss; all are right"
-)
 @pytest.mark.interpreted
 def test_a_dense_wall_is_hit_without_its_voxels(tmp_path: Path, rng: np.random.Generator) -> None:
     wall = rng.uniform(0, 1, (6000, 3)) * [2.0, 0.003, 2.0]

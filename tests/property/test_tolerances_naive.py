@@ -134,3 +134,20 @@ def test_a_hundred_thousand_poses_by_brute_force() -> None:
     figures = load_script("check_tolerances").run(100_000, 20_000, 1)
     assert figures["poses"] == 100_000 and figures["what"] == {}
     assert figures["contact early"] > 50_000 and figures["distance not exact"] > 300_000
+
+
+def test_a_pair_just_beyond_the_first_bound_ends_the_search(tmp_path: Path) -> None:
+    """`distance` searches within twice the radii first, then within widening bounds.
+
+    A pair found at such a bound left the search to repeat it, although nothing nearer was worth finding.
+    """
+    rng = np.random.default_rng(7)
+    points, body = rng.uniform(-1, 1, (300, 3)), rng.uniform(-0.15, 0.15, (12, 3))
+    case = archive_cases.build(tmp_path, points, radius=0.0, voxel=4.0, leaf=4, degree=2, cell_points=32)
+    poses = np.tile(np.eye(4), (20_000, 1, 1))
+    poses[:, :3, 3] = points[rng.integers(300, size=20_000)] + rng.normal(size=(20_000, 3)) * 0.1
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", body, 0.01)
+        exact = scene.distance("body", poses, 1.0).node_visits
+        for tolerance in (0.01, 0.03, 0.1):
+            assert (scene.distance("body", poses, 1.0, tolerance=tolerance).node_visits <= exact).all()

@@ -78,7 +78,7 @@ def query(
     relative_tolerance: Annotated[
         float | None,
         typer.Option(
-            help="distance: allowed error as a share of the gap between centres, 0.3 for 30 %; default 0."
+            help="distance, within: allowed error as a share of the gap between centres, 0.3 for 30 %; default 0."
         ),
     ] = None,
     budget_ms: Annotated[

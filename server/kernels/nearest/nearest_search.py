@@ -300,6 +300,10 @@ def _search_widening(
             )
         if units[1] < bound or bound == limit or should_end(scene.stop, best.counters[0], best.counters[3]):
             break
+        # With a tolerance, a pair just beyond the bound may leave nothing within it worth finding.
+        loose = best.frame[5] > 0.0 or best.frame[6] > 0.0
+        if loose and found[0] >= 0 and units_to_beat(found_units(found), best.frame) <= bound:
+            break
         near *= 4
         for at in range(last - first):
             if gaps[at] < 0.0:

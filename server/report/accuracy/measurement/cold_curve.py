@@ -1,15 +1,16 @@
-"""Wait and bytes of `collide` with nothing in memory, against the error allowed."""
+"""Wait and bytes of a question with nothing in memory, against the error allowed."""
 
 import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .....schemas.errors import BadDataError
-from .....schemas.wire.answers import Verdict
+from .....schemas.wire.answers import CollideAnswers, Verdict
 from ....scene import Scene
 from ...common.machine import drop_from_page_cache
 from ...common.paired_times import Floats
@@ -19,6 +20,15 @@ from .measured_scene import AVATAR, SEED
 # Of address space, for voxels and level: memory that is not used costs nothing.
 BUDGET = 16 << 30
 RESAMPLED = 2000
+
+
+# Asks a scene about a place (4, 4) within a tolerance [m]; all answers have verdicts and misses.
+Query = Callable[[Scene, Floats, float], Any]
+
+
+def collide_at(scene: Scene, pose: Floats, tolerance: float) -> CollideAnswers:
+    """Ask whether the avatar touches the scene at a pose (4, 4)."""
+    return scene.collide(AVATAR, pose[None], tolerance=tolerance)
 
 
 def bytes_read() -> int | None:
@@ -41,22 +51,23 @@ def cold_curve(
     places: Floats,
     tolerances: tuple[float, ...],
     tick: Callable[[], None],
+    query: Query = collide_at,
 ) -> list[ColdRow]:
     """Ask about one pose (k, 4, 4) at a time, of a scene that was opened just before.
 
     The system's cache of the files is dropped before each question, where the system can. The
     settings are asked in random order at each place: exact without the level of detail, exact with
     it, and each tolerance.
-    tick: called after each place.
+    tick: called after each place.  query: asks a scene about a place (4, 4) within a tolerance [m].
     """
     settings = (None, 0.0, *tolerances)
     rng = np.random.default_rng([SEED, 0xC0])
     for tolerance in settings:  # untimed: the first questions of a process may compile
-        _ask(archive, avatar, places[0], tolerance)
+        _ask(archive, avatar, places[0], tolerance, query)
     spent = np.zeros((len(places), len(settings), 3))
     for at, pose in enumerate(places):
         for number in rng.permutation(len(settings)):
-            spent[at, number] = _ask(archive, avatar, pose, settings[number])
+            spent[at, number] = _ask(archive, avatar, pose, settings[number], query)
         tick()
     picks = rng.integers(0, len(places), (RESAMPLED, len(places)))
     counted = bytes_read() is not None
@@ -84,16 +95,18 @@ def _share(spent: Floats, number: int, picks: NDArray[np.int64]) -> tuple[float,
     return float(spent[:, number].sum() / max(first.sum(), 1e-12)), low, high
 
 
-def _ask(archive: Path, avatar: Floats, pose: Floats, tolerance: float | None) -> tuple[int, float, int]:
+def _ask(
+    archive: Path, avatar: Floats, pose: Floats, tolerance: float | None, query: Query
+) -> tuple[int, float, int]:
     """Ask about one pose with nothing in memory: bytes read, wait [s], voxels loaded."""
     coarse = 0 if tolerance is None else BUDGET // 16
     with Scene.open(archive, budget_bytes=BUDGET, coarse_bytes=coarse) as scene:
         scene.add_avatar(AVATAR, avatar)
         drop_cache(archive)
         before, begin = bytes_read() or 0, time.perf_counter()
-        answers = scene.collide(AVATAR, pose[None], tolerance=tolerance or 0.0)
+        answers = query(scene, pose, tolerance or 0.0)
         taken = time.perf_counter() - begin
-        if answers.verdict[0] == Verdict.UNKNOWN:
+        if (answers.verdict == Verdict.UNKNOWN).any():
             raise BadDataError(
                 "a pose is unknown, expected none: check the archive with `solidcloud validate`"
             )

@@ -71,7 +71,7 @@ def distance(
         return settled
 
     by_level = SettledPoses(data, array, budget, ask)
-    settled = by_level.drop
+    settled: Callable[[VoxelsInReach], VoxelsInReach] = by_level.drop
     if budget.late is not None:
         settled = drop_proved_voxels(data, avatar, array, reach_units, budget)
     nearest, counts, around = _pairs(data, avatar, array, reach_units, budget, spent, settled)

@@ -170,7 +170,9 @@ class VoxelStates:
 
     def sort_out(self, rows: Sequence[int]) -> tuple[list[int], tuple[str, ...], tuple[int, ...]]:
         """Return the resident rows, the faults of unreadable ones, and the rows that are late."""
-        there, faults, late = [], [], []
+        there: list[int] = []
+        late: list[int] = []
+        faults: list[str] = []
         for row in rows:
             fault = self.fault(row)
             if fault:

@@ -27,7 +27,7 @@ class FrameWalk(NamedTuple):
     effects: of the scene.  frames: number.
     slow: frames longer than FRAME_SECONDS.  longest_ms, median_ms: of a frame.
     longest_cpu_ms, median_cpu_ms: of the processor for a frame, which other programs delay less.
-    stopped: share of the frames that ended at voxels not in memory.
+    stopped: share of the frames whose commanded motion ended at voxels not in memory.
     behind: farthest distance from the pose of the walk at that time [m].
     false_clear: frames whose pose touches the scan; with continuous motion alone, also those whose
     straight motion crosses it. After sliding, the way is not straight.
@@ -75,8 +75,8 @@ def late_walk(
         judge.collide(AVATAR, walk)
         decoded = judge.info().resident_bytes
         memory = int(decoded * share)
-        how = {"coarse_bytes": memory} if coarse else {}
-        with Scene.open(target, budget_bytes=memory, policy="lru+prefetch", **how) as scene:
+        level = memory if coarse else None
+        with Scene.open(target, budget_bytes=memory, policy="lru+prefetch", coarse_bytes=level) as scene:
             scene.add_avatar(AVATAR, avatar)
             scene.simulation.warm()
             drop_cache(archive)
@@ -110,7 +110,7 @@ def _go(scene: Scene, walk: Floats, late: str) -> tuple[Floats, Floats, Floats, 
             state = session.latest()
             assert state is not None
             poses.append(state.pose[0])
-            stopped.append(any(touched.unloaded for touched in state.touched))
+            stopped.append(state.unloaded > 0.0)
             due = max(due + FRAME_SECONDS, time.perf_counter())
             time.sleep(due - time.perf_counter() if due > time.perf_counter() else 0.0)
     return np.array(poses), np.array(times), np.array(used), np.array(stopped, float)

@@ -50,6 +50,27 @@ def box_square(words, row, dx, dy, dz):
     return ex * ex + ey * ey + ez * ez
 
 
+@njit_no_refcount
+def enter_box(words, row, ray, radius, first, last):
+    """Return where a ray enters the box of a row, inflated by `radius`, in [first, last]; inf if nowhere.
+
+    ray: as in `_meet_node` of kernels/rays/rays.py. All distances in steps, float64.
+    """
+    for k in range(3):
+        slope, off = ray[3 + k], np.float64(words[row + k]) - ray[k]
+        wide = np.float64(words[row + 4 + k]) + radius
+        if slope == 0.0:
+            if abs(off) > wide:
+                return np.inf
+            continue
+        # Where the ray enters and leaves the two sides; both rounded outwards.
+        begin, end = (off - wide) / slope, (off + wide) / slope
+        slack = (abs(begin) + abs(end)) * 2.0**-50
+        first = max(first, min(begin, end) - slack)
+        last = min(last, max(begin, end) + slack)
+    return first if first <= last else np.inf
+
+
 @nb.njit(nogil=True, cache=True)
 def lay_boxes(nodes, block_words, step, arena, where):
     """Replace the slabs of a voxel's nodes by boxes where boxes are tighter.
@@ -98,7 +119,7 @@ def _lay_box(words, row, box, room):
         square += half * half
         moved += (0.5 * (np.float64(box[3 + k]) + box[k]) - words[row + k]) ** 2
         shortest = min(shortest, half)
-    radius, around = np.float64(words[row + 3]), np.float64(words[row + 3]) + room
+    around = np.float64(words[row + 3]) + room
     of_slab = 4.0 / 3.0 * math.pi * around**3
     if words[row + 4] != ZERO or words[row + 5] != ZERO or words[row + 6] != ZERO:
         thick = (np.float64(words[row + 9]) - words[row + 8]) / words[row + 7]
@@ -106,7 +127,7 @@ def _lay_box(words, row, box, room):
     if volume >= of_slab:
         return
     # Two steps of float32 upwards cover the rounding of the root and of the sum.
-    radius = min(math.sqrt(square), radius + math.sqrt(moved)) * (1.0 + 2.0**-22)
+    radius = min(math.sqrt(square), np.float64(words[row + 3]) + math.sqrt(moved)) * (1.0 + 2.0**-22)
     for k in range(3):
         words[row + k] = np.float32(0.5 * (np.float64(box[3 + k]) + box[k]))
         words[row + 4 + k] = np.float32(0.5 * (np.float64(box[3 + k]) - box[k]))

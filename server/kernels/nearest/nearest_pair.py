@@ -117,8 +117,7 @@ def lower_bound(words, row, x, y, z, radius):
     apart = np.sqrt(dx * dx + dy * dy + dz * dz)
     both = words[at + U(3)] + radius
     if has_box(words, row):
-        gap = np.sqrt(box_square(words, row, dx, dy, dz))
-        return max(apart - both, gap - radius) - SLACK * (apart + both)
+        return max(apart - both, np.sqrt(box_square(words, row, dx, dy, dz)) - radius) - SLACK * (apart + both)
     along = words[at + U(4)] * dx + words[at + U(5)] * dy + words[at + U(6)] * dz
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_boxes import has_box
+from ..core.node_boxes import enter_box, has_box
 from ..core.node_overlap import U32
 from ..core.placed_avatar import lattice_to_units
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
@@ -114,19 +114,7 @@ def _meet_node(words, row, ray, radius, limit):
         return np.inf
     first = max(first, 0.0)
     if has_box(words, row):
-        for k in range(3):
-            off = dx if k == 0 else dy if k == 1 else dz
-            slope, wide = ray[3 + k], np.float64(words[row + 4 + k]) + radius
-            if slope == 0.0:
-                if abs(off) > wide:
-                    return np.inf
-                continue
-            # Where the ray enters and leaves the two sides; both bounds outwards.
-            begin, end = (off - wide) / slope, (off + wide) / slope
-            slack = (abs(begin) + abs(end)) * 2.0**-50
-            first = max(first, min(begin, end) - slack)
-            last = min(last, max(begin, end) + slack)
-        return first if first <= min(last, limit) else np.inf
+        return enter_box(words, row, ray, radius, first, min(last, limit))
     nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
     slope = nx * ray[3] + ny * ray[4] + nz * ray[5]
     offset = nx * dx + ny * dy + nz * dz

@@ -108,16 +108,17 @@ def make_best_pair(deficit):
 def lower_bound(words, row, x, y, z, radius):
     """Return a lower bound of the distance of a sphere's points from a node's points [steps].
 
-    x, y, z: float32, relative to the voxel's low corner. The bound is the larger of the sphere's
-    and that of the slab or the box, minus all float32 rounding of this function; a negative bound says nothing. It
-    does not include the errors of placed coordinates: `BestPair.cut` does.
+    x, y, z: float32, relative to the voxel's low corner. The bound is the larger of the sphere's and
+    the slab's or box's, minus all float32 rounding of this function; a negative bound says nothing.
+    It does not include the errors of placed coordinates: `BestPair.cut` does.
     """
     at = U(row)  # not negative: saves a comparison for every index
     dx, dy, dz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     apart = np.sqrt(dx * dx + dy * dy + dz * dz)
     both = words[at + U(3)] + radius
     if has_box(words, row):
-        return max(apart - both, np.sqrt(box_square(words, row, dx, dy, dz)) - radius) - SLACK * (apart + both)
+        gap = np.sqrt(box_square(words, row, dx, dy, dz)) - radius
+        return max(apart - both, gap) - SLACK * (apart + both)
     along = words[at + U(4)] * dx + words[at + U(5)] * dy + words[at + U(6)] * dz
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.

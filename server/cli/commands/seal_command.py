@@ -23,8 +23,8 @@ def seal(
 ) -> None:
     """Seal an archive against forgery.
 
-    Readers with the key find every change. Adding or removing scans removes the seal, and writing another level of detail removes that of
-    the level: seal the archive again.
+    Readers with the key find every change. Adding or removing scans removes the seal, and writing
+    another level of detail removes that of the level: seal the archive again.
     """
     from ....schemas.archive.seal import MIN_KEY_BYTES, read_archive_key, write_new_key
     from ....schemas.errors import BadRequestError

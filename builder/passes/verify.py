@@ -61,7 +61,7 @@ class _Unit(NamedTuple):
     asked: list[NDArray[np.int64]] | None
     summed: bool
     points: int
-    key: bytes | None
+    key: bytes | None = None
 
 
 class _Found(NamedTuple):

@@ -21,10 +21,10 @@ def seal(
         typer.Option("--new-key", help="Write a random key to this new file, and seal nothing."),
     ] = None,
 ) -> None:
-    """Seal an archive, so that readers with the key find every change.
+    """Seal an archive against forgery.
 
-    Adding or removing scans removes the seal, and writing another level of detail removes that of
-    the level: seal the archive again.
+    Readers with the key find every change. Adding or removing scans removes the seal, and writing
+    another level of detail removes that of the level: seal the archive again.
     """
     from ....schemas.archive.seal import MIN_KEY_BYTES, read_archive_key, write_new_key
     from ....schemas.errors import BadRequestError

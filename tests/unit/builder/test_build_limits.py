@@ -189,6 +189,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "coordinates alone": {},
     "scan and intensity": {"keep": ALL},
     "scan, intensity and classes": {"keep": ALL, "models": frozenset({"mean", "local"})},
+    "all that scans have": {"keep": ALL | {"rgb", "classification"}},
     "small leaf nodes": {"leaf": 4, "degree": 4},
 }
 

@@ -67,7 +67,7 @@ def test_output_and_overwrite_have_one_spelling() -> None:
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [
-        ("solidcloud se", ["serve"]),
+        ("solidcloud ser", ["serve"]),
         ("solidcloud scene ", ["new", "check"]),
         ("solidcloud export hall --over", ["--overwrite"]),
         ("solidcloud serve hall --policy lru", ["lru", "lru+prefetch"]),

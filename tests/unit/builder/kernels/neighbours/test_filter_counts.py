@@ -165,15 +165,16 @@ def test_the_best_of_a_cell_is_the_least_of_all_it_is_judged_by(values: int) -> 
         cells = rng.integers(0, 8, n).astype(np.uint64)
         away, ranks, scans = (rng.integers(0, values, n) for _ in range(3))
         intensities = rng.choice(np.array([0.5, 1.5, np.nan], np.float32), n)
+        looks = rng.integers(0, values, n).astype(np.uint32)
         shuffled = rng.permutation(n)
         order = shuffled[np.argsort(cells[shuffled], kind="stable")]
-        best = best_of_cells(order, cells, away, ranks.astype(np.uint64), scans, intensities)
+        best = best_of_cells(order, cells, away, ranks.astype(np.uint64), scans, intensities, looks)
 
         def merit(at: int) -> tuple:
             bright = float(intensities[order[at]])  # noqa: B023
             lack = math.isnan(bright)
             i = order[at]  # noqa: B023
-            return (away[i], ranks[i], scans[i], lack, 0.0 if lack else bright, at)  # noqa: B023
+            return (away[i], ranks[i], scans[i], lack, 0.0 if lack else bright, looks[i], at)  # noqa: B023
 
         expected = [
             int(order[min(np.flatnonzero(cells[order] == cell).tolist(), key=merit)])

@@ -60,7 +60,8 @@ class HitsByLevel:
         """
         level = None if data.nothing_clear else data.level
         self._level = None if level is None else stoppable(level, budget)
-        self.before_loads = level is not None and (max(allowed) > 0.0 or level.settles_exact)
+        # An exact answer nearly always needs the voxel of the hit: the level would be read in addition.
+        self.before_loads = level is not None and max(allowed) > 0.0
         self._late = budget.deadline < math.inf
         self._asked = np.zeros(k, bool)
         self.clear_until = np.zeros(k)

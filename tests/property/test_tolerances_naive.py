@@ -143,7 +143,8 @@ def test_a_pair_just_beyond_the_first_bound_ends_the_search(tmp_path: Path) -> N
     """
     rng = np.random.default_rng(7)
     points, body = rng.uniform(-1, 1, (300, 3)), rng.uniform(-0.15, 0.15, (12, 3))
-    case = archive_cases.build(tmp_path, points, radius=0.0, voxel=4.0, leaf=4, degree=2, cell_points=32)
+    points *= 0.3 * rng.random((300, 1)) ** 2
+    case = archive_cases.build(tmp_path, points, radius=0.0, voxel=4.0, leaf=16, degree=4, cell_points=128)
     poses = np.tile(np.eye(4), (20_000, 1, 1))
     poses[:, :3, 3] = points[rng.integers(300, size=20_000)] + rng.normal(size=(20_000, 3)) * 0.1
     with Scene.open(case.archive) as scene:

@@ -60,8 +60,8 @@ class HitsByLevel:
         """
         level = None if data.nothing_clear else data.level
         self._level = None if level is None else stoppable(level, budget)
-        wanted = max(allowed) > 0.0 or (level is not None and level.settles_exact)
-        self.before_loads = level is not None and wanted and budget.late is None
+        # An exact answer nearly always needs the voxel of the hit: the level would be read in addition.
+        self.before_loads = level is not None and max(allowed) > 0.0 and budget.late is None
         self._late = budget.deadline < math.inf
         self._asked = np.zeros(k, bool)
         self.clear_until = np.zeros(k)

@@ -5,13 +5,14 @@ against every surface touched in the frame, so that it leads into none of them: 
 crease of two, and is zero between three. It is never directed against the motion command, and never
 longer than the remainder.
 
-A surface is a plane with the smoothed normal of the scan points around the touched one. The scan's
-spheres make a flat wall bumpy, by up to their radius. If a motion touches a plane that the frame
-has touched before, a bump obstructs it. The avatar then moves off the surface by a few millimetres
-and continues; the result is kept if it led farther along the motion command. Repeated frames of one
-motion command therefore improve the position or keep it, and an avatar that keeps pushing does not
-tremble. In a nearly head-on push, the remainder along the surface is mostly the error of the
-normal, and the avatar stays, as by friction (MIN_SLIDE_SHARE).
+A surface is a plane with the smoothed normal of the scan points around the touched one, or at an
+edge that of the avatar (contact_normal.py). The scan's spheres make a flat wall bumpy, by up to
+their radius. If a motion touches a plane that the frame has touched before, a bump obstructs it.
+The avatar then moves off the surface by a few millimetres and continues; the result is kept if it
+led farther along the motion command. Repeated frames of one motion command therefore improve the
+position or keep it, and an avatar that keeps pushing does not tremble. In a nearly head-on push,
+the remainder along the surface is mostly the error of the normal, and the avatar stays, as by
+friction (MIN_SLIDE_SHARE).
 
 If the command turns the avatar, its screw motion is tried first. The rest of its translation then
 slides at the orientation reached. Finally, the rest of the rotation is tried in place.

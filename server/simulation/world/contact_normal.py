@@ -4,18 +4,18 @@ The smoothed normal of the scan points around a touched one is the surface's if 
 the surface from one side. At a free edge, such as the jamb of a door in a wall scanned as one sheet
 of points, it is still the sheet's, and an avatar would press against the edge for ever.
 
-A normal of a contact separates the two bodies: close to the touched point, the avatar lies on one
-side of the plane, and the scan on the other. So the smoothed normal of the scan is taken if the
-plane separates the avatar's patch, that is its points within reach of the touched one. Otherwise
-the contact is at an edge, and three directions are compared: the scan's smoothed normal, the
-avatar's, and that from the one touched sphere to the other. The one whose plane the points of
-either patch exceed least is taken. Where a smooth body touches an edge, this is the body's normal,
-as for the contact of a face and an edge in collision detection between polyhedra (Lin and Canny
-1991; Ericson, Real-Time Collision Detection, 2005, section 9.1).
+The normal of a contact separates the two bodies: near the touched point, the avatar lies on one
+side of the plane, and the scan on the other. The smoothed normal of the scan is therefore taken if
+its plane separates the avatar's patch, which is its points within reach of the touched one.
+Otherwise the contact is at an edge, and three directions are compared: the smoothed normal of the
+scan, that of the avatar, and the direction from the touched sphere to the touching one. The one
+whose plane the points of both patches exceed least is taken. Where a smooth body touches an edge,
+this is the body's normal, as for the contact of a vertex with a face in Baraff 1989 (Analytical
+Methods for Dynamic Simulation of Non-penetrating Rigid Bodies).
 
-The smoothed normal of a scan's border need not be recognized from the scan alone (Bendels et al.
-2006, Detecting Holes in Point Set Surfaces): a body that stands flat against a sheet beside its
-edge keeps the sheet's normal, and where the spacing is uneven no border is taken for one.
+The border of a scan is not recognized from the scan alone, as by Bendels et al. 2006 (Detecting
+Holes in Point Set Surfaces): a body that stands flat against a sheet beside its edge keeps the
+sheet's normal, and uneven spacing or the boundary of a voxel is not taken for a border.
 """
 
 import numpy as np

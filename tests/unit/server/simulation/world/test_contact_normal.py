@@ -6,12 +6,14 @@ from pathlib import Path
 import effect_rooms
 import numpy as np
 import pytest
-from effect_rooms import APART, INTERPRETED, RADIUS, Play, at, play
+from effect_rooms import Play, at, play
 from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.simulation.world.contact_normal import contact_normal
 from solidcloud.server.simulation.world.frame import Frame, Hit, find_first_hit, translated, with_point
 
+# Radius and spacing of the spheres of scan and body [m], interpreted too: an edge needs dense points.
+RADIUS, APART = 0.03, 0.04
 # Points within this distance form a surface [m].
 REACH = 2.0 * APART + 0.001
 
@@ -19,9 +21,8 @@ REACH = 2.0 * APART + 0.001
 @pytest.fixture(scope="module")
 def sheet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Play]:
     """A sheet of points at y = 0, whose free edge is at x = 0."""
-    high = 0.6 if not INTERPRETED else 1.0
-    points = effect_rooms.plane((0.0, 0.0, -high), (1.6, 0.0, high))
-    case = effect_rooms.build(tmp_path_factory.mktemp("sheet"), points)
+    points = effect_rooms.plane((0.0, 0.0, -0.16), (1.2, 0.0, 0.16), APART)
+    case = effect_rooms.build(tmp_path_factory.mktemp("sheet"), points, radius=RADIUS)
     with play(case.archive, Stop(), Sweep(), Slide()) as game:
         yield game
 
@@ -48,7 +49,7 @@ def hit_of(game: Play, avatar: AvatarModel, x: float, way: tuple[float, float, f
 
 @pytest.mark.interpreted
 def test_before_a_sheet_it_is_the_normal_of_the_sheet(sheet: Play) -> None:
-    frame, hit = hit_of(sheet, column(0.5), 0.8, (0.0, 1.4, 0.0))
+    frame, hit = hit_of(sheet, column(0.5), 0.6, (0.0, 1.4, 0.0))
     with sheet.world:
         normal = contact_normal(frame, hit, REACH)
         np.testing.assert_array_equal(normal, sheet.world.normal(hit, REACH))
@@ -71,7 +72,7 @@ def test_at_a_free_edge_it_is_the_normal_of_the_body(sheet: Play, share: float) 
 
 @pytest.mark.interpreted
 def test_where_nothing_forms_a_surface_it_is_the_direction_of_the_pair(tmp_path: Path) -> None:
-    case = effect_rooms.build(tmp_path, np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    case = effect_rooms.build(tmp_path, np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), radius=RADIUS)
     with play(case.archive, Stop(), Sweep(), Slide()) as game:
         frame, hit = hit_of(game, make_avatar([[0.0, 0.0, 0.0]], 0.2), 0.05, (0.0, 1.4, 0.0))
         assert hit.avatar is not None and hit.cloud is not None

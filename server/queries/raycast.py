@@ -11,7 +11,8 @@ from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxel_tree import VoxelLists
-from ..kernels.rays.rays import ClosestHits, RayBatch, bound_rays, follow_rays
+from ..kernels.rays.level_rays import bound_rays
+from ..kernels.rays.rays import ClosestHits, RayBatch, follow_rays
 from .context.front_to_back import make_origins, search_front_to_back, verdict_and_bounds
 from .context.level_hits import HitsByLevel, LevelHits
 from .context.level_of_detail import level_budget

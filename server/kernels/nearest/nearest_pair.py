@@ -109,21 +109,20 @@ def lower_bound(words, row, x, y, z, radius):
     """Return a lower bound of the distance of a sphere's points from a node's points [steps].
 
     x, y, z: float32, relative to the voxel's low corner. The bound is the larger of the sphere's and
-    the slab's or box's, minus all float32 rounding of this function; a negative bound says nothing.
-    It does not include the errors of placed coordinates: `BestPair.cut` does.
+    the slab's or box's, minus the rounding of this function, and may be negative. It does not include
+    the errors of placed coordinates: `BestPair.cut` does.
     """
     at = U(row)  # not negative: saves a comparison for every index
     dx, dy, dz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     apart = np.sqrt(dx * dx + dy * dy + dz * dz)
     both = words[at + U(3)] + radius
+    slack = SLACK * (apart + both)
     if has_box(words, row):
-        gap = np.sqrt(box_square(words, row, dx, dy, dz)) - radius
-        return max(apart - both, gap) - SLACK * (apart + both)
+        return max(apart - both, np.sqrt(box_square(words, row, dx, dy, dz)) - radius) - slack
     along = words[at + U(4)] * dx + words[at + U(5)] * dy + words[at + U(6)] * dz
     gap = max(along - words[at + U(9)], words[at + U(8)] - along)
     # Without a slab, gap is 0. The slab's length is never 0, and is rounded up.
-    bound = max(apart - both, gap / words[at + U(7)] - radius)
-    return bound - SLACK * (apart + both)
+    return max(apart - both, gap / words[at + U(7)] - radius) - slack
 
 
 @njit_no_refcount

@@ -295,7 +295,7 @@ class VoxelStates:
 
 
 class CacheFacts:
-    """What a cache states about its voxels: the read-only part of `VoxelCache`.
+    """Read-only part of `VoxelCache`: the states of its voxels, and counts of them.
 
     policy, stats: see `VoxelCache`. The rest is set by it.
     """

@@ -1,4 +1,4 @@
-"""Where rays may first be hit, by the cover spheres of a level of detail.
+"""Lower bounds of the hits of rays, by the cover spheres of a level of detail.
 
 schemas/archive/level.py says what a level is. rays.py finds the hits of a scene's own points.
 """

@@ -145,7 +145,7 @@ def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_somethi
     for name in ("proximity", "contacts", "uncertainty"):
         assert all(name in frame for frame in found[name]["said"])
     nothing = found["nothing"]["said"]
-    assert all(frame.keys() <= {"pose", "verdict", "left"} for frame in nothing), (
+    assert all(frame.keys() <= {"pose", "verdict", "left", "unloaded"} for frame in nothing), (
         "where it is, and what it touches"
     )
     for frame, beside in zip(found["proximity"]["said"], nothing, strict=True):

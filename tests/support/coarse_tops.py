@@ -99,9 +99,16 @@ def rows_of(reach: VoxelsInReach) -> list[list[int]]:
     return [reach.rows[begin:end].tolist() for begin, end in ends]
 
 
-def open_made(folder: Path, model: str | None = None, budget_bytes: int = ROOM) -> Made:
-    """Open an archive and load all its voxels, with the spheres of a radius model."""
+def open_made(
+    folder: Path, model: str | None = None, budget_bytes: int = ROOM, *, boxes: bool = True
+) -> Made:
+    """Open an archive and load all its voxels, with the spheres of a radius model.
+
+    boxes: whether nodes have boxes where these are tighter. They are computed from points, so slots
+    filled without points have slabs only, and differ from those of loaded voxels.
+    """
     store = VoxelStore(folder)
+    store._with_boxes = store._with_boxes and boxes
     archive, header = store.archive, store.archive.header
     sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
     buffer = ArenaBuffer(sum(sizes))

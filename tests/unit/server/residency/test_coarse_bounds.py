@@ -34,8 +34,8 @@ def scattered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def made(scattered: Path, tmp_path: Path) -> Made:
-    """Open a copy of the archive, which the test may damage."""
-    return open_made(shutil.copytree(scattered, tmp_path / "archive"))
+    """Open a copy of the archive, which the test may damage. Loaded and filled slots are the same."""
+    return open_made(shutil.copytree(scattered, tmp_path / "archive"), boxes=False)
 
 
 def enclosing(top: NDArray[np.int32], points: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -43,7 +43,9 @@ def enclosing(top: NDArray[np.int32], points: NDArray[np.int64]) -> NDArray[np.b
     words = top.view(np.float32).astype(np.float64)
     apart = points[:, None, :] - words[:, :3]
     along = (apart * words[:, 4:7]).sum(axis=2)
-    return ((apart**2).sum(axis=2) <= words[:, 3] ** 2) & (along >= words[:, 8]) & (along <= words[:, 9])
+    in_slab = (along >= words[:, 8]) & (along <= words[:, 9])
+    in_box = (np.abs(apart) <= words[:, 4:7]).all(axis=2)
+    return ((apart**2).sum(axis=2) <= words[:, 3] ** 2) & np.where(words[:, 7] < 0, in_box, in_slab)
 
 
 def damage(store: VoxelStore, row: int, dataset: int) -> None:
@@ -126,7 +128,7 @@ def test_no_point_has_a_larger_sphere_than_its_node_says(tmp_path: Path, voxel: 
             degree=2,
             models=radius_class_archives.STORED,
         )
-    made = open_made(case.archive)
+    made = open_made(case.archive, boxes=False)
     header, filled = made.store.archive.header, CoarseBounds(made.voxels, ROOM)
     tables = [class_radii(model, header.radius, header.models) for model in radius_class_archives.MODELS]
     for row in range(made.voxels):

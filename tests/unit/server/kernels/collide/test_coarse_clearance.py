@@ -201,8 +201,8 @@ def test_radii_of_a_model_are_those_of_the_nodes(tmp_path: Path) -> None:
     made = open_made(case.archive, "local")
     made.remember(0)
     avatar = make_avatar([[0.0, 0, 0], [0.01, 0, 0]], 0.001)
-    # 20 mm below either plate: clear of spheres of 1 mm, not of such of 32.
-    poses = shifted((0.5, 0.5, 0.1 - 0.02), (0.5, 0.5, 1.0 - 0.02))
+    # 20 mm below a point of either plate: clear of spheres of 1 mm, not of such of 32.
+    poses = shifted((6 / 11, 6 / 11, 0.1 - 0.02), (6 / 11, 6 / 11, 1.0 - 0.02))
     assert made.settled(avatar, poses) == ([[0], [0]], [[0], []])
     filled = made._replace(coarse=CoarseBounds(made.voxels, ROOM))  # knows no better than that all are large
     filled.fill()

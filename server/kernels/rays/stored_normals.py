@@ -11,6 +11,7 @@ from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
 from ....schemas.kernels.normal_codes import NO_NORMAL, normal_code
 from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_boxes import box_square, has_box
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_run
 from ..core.voxels_in_reach import find_key
 from .rays import STACK
@@ -49,6 +50,8 @@ def _find_point(scene, voxel, x, y, z, rows):
         dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
         radius = np.float64(words[row + 3])
         if dx * dx + dy * dy + dz * dz > radius * radius:
+            continue
+        if has_box(words, row) and box_square(words, row, dx, dy, dz) > 0.0:
             continue
         first = np.int64(ints[row + FIRST])
         count = np.int64(ints[row + COUNT] & COUNTED)
@@ -90,6 +93,8 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
         dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
         both = (reach + words[row + 3]) * (1.0 + 2.0**-50)
         if dx * dx + dy * dy + dz * dz > both * both * (1.0 + 2.0**-50):
+            continue
+        if has_box(words, row) and box_square(words, row, dx, dy, dz) > reach * reach * (1.0 + 2.0**-50):
             continue
         first = np.int64(ints[row + FIRST])
         count = np.int64(ints[row + COUNT] & COUNTED)
@@ -193,6 +198,8 @@ def highest_near(scene, voxel, x, y, z, square, directions, heights):
         dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
         both = (reach + words[row + 3]) * (1.0 + 2.0**-50)
         if dx * dx + dy * dy + dz * dz > both * both * (1.0 + 2.0**-50):
+            continue
+        if has_box(words, row) and box_square(words, row, dx, dy, dz) > reach * reach * (1.0 + 2.0**-50):
             continue
         first = np.int64(ints[row + FIRST])
         count = np.int64(ints[row + COUNT] & COUNTED)

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.interpreted
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 COUNT = 150 if INTERPRETED else 1500
 REACH = 0.4 if INTERPRETED else 0.15
-VISITS = [3262, 3646, 4581]
+VISITS = [3024, 3396, 4343]
 COARSE = 0.56  # of codes [degrees]
 UP = np.array([0.0, 0.0, 1.0])
 

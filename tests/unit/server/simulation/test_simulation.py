@@ -263,4 +263,5 @@ def test_a_simulation_has_frames_and_no_questions():
     public = {name for name in dir(Simulation) if not name.startswith("_")}
     assert public == {
         "drop_client", "end", "end_client", "most_users", "move", "record", "reloaded", "step", "users", "warm",
+        "world",
     }  # fmt: skip

@@ -227,6 +227,13 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/nearest/pair_heap.py": work("bounded deep", "collide bounded", "distance bounded"),
     "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
+    "server/kernels/rays/level_rays.py": ("tests/property/test_ray_tolerances_naive.py",),
+    "server/kernels/core/node_boxes.py": (
+        "tests/hard_cases/test_bounds.py",
+        SERVER + "kernels/core/test_scene_arrays.py",
+        *work("collide", "distance", "raycast"),
+    ),
+    "server/kernels/bodies/avatar_patch.py": (SERVER + "kernels/bodies/test_avatar_patch.py",),
     "server/kernels/motion/sweep_interval.py": work("sweep", "sweep bounded"),
     "server/kernels/core/voxel_tree.py": (SERVER + "kernels/core/test_voxel_tree.py",),
     "server/kernels/prediction/user_tracks.py": (SERVER + "residency/test_motion_prediction.py",),

@@ -10,6 +10,7 @@ import time
 import numpy as np
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.kernels import compiling
+from solidcloud.schemas.scene.effect_table import MOTION_VERSION
 from solidcloud.schemas.scene.scene_file import SceneFile, SceneLimits, scene_of
 from solidcloud.schemas.wire.answers import (
     CollideAnswers,
@@ -313,5 +314,5 @@ if __name__ == "__main__":
         scene = floor_simulation(arguments.name).scene
     scene.never_warm = arguments.never_warm
     if arguments.log:
-        scene.simulation.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [])))
+        scene.simulation.record(FrameLog(arguments.log, Begin(arguments.name, "", b"", [], MOTION_VERSION)))
     serve([scene], ServerConfig(listen=arguments.listen, stop_seconds=arguments.stop_seconds))

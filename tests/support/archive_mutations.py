@@ -242,6 +242,10 @@ def judge(template: Template, folder: Path, name: str) -> Outcome:
         scene = Scene.open(folder, budget_bytes=32 << 20)
     except BadRequestError as refused:  # the cache is too small for what the index claims
         return Outcome(name, "found" if faults else "a cache too small for a sound archive", str(refused))
+    except FormatError as refused:  # the level does not describe this archive
+        return Outcome(
+            name, "refused" if faults else "a server refuses what validate finds sound", str(refused)
+        )
     with scene:
         scene.add_avatar("a", AVATAR, AVATAR_RADIUS)
         found = scene.collide("a", template.poses).verdict

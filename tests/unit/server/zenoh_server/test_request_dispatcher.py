@@ -145,7 +145,7 @@ def test_a_move_is_asked_of_the_scene(service, scene, encoding):
     moved = decode_answer(Moved, answer.payload, encoding)
     assert answer.ok and np.array_equal(moved.pose, POSES[1:2])
     assert (moved.verdict, moved.left, moved.simulated) == (1, 0.5, ["stop"])
-    assert scene.asked == [("move", ("al", 0.125), {"stop": STOP})]
+    assert scene.asked == [("move", ("al", 0.125), {"late": "wait", "stop": STOP})]
     assert error(ask(service, "move", request, encoding, client="d"), encoding).code == "unknown_avatar"
 
 

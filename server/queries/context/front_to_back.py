@@ -147,6 +147,8 @@ def search_front_to_back(
             with data.residency.hold(rows.tolist(), until, scan=budget.scan, stop=budget.stop) as found:
                 held[list(found.late)] = False  # another thread may be writing them
                 kernel(begin, end, lists, cursor, held, part)
+            if budget.late is not None and found.late:
+                _pass_late(lists, cursor, list(found.late), part)
             spent.add(found, int(looked[rows].sum()))
             looked |= held
         if doubts is not None:
@@ -185,6 +187,15 @@ def _list(
         if needed <= capacity:
             return lists
         capacity = needed
+
+
+def _pass_late(lists: VoxelLists, cursor: NDArray[np.int64], late: list[int], part: ClosestHits) -> None:
+    """Count late voxels that come next as missing, and go on behind them."""
+    ahead = np.flatnonzero(cursor < lists.starts[1:])
+    stuck = ahead[np.isin(lists.rows[cursor[ahead]], late)]
+    part.unseen[stuck] = np.minimum(part.unseen[stuck], lists.near[cursor[stuck]])
+    part.counts[0, stuck] += np.uint32(1)
+    cursor[stuck] += 1
 
 
 def _settle_doubts(

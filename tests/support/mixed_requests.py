@@ -59,6 +59,10 @@ def question(
     if rng.random() < 0.5:
         effort["radius_model"] = str(rng.choice(MODELS))
     op = str(rng.choice(list(QUESTIONS)))
+    if op not in ("collide", "distance"):
+        # These ask the level of detail about voxels that are not in memory: which of two answers within
+        # the tolerance is given then depends on what is in memory.
+        effort.pop("tolerance", None)
     starts = rng.uniform(0, 2, (2, 3))
     asked: QuestionRequest
     if op == "collide":
@@ -68,8 +72,6 @@ def question(
     elif op == "contacts":
         asked = ContactsRequest("body", poses, 10, 0.01, **effort)
     elif op == "sweep":
-        # Within a tolerance, which of two right answers is given depends on what is in memory.
-        effort.pop("tolerance", None)
         asked = SweepRequest(avatar="body", pose_from=poses, pose_to=poses[::-1].copy(), **effort)
     elif op == "raycast":
         asked = RaycastRequest(starts, points[rng.integers(len(points), size=2)] - starts, 2.0, **effort)

@@ -31,6 +31,7 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 MODELS = (*radius_class_archives.MODELS, "local", "border:0.5")
 
 
+@pytest.mark.timeout(900)  # the first run may have to compile everything
 @settings(max_examples=4 if INTERPRETED else 30, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -52,7 +52,8 @@ def scene_options(tolerance: float, model: str | None) -> dict[str, Any]:
     return {"radius_model": model, **({"tolerance": tolerance} if tolerance else {})}
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@pytest.mark.timeout(900)  # the first run may have to compile everything
+@settings(max_examples=10, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

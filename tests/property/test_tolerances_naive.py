@@ -124,6 +124,7 @@ def test_soles_above_a_floor_are_in_contact_early(
         assert early.mean() > 0.8 and visits.sum() < exact.node_visits.sum()
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.case(
     30,
     "100,000 poses with tolerances of 1 mm to 1 m: brute force finds no answer outside its bounds",

@@ -223,7 +223,8 @@ def _sweep(
                 which = np.setdiff1d(which, settled)
                 continue
         if unproved and absent is None and bounds.unsettled(rows[:needed], unproved).any():
-            # By the boxes of the index some may be out of reach, which changes the segments.
+            # By the boxes of the index some may be out of reach, or be met later, which changes the
+            # segments: what is answered must not depend on which voxels were loaded before.
             by_index = progress._replace(
                 at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
             )
@@ -231,8 +232,9 @@ def _sweep(
             count = plan_segments(*planned, bounds.index_boxes, which, by_index, index_starts, index_rows)
             if not 0 <= count <= len(index_rows):
                 index_starts[:] = 0
+            moved = (by_index.at != progress.at) | (by_index.end != progress.end)
             doubted = _hidden_rows(
-                (starts, rows), (index_starts, index_rows), len(bounds.proved), budget.stop
+                (starts, rows), (index_starts, index_rows), moved, len(bounds.proved), budget.stop
             )
             new = set(doubted) - asked
             if new:
@@ -310,12 +312,14 @@ def _sweep(
 def _hidden_rows(
     planned: tuple[NDArray[np.int64], NDArray[np.int64]],
     by_index: tuple[NDArray[np.int64], NDArray[np.int64]],
+    moved: NDArray[np.bool_],
     voxels: int,
     stop: StopFlag,
 ) -> list[int]:
     """Return the distinct rows, ascending, in reach of a motion by `planned` but not by the index.
 
     planned, by_index: starts (k + 1,) and rows of k motions.
+    moved: (k,) motions whose segment is another one by the index; all their rows are returned.
     stop: once it is set, the result may be incomplete.
     """
     hidden: NDArray[np.bool_] = np.zeros(voxels, bool)
@@ -325,6 +329,7 @@ def _hidden_rows(
         end = int(np.searchsorted(starts, starts[begin] + ENTRIES_AT_ONCE, side="right")) - 1
         end = min(max(end, begin + 1), k)
         own, known = (_pairs(*lists, begin, end, voxels) for lists in (planned, by_index))
+        known = known[~moved[known // voxels]]
         hidden[np.setdiff1d(own, known) % voxels] = True
         begin = end
     found: list[int] = np.flatnonzero(hidden).tolist()

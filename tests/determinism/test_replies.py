@@ -29,12 +29,12 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.case(
     25,
-    "10,000 mixed requests on 1, 2 and 4 threads, with loads and evictions: the same reply bytes, except for costs",
+    "2,500 mixed requests on 1, 2 and 4 threads, with loads and evictions: the same reply bytes, except for costs",
 )
 @pytest.mark.interpreted
 @pytest.mark.timeout(900)  # the first run may have to compile everything
 def test_threads_change_no_byte(archive: Path) -> None:
-    count = 40 if INTERPRETED else 10_000
+    count = 40 if INTERPRETED else 2_500
     asked = mixed_requests.requests(count)
     assert len(Counter(op for op, _ in asked)) == 8
     with Archive(archive) as opened, Scene.open(archive) as scene:

@@ -26,16 +26,17 @@ from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# UTM and ECEF, in whole metres.
-SHIFTS = [(0, 0, 0), (500_000, 5_600_000, 100), (4_027_894, 307_045, 4_919_475)]
+# ECEF and UTM, in whole metres.
+SHIFTS = [(0, 0, 0), (4_027_894, 307_045, 4_919_475), (500_000, 5_600_000, 100)]
+SHIFTS = SHIFTS[:2] if INTERPRETED else SHIFTS
 STEP = archive_cases.BINARY_STEP
 MARGIN, REACH = 0.02, 0.75
-TOLERANCES = (0.0, 3e-3, 0.05, 0.4)
+TOLERANCES = (0.0, 0.05) if INTERPRETED else (0.0, 3e-3, 0.05, 0.4)
 
 
 def scan(rng: np.random.Generator) -> NDArray[np.float64]:
     """Return a floor, a wall and scattered points in nine voxels and more, on the lattice."""
-    count = 150 if INTERPRETED else 1500
+    count = 60 if INTERPRETED else 1500
     floor, wall = rng.uniform(0, 1.5, (2, count, 3))
     floor[:, 2] *= 0.002
     wall[:, 0] *= 0.002
@@ -88,7 +89,7 @@ def test_case_35_voxels_and_representatives_together(tmp_path: Path, share: floa
     rng = np.random.default_rng(35)
     points = scan(rng)
     body = np.rint(rng.uniform(-0.15, 0.15, (20, 3)) / STEP) * STEP
-    poses = archive_cases.near_poses(rng, points, body, 8 if INTERPRETED else 40, 0.5)
+    poses = archive_cases.near_poses(rng, points, body, 5 if INTERPRETED else 40, 0.5)
     poses[:, :3, 3] = np.rint(poses[:, :3, 3] / STEP) * STEP
     chosen: set[int] = set()
     answers: list[list[Any]] = []

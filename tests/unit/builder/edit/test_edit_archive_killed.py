@@ -107,7 +107,7 @@ def test_killed_anywhere_it_is_the_old_archive_or_the_new_one(
     assert len(renamed) > 5
     seen = set()
     for step in sorted(
-        renamed | {n + 1 for n in renamed if n + 1 < len(steps)} | set(range(0, len(steps), 15))
+        renamed | {n + 1 for n in renamed if n + 1 < len(steps)} | set(range(0, len(steps), 40))
     ):
         place = tmp_path / f"at{step}"
         target = place / "hall"

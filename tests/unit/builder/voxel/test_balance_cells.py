@@ -92,12 +92,12 @@ def test_the_same_voxel_has_the_same_bytes_in_any_order_of_points() -> None:
 
 
 def scattered() -> np.ndarray:
-    """Return a voxel of 100,000 steps whose largest cubes hold 900, 200, 12, 2 and 1 points."""
+    """Return a voxel of 100,000 steps whose largest cubes hold 300, 200, 12, 2 and 1 points."""
     rng = np.random.default_rng(12)
     corners = [(0, 0, 0), (65536, 0, 0), (0, 65536, 0), (65536, 65536, 0), (0, 0, 65536)]
     clusters = [
         corner + rng.integers(0, 30000, (held, 3))
-        for corner, held in zip(corners, (900, 200, 12, 2, 1), strict=True)
+        for corner, held in zip(corners, (300, 200, 12, 2, 1), strict=True)
     ]
     return np.concatenate(clusters).astype(np.int32)
 

@@ -67,7 +67,7 @@ def test_info_says_that_there_is_a_seal(archive: Path, capsys: pytest.CaptureFix
     seal.write_bytes(bytes(32))
     assert run(["info", str(archive)]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "`solidcloud validate --archive-key FILE` checks it" in said
+    assert "validate --archive-key FILE` checks it" in said
     assert run(["info", str(archive), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["sealed"] is True
     seal.unlink()

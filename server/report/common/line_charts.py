@@ -31,7 +31,9 @@ def label_ends(axes: Any, ends: Sequence[tuple[float, float, str, str]], font: f
         axes.annotate(
             name, (x, y), xytext=(LABEL_AT, float(at)), textcoords="axes fraction", fontsize=font,
             color=colour, va="center", ha="left", annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 1, "shrinkB": 3},
+            arrowprops={
+                "arrowstyle": "-", "lw": 0.6, "color": colour, "shrinkA": 1, "shrinkB": 3, "relpos": (0.0, 0.5),
+            },
         )  # fmt: skip
 
 

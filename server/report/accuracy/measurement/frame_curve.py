@@ -44,11 +44,14 @@ def frame_rows(
 
     walk: (k, 4, 4).  contact: (k,), poses that touch. The frames follow the longest part that does not.
 
-    Pairs of walks, with the first tolerance and with another, are timed in turn.
+    Pairs of walks, with the first tolerance and with another, are timed in turn. Times are those of
+    the first tolerance, measured once, times the ratio of the pairs: a machine's speed changes between
+    two rows.
     folder: receives scene files.  tick: called after each tolerance.
     """
     walk = along(walk[longest_run(~contact)], SPACING)[:MOST]
-    rows = []
+    rows: list[FrameRow] = []
+    base: tuple[float, float] | None = None
     with ExitStack() as stack:
         first = stack.enter_context(_scene(archive, avatar, tolerances[0], folder))
         _go(first, walk)
@@ -56,21 +59,23 @@ def frame_rows(
             with _scene(archive, avatar, tolerance, folder) as scene:
                 _go(scene, walk)
                 spent = [np.empty((PAIRS, 2)) for _ in range(PASSES)]
-                frames = np.empty((PASSES * PAIRS, len(walk)))
+                frames = np.empty((2, PASSES * PAIRS, len(walk)))
                 for number, pairs in enumerate(spent):
                     for at, pair in enumerate(pairs):
-                        pair[0] = _go(first, walk)[0].sum()
-                        times, places = _go(scene, walk)
-                        pair[1], frames[number * PAIRS + at] = times.sum(), times
+                        frames[0, number * PAIRS + at] = _go(first, walk)[0]
+                        frames[1, number * PAIRS + at], places = _go(scene, walk)
+                        pair[:] = frames[:, number * PAIRS + at].sum(axis=1)
                 apart = _apart(first, scene, walk)
             passes = [mean_ratio(pairs[:, 1] / pairs[:, 0]) for pairs in spent]
             both = np.concatenate(spent)
             low, high = sorted(each.ratio for each in passes)
-            best = np.median(frames, axis=0)
+            ratio = mean_ratio(both[:, 1] / both[:, 0])
+            best = np.median(frames, axis=1)
+            p99 = np.quantile(best, 0.99, axis=1)
+            base = base or (float(best[0].mean()) * 1e6, float(p99[0]) * 1e6)
             rows.append(
                 FrameRow(
-                    tolerance, float(best.mean()) * 1e6, float(np.quantile(best, 0.99)) * 1e6,
-                    *mean_ratio(both[:, 1] / both[:, 0]), high <= REPEATS * low,
+                    tolerance, base[0] * ratio.ratio, base[1] * float(p99[1] / p99[0]), *ratio, high <= REPEATS * low,
                     float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), apart,
                 )
             )  # fmt: skip

@@ -138,19 +138,22 @@ def draw_walks(report: Report, target: Path) -> Path:
 
 
 def draw_frames(report: Report, target: Path) -> Path:
-    """Draw the time of a frame against the tolerance of `sweep`."""
+    """Draw the time of a frame against the tolerance of `sweep`, relative to the first tolerance."""
     figure, panel = load_pyplot().subplots(figsize=(WIDTH, 3.4), dpi=DPI, layout="constrained")
     rows = report.frames
     at = [row.tolerance for row in rows]
-    lines = (("mean", [r.time_us for r in rows], INK, "o"), ("p99", [r.p99_us for r in rows], "#1e7586", "s"))
+    p99 = [100 * row.p99_us / rows[0].p99_us for row in rows]
+    lines = (("mean", [100 * row.ratio for row in rows], INK, "o"), ("p99", p99, "#1e7586", "s"))
     panel.set_xscale("log")
     for _, values, colour, mark in lines:
         panel.plot(at, values, mark + "-", color=colour)
+    low, high = ([100 * getattr(row, name) for row in rows] for name in ("low", "high"))
+    panel.fill_between(at, low, high, color=INK, alpha=0.15, lw=0)
     for row in rows:
         if not row.repeats:
-            panel.plot([row.tolerance], [row.time_us], "o", color=INK, markerfacecolor="white")
+            panel.plot([row.tolerance], [100 * row.ratio], "o", color=INK, markerfacecolor="white")
     panel.set(ylim=(0, None), xlabel="tolerance of sweep")
-    _title(panel, "Time of a frame of a walk [µs]")
+    _title(panel, f"Time of a frame of a walk, % of that at {length_name(at[0])}")
     panel.set_xticks(at, [length_name(each) for each in at], minor=False)
     panel.minorticks_off()
     _frame(panel)

@@ -137,7 +137,7 @@ def _cold(report: Report, charts: dict[str, Path]) -> list[str]:
             f"{row.wait:.3f} ({row.wait_low:.3f} to {row.wait_high:.3f})",
             "" if row.read_bytes is None else f"{row.read_bytes / 1e3:,.0f}",
             "" if row.bytes_ratio is None else f"{row.bytes_ratio:.3f} ({row.bytes_low:.3f} to "
-            "{row.bytes_high:.3f})",
+            f"{row.bytes_high:.3f})",
             f"{100 * row.loaded:.0f} %",
         )
         for row in report.cold

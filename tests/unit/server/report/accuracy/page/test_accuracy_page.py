@@ -114,6 +114,7 @@ def test_the_page_begins_with_the_answer_fetches_nothing_and_holds_every_result(
     parser = Outside()
     parser.feed(page)
     assert parser.fetched == [] and "url(" not in page and "@import" not in page
+    assert "{" not in page.partition("</style>")[2], "a value that was not formatted"
     text = parser.text
     assert 0 < text.index(answer(made)) < text.index("Three settings") < text.index("1. In memory")
     titles = ("In memory", "With nothing in memory", "A walk with", "Radius", "Frames")

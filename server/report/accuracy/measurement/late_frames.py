@@ -78,7 +78,7 @@ def late_walk(
         level = memory if coarse else None
         with Scene.open(target, budget_bytes=memory, policy="lru+prefetch", coarse_bytes=level) as scene:
             scene.add_avatar(AVATAR, avatar)
-            scene.simulation.warm()
+            scene.warm()  # as a server does
             drop_cache(archive)
             poses, times, used, stopped = _go(scene, walk, late)
         verdict = judge.collide(AVATAR, poses).verdict

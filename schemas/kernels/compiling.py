@@ -25,6 +25,7 @@ from numba.core import types
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+from numba.experimental import structref
 from numba.extending import intrinsic
 
 from .compile_progress import CompileProgress
@@ -34,11 +35,13 @@ from .kernel_sources import source_digest
 
 __all__ = [
     "config",
+    "entry_point",
     "has_compiled",
     "intrinsic",
     "kernel_files",
     "njit",
     "on_first_compilation",
+    "structref",
     "types",
     "without_linear_algebra",
 ]
@@ -69,6 +72,16 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
         return kernel
 
     return decorate
+
+
+def entry_point(kernel: Any, *arguments: Any) -> Any:
+    """Return the compiled code of a kernel, for arguments of the types of these.
+
+    A call of a kernel finds the types of its arguments, which takes up to half a microsecond each
+    (scripts/bench_walk); a call of its code takes them for granted. Each argument must therefore have
+    the type, and an array the memory order, of the one given here.
+    """
+    return kernel if config.DISABLE_JIT else kernel.compile(tuple(map(kernel.typeof_pyval, arguments)))
 
 
 def on_first_compilation(call: Callable[[], object] | None) -> None:

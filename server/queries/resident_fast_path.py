@@ -16,7 +16,7 @@ keep it to some tens of microseconds.
 """
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_resident
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN
+from ..kernels.core.array_references import Held, refer_to_avatar
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest
@@ -75,20 +76,12 @@ def collide_fast(
     rows, outside = np.empty(MAX_FAST_VOXELS, np.int64), np.zeros(1, bool)
     verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
     other_units = data.radius_units + to_units(margin, "margin")
+    body, held = refer_to_avatar(avatar.arrays), data.references.to(data.arrays, data.broad)
     with residency.frozen():
-        fault, pose, found, needed = collide_resident(
-            array,
-            avatar.arrays,
-            avatar.radius,
-            other_units,
-            0,
-            data.arrays,
-            data.broad,
-            rows,
-            outside,
-            verdict,
-            counts,
-        )
+        fault, pose, found, needed = held.call(
+            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, data.arrays.stop, rows,
+            outside, verdict, counts,
+        )  # fmt: skip
         if needed > 0:
             residency.use(rows[:needed].tolist())
     refuse(fault, pose, found)
@@ -101,9 +94,17 @@ def collide_fast(
 
 
 def distance_fast(
-    data: SceneData, avatar: AvatarModel, pose: ArrayLike, reach: float, budget: QueryBudget = EXACT
+    data: SceneData,
+    avatar: AvatarModel,
+    pose: ArrayLike,
+    reach: float,
+    budget: QueryBudget = EXACT,
+    body: Any = None,
 ) -> DistanceAnswers:
-    """Answer `distance` for one pose (4, 4), in one kernel call if the fast path applies."""
+    """Answer `distance` for one pose (4, 4), in one kernel call if the fast path applies.
+
+    body: reference to the arrays of the avatar, if there is one.
+    """
     begin = time.perf_counter()
     poses = kernel_poses(np.asarray(pose)[None])
     if reach > MAX_FAST_REACH or len(avatar.points) > MAX_FAST_POINTS or budget.limited or _has_unknown(data):
@@ -111,10 +112,12 @@ def distance_fast(
     reach_units = to_units(reach, "reach")
     residency = data.residency
     rows, result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_nearest.COLUMNS)
+    body = refer_to_avatar(avatar.arrays) if body is None else body
+    held = data.references.to(data.arrays, data.broad)
     with residency.frozen():
-        fault, at, found, needed, outside, visits, tests = nearest_resident(
-            poses, avatar.arrays, avatar.radius, data.radius_units, reach_units, float(reach), data.arrays,
-            data.broad, rows, result,
+        fault, at, found, needed, outside, visits, tests = held.call(
+            nearest_resident, poses, body, avatar.radius, data.radius_units, reach_units, float(reach), held.reference,
+            data.arrays.stop, rows, result,
         )  # fmt: skip
         if needed > 0:
             residency.use(rows[:needed].tolist(), scan=budget.scan)
@@ -164,13 +167,15 @@ class SweepResult(NamedTuple):
 class ResidentQueries:
     """Queries of one avatar, frame after frame. Not thread-safe: it reuses its arrays.
 
-    avatar: the avatar's model.
+    avatar: the avatar's model.  body: reference to its arrays.
     """
 
     __slots__ = (
         "_again",
         "_box",
         "_counts",
+        "_first",
+        "_last",
         "_outside",
         "_poses",
         "_result",
@@ -179,13 +184,15 @@ class ResidentQueries:
         "_used",
         "_verdict",
         "avatar",
+        "body",
     )
 
     def __init__(self, avatar: AvatarModel) -> None:
         self.avatar = avatar
+        self.body = Held(refer_to_avatar(avatar.arrays))
         self._small = 0 < len(avatar.points) <= MAX_FAST_POINTS
         self._box = box_of(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
-        self._poses = np.empty((1, 4, 4))
+        self._poses, self._first, self._last = np.empty((1, 4, 4)), np.empty((4, 4)), np.empty((4, 4))
         self._rows, self._result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_swept.COLUMNS)
         self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
         self._counts = np.zeros((3, 1), np.uint32)
@@ -197,11 +204,14 @@ class ResidentQueries:
     ) -> SweepResult:
         """Find when the avatar first touches between two poses (4, 4); errors as for `sweep`."""
         if self._small and not budget.limited:
-            avatar, residency, rows, result = self.avatar, data.residency, self._rows, self._result
+            residency, rows, result = data.residency, self._rows, self._result
+            self._first[:], self._last[:] = pose_from, pose_to
+            held = data.references.to(data.arrays, data.broad)
             with residency.frozen():
-                needed, verdict, visits, _, _ = sweep_resident(
-                    pose_from, pose_to, avatar.arrays, avatar.radius, data.radius_units, self._box, data.arrays,
-                    data.broad, data.unknown, data.nothing_clear, max(tolerance, budget.tolerance), rows, result,
+                needed, verdict, visits, _, _ = held.call(
+                    sweep_resident, self._first, self._last, self.body.reference, self.avatar.radius, data.radius_units,
+                    self._box, held.reference, data.arrays.stop, data.unknown, data.nothing_clear,
+                    max(tolerance, budget.tolerance), rows, result,
                 )  # fmt: skip
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
@@ -247,15 +257,16 @@ class ResidentQueries:
     def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
         """Return verdict and node visits of `collide` for a pose (4, 4)."""
         if self._small and not budget.limited and not _has_unknown(data):
-            avatar, residency, rows = self.avatar, data.residency, self._rows
+            residency, rows = data.residency, self._rows
+            held = data.references.to(data.arrays, data.broad)
             poses, verdict, counts = self._poses, self._verdict, self._counts
             poses[0] = pose
             verdict[0] = _CLEAR
             counts[:] = 0
             with residency.frozen():
-                fault, at, found, needed = collide_resident(
-                    poses, avatar.arrays, avatar.radius, data.radius_units, budget.tolerance_units, data.arrays,
-                    data.broad, rows, self._outside, verdict, counts,
+                fault, at, found, needed = held.call(
+                    collide_resident, poses, self.body.reference, self.avatar.radius, data.radius_units,
+                    budget.tolerance_units, held.reference, data.arrays.stop, rows, self._outside, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
@@ -272,5 +283,6 @@ class ResidentQueries:
         origin: (3,) of the dataset, world [m].
         """
         pose = np.empty((4, 4))
-        same = pose_between(pose_from, pose_to, fraction, self._box, origin, pose)
+        self._first[:], self._last[:] = pose_from, pose_to
+        same = self.body.call(pose_between, self._first, self._last, fraction, self._box, origin, pose)
         return pose, bool(same)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.errors import CorruptError
 from ...schemas.kernels.normal_codes import NO_NORMAL, decode_normal
+from ..kernels.core.array_references import refer_to_scene
 from ..kernels.core.scene_arrays import LANES
 from ..kernels.rays.stored_normals import NOT_ESTIMATED, code_at, find_voxel, highest_near, stored_code_at
 from ..residency.voxel_store import VoxelStore
@@ -29,8 +30,9 @@ _Found = TypeVar("_Found")
 
 def warm(data: SceneData) -> None:
     """Compile the kernels in advance: a frame needs normals only once something is touched."""
-    nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-    find_voxel(data.broad.keys, nowhere.voxel_steps, 0, 0, 0)
+    arrays = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+    nowhere = refer_to_scene(arrays, data.broad)
+    find_voxel(data.broad.keys, arrays.voxel_steps, 0, 0, 0)
     code_at(nowhere, 0, 0, 0, 0, 1, np.empty(0, np.uint16))
     stored_code_at(nowhere, 0, 0, 0, 0, data.keeps_scan)
     highest_near(nowhere, 0, 0, 0, 0, 1, np.empty((0, 3)), np.empty(0))
@@ -59,6 +61,7 @@ class Normals:
         self.used_bytes = self.estimated = self.visits = 0
         # Shared by all requests, so the stop flag of the first one must not apply.
         self._data, self._leaves = with_stop(data, NO_STOP), rows["leaves"]
+        self._held = data.references.to(data.arrays, data.broad)
         self._most_points = int(rows["rows"][:, 2].max(initial=0))
         self._origin = tuple(data.arrays.origin.tolist())
         self._codes: OrderedDict[tuple[int, int], NDArray[np.uint16]] = OrderedDict()
@@ -125,10 +128,11 @@ class Normals:
         directions: (k, 3) unit. Other arguments and errors as for `at`.
         """
         square = self._square(reach)
-        heights = np.zeros(len(directions))
+        directions, heights = np.ascontiguousarray(directions), np.zeros(len(directions))
 
         def look(row: int, x: int, y: int, z: int) -> int:
-            return int(highest_near(self._data.arrays, row, x, y, z, square, directions, heights))
+            held = self._held
+            return int(held.call(highest_near, held.reference, row, x, y, z, square, directions, heights))
 
         self.visits += self._at_point(cloud, look, 0, stop, waits=waits)
         return heights * self._data.arrays.step
@@ -158,7 +162,7 @@ class Normals:
         place = np.asarray(cloud, np.float64).tolist()
         # Lattice.to_lattice without arrays: both round half to even.
         x, y, z = (round((c - o) / step) for c, o in zip(place, self._origin, strict=True))
-        row = find_voxel(self._data.broad.keys, self._data.arrays.voxel_steps, x, y, z)
+        row = self._held.call(find_voxel, self._data.broad.keys, self._data.arrays.voxel_steps, x, y, z)
         if row < 0:
             return nothing
         residency = self._data.residency
@@ -177,14 +181,16 @@ class Normals:
     def _look(self, row: int, x: int, y: int, z: int, square: int) -> int:
         """Return `code` of a lattice point in a voxel that stays resident during the call."""
         if square == self._stored:
-            found, visits = stored_code_at(self._data.arrays, row, x, y, z, self._data.keeps_scan)
+            found, visits = self._held.call(
+                stored_code_at, self._held.reference, row, x, y, z, self._data.keeps_scan
+            )
             self.visits += int(visits)
             return int(found)
         self._drop_evicted()
         codes = self._codes.get((row, square))
         if codes is None:
             codes = self._make(row, square)
-        code, visits, fresh = code_at(self._data.arrays, row, x, y, z, square, codes)
+        code, visits, fresh = self._held.call(code_at, self._held.reference, row, x, y, z, square, codes)
         self.visits += int(visits)
         self.estimated += int(fresh)
         return int(code)

@@ -24,6 +24,7 @@ children saved a tenth of these visits and no time.
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
+from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import (
     BROAD,
@@ -298,11 +299,11 @@ def rows_or_reset(needed, verdict, counts):
 
 
 @nb.njit(nogil=True, cache=True)
-def collide_resident(
-    poses, avatar, radius, other_units, tolerance, scene, index, rows, outside, verdict, counts
-):
+def collide_resident(poses, body, radius, other_units, tolerance, held, stop, rows, outside, verdict, counts):
     """Answer a whole request in one call, where all voxels in its reach are resident.
 
+    body, held: references to the arrays of the avatar and the scene (array_references.py).  stop:
+    (1,) int64, the request's stop flag.
     This is `find_reach`, then `collide_poses`. Writes rows (capacity,) int64, the voxels in reach,
     pose by pose; outside (k,) bool; and verdict and counts, as `collide_poses` does. The remaining
     arrays of `VoxelsInReach` are local: arrays created here cost a tenth of arrays passed in.
@@ -310,6 +311,7 @@ def collide_resident(
     answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
     (scene.stop, MAX_RESIDENT_PATH_VISITS); verdict and counts are then unchanged.
     """
+    avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
     k = poses.shape[0]
     reach = VoxelsInReach(
         np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside

@@ -1,8 +1,8 @@
 """Sweep of one motion in one call, where all voxels in its reach are resident.
 
-The result is that of server/queries/sweep.py. The cost of a motion is then only its search: each
-array passed from Python to a kernel costs a tenth of a microsecond, and each inspection of its
-contents costs another call.
+The result is that of server/queries/sweep.py. The cost of a motion is then only its search: the
+arrays are passed by reference (array_references.py), and each inspection of a result's contents
+costs another call.
 """
 
 import numpy as np
@@ -43,20 +43,22 @@ def _rigid(pose):
 
 @nb.njit(nogil=True, cache=True)
 def sweep_resident(
-    pose_from, pose_to, avatar, radius, other_units, box, scene, index, unknown, unknown_everywhere, tolerance, rows,
+    pose_from, pose_to, body, radius, other_units, box, held, stop, unknown, unknown_everywhere, tolerance, rows,
     result,
 ):  # fmt: skip
     """Sweep one motion if it is short, of scale 1, and all voxels in its reach are resident.
 
-    pose_from, pose_to: (4, 4) world, unchecked.  avatar: not empty.  box: `box_of` it.  radius,
-    other_units, tolerance: as in kernels/motion/sweep_advance.py.  scene: with the dataset's
-    origin, which is subtracted from the motion as in server/queries/sweep.py.  unknown: (u, 2, 3)
-    int64, boxes [steps] of excluded scans.
+    pose_from, pose_to: (4, 4) world, unchecked.  body, held: references to the arrays of an avatar
+    that is not empty, and of the scene.  box: `box_of` the avatar.  stop: (1,) int64, the request's
+    stop flag.  radius, other_units, tolerance: as in kernels/motion/sweep_advance.py.  The dataset's
+    origin is subtracted from the motion as in server/queries/sweep.py.  unknown: (u, 2, 3) int64,
+    boxes [steps] of excluded scans.
     Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64; the witness
     is written where the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
     this includes invalid poses.
     """
+    avatar, scene, index = body.avatar, held.scene, held.index
     origin, zero = scene.origin, np.zeros(3)
     first, last = np.empty((1, 4, 4)), np.empty((1, 4, 4))
     first[0], last[0] = pose_from, pose_to
@@ -71,7 +73,7 @@ def sweep_resident(
         last[0, r, 3] -= origin[r]
     from_zero = SceneArrays(
         scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, zero, scene.step, scene.units_per_step,
-        scene.voxel_steps, scene.block_words, scene.radius_deficit, scene.stop,
+        scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
     progress = SweepProgress(
         np.zeros(1), np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1), np.full((1, 2, 3), np.nan),
@@ -94,7 +96,7 @@ def sweep_resident(
             box, first, last, avatar, radius, other_units, scales, units, np.zeros(1), from_zero, index, starts, rows,
             which, tolerance, progress, counts,
         )  # fmt: skip
-        if progress.visits[0] < 0 or stopped(scene.stop):
+        if progress.visits[0] < 0 or stopped(stop):
             return _NOT_ANSWERED
         proved = progress.lower[0]
     upper = progress.upper[0]

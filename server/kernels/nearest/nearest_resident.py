@@ -12,6 +12,7 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
+from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import lattice_to_units
 from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS
@@ -45,12 +46,13 @@ def _write_result(square, pair, deficit, radii, reach, scene, result):
 
 
 @nb.njit(nogil=True, cache=True)
-def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, scene, index, rows, result):
+def nearest_resident(poses, body, radius, radius_units, reach_units, reach, held, stop, rows, result):
     """Answer `distance` for one pose: `find_reach`, `nearest_poses`, then the values of the pair.
 
-    poses: (1, 4, 4) float64, unchecked.  radius: of the avatar's points [m].  radius_units: radius
-    of the scan's largest sphere, exact units.  reach_units: the reach, exact units.  reach: the
-    same [m].
+    poses: (1, 4, 4) float64, unchecked.  body, held: references to the arrays of the avatar and the
+    scene (array_references.py).  stop: (1,) int64, the request's stop flag.  radius: of the avatar's
+    points [m].  radius_units: radius of the scan's largest sphere, exact units.  reach_units: the
+    reach, exact units.  reach: the same [m].
     Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64: signed
     distance and its lower bound [m], normal, witness of the avatar, witness of the cloud, world
     [m]; inf and NaN where no pair is within reach.
@@ -58,6 +60,7 @@ def nearest_resident(poses, avatar, radius, radius_units, reach_units, reach, sc
     node visits, point tests. -1 rows: not answered, because a voxel has to be loaded, the rows do
     not fit, or the search ended early (scene.stop, MAX_RESIDENT_PATH_VISITS).
     """
+    avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
     outside = np.zeros(1, np.bool_)
     scales, units = np.empty(1), np.empty(1, np.int64)
     around = VoxelsInReach(scales, units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)

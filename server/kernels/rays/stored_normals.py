@@ -127,15 +127,16 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
 
 
 @nb.njit(nogil=True, cache=True)
-def code_at(scene, voxel, x, y, z, square, codes):
+def code_at(held, voxel, x, y, z, square, codes):
     """Return the code of the normal at a lattice point, from `codes` or estimated.
 
-    scene: SceneArrays.  x, y, z: int64.  square: of the reach [steps^2], as `squared_reach` returns
+    held: reference to the scene's arrays.  x, y, z: int64.  square: of the reach [steps^2], as `squared_reach` returns
     it (schemas/archive/normal_reach.py).  codes: (blocks * LANES,) uint16, NOT_ESTIMATED where not
     estimated yet; an estimate is stored there. With length 0, nothing is stored.
     Returns (code, nodes visited, whether it was estimated). The code is NO_NORMAL where the voxel
     has no point there, or is not resident.
     """
+    scene = held.scene
     if scene.where[voxel, 0] < 0:
         return NO_NORMAL, 0, False
     rows, sums = np.empty(STACK, np.int64), np.zeros(SUMS, np.int64)
@@ -155,11 +156,12 @@ def code_at(scene, voxel, x, y, z, square, codes):
 
 
 @nb.njit(nogil=True, cache=True)
-def stored_code_at(scene, voxel, x, y, z, with_scan):
+def stored_code_at(held, voxel, x, y, z, with_scan):
     """Return (code, nodes visited) of an archive whose normals are in memory; see `code_at`.
 
     with_scan: whether scan numbers are in memory.
     """
+    scene = held.scene
     if scene.where[voxel, 0] < 0:
         return NO_NORMAL, 0
     rows = np.empty(STACK, np.int64)
@@ -173,13 +175,14 @@ def stored_code_at(scene, voxel, x, y, z, with_scan):
 
 
 @nb.njit(nogil=True, cache=True)
-def highest_near(scene, voxel, x, y, z, square, directions, heights):
+def highest_near(held, voxel, x, y, z, square, directions, heights):
     """Find how high a resident voxel's points near a lattice point lie along directions.
 
-    scene, x, y, z, square: as for `code_at`.  directions: (k, 3) unit, float64.  heights: (k,),
+    held, x, y, z, square: as for `code_at`.  directions: (k, 3) unit, float64.  heights: (k,),
     set to the greatest height over the points within reach, relative to the point [steps]; 0 if
     there are none. Returns the nodes visited.
     """
+    scene = held.scene
     heights[:] = 0.0
     if scene.where[voxel, 0] < 0:
         return 0

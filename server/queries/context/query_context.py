@@ -22,6 +22,7 @@ from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core import voxels_in_reach as pose_checks
+from ...kernels.core.array_references import SceneReferences
 from ...kernels.core.scene_arrays import SceneArrays, block_words
 from ...kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
 from ...residency.coarse_bounds import CoarseBounds
@@ -91,6 +92,7 @@ class SceneData(NamedTuple):
     unknown: (u, 2, 3) int64, lattice boxes of scans that the build left out.
     unknown_everywhere: whether the build left out a scan with unknown bounds.
     keeps_scan: whether the arena stores the scan of each point.
+    references: of the data with these radii, for kernels that are called once a pose.
     coarse: coarse bounds of voxels that are not in memory; None if the scene has none.
     level: its level of detail; None if it has none.
     """
@@ -103,6 +105,7 @@ class SceneData(NamedTuple):
     unknown: NDArray[np.int64]
     unknown_everywhere: bool
     keeps_scan: bool
+    references: SceneReferences
     coarse: CoarseBounds | None = None
     level: LevelOfDetail | None = None
 
@@ -162,16 +165,9 @@ def make_scene_data(
         NO_STOP.flag,
     )
     return SceneData(
-        residency,
-        arrays,
-        bounds,
-        bounds.index,
-        to_units(header.radius, "radius of the archive"),
-        header.unknown,
-        header.unknown_everywhere,
-        header.scan_index,
-        coarse,
-    )
+        residency, arrays, bounds, bounds.index, to_units(header.radius, "radius of the archive"), header.unknown,
+        header.unknown_everywhere, header.scan_index, SceneReferences(), coarse,
+    )  # fmt: skip
 
 
 def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> SceneData:
@@ -186,7 +182,8 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
     # node may have a class that no point has, but no sphere of its points is larger than these.
     largest = int(radii[header.radius_counts > 0].max()) if len(radii) > 1 else int(radii[0])
     radius_deficit = np.maximum(largest - radii, 0)
-    return data._replace(arrays=data.arrays._replace(radius_deficit=radius_deficit), radius_units=largest)
+    arrays = data.arrays._replace(radius_deficit=radius_deficit)
+    return data._replace(arrays=arrays, radius_units=largest, references=SceneReferences())
 
 
 def with_stop(data: SceneData, stop: StopFlag) -> SceneData:

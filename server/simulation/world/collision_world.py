@@ -21,6 +21,7 @@ from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, 
 from ...archives.placed_archive import PlacedArchive
 from ...archives.rigid_transform import rotate_vectors, transform_points
 from ...avatars.avatar_model import AvatarModel
+from ...kernels.core.array_references import Held
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import with_stop
@@ -216,6 +217,10 @@ class World:
             pose, same = self._probe(avatar).between(origin, pose_from, pose_to, fraction)
         return pose, same and self._alone
 
+    def body(self, avatar: AvatarModel) -> Held:
+        """Return the reference to an avatar's arrays, for kernels that take one."""
+        return self._probe(avatar).body
+
     def lowest_height(self) -> float:
         """Return the height of the lowest corner of the archives' boxes, spheres included [m]."""
         least = np.inf
@@ -283,10 +288,10 @@ class World:
 
         See server/queries/distance.py, and `comes_first` for several at the same distance.
         """
-        found: DistanceAnswers | None = None
+        found, body = None, self._probe(avatar).body.reference
         with self as seen:
             for each in seen:
-                answers = distance_fast(each.data, avatar, to_archive(each, pose), reach, budget)
+                answers = distance_fast(each.data, avatar, to_archive(each, pose), reach, budget, body)
                 self._count_of(answers, budget)
                 if each.placed.pose is not None:
                     answers = msgspec.structs.replace(

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...avatars.avatar_model import make_avatar
 from ...kernels.bodies.avatar_patch import SUMS, lowest_heights
+from ...kernels.core.array_references import refer_to_avatar
 from .frame import Frame, Hit, Vec
 from .vectors import dot, norm, rotate, rotate_back
 
@@ -79,7 +80,9 @@ def _lowest(
     assert hit.avatar is not None and hit.cloud is not None and hit.point is not None
     directions = np.array([rotate_back(frame.pose, each) for each in normals])
     heights, sums = np.empty(len(normals)), np.empty(SUMS, np.int64)
-    lowest_heights(frame.body.avatar.arrays, hit.point, reach, directions, heights, sums)
+    body = frame.world.body(frame.body.avatar)
+    point = np.ascontiguousarray(hit.point)
+    body.call(lowest_heights, body.reference, point, reach, directions, heights, sums)
     out = hit.avatar - hit.cloud
     apart = norm(out)
     found = [low + dot(out, each) - apart for low, each in zip(heights.tolist(), normals, strict=True)]
@@ -88,7 +91,7 @@ def _lowest(
 
 def warm_patch() -> None:
     """Compile the kernels before the first contact needs them."""
-    arrays = make_avatar([[0.0, 0.0, 0.0]], 0.1).arrays
+    body = refer_to_avatar(make_avatar([[0.0, 0.0, 0.0]], 0.1).arrays)
     sums = np.empty(SUMS, np.int64)
-    lowest_heights(arrays, np.zeros(3), 0.1, np.zeros((1, 3)), np.empty(1), sums)
+    lowest_heights(body, np.zeros(3), 0.1, np.zeros((1, 3)), np.empty(1), sums)
     normal_code(sums)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.bodies.avatar_patch import PATCH_STEPS, SUMS, lowest_heights
+from solidcloud.server.kernels.core.array_references import refer_to_avatar
 
 pytestmark = pytest.mark.interpreted
 
@@ -22,7 +23,7 @@ def test_heights_and_sums_are_those_of_all_points_within_reach(
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     heights, sums = np.empty(3), np.empty(SUMS, np.int64)
     for at in points[:: COUNT // 20]:
-        lowest_heights(arrays, at, reach, directions, heights, sums)
+        lowest_heights(refer_to_avatar(arrays), at, reach, directions, heights, sums)
         near = (points - at)[((points - at) ** 2).sum(axis=1) <= reach**2]
         np.testing.assert_allclose(heights, (near @ directions.T).min(axis=0), atol=1e-14)
         x, y, z = np.rint(near * PATCH_STEPS).astype(np.int64).T
@@ -33,5 +34,7 @@ def test_heights_and_sums_are_those_of_all_points_within_reach(
 def test_a_patch_without_points_has_no_height() -> None:
     arrays = make_avatar([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 0.1).arrays
     heights, sums = np.full(1, 7.0), np.full(SUMS, 7, np.int64)
-    lowest_heights(arrays, np.array([0.5, 0.0, 0.0]), 0.1, np.array([[1.0, 0.0, 0.0]]), heights, sums)
+    lowest_heights(
+        refer_to_avatar(arrays), np.array([0.5, 0.0, 0.0]), 0.1, np.array([[1.0, 0.0, 0.0]]), heights, sums
+    )
     assert heights[0] == 0.0 and not sums.any()

@@ -1,0 +1,54 @@
+"""Test references to arrays: reused while the arrays are the same, and safe for arrays of any memory order."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+from solidcloud.server.queries.context.query_budget import EXACT
+from solidcloud.server.queries.context.query_context import with_stop
+from solidcloud.server.queries.resident_fast_path import ResidentQueries, distance_fast
+from solidcloud.server.runtime.stop_flag import StopFlag
+from solidcloud.server.scene import Scene
+
+pytestmark = pytest.mark.interpreted
+
+
+def test_a_reference_is_made_once_for_all_requests_of_a_radius_model(tmp_path: Path) -> None:
+    case = archive_cases.build(tmp_path, np.random.default_rng(1).uniform(0, 1, (50, 3)))
+    with Scene.open(case.archive) as scene, scene.archives[0].take() as generation:
+        data = generation.data
+        first = data.references.to(data.arrays, data.broad)
+        stopped = with_stop(data, StopFlag())
+        assert stopped.arrays.stop is not data.arrays.stop
+        assert stopped.references.to(stopped.arrays, stopped.broad) is first
+        larger = generation.radius_model("fixed:0.5")
+        other = larger.references.to(larger.arrays, larger.broad)
+        assert other is not first and larger.references.to(larger.arrays, larger.broad) is other
+        # Arrays that were replaced are never answered with the reference of those before.
+        nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
+        assert data.references.to(nowhere, data.broad) is not first
+
+
+def test_poses_of_any_memory_order_are_the_same_poses(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    case = archive_cases.build(tmp_path, rng.uniform(0, 1, (200, 3)))
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", rng.uniform(-0.2, 0.2, (30, 3)), 0.01)
+        scene.collide("body", np.eye(4))
+        model = scene.avatar("body", "")
+        poses = archive_cases.near_poses(rng, case.points, model.points, 20, 0.5)
+        with scene.archives[0].take() as generation:
+            data, queries = generation.data, ResidentQueries(model)
+            for first, last in pairwise(poses):
+                other_first, other_last = np.asfortranarray(first), np.repeat(last, 2, axis=1)[:, ::2]
+                assert not other_first.flags.c_contiguous and not other_last.flags.c_contiguous
+                plain = queries.sweep(data, first, last, 1e-6, EXACT)
+                assert repr(queries.sweep(data, other_first, other_last, 1e-6, EXACT)) == repr(plain)
+                assert queries.collide(data, other_last, EXACT) == queries.collide(data, last, EXACT)
+                between, _ = queries.between(data.arrays.origin, first, last, 0.5)
+                other, _ = queries.between(data.arrays.origin, other_first, other_last, 0.5)
+                assert between.tobytes() == other.tobytes()
+                near = distance_fast(data, model, last, 0.5)
+                assert distance_fast(data, model, other_last, 0.5).signed_distance == near.signed_distance

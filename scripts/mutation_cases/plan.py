@@ -261,6 +261,7 @@ NONE = {
     "schemas/kernels/kernel_dispatcher.py": "no kernel: for which uses kernels are compiled",
     "schemas/kernels/kernel_files.py": "no kernel: how compiled kernels are kept",
     "schemas/kernels/kernel_sources.py": "no kernel: what compiled kernels depend on",
+    "server/kernels/core/array_references.py": "no kernel: how arrays are handed to kernels",
     "server/kernels/core/kernel_decorators.py": (
         "options of the compiler only, which an interpreted kernel does not see"
     ),

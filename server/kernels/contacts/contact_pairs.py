@@ -51,6 +51,8 @@ from .contact_cells import (
 )
 from .contact_clusters import list_pose
 
+U = np.uint64  # see placed_avatar.py
+
 
 class ContactResults(NamedTuple):
     """Results for k poses.
@@ -89,6 +91,8 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
     scene_block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
+    at_x = U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     lx = off[0] + np.float32(ints[block_at])
     ly = off[1] + np.float32(ints[block_at + 1])
     lz = off[2] + np.float32(ints[block_at + 2])
@@ -96,9 +100,9 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
     both = nodes[3, a] + threshold
     square = both * both * ONE_SLACK
     for j in range(LANES):
-        dx = np.float32(halves[lane_at + j]) - cx
-        dy = np.float32(halves[lane_at + LANES + j]) - cy
-        dz = np.float32(halves[lane_at + 2 * LANES + j]) - cz
+        dx = np.float32(halves[at_x + U(j)]) - cx
+        dy = np.float32(halves[at_y + U(j)]) - cy
+        dz = np.float32(halves[at_z + U(j)]) - cz
         keep[j] = dx * dx + dy * dy + dz * dz <= square
     for j in range(LANES):
         avatar_lanes[0, j] = lanes[block, 0, j] - lx
@@ -109,9 +113,9 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
     for j in range(ints[row + COUNT] & COUNTED):
         if not keep[j]:
             continue
-        x = np.float32(halves[lane_at + j])
-        y = np.float32(halves[lane_at + LANES + j])
-        z = np.float32(halves[lane_at + 2 * LANES + j])
+        x = np.float32(halves[at_x + U(j)])
+        y = np.float32(halves[at_y + U(j)])
+        z = np.float32(halves[at_z + U(j)])
         counts[2, i] += LANES
         own = point_class(ints, block_at, j, mask)
         far = fars[own]

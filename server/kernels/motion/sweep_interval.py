@@ -58,6 +58,7 @@ from .screw_motion import pose_at
 # Halving an interval whose sagitta is below this many units is useless: rounding alone contributes
 # 0.87 to the band.
 LEAST_SAGITTA = 0.25
+U = np.uint64  # see placed_avatar.py
 
 
 @njit_no_refcount
@@ -68,9 +69,10 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     threshold: reach plus error. Tests the sphere, then the slab or each pair of sides of the box. All
     float32.
     """
-    wx, wy, wz = x - words[row], y - words[row + 1], z - words[row + 2]
+    at = U(row)
+    wx, wy, wz = x - words[at], y - words[at + U(1)], z - words[at + U(2)]
     span = radius + threshold
-    both = words[row + 3] + span
+    both = words[at + U(3)] + span
     t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
     ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
     if ex * ex + ey * ey + ez * ez > both * both * ONE_SLACK:
@@ -79,15 +81,15 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
         wide = span + SLACK * both + SLACK * both
         for k in range(3):
             begin, way = (wx, dx) if k == 0 else (wy, dy) if k == 1 else (wz, dz)
-            end, most = begin + latest * way, words[row + 4 + k] + wide
+            end, most = begin + latest * way, words[at + U(4) + U(k)] + wide
             if min(begin, end) > most or max(begin, end) < -most:
                 return False
         return True
-    nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
+    nx, ny, nz = words[at + U(4)], words[at + U(5)], words[at + U(6)]
     begin = nx * wx + ny * wy + nz * wz
     end = begin + latest * (nx * dx + ny * dy + nz * dz)
-    wide = words[row + 7] * (span + SLACK * both + SLACK * both)
-    return min(begin, end) <= words[row + 9] + wide and max(begin, end) >= words[row + 8] - wide
+    wide = words[at + U(7)] * (span + SLACK * both + SLACK * both)
+    return min(begin, end) <= words[at + U(9)] + wide and max(begin, end) >= words[at + U(8)] - wide
 
 
 @njit_no_refcount
@@ -110,16 +112,17 @@ def _leaves(sweep, chord, voxel, block, row):
     threshold = thresholds[0, node_class(ints, row, mask)]
     far = thresholds[1, leaf_class(ints, row, mask)]  # for the largest sphere in the scene's block
     latest = _latest(moving)
-    cx, cy, cz = words[row] + off[0], words[row + 1] + off[1], words[row + 2] + off[2]
-    nx, ny, nz = words[row + 4], words[row + 5], words[row + 6]
-    both = words[row + 3] + threshold
-    wide = abs(words[row + 7]) * (threshold + SLACK * both + SLACK * both)
-    least, most = words[row + 8] - wide, words[row + 9] + wide
+    at, own = U(row), U(block)
+    cx, cy, cz = words[at] + off[0], words[at + U(1)] + off[1], words[at + U(2)] + off[2]
+    nx, ny, nz = words[at + U(4)], words[at + U(5)], words[at + U(6)]
+    both = words[at + U(3)] + threshold
+    wide = abs(words[at + U(7)]) * (threshold + SLACK * both + SLACK * both)
+    least, most = words[at + U(8)] - wide, words[at + U(9)] + wide
     square, boxed = both * both * ONE_SLACK, has_box(words, row)
     for j in range(LANES):
-        dx, dy, dz = displacements[block, 0, j], displacements[block, 1, j], displacements[block, 2, j]
-        wx, wy, wz = lanes[block, 0, j] - cx, lanes[block, 1, j] - cy, lanes[block, 2, j] - cz
-        t = min(max(-(wx * dx + wy * dy + wz * dz) * displacements[block, 3, j], ZERO), latest)
+        dx, dy, dz = displacements[own, 0, j], displacements[own, 1, j], displacements[own, 2, j]
+        wx, wy, wz = lanes[own, 0, j] - cx, lanes[own, 1, j] - cy, lanes[own, 2, j] - cz
+        t = min(max(-(wx * dx + wy * dy + wz * dz) * displacements[own, 3, j], ZERO), latest)
         ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
         near = ex * ex + ey * ey + ez * ez <= square
         if boxed:
@@ -132,37 +135,39 @@ def _leaves(sweep, chord, voxel, block, row):
             end = begin + latest * (nx * dx + ny * dy + nz * dz)
             near &= (min(begin, end) <= most) & (max(begin, end) >= least)
         keep[j] = near
-    scene_block = ~ints[row + FIRST]
+    scene_block = ~ints[at + U(FIRST)]
     block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES
-    lx = off[0] + np.float32(ints[block_at])
-    ly = off[1] + np.float32(ints[block_at + 1])
-    lz = off[2] + np.float32(ints[block_at + 2])
+    low, at_x = U(block_at), U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
+    lx = off[0] + np.float32(ints[low])
+    ly = off[1] + np.float32(ints[low + U(1)])
+    lz = off[2] + np.float32(ints[low + U(2)])
     for lane in range(LANES):
         if not keep[lane]:
             continue
-        x, y, z = lanes[block, 0, lane] - lx, lanes[block, 1, lane] - ly, lanes[block, 2, lane] - lz
+        x, y, z = lanes[own, 0, lane] - lx, lanes[own, 1, lane] - ly, lanes[own, 2, lane] - lz
         dx, dy, dz, inverse = (
-            displacements[block, 0, lane],
-            displacements[block, 1, lane],
-            displacements[block, 2, lane],
-            displacements[block, 3, lane],
+            displacements[own, 0, lane],
+            displacements[own, 1, lane],
+            displacements[own, 2, lane],
+            displacements[own, 3, lane],
         )
         moving.counters[1] += LANES
         touched = False
         for j in range(LANES):
-            wx = x - np.float32(halves[lane_at + j])
-            wy = y - np.float32(halves[lane_at + LANES + j])
-            wz = z - np.float32(halves[lane_at + 2 * LANES + j])
+            wx = x - np.float32(halves[at_x + U(j)])
+            wy = y - np.float32(halves[at_y + U(j)])
+            wz = z - np.float32(halves[at_z + U(j)])
             t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
             ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
             touched |= ex * ex + ey * ey + ez * ez <= far
         if not touched:
             continue
         for j in range(LANES):
-            wx = x - np.float32(halves[lane_at + j])
-            wy = y - np.float32(halves[lane_at + LANES + j])
-            wz = z - np.float32(halves[lane_at + 2 * LANES + j])
+            wx = x - np.float32(halves[at_x + U(j)])
+            wy = y - np.float32(halves[at_y + U(j)])
+            wz = z - np.float32(halves[at_z + U(j)])
             t = min(max(-(wx * dx + wy * dy + wz * dz) * inverse, ZERO), latest)
             ex, ey, ez = wx + t * dx, wy + t * dy, wz + t * dz
             square = ex * ex + ey * ey + ez * ez
@@ -200,7 +205,7 @@ def _sweep_voxel(sweep, chord, voxel):
             return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
-        a_first, b_first = avatar.first[a], ints[row + FIRST]
+        a_first, b_first = avatar.first[a], ints[U(row) + U(FIRST)]
         if a_first < 0 and b_first < 0:
             block = ~a_first
             if moving.stamp[block] != counters[2]:
@@ -210,7 +215,7 @@ def _sweep_voxel(sweep, chord, voxel):
             if moving.first[2] <= 0.0:
                 return False
             latest = _latest(moving)
-        elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
+        elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[U(row) + U(3)]):
             counters[0] += avatar.count[a]
             threshold = thresholds[node_class(ints, row, mask)]
             for child in range(a_first, a_first + avatar.count[a]):
@@ -224,8 +229,9 @@ def _sweep_voxel(sweep, chord, voxel):
         else:
             x, y, z = nodes[0, a] - off[0], nodes[1, a] - off[1], nodes[2, a] - off[2]
             dx, dy, dz, inverse = nodes[4, a], nodes[5, a], nodes[6, a], nodes[7, a]
-            counters[0] += ints[row + COUNT] & COUNTED
-            for i in range(ints[row + COUNT] & COUNTED):
+            count = ints[U(row) + U(COUNT)] & COUNTED
+            counters[0] += count
+            for i in range(count):
                 child_row = base + (b_first + i) * ROW_WORDS
                 threshold = thresholds[node_class(ints, child_row, mask)]
                 if _nodes_meet(

@@ -38,6 +38,8 @@ from ..core.scene_arrays import (
 )
 from .nearest_pair import lower_bound, set_cut
 
+U = np.uint64  # see placed_avatar.py
+
 
 class NearestPerScan(NamedTuple):
     """Results for each of n scans; the last entry stands for numbers that no scan has.
@@ -114,6 +116,8 @@ def _search_leaves(
     number = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + number * scene.block_words
     lane_at = scene.where[voxel, 2] + number * 3 * LANES
+    at_x = U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     scan_at = scan_run(scene.where, voxel, scene.block_words) + number * LANES
     c, held = node_class(ints, row, mask), ints[row + COUNT] & COUNTED
     bound = lower_bound(
@@ -121,7 +125,7 @@ def _search_leaves(
     )
     widest = np.float32(-1.0)
     for j in range(held):
-        widest = max(widest, cut[min(np.int64(halves[scan_at + j]), last), c])
+        widest = max(widest, cut[min(np.int64(halves[U(scan_at) + U(j)]), last), c])
     if not bound <= widest:
         return
     if placed.stamp[block] != 0:
@@ -135,13 +139,13 @@ def _search_leaves(
     low_y = off[1] + np.float32(ints[block_at + 1])
     low_z = off[2] + np.float32(ints[block_at + 2])
     for j in range(held):
-        s = min(np.int64(halves[scan_at + j]), last)
+        s = min(np.int64(halves[U(scan_at) + U(j)]), last)
         if not bound <= cut[s, c]:
             continue
         own = point_class(ints, block_at, j, mask)
-        x = np.float32(halves[lane_at + j])
-        y = np.float32(halves[lane_at + LANES + j])
-        z = np.float32(halves[lane_at + 2 * LANES + j])
+        x = np.float32(halves[at_x + U(j)])
+        y = np.float32(halves[at_y + U(j)])
+        z = np.float32(halves[at_z + U(j)])
         scratch.counts[2] += LANES
         within = far[s, own]
         touched = False

@@ -35,6 +35,8 @@ from ..core.node_overlap import U32
 from ..core.placed_avatar import lattice_to_units
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
 
+U = np.uint64  # see placed_avatar.py
+
 # Siblings that a descent of one tree leaves on the stack.
 STACK = MAX_LEVELS * 15 + 16
 
@@ -100,10 +102,10 @@ def meet_node(words, row, ray, radius, limit):
     its frame.  radius: of the largest sphere below, inflated by the rounding of this function. The
     ray is clipped by the node's sphere, then by its slab or its box.
     """
-    dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
+    dx, dy, dz = words[U(row)] - ray[0], words[U(row) + U(1)] - ray[1], words[U(row) + U(2)] - ray[2]
     a = dx * ray[6] + dy * ray[7] + dz * ray[8]
     b = dx * ray[9] + dy * ray[10] + dz * ray[11]
-    both = words[row + 3] + radius
+    both = words[U(row) + U(3)] + radius
     half = both * both - (a * a + b * b)
     if half < 0.0:
         return np.inf
@@ -115,11 +117,15 @@ def meet_node(words, row, ray, radius, limit):
     first = max(first, 0.0)
     if has_box(words, row):
         return enter_box(words, row, ray, radius, first, min(last, limit))
-    nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
+    nx, ny, nz = (
+        np.float64(words[U(row) + U(4)]),
+        np.float64(words[U(row) + U(5)]),
+        np.float64(words[U(row) + U(6)]),
+    )
     slope = nx * ray[3] + ny * ray[4] + nz * ray[5]
     offset = nx * dx + ny * dy + nz * dz
-    wide = words[row + 7] * radius
-    least, most = words[row + 8] - wide, words[row + 9] + wide
+    wide = words[U(row) + U(7)] * radius
+    least, most = words[U(row) + U(8)] - wide, words[U(row) + U(9)] + wide
     begin, end = first * slope - offset, last * slope - offset
     if (begin > most and end > most) or (begin < least and end < least):
         return np.inf
@@ -142,22 +148,24 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + block * scene.block_words
     lane_at = scene.where[voxel, 2] + block * 3 * LANES
+    at_x = U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     deficit = scene.radius_deficit
     mask = np.uint64(deficit.shape[0] - 1)
-    dx, dy, dz = words[row] - ray[0], words[row + 1] - ray[1], words[row + 2] - ray[2]
+    dx, dy, dz = words[U(row)] - ray[0], words[U(row) + U(1)] - ray[1], words[U(row) + U(2)] - ray[2]
     along = dx * ray[3] + dy * ray[4] + dz * ray[5]
     qx = np.float32(ray[0] + along * ray[3] - ints[block_at])
     qy = np.float32(ray[1] + along * ray[4] - ints[block_at + 1])
     qz = np.float32(ray[2] + along * ray[5] - ints[block_at + 2])
     ax, ay, az = np.float32(ray[6]), np.float32(ray[7]), np.float32(ray[8])
     bx, by, bz = np.float32(ray[9]), np.float32(ray[10]), np.float32(ray[11])
-    span = radius + 64.0 * U32 * (words[row + 3] + radius + 1.0)
+    span = radius + 64.0 * U32 * (words[U(row) + U(3)] + radius + 1.0)
     far = np.float32(span * span * (1.0 + 64.0 * U32))
     met: bool | np.bool_ = False
     for j in range(LANES):
-        x = np.float32(halves[lane_at + j]) - qx
-        y = np.float32(halves[lane_at + LANES + j]) - qy
-        z = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        x = np.float32(halves[at_x + U(j)]) - qx
+        y = np.float32(halves[at_y + U(j)]) - qy
+        z = np.float32(halves[at_z + U(j)]) - qz
         a, b = x * ax + y * ay + z * az, x * bx + y * by + z * bz
         met |= a * a + b * b <= far
     if not met:
@@ -167,16 +175,16 @@ def _test_block(scene, voxel, row, ray, radius, rays, i, best):
     ly = scene.coordinates[voxel, 1] * scene.voxel_steps + np.int64(ints[block_at + 1])
     lz = scene.coordinates[voxel, 2] * scene.voxel_steps + np.int64(ints[block_at + 2])
     for j in range(ints[block_at + 3]):
-        x = np.float32(halves[lane_at + j]) - qx
-        y = np.float32(halves[lane_at + LANES + j]) - qy
-        z = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        x = np.float32(halves[at_x + U(j)]) - qx
+        y = np.float32(halves[at_y + U(j)]) - qy
+        z = np.float32(halves[at_z + U(j)]) - qz
         a, b = x * ax + y * ay + z * az, x * bx + y * by + z * bz
         if not a * a + b * b <= far:
             continue
         sx, sy, sz = (
-            lx + np.int64(halves[lane_at + j]),
-            ly + np.int64(halves[lane_at + LANES + j]),
-            lz + np.int64(halves[lane_at + 2 * LANES + j]),
+            lx + np.int64(halves[at_x + U(j)]),
+            ly + np.int64(halves[at_y + U(j)]),
+            lz + np.int64(halves[at_z + U(j)]),
         )
         t = first_meeting(
             lattice_to_units(sx, scene.units_per_step) - rays.origin[i, 0],

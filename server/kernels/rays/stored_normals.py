@@ -16,6 +16,8 @@ from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, normal_
 from ..core.voxels_in_reach import find_key
 from .rays import STACK
 
+U = np.uint64  # see placed_avatar.py
+
 # A code that no normal has: both bytes of a normal's code are at least 1.
 NOT_ESTIMATED = np.uint16(1)
 SUMS = 10
@@ -47,8 +49,8 @@ def _find_point(scene, voxel, x, y, z, rows):
         depth -= 1
         row = rows[depth]
         visits += 1
-        dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
-        radius = np.float64(words[row + 3])
+        dx, dy, dz = x - words[U(row)], y - words[U(row) + U(1)], z - words[U(row) + U(2)]
+        radius = np.float64(words[U(row) + U(3)])
         if dx * dx + dy * dy + dz * dz > radius * radius:
             continue
         if has_box(words, row) and box_square(words, row, dx, dy, dz) > 0.0:
@@ -63,12 +65,14 @@ def _find_point(scene, voxel, x, y, z, rows):
         block = ~first
         block_at = scene.where[voxel, 1] + block * scene.block_words
         lane_at = scene.where[voxel, 2] + block * 3 * LANES
+        at_x = U(lane_at)
+        at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
         ox, oy, oz = x - ints[block_at], y - ints[block_at + 1], z - ints[block_at + 2]
         for j in range(count):
             if (
-                ox == np.int64(halves[lane_at + j])
-                and oy == np.int64(halves[lane_at + LANES + j])
-                and oz == np.int64(halves[lane_at + 2 * LANES + j])
+                ox == np.int64(halves[at_x + U(j)])
+                and oy == np.int64(halves[at_y + U(j)])
+                and oz == np.int64(halves[at_z + U(j)])
             ):
                 return block * LANES + j, visits
     return np.int64(-1), visits
@@ -90,8 +94,8 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
         depth -= 1
         row = rows[depth]
         visits += 1
-        dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
-        both = (reach + words[row + 3]) * (1.0 + 2.0**-50)
+        dx, dy, dz = x - words[U(row)], y - words[U(row) + U(1)], z - words[U(row) + U(2)]
+        both = (reach + words[U(row) + U(3)]) * (1.0 + 2.0**-50)
         if dx * dx + dy * dy + dz * dz > both * both * (1.0 + 2.0**-50):
             continue
         if has_box(words, row) and box_square(words, row, dx, dy, dz) > reach * reach * (1.0 + 2.0**-50):
@@ -106,11 +110,13 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums):
         block = ~first
         block_at = scene.where[voxel, 1] + block * scene.block_words
         lane_at = scene.where[voxel, 2] + block * 3 * LANES
+        at_x = U(lane_at)
+        at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
         ox, oy, oz = ints[block_at] - x, ints[block_at + 1] - y, ints[block_at + 2] - z
         for j in range(count):
-            px = ox + np.int64(halves[lane_at + j])
-            py = oy + np.int64(halves[lane_at + LANES + j])
-            pz = oz + np.int64(halves[lane_at + 2 * LANES + j])
+            px = ox + np.int64(halves[at_x + U(j)])
+            py = oy + np.int64(halves[at_y + U(j)])
+            pz = oz + np.int64(halves[at_z + U(j)])
             if px * px + py * py + pz * pz > square:
                 continue
             sums[0] += 1
@@ -198,8 +204,8 @@ def highest_near(held, voxel, x, y, z, square, directions, heights):
         depth -= 1
         row = rows[depth]
         visits += 1
-        dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
-        both = (reach + words[row + 3]) * (1.0 + 2.0**-50)
+        dx, dy, dz = x - words[U(row)], y - words[U(row) + U(1)], z - words[U(row) + U(2)]
+        both = (reach + words[U(row) + U(3)]) * (1.0 + 2.0**-50)
         if dx * dx + dy * dy + dz * dz > both * both * (1.0 + 2.0**-50):
             continue
         if has_box(words, row) and box_square(words, row, dx, dy, dz) > reach * reach * (1.0 + 2.0**-50):
@@ -214,11 +220,13 @@ def highest_near(held, voxel, x, y, z, square, directions, heights):
         block = ~first
         block_at = scene.where[voxel, 1] + block * scene.block_words
         lane_at = scene.where[voxel, 2] + block * 3 * LANES
+        at_x = U(lane_at)
+        at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
         ox, oy, oz = ints[block_at] - x, ints[block_at + 1] - y, ints[block_at + 2] - z
         for j in range(count):
-            px = ox + np.int64(halves[lane_at + j])
-            py = oy + np.int64(halves[lane_at + LANES + j])
-            pz = oz + np.int64(halves[lane_at + 2 * LANES + j])
+            px = ox + np.int64(halves[at_x + U(j)])
+            py = oy + np.int64(halves[at_y + U(j)])
+            pz = oz + np.int64(halves[at_z + U(j)])
             if px * px + py * py + pz * pz > square:
                 continue
             for k in range(directions.shape[0]):

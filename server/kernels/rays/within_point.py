@@ -21,6 +21,8 @@ from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class, stopped
 from .rays import STACK, is_less, push_sorted
 
+U = np.uint64  # see placed_avatar.py
+
 
 @njit_no_refcount
 def _below_node(words, row, x, y, z, limit):
@@ -32,11 +34,15 @@ def _below_node(words, row, x, y, z, limit):
     therefore in the round disc that contains both. Rounding: less than 2^-24 of the distance to the
     centre, where the root of a small difference magnifies it.
     """
-    dx, dy, dz = x - words[row], y - words[row + 1], z - words[row + 2]
-    nx, ny, nz = np.float64(words[row + 4]), np.float64(words[row + 5]), np.float64(words[row + 6])
+    dx, dy, dz = x - words[U(row)], y - words[U(row) + U(1)], z - words[U(row) + U(2)]
+    nx, ny, nz = (
+        np.float64(words[U(row) + U(4)]),
+        np.float64(words[U(row) + U(5)]),
+        np.float64(words[U(row) + U(6)]),
+    )
     square = dx * dx + dy * dy + dz * dz
-    radius = np.float64(words[row + 3])
-    length = np.float64(words[row + 7])
+    radius = np.float64(words[U(row) + U(3)])
+    length = np.float64(words[U(row) + U(7)])
     middle = math.sqrt(square)
     slack = middle * 2.0**-24
     below: float = middle - radius
@@ -48,7 +54,7 @@ def _below_node(words, row, x, y, z, limit):
         along = (nx * dx + ny * dy + nz * dz) * inverse
         # The length is rounded up; offsets divided by it are too short by at most 2^-23, which the
         # slack covers.
-        gap: float = max(along - words[row + 9] * inverse, words[row + 8] * inverse - along, 0.0)
+        gap: float = max(along - words[U(row) + U(9)] * inverse, words[U(row) + U(8)] * inverse - along, 0.0)
         gap = gap - (abs(along) + radius) * 2.0**-21
         if gap > 0.0:
             across: float = math.sqrt(max(square - along * along * (1.0 + 2.0**-21), 0.0)) - radius
@@ -70,43 +76,45 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
     block = ~ints[row + FIRST]
     block_at = scene.where[voxel, 1] + block * scene.block_words
     lane_at = scene.where[voxel, 2] + block * 3 * LANES
+    at_x = U(lane_at)
+    at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
     qx = np.float32(x - ints[block_at])
     qy = np.float32(y - ints[block_at + 1])
     qz = np.float32(z - ints[block_at + 2])
     span = math.sqrt(np.float64(limit)) / scene.units_per_step + error
-    span += 16.0 * U32 * (span + 4.0 * words[row + 3] + 1.0)
+    span += 16.0 * U32 * (span + 4.0 * words[U(row) + U(3)] + 1.0)
     far = np.float32(span * span * (1.0 + 64.0 * U32))
     least = np.float32(np.inf)
     met: bool | np.bool_ = False
     for j in range(LANES):
-        dx = np.float32(halves[lane_at + j]) - qx
-        dy = np.float32(halves[lane_at + LANES + j]) - qy
-        dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        dx = np.float32(halves[at_x + U(j)]) - qx
+        dy = np.float32(halves[at_y + U(j)]) - qy
+        dz = np.float32(halves[at_z + U(j)]) - qz
         met |= dx * dx + dy * dy + dz * dz <= far
     if not met:
         return limit
     for j in range(ints[block_at + 3]):
-        dx = np.float32(halves[lane_at + j]) - qx
-        dy = np.float32(halves[lane_at + LANES + j]) - qy
-        dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        dx = np.float32(halves[at_x + U(j)]) - qx
+        dy = np.float32(halves[at_y + U(j)]) - qy
+        dz = np.float32(halves[at_z + U(j)]) - qz
         least = min(least, dx * dx + dy * dy + dz * dz)
     # No point beyond the least by more than twice the rounding can be nearest.
     nearest = math.sqrt(np.float64(least)) * (1.0 + 8.0 * U32)
-    nearest += 2.0 * error + 32.0 * U32 * (nearest + 4.0 * words[row + 3] + 1.0)
+    nearest += 2.0 * error + 32.0 * U32 * (nearest + 4.0 * words[U(row) + U(3)] + 1.0)
     far = min(far, np.float32(nearest * nearest * (1.0 + 64.0 * U32)))
     lx = scene.coordinates[voxel, 0] * scene.voxel_steps + np.int64(ints[block_at])
     ly = scene.coordinates[voxel, 1] * scene.voxel_steps + np.int64(ints[block_at + 1])
     lz = scene.coordinates[voxel, 2] * scene.voxel_steps + np.int64(ints[block_at + 2])
     for j in range(ints[block_at + 3]):
-        dx = np.float32(halves[lane_at + j]) - qx
-        dy = np.float32(halves[lane_at + LANES + j]) - qy
-        dz = np.float32(halves[lane_at + 2 * LANES + j]) - qz
+        dx = np.float32(halves[at_x + U(j)]) - qx
+        dy = np.float32(halves[at_y + U(j)]) - qy
+        dz = np.float32(halves[at_z + U(j)]) - qz
         if not dx * dx + dy * dy + dz * dz <= far:
             continue
         sx, sy, sz = (
-            lx + np.int64(halves[lane_at + j]),
-            ly + np.int64(halves[lane_at + LANES + j]),
-            lz + np.int64(halves[lane_at + 2 * LANES + j]),
+            lx + np.int64(halves[at_x + U(j)]),
+            ly + np.int64(halves[at_y + U(j)]),
+            lz + np.int64(halves[at_z + U(j)]),
         )
         ux = lattice_to_units(sx, scene.units_per_step) - at_units[i, 0]
         uy = lattice_to_units(sy, scene.units_per_step) - at_units[i, 1]
@@ -266,10 +274,12 @@ def _bound(scene, voxel, at_units, i, least, below, reach, rows, bounds):
             continue
         block_at = scene.where[voxel, 1] + ~first * scene.block_words
         lane_at = scene.where[voxel, 2] + ~first * 3 * LANES
+        at_x = U(lane_at)
+        at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
         for j in range(count):
-            dx = np.float64(ints[block_at]) + np.float64(halves[lane_at + j]) - x
-            dy = np.float64(ints[block_at + 1]) + np.float64(halves[lane_at + LANES + j]) - y
-            dz = np.float64(ints[block_at + 2]) + np.float64(halves[lane_at + 2 * LANES + j]) - z
+            dx = np.float64(ints[block_at]) + np.float64(halves[at_x + U(j)]) - x
+            dy = np.float64(ints[block_at + 1]) + np.float64(halves[at_y + U(j)]) - y
+            dz = np.float64(ints[block_at + 2]) + np.float64(halves[at_z + U(j)]) - z
             apart = (math.sqrt(dx * dx + dy * dy + dz * dz) * (1.0 - 2.0**-50) - error) * scene.units_per_step
             cover = least - np.float64(scene.radius_deficit[point_class(ints, block_at, j, mask)])
             below = min(below, max(apart - cover, bound))

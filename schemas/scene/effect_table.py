@@ -88,12 +88,15 @@ class Ground(Effect, frozen=True, tag="ground"):
 
     slope: steeper surfaces are not ground [degrees].
     clearance: height of the feet above the ground, kept within a fifth of it while walking [m].
+    snap: ground that lies lower by up to this distance is followed without a fall, at least
+    `clearance` [m]; omitted: the height of `step`.
     gravity: [m/s^2].  fall_speed: maximum [m/s].
     """
 
     needs: ClassVar[tuple[str, ...]] = ("stop",)
     slope: Degrees = 45.0
     clearance: Near = 0.03
+    snap: Annotated[float, msgspec.Meta(ge=0, le=2)] | None = None
     gravity: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 9.81
     fall_speed: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 50.0
 

@@ -214,6 +214,23 @@ def test_a_ledge_higher_than_a_step_is_fallen_from(tmp_path: Path) -> None:
         assert fell > 1.0 and body.on_ground and body.pose[2, 3] == pytest.approx(STANDS, abs=0.02)
 
 
+@pytest.mark.parametrize(("snap", "falls"), [(0.0, True), (0.1, True), (0.25, False), (None, False)])
+def test_lower_ground_is_followed_as_far_as_it_snaps(
+    tmp_path: Path, snap: float | None, *, falls: bool
+) -> None:
+    case = effect_rooms.build(tmp_path, stairs(0.17, count=1))
+    with play(case.archive, Stop(), Sweep(), Slide(), Step(), Ground(snap=snap)) as game:
+        body = game.body(PERSON, at(0.6, 0, 0.3))
+        settled(game, body, 10)
+        fell = 0.0
+        for _ in range(60):
+            game.go(body, (-0.04, 0, 0))
+            fell = max(fell, body.fall_speed)
+            assert not game.touches(body)
+        assert (fell > 0.0) == falls
+        assert body.on_ground and body.pose[2, 3] == pytest.approx(STANDS, abs=0.02)
+
+
 def test_a_hole_of_the_scan_is_walked_over(tmp_path: Path) -> None:
     points = floor(3.0)
     hole = (np.abs(points[:, 0]) < 0.45) & (np.abs(points[:, 1]) < 0.45)

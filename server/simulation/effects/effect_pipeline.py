@@ -9,8 +9,7 @@ prevent contact are never skipped.
 
 import importlib
 import time
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -116,13 +115,28 @@ class Pipeline:
         frame = Frame(body, target, seconds, self.world, budget, body.pose)
         frame.fall_speed, frame.on_ground = body.fall_speed, body.on_ground
         self.world.begin(budget.stop)
-        with self._restored_if_stopped(body, budget), self.world as seen:
+        pushed = self._poses_to_restore(body, budget)
+        try:
+            self._simulate(frame, begin, skip)
+        except StoppedError:
+            if pushed is not None:
+                self.bodies.restore(pushed)
+            raise
+        body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
+        body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
+        body.effect_state.update(frame.effect_state)
+        return _moved(frame, self.world.unknown)
+
+    def _simulate(self, frame: Frame, begin: float, skip: Collection[str] | None) -> None:
+        """Run the effects of a frame that began at the time `begin` [s]. Raise StoppedError."""
+        body, budget, world = frame.body, frame.budget, self.world
+        with world as seen:
             frame.generations = tuple([each.opened.number for each in seen])
             for runner in self._command_filters:
                 runner.begin(frame)
             if not self._stops:
                 frame.pose = frame.target
-            since = self.world.visits
+            since = world.visits
             for runner in self.runners:
                 if budget.stop:
                     raise StoppedError
@@ -132,34 +146,23 @@ class Pipeline:
                 else:
                     self._run_one(runner, frame, begin, since, skip)
             if not self._stops:
-                frame.verdict = self.world.collide(body.avatar, frame.pose, budget)
+                frame.verdict = world.collide(body.avatar, frame.pose, budget)
             # Bodies that overlap the avatar since the frame's start, such as a placed object, do
             # not block it, but the verdict reports them.
-            if any(each.overlaps(body.avatar, frame.pose) for each in frame.obstacles):
+            if any([each.overlaps(body.avatar, frame.pose) for each in frame.obstacles]):
                 frame.verdict = Verdict.CONTACT
             if budget.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError
-            self.world.saw(body.user, body.avatar, frame.pose)
-        body.pose, body.clear, body.generations = frame.pose, frame.clear, frame.generations
-        body.fall_speed, body.on_ground = frame.fall_speed, frame.on_ground
-        body.effect_state.update(frame.effect_state)
-        return _moved(frame, self.world.unknown)
+            world.saw(body.user, body.avatar, frame.pose)
 
-    @contextmanager
-    def _restored_if_stopped(self, body: Body, budget: QueryBudget) -> Iterator[None]:
-        """Restore the poses of pushed objects if the frame is stopped.
+    def _poses_to_restore(self, body: Body, budget: QueryBudget) -> Any:
+        """Return the poses of pushed objects that a stopped frame must restore; None if there are none.
 
         When a frame is stopped depends on a clock, and no pose may depend on a clock.
         """
         if budget.stop is NO_STOP or self.bodies is None or not self.bodies.is_present(body):
-            yield
-            return
-        poses = self.bodies.snapshot()
-        try:
-            yield
-        except StoppedError:
-            self.bodies.restore(poses)
-            raise
+            return None
+        return self.bodies.snapshot()
 
     def _run_one(
         self, runner: Runner, frame: Frame, begin: float, since: int, skip: Collection[str] | None

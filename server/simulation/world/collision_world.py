@@ -142,13 +142,12 @@ class World:
             return tuple([each.opened.number for each in seen])
 
     def saw(self, user: tuple[str, str], avatar: AvatarModel, pose: Pose, around: float = 0.0) -> None:
-        """Record a user's pose, around which voxels are prefetched.
+        """Record a user's pose, around which voxels are prefetched. Call it inside a `with`.
 
         around: distance beyond the avatar's spheres [m].
         """
-        with self as seen:
-            for each in seen:
-                each.opened.record_user(user, avatar, to_archive(each, pose)[None], around)
+        for each in self._held.seen:
+            each.opened.record_user(user, avatar, to_archive(each, pose), around)
 
     def _probe(self, avatar: AvatarModel) -> ResidentQueries:
         """Return this thread's `ResidentQueries` of an avatar."""

@@ -29,7 +29,8 @@ class Row(NamedTuple):
     """One scene in a panel.
 
     dots: (n, 2), scan points of the view.  low, high: (2,) corners of what is shown [m].
-    every: number of frames between two outlines.  label: says which value of the option this is.
+    every: number of frames between two outlines of the body.  moments: frames of the outlines instead.
+    label: says which value of the option this is.
     label_at: (x, y), as a share of the row.  crate: side of the scene's object [m]; 0: none.
     """
 
@@ -43,6 +44,7 @@ class Row(NamedTuple):
     label_at: tuple[float, float] = (0.02, 0.95)
     measures: tuple[Measure, ...] = ()
     crate: float = 0.0
+    moments: tuple[int, ...] = ()
 
 
 class Case(NamedTuple):

@@ -165,7 +165,7 @@ def crowd(folder: Path) -> Case:
     apart = nearest_users(found)
     return Case(
         "crowd", "Crowd", f"{USERS} users through one door, {MARGIN * 100:.0f} cm apart",
-        (Row("plan", dots, found, (-2.0, -2.05), (2.0, 1.9), 0),),
+        (Row("plan", dots, found, (-2.2, -1.95), (2.2, 1.95), moments=(0, 36)),),
         {
             "all pass": all(walk.places[-1, 1] > DEPTH for walk in found),
             "users touch users": any((walk.touched == OTHER).any() for walk in found),

@@ -43,6 +43,12 @@ class Ground(NamedTuple):
     scene: Scene
     points: Floats
 
+    def separation(self, place: Floats) -> float:
+        """Return the distance of the body at a place (3,) from the scan, up to a metre [m]."""
+        pose = np.eye(4)
+        pose[:3, 3] = place
+        return float(self.scene.distance("visitor", pose, 1.0).signed_distance[0])
+
     def walk(
         self, start: Sequence[float], steering: Steering, seconds: float, objects: Mapping[str, Any] | None = None
     ) -> Walk:

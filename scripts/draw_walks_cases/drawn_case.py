@@ -29,9 +29,11 @@ class Row(NamedTuple):
     """One scene in a panel.
 
     dots: (n, 2), scan points of the view.  low, high: (2,) corners of what is shown [m].
-    every: number of frames between two outlines of the body.  moments: frames of the outlines instead.
+    every: number of frames between two outlines of the body.  moments: frames of the outlines
+    instead, the last of them darker.
     label: says which value of the option this is.
-    label_at: (x, y), as a share of the row.  crate: side of the scene's object [m]; 0: none.
+    crate: side of the scene's object [m]; 0: none.  scale_left: the scale is at the left.
+    label_low: the label is at the bottom.
     """
 
     view: View
@@ -41,16 +43,17 @@ class Row(NamedTuple):
     high: tuple[float, float]
     every: int = 6
     label: str = ""
-    label_at: tuple[float, float] = (0.02, 0.95)
     measures: tuple[Measure, ...] = ()
     crate: float = 0.0
     moments: tuple[int, ...] = ()
+    scale_left: bool = False
+    label_low: bool = False
 
 
 class Case(NamedTuple):
     """One panel.
 
-    title, text: what it shows.  rows: from top to bottom.
+    title, text: what it shows.  rows: from top to bottom; beside: from left to right.
     claims: what the caption says of the walks, and whether it is so.
     """
 
@@ -59,6 +62,7 @@ class Case(NamedTuple):
     text: str
     rows: tuple[Row, ...]
     claims: dict[str, bool]
+    beside: bool = False
 
 
 def section(view: View, points: Floats) -> Floats:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from solidcloud.schemas.scene.effect_table import Ground, Step, Stop
 
 from .drawn_case import Case, Measure, Row, section
@@ -29,7 +28,7 @@ SKIN_START = -0.924
 # Heights of the sills that CLEARANCES tell apart [m].
 SILLS = (0.02, 0.07)
 # Side of the crate, and where the wall stands behind it [m].
-CRATE, WALL = 0.4, 0.85
+CRATE, WALL = 0.4, 1.2
 
 
 def skin(folder: Path) -> Case:
@@ -39,44 +38,46 @@ def skin(folder: Path) -> Case:
         points = walls([np.array([[0.0, -0.5], [0.0, 0.5]])], (-1.3, -0.5, 0.0, 0.5), SPACING)
         with opened(folder, points, {"stop": {"skin": value}}) as scene:
             found = scene.walk((SKIN_START, 0.0, FEET), straight(SPEED, 0.0), 1.0)
-            gaps.append(scene.separation(found.places[-1]))
+            gaps.append(scene.free_way(found.places[-1], (0.2, 0.0, 0.0)))
             dots = section("plan", scene.points)
         end = float(found.places[-1, 0]) + RADIUS
         text = f"{gaps[-1] * 1000:.0f} mm"
         rows.append(
             Row(
                 "plan", dots, [found], (-1.25, -0.3), (0.28, 0.3), 7, _label(value, Stop().skin, " m"),
-                measures=(Measure((end, 0.0), (-SPACING / 2, 0.0), text, (0.15, 0.0)),),
+                measures=(Measure((end, 0.0), (-SPACING / 2, 0.0), text, (0.13, 0.0)),), scale_left=True,
             )
         )  # fmt: skip
     return Case(
         "skin", "stop.skin", "distance kept from what stops the avatar", tuple(rows),
-        {f"skin {value:g} is kept": -1e-5 < gap - value < 0.002 for value, gap in zip(SKINS, gaps, strict=True)},
+        {f"skin {value:g} is kept": abs(gap - value) < 1e-3 for value, gap in zip(SKINS, gaps, strict=True)},
     )  # fmt: skip
 
 
 def step_height(folder: Path) -> Case:
     """Walk at a step."""
-    profile = np.array([[-0.7, 0.0], [0.4, 0.0], [0.4, STEP], [1.6, STEP]])
-    found = [_walked(folder, profile, {"step": {"height": value}}, -0.4, 1.5) for value in HEIGHTS]
-    rows = _rows(found, HEIGHTS, Step().height, " m", (-0.7, -0.12), (1.6, 1.95))
+    profile = np.array([[-0.8, 0.0], [0.2, 0.0], [0.2, STEP], [1.0, STEP]])
+    found = [_walked(folder, profile, {"step": {"height": value}}, -0.4, 0.85) for value in HEIGHTS]
+    rows = _rows(found, HEIGHTS, Step().height, " m", (-0.7, -0.25), (0.9, 2.2))
     rise = [float(walk.places[-1, 2] - walk.places[0, 2]) for walk, _ in found]
     return Case(
         "step", "step.height", f"a step of {STEP * 100:.0f} cm", rows,
-        {"the default climbs": abs(rise[0] - STEP) < 0.02, "the lower one does not": abs(rise[1]) < 0.02},
+        beside=True,
+        claims={"the default climbs": abs(rise[0] - STEP) < 0.02, "the lower one does not": abs(rise[1]) < 0.02},
     )  # fmt: skip
 
 
 def slope_limit(folder: Path) -> Case:
     """Walk at a slope."""
     rise = float(np.tan(np.radians(SLOPE)))
-    profile = np.array([[-0.7, 0.0], [0.3, 0.0], [1.3, rise], [1.6, rise]])
-    found = [_walked(folder, profile, {"ground": {"slope": value}}, -0.4, 1.4) for value in SLOPES]
-    rows = _rows(found, SLOPES, Ground().slope, "°", (-0.7, -0.12), (1.6, 2.55))
+    profile = np.array([[-0.8, 0.0], [0.0, 0.0], [0.6, 0.6 * rise], [1.0, 0.6 * rise]])
+    found = [_walked(folder, profile, {"ground": {"slope": value}}, -0.45, 0.95) for value in SLOPES]
+    rows = _rows(found, SLOPES, Ground().slope, "°", (-0.7, -0.15), (0.9, 2.3))
     rose = [float(walk.places[-1, 2] - walk.places[0, 2]) for walk, _ in found]
     return Case(
         "slope", "ground.slope", f"a slope of {SLOPE:.0f}°", rows,
-        {"the default walks up": rose[0] > 0.5 * rise, "the lower one stays below": rose[1] < 0.1},
+        beside=True,
+        claims={"the default walks up": rose[0] > 0.5 * rise, "the lower one stays below": abs(rose[1]) < 0.05},
     )  # fmt: skip
 
 
@@ -84,15 +85,14 @@ def snap(folder: Path) -> Case:
     """Walk down two ledges."""
     first, second = DROPS
     profile = np.array(
-        [[-0.7, first + second], [0.2, first + second], [0.2, second], [1.3, second], [1.3, 0.0], [2.4, 0.0]]
+        [[-2.4, first + second], [0.0, first + second], [0.0, second], [1.5, second], [1.5, 0.0], [4.0, 0.0]]
     )
     effect, field = SNAP_OPTION
-    found = [
-        _walked(folder, profile, {effect: {field: value}}, -0.4, 2.2, first + second) for value in SNAPS
-    ]
-    rows = _rows(found, SNAPS, Step().height, " m", (-0.7, -0.12), (2.4, 2.4), (0.72, 0.95))
-    fell = [[_fell(walk, 0.2, 1.0), _fell(walk, 1.3, 2.2)] for walk, _ in found]
-    text = f"steps down of {first * 100:.0f} and {second * 100:.0f} cm; dotted: falls"
+    found = [_walked(folder, profile, {effect: {field: value}}, -1.8, 4.3, first + second) for value in SNAPS]
+    rows = _rows(found, SNAPS, Step().height, " m", (-2.2, -0.62), (3.9, 2.15))
+    rows = tuple(row._replace(label_low=True) for row in rows)
+    fell = [[_fell(walk, -0.3, 1.2), _fell(walk, 1.2, 3.0)] for walk, _ in found]
+    text = f"down {first * 100:.0f} and {second * 100:.0f} cm; limit: {effect}.{field}"
     return Case(
         "snap", "ground snap", text, rows,
         {
@@ -110,18 +110,19 @@ def clearance(folder: Path) -> Case:
     for x, height in ((0.25, low), (1.0, high)):
         line += [[x, 0.0], [x, height], [x + 0.08, height], [x + 0.08, 0.0]]
     profile = np.array([*line, [1.7, 0.0]])
-    found = [_walked(folder, profile, {"ground": {"clearance": value}}, -0.25, 1.5) for value in CLEARANCES]
-    rows = []
-    gaps = []
+    found = [
+        _walked(folder, profile, {"ground": {"clearance": value}}, -0.25, 1.5, value - FEET + SPACING / 2)
+        for value in CLEARANCES
+    ]
+    rows, gaps = [], []
     for (walk, dots), value in zip(found, CLEARANCES, strict=True):
-        feet = float(walk.places[5, 2])
-        gaps.append(feet - SPACING / 2)
-        x = float(walk.places[5, 0]) - RADIUS - 0.08
+        x, _, feet = walk.places[np.abs(walk.places[:, 0] - 0.72).argmin()].tolist()
+        gaps.append(feet - SPACING / 2)  # from the spheres of the scan
         text = f"{gaps[-1] * 100:.0f} cm"
         rows.append(
             Row(
-                "side", dots, [walk], (-0.5, -0.05), (1.7, 0.52), 11, _label(value, Ground().clearance, " m"),
-                measures=(Measure((x, SPACING / 2), (x, feet), text, (x, feet + 0.07)),),
+                "side", dots, [walk], (-0.5, -0.12), (1.7, 0.5), 11, _label(value, Ground().clearance, " m"),
+                measures=(Measure((x, SPACING / 2), (x, feet), text, (x - 0.13, feet + 0.065)),),
             )
         )  # fmt: skip
     rose = [float(np.ptp(walk.places[8:, 2])) for walk, _ in found]
@@ -150,11 +151,13 @@ def push(folder: Path) -> Case:
         with opened(
             folder, points, extra=["objects"], objects=[item], shapes={"crate": crate(CRATE)}
         ) as scene:
-            found = scene.walk((-0.95, 0.0, FEET), straight(SPEED, 0.0), 1.6, {"crate": start})
+            found = scene.walk((-0.95, 0.0, FEET), straight(SPEED, 0.0), 1.9, {"crate": start})
             dots = section("plan", scene.points)
         ends.append(float(found.objects[-1, 0, 0]))
         walked.append(found)
-        rows.append(Row("plan", dots, [found], (-1.25, -0.36), (1.0, 0.36), 9, kind, crate=CRATE))
+        rows.append(
+            Row("plan", dots, [found], (-1.2, -0.5), (1.35, 0.5), 14, kind, crate=CRATE, scale_left=True)
+        )
     return Case(
         "push", "objects.kind", "a crate pushed to a wall; one that stays", tuple(rows),
         {
@@ -182,11 +185,10 @@ def _rows(
     unit: str,
     low: tuple[float, float],
     high: tuple[float, float],
-    label_at: tuple[float, float] = (0.02, 0.95),
 ) -> tuple[Row, ...]:
     """Return side views of walks, one a value of an option."""
     return tuple(
-        Row("side", dots, [walk], low, high, 14, _label(value, default, unit), label_at)
+        Row("side", dots, [walk], low, high, 14, _label(value, default, unit))
         for (walk, dots), value in zip(found, values, strict=True)
     )
 

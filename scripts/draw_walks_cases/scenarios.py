@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .drawn_case import Case, Row, section
 from .made_shapes import RADIUS, SPACING, box, circle, ground, walls
-from .simulated_walks import CLEAR, FALL, OTHER, SCAN, Steering, Walk, opened, straight
+from .simulated_walks import CLEAR, FALL, FRAME, OTHER, SCAN, Steering, Walk, opened, straight
 
 Floats = NDArray[np.float64]
 
@@ -21,7 +21,8 @@ RISE, TREAD, STEPS = 0.17, 0.3, 4
 # Slopes: one to walk, one too steep for the default limit of 45 degrees [degrees].
 GENTLE, STEEP = 30.0, 55.0
 COLUMN = 0.3  # radius [m]
-USERS, MARGIN = 7, 0.05  # users, and distance that they keep [m]
+# Number of users of the crowd, distance that they keep [m], and the frame in which they are shown.
+USERS, MARGIN, SEEN = 7, 0.05, 36
 
 
 def door_wall(half: float) -> list[Floats]:
@@ -33,14 +34,14 @@ def door(folder: Path) -> Case:
     """Pass a door, straight and obliquely."""
     turn = np.radians(40.0)
     x, y = SPEED * np.sin(turn), SPEED * np.cos(turn)
-    with opened(folder, walls(door_wall(1.4), (-1.7, -1.5, 1.7, 1.6), SPACING)) as scene:
+    with opened(folder, walls(door_wall(1.9), (-1.9, -1.5, 1.9, 1.6), SPACING)) as scene:
         found = [
             scene.walk((0.12, -1.1, FEET), straight(0.0, SPEED), 1.9),
             scene.walk((-1.1, -1.0, FEET), straight(x, y), 2.4),
         ]
         dots = section("plan", scene.points)
     return Case(
-        "door", "Door", "straight: touches nothing; oblique: slides through",
+        "door", "Door", "straight, and obliquely along a jamb",
         (Row("plan", dots, found, (-1.5, -1.35), (1.5, 1.45), 8),),
         {
             "both pass": all(walk.places[-1, 1] > DEPTH + RADIUS for walk in found),
@@ -53,13 +54,13 @@ def door(folder: Path) -> Case:
 def jamb(folder: Path) -> Case:
     """Walk into a jamb with some overlap."""
     overlap = 0.08
-    with opened(folder, walls(door_wall(1.0), (-1.0, -1.2, 1.0, 1.2), SPACING)) as scene:
+    with opened(folder, walls(door_wall(1.6), (-1.6, -1.2, 1.6, 1.3), SPACING)) as scene:
         start = (DOOR / 2 - RADIUS + overlap, -0.75, FEET)
         found = scene.walk(start, straight(0.0, SPEED), 1.4)
         dots = section("plan", scene.points)
     return Case(
         "jamb", "Jamb", f"{overlap * 100:.0f} cm too far right: slides off the jamb",
-        (Row("plan", dots, [found], (-0.62, -0.95), (1.0, 0.95), 5),),
+        (Row("plan", dots, [found], (-1.0, -1.05), (1.0, 1.15), 6),),
         {
             "it passes": bool(found.places[-1, 1] > DEPTH + RADIUS),
             "it touches the jamb": bool((found.touched == SCAN).any()),
@@ -100,14 +101,14 @@ def slope(folder: Path) -> Case:
     """Walk up a slope to a landing, and at one that is too steep."""
     gentle, steep = np.tan(np.radians([GENTLE, STEEP]))
     profile = np.array([[-0.8, 0.0], [0.0, 0.0], [1.4, 1.4 * gentle], [2.6, 1.4 * gentle]])
-    profile = np.concatenate([profile, [[3.5, 1.4 * gentle + 0.9 * steep]]])
+    profile = np.concatenate([profile, [[3.6, 1.4 * gentle + 1.0 * steep]]])
     with opened(folder, ground(profile, 0.4, SPACING)) as scene:
         found = scene.walk((-0.5, 0.0, FEET), straight(SPEED, 0.0), 3.6)
         dots = section("side", scene.points)
     top = 1.4 * gentle
     return Case(
         "slope", "Slope", f"{GENTLE:.0f}°: walked; {STEEP:.0f}°: too steep",
-        (Row("side", dots, [found], (-0.8, -0.25), (3.5, 2.75), 13),),
+        (Row("side", dots, [found], (-0.75, -0.25), (3.35, 2.75), 13),),
         {
             "it walks up the gentle one": bool(found.places[-1, 2] > top),
             "it does not climb the steep one": bool(found.places[:, 2].max() < top + 0.1),
@@ -121,7 +122,8 @@ def column(folder: Path) -> Case:
     lines = [circle((0.0, 0.0), COLUMN, 96)]
     with opened(folder, walls(lines, (-1.2, -1.6, 1.2, 1.6), SPACING)) as scene:
         found = [
-            scene.walk((x, y, FEET), straight(0.0, SPEED), 3.0) for x, y in ((-0.25, -1.2), (0.1, -1.2))
+            scene.walk((x, -1.15, FEET), straight(0.0, SPEED), seconds)
+            for x, seconds in ((-0.25, 1.9), (0.1, 2.3))
         ]
         dots = section("plan", scene.points)
     return Case(
@@ -137,14 +139,13 @@ def column(folder: Path) -> Case:
     )  # fmt: skip
 
 
-def _to_door(target: float) -> Steering:
-    """Return the steering of a user who walks to the door, and then to (target, 2)."""
+def _to_door(aside: float) -> Steering:
+    """Return the steering of a user who walks to the door, and then to (aside, 1.75) behind it."""
 
     def velocity(place: Floats, _time: float) -> tuple[float, float]:
-        behind = place[1] > DEPTH / 2
-        goal = np.array([target, 2.0]) if behind else np.array([0.0, DEPTH / 2 + 0.1])
+        goal = np.array([aside, 1.75] if place[1] > DEPTH / 2 else [0.0, DEPTH / 2 + 0.1])
         way = goal - place[:2]
-        x, y = way / max(float(np.linalg.norm(way)), 1e-9) * SPEED
+        x, y = way / max(float(np.linalg.norm(way)), SPEED * FRAME) * SPEED
         return float(x), float(y)
 
     return velocity
@@ -152,20 +153,20 @@ def _to_door(target: float) -> Steering:
 
 def crowd(folder: Path) -> Case:
     """Walk through one door with many users at the same time."""
-    angles = np.linspace(-1.25, 1.25, USERS)
+    angles = np.linspace(-1.2, 1.2, USERS)
     # They arrive one after another. Users who all arrive at once jam in an arch before the door.
     far = 0.8 + 0.3 * (3 * np.arange(USERS) % USERS)
     starts = np.stack([far * np.sin(angles), -far * np.cos(angles), np.full(USERS, FEET)], axis=1)
-    steering = [_to_door(2.0 * x) for x in np.sin(angles)]
+    steering = [_to_door(x) for x in np.linspace(-1.9, 1.9, USERS).tolist()]
     options = {"crowd": {"margin": MARGIN}}
-    points = walls(door_wall(2.4), (-2.5, -2.5, 2.5, 2.5), SPACING)
+    points = walls(door_wall(2.8), (-2.8, -2.9, 2.8, 2.2), SPACING)
     with opened(folder, points, options, extra=["crowd"]) as scene:
-        found = scene.walks(starts.tolist(), steering, 3.6)
+        found = scene.walks(starts.tolist(), steering, 4.8)
         dots = section("plan", scene.points)
     apart = nearest_users(found)
     return Case(
-        "crowd", "Crowd", f"{USERS} users through one door, {MARGIN * 100:.0f} cm apart",
-        (Row("plan", dots, found, (-2.2, -1.95), (2.2, 1.95), moments=(0, 36)),),
+        "crowd", "Crowd", f"{USERS} users, {MARGIN * 100:.0f} cm apart: start, {SEEN * FRAME:.1f} s (dark), end",
+        (Row("plan", dots, found, (-2.3, -2.65), (2.3, 2.05), moments=(0, len(found[0].touched), SEEN)),),
         {
             "all pass": all(walk.places[-1, 1] > DEPTH for walk in found),
             "users touch users": any((walk.touched == OTHER).any() for walk in found),

@@ -43,14 +43,18 @@ class Ground(NamedTuple):
     scene: Scene
     points: Floats
 
-    def separation(self, place: Floats) -> float:
-        """Return the distance of the body at a place (3,) from the scan, up to a metre [m]."""
-        pose = np.eye(4)
-        pose[:3, 3] = place
-        return float(self.scene.distance("visitor", pose, 1.0).signed_distance[0])
+    def free_way(self, place: Floats, way: Sequence[float]) -> float:
+        """Return how far the body can move from a place (3,) along a way (3,) without contact [m]."""
+        begin, end = np.eye(4), np.eye(4)
+        begin[:3, 3], end[:3, 3] = place, place + way
+        return float(self.scene.sweep("visitor", begin, end).lower[0] * np.linalg.norm(way))
 
     def walk(
-        self, start: Sequence[float], steering: Steering, seconds: float, objects: Mapping[str, Any] | None = None
+        self,
+        start: Sequence[float],
+        steering: Steering,
+        seconds: float,
+        objects: Mapping[str, Any] | None = None,
     ) -> Walk:
         """Simulate one user, alone. See `walks`."""
         return self.walks([start], [steering], seconds, objects)[0]
@@ -115,7 +119,9 @@ def opened(
     points = noisy(points, np.random.default_rng(5))
     np.savetxt(place / "scan.xyz", points, fmt="%.5f")
     build_archive(
-        [place / "scan.xyz"], place / "archive", BuildConfig(voxel=2.0, resolution=1e-4, radius=SPACING / 2, jobs=1)
+        [place / "scan.xyz"],
+        place / "archive",
+        BuildConfig(voxel=8.0, resolution=1e-4, radius=SPACING / 2, jobs=1),
     )
     shapes = {"visitor": body(), **(shapes or {})}
     for name, centres in shapes.items():
@@ -141,6 +147,7 @@ def _touched(state: State) -> int:
     """Return what a frame touched."""
     if state.ground is not None and not state.ground.on_ground:
         return FALL
-    if any(each.what for each in state.touched):
+    pushed = state.objects is not None and state.objects.poses
+    if pushed or any(each.what for each in state.touched):
         return OTHER
     return SCAN if state.touched else CLEAR

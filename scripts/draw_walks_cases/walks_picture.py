@@ -17,7 +17,7 @@ from solidcloud.server.report.walk.walk_picture import COLOURS, INK, PAPER
 
 from .drawn_case import AXES, Case, Measure, Row
 from .made_shapes import RADIUS, body_profile, box, circle
-from .simulated_walks import CLEAR, FALL, FRAME, OTHER, SCAN, Walk
+from .simulated_walks import CLEAR, FALL, OTHER, SCAN, Walk
 
 Floats = NDArray[np.float64]
 
@@ -31,9 +31,9 @@ TOUCHED: dict[int, tuple[str, Any, str]] = {
 }
 DOT, BODY, FRAME_COLOUR = "#5b4d40", "#8a8178", "#d9cfc1"
 # Size of a panel without its texts, and the room for texts and margins [inches].
-WIDE, HIGH = 2.86, 2.5
+WIDE, HIGH = 2.86, 2.4
 ABOVE, BELOW, BETWEEN, MARGIN, LEGEND = 0.46, 0.06, 0.12, 0.08, 0.3
-COLUMNS, DPI, PALETTE = 3, 200, 128
+COLUMNS, DPI, PALETTE = 3, 200, 256
 TITLE, TEXT, SMALL = 11.0, 8.6, 8.2
 
 
@@ -47,7 +47,9 @@ def draw(cases: Sequence[Case], path: Path) -> None:
         left = MARGIN + number % COLUMNS * (WIDE + BETWEEN)
         top = height - LEGEND - number // COLUMNS * (ABOVE + HIGH + BELOW)
         _draw_case(figure, case, (left, top, width, height))
-    shown = {what for case in cases for row in case.rows for walk in row.walks for what in walk.touched.tolist()}
+    shown = {
+        what for case in cases for row in case.rows for walk in row.walks for what in walk.touched.tolist()
+    }
     figure.legend(
         handles=_handles(shown), loc="center", bbox_to_anchor=(0.5, 1 - 0.55 * LEGEND / height),
         ncols=len(shown) + 2, frameon=False, fontsize=SMALL, handlelength=1.7, columnspacing=1.3,
@@ -55,20 +57,29 @@ def draw(cases: Sequence[Case], path: Path) -> None:
     )  # fmt: skip
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=DPI, format="png")
-    image = Image.open(buffer).convert("RGB").quantize(PALETTE, dither=Image.Dither.NONE)
+    # Without k-means, the few pixels of a crowd's paths lose their colour to the many greys.
+    image = (
+        Image.open(buffer)
+        .convert("RGB")
+        .quantize(PALETTE, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+    )
     image.save(path, optimize=True)
 
 
 def _draw_case(figure: Figure, case: Case, at: tuple[float, float, float, float]) -> None:
     """Draw one panel. at: its left and top, and the figure's width and height [inches]."""
     left, top, width, height = at
-    figure.text(left / width, (top - 0.06) / height, case.title, fontsize=TITLE, weight="bold", color=INK, va="top")
+    figure.text(
+        left / width, (top - 0.06) / height, case.title, fontsize=TITLE, weight="bold", color=INK, va="top"
+    )
     figure.text(left / width, (top - 0.26) / height, case.text, fontsize=TEXT, color=INK, va="top")
-    high = (HIGH - (len(case.rows) - 1) * BELOW) / len(case.rows)
+    count = len(case.rows)
+    wide = (WIDE - (count - 1) * BELOW) / count if case.beside else WIDE
+    high = HIGH if case.beside else (HIGH - (count - 1) * BELOW) / count
     for number, row in enumerate(case.rows):
-        bottom = top - ABOVE - high - number * (high + BELOW)
-        axes = figure.add_axes((left / width, bottom / height, WIDE / width, high / height))
-        _draw_row(axes, row, WIDE / high)
+        x = left + number * (wide + BELOW) * case.beside
+        y = top - ABOVE - high - number * (high + BELOW) * (not case.beside)
+        _draw_row(figure.add_axes((x / width, y / height, wide / width, high / height)), row, wide / high)
 
 
 def _draw_row(axes: Any, row: Row, ratio: float) -> None:
@@ -91,9 +102,11 @@ def _draw_row(axes: Any, row: Row, ratio: float) -> None:
         _draw_measure(axes, measure)
     if row.label:
         axes.text(
-            *row.label_at, row.label, transform=axes.transAxes, fontsize=TEXT, color=INK, va="top", zorder=7
-        )
-    _draw_scale(axes, size)
+            0.02, 0.05 if row.label_low else 0.96, row.label, transform=axes.transAxes, fontsize=TEXT,
+            color=INK, va="bottom" if row.label_low else "top", zorder=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
+        )  # fmt: skip
+    _draw_scale(axes, size, left=row.scale_left)
 
 
 def _draw_bodies(axes: Any, row: Row, walk: Walk) -> None:
@@ -109,9 +122,14 @@ def _draw_bodies(axes: Any, row: Row, walk: Walk) -> None:
     if row.crate:
         shown, _ = AXES[row.view]
         half = row.crate / 2
-        for frame, colour in [*((frame, BODY) for frame in frames), (last, INK)]:
-            x, y = walk.objects[frame, 0, shown]
-            axes.plot(*box((x - half, y - half), (x + half, y + half)).T, color=colour, lw=0.9, zorder=3)
+        moved = [frame for frame in frames if (walk.objects[frame] != walk.objects[last]).any()]
+        places = walk.objects[[*moved, last], 0][:, shown]
+        crates = [box((x - half, y - half), (x + half, y + half)) for x, y in places.tolist()]
+        colours = [BODY] * len(moved) + [INK]
+        tint = (0.945, 0.72, 0.2, 0.14)
+        axes.add_collection(
+            PolyCollection(crates, facecolor=tint, edgecolor=colours, linewidth=0.8, zorder=3)
+        )
 
 
 def outline(row: Row, place: Floats) -> Floats:
@@ -131,7 +149,9 @@ def _draw_path(axes: Any, row: Row, walk: Walk) -> None:
         parts = [places[begin : end + 1] for begin, end in _runs(walk.touched == what)]
         if parts:
             axes.add_collection(
-                LineCollection(parts, colors=colour, linestyles=[line], linewidths=2.0, zorder=4, capstyle="butt")
+                LineCollection(
+                    parts, colors=colour, linestyles=[line], linewidths=2.0, zorder=4, capstyle="butt"
+                )
             )
     axes.plot(*places[0], marker="o", ms=4.2, color=INK, mec="white", mew=0.8, zorder=5)
 
@@ -145,15 +165,20 @@ def _runs(flags: NDArray[np.bool_]) -> Iterable[tuple[int, int]]:
 def _draw_measure(axes: Any, measure: Measure) -> None:
     """Draw a length with its value beside it."""
     begin, end = np.array(measure.begin), np.array(measure.end)
-    axes.plot(*np.array([begin, end]).T, color=INK, lw=1.0, zorder=6, marker="|", ms=5, mew=0.9)
+    mark = "_" if begin[0] == end[0] else "|"
+    axes.plot(*np.array([begin, end]).T, color=INK, lw=1.0, zorder=6, marker=mark, ms=5, mew=0.9)
     axes.text(*measure.at, measure.text, fontsize=SMALL, color=INK, ha="center", va="center", zorder=7)
 
 
-def _draw_scale(axes: Any, size: Floats) -> None:
-    """Draw a bar of half a metre in the lower right corner."""
-    x, y = axes.get_xlim()[1] - 0.04 * size[0], axes.get_ylim()[0] + 0.06 * size[1]
-    axes.plot([x - 0.5, x], [y, y], color=BODY, lw=2.0, solid_capstyle="butt", zorder=6)
-    axes.text(x - 0.25, y + 0.02 * size[1], "0.5 m", fontsize=7.0, color=BODY, ha="center", va="bottom", zorder=6)
+def _draw_scale(axes: Any, size: Floats, *, left: bool) -> None:
+    """Draw a bar of half a metre in a lower corner. size: (2,) of what is shown [m]."""
+    begin, end = axes.get_xlim()
+    x = begin + 0.04 * size[0] if left else end - 0.04 * size[0] - 0.5
+    y = axes.get_ylim()[0] + 0.06 * size[1]
+    axes.plot([x, x + 0.5], [y, y], color=BODY, lw=2.0, solid_capstyle="butt", zorder=6)
+    axes.text(
+        x + 0.25, y + 0.02 * size[1], "0.5 m", fontsize=7.0, color=BODY, ha="center", va="bottom", zorder=6
+    )
 
 
 def _handles(shown: set[int]) -> list[Any]:

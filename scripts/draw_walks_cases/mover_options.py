@@ -45,7 +45,7 @@ def skin(folder: Path) -> Case:
         rows.append(
             Row(
                 "plan", dots, [found], (-1.25, -0.3), (0.28, 0.3), 7, _label(value, Stop().skin, " m"),
-                measures=(Measure((end, 0.0), (-SPACING / 2, 0.0), text, (0.13, 0.0)),), scale_left=True,
+                measures=(Measure((end, 0.0), (-SPACING / 2, 0.0), text, (0.15, 0.0)),), scale_left=True,
             )
         )  # fmt: skip
     return Case(

@@ -157,11 +157,11 @@ def crowd(folder: Path) -> Case:
     # They arrive one after another. Users who all arrive at once jam in an arch before the door.
     far = 0.8 + 0.3 * (3 * np.arange(USERS) % USERS)
     starts = np.stack([far * np.sin(angles), -far * np.cos(angles), np.full(USERS, FEET)], axis=1)
-    steering = [_to_door(x) for x in np.linspace(-1.9, 1.9, USERS).tolist()]
+    steering = [_to_door(x) for x in np.linspace(-2.1, 2.1, USERS).tolist()]
     options = {"crowd": {"margin": MARGIN}}
     points = walls(door_wall(2.8), (-2.8, -2.9, 2.8, 2.2), SPACING)
     with opened(folder, points, options, extra=["crowd"]) as scene:
-        found = scene.walks(starts.tolist(), steering, 4.8)
+        found = scene.walks(starts.tolist(), steering, 5.2)
         dots = section("plan", scene.points)
     apart = nearest_users(found)
     return Case(

@@ -19,9 +19,8 @@ Floats = NDArray[np.float64]
 SKINS, HEIGHTS, SLOPES, CLEARANCES = (0.002, 0.03), (0.2, 0.1), (45.0, 30.0), (0.03, 0.1)
 # Height of the step that HEIGHTS tell apart [m], and angle of the slope that SLOPES do [degrees].
 STEP, SLOPE = 0.15, 38.0
-# Ground snap: drops [m], and the values of the option that limits it. A standing avatar follows
-# ground down to the larger of `step.height` and `ground.clearance`.
-DROPS, SNAP_OPTION, SNAPS = (0.15, 0.3), ("step", "height"), (0.2, 0.35)
+# Drops [m], and the values of `ground.snap` that tell them apart [m].
+DROPS, SNAPS = (0.15, 0.3), (0.2, 0.35)
 # Where the walks at SKINS begin [m]. The avatar never moves back: a frame that begins nearer to the
 # wall than the skin stays where it is, so the skin is seen only from some starts.
 SKIN_START = -0.924
@@ -87,14 +86,15 @@ def snap(folder: Path) -> Case:
     profile = np.array(
         [[-2.4, first + second], [0.0, first + second], [0.0, second], [1.5, second], [1.5, 0.0], [4.0, 0.0]]
     )
-    effect, field = SNAP_OPTION
-    found = [_walked(folder, profile, {effect: {field: value}}, -1.8, 4.3, first + second) for value in SNAPS]
+    found = [
+        _walked(folder, profile, {"ground": {"snap": value}}, -1.8, 4.3, first + second) for value in SNAPS
+    ]
     rows = _rows(found, SNAPS, Step().height, " m", (-2.2, -0.62), (3.9, 2.15))
     rows = tuple(row._replace(label_low=True) for row in rows)
     fell = [[_fell(walk, -0.3, 1.2), _fell(walk, 1.2, 3.0)] for walk, _ in found]
-    text = f"down {first * 100:.0f} and {second * 100:.0f} cm; limit: {effect}.{field}"
+    text = f"down {first * 100:.0f} and {second * 100:.0f} cm"
     return Case(
-        "snap", "ground snap", text, rows,
+        "snap", "ground.snap", text, rows,
         {
             "the low drop is followed": not fell[0][0] and not fell[1][0],
             "the high drop is fallen": fell[0][1],

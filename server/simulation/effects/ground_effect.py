@@ -12,7 +12,9 @@ the last frame and has no ground below falls only if its feet would land. It kee
 instead if nothing below was scanned, or if the rim of a hole, or the ledge just left, would catch
 the rest of the body. It then falls or stands again when there is ground or it has left the ledge.
 
-The vertical part of a motion command is ignored, both when standing and when falling.
+The vertical part of a motion command is ignored, both when standing and when falling. A body whose
+top is above the middle of the avatar stands beside it and is no ground: a user pressed between two
+others would otherwise fall.
 """
 
 import math
@@ -189,9 +191,7 @@ class GroundRunner:
         point, normal = stood
         (x, y, z), (a, b, c), (u, v, w) = hit.cloud.tolist(), point.tolist(), normal.tolist()
         x, y, z = x - a, y - b, z - c
-        same = (
-            abs(x * u + y * v + z * w) <= _SAME_FLOOR and x * x + y * y + z * z <= _SAME_FLOOR_REACH**2
-        )
+        same = abs(x * u + y * v + z * w) <= _SAME_FLOOR and x * x + y * y + z * z <= _SAME_FLOOR_REACH**2
         return normal if same else None
 
     def _store_ground(self, frame: Frame, hit: Hit, normal: Vec) -> None:
@@ -251,7 +251,8 @@ class GroundRunner:
         return first
 
     def _first_below(self, frame: Frame, reach: float) -> Hit | None:
-        return find_first_hit(frame, translated(frame.pose, -reach * frame.world.up), self._tolerance)
+        to = translated(frame.pose, -reach * frame.world.up)
+        return find_first_hit(frame, to, self._tolerance, below=True)
 
     def _away(self, frame: Frame, hit: Hit) -> Vec | None:
         """Return the horizontal unit vector (3,) away from a steep surface; None if unknown."""
@@ -269,7 +270,7 @@ class GroundRunner:
         assert frame.advance is not None
         if way <= 0.0:
             return
-        if not below.aside:
+        if not below.aside and not frame.obstacles:  # the search left out bodies beside the avatar
             down = translated(frame.pose, -below.reach * frame.world.up)
             settle_before(frame, down, way / below.reach, below.free / below.reach if below.hit else 1.0)
             return

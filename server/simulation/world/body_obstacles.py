@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel, make_avatar
-from ...kernels.bodies.body_pairs import find_near_bodies
+from ...kernels.bodies.body_pairs import bound_body, find_near_bodies
 from ...kernels.bodies.body_sweep import sweep_bodies
 from ...runtime.stop_flag import NO_STOP, StopFlag
 from .bodies import USER, Bodies, Shape
@@ -27,6 +27,7 @@ from .vectors import dot, horizontal, norm, rotate
 
 # Tolerance for a translation across an overlapped body, so that rounding does not count as deeper.
 _ACROSS = 1e-9
+_NO_ORIGIN = np.zeros(3)
 
 
 class _FirstHit(NamedTuple):
@@ -65,9 +66,14 @@ class BodyObstacle:
         self._overlapped: dict[int, bool] = {}
         self._hits: list[Hit] = []
 
-    def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
-        """Return the hit that ends the motion first; of equals, that of the lowest row."""
-        hit = self._sweep(avatar, pose_from, pose_to, tolerance)
+    def sweep(
+        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
+    ) -> Hit | None:
+        """Return the hit that ends the motion first; of equals, that of the lowest row.
+
+        below: leave out bodies beside the avatar.
+        """
+        hit = self._sweep(avatar, pose_from, pose_to, tolerance, below=below)
         if hit is not None:
             self._hits.append(hit)
         return hit
@@ -86,13 +92,17 @@ class BodyObstacle:
         """Return whether this obstacle reported the hit."""
         return any(hit is own for own in self._hits)
 
-    def _sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+    def _sweep(
+        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool
+    ) -> Hit | None:
         """Implement `sweep`."""
         bodies = self._bodies
         with bodies.lock:
             shape = bodies.shape_of(avatar)
             ends = self._from_origin(pose_from), self._from_origin(pose_to)
             rows = self._near(shape, *ends)
+            if below and len(rows):
+                rows = rows[~self._beside(shape, ends[0], rows)]
             while len(rows):
                 first = self._first(shape, ends, rows, tolerance)
                 if first is None:
@@ -155,6 +165,18 @@ class BodyObstacle:
         if self._skip:
             left_out.append(bodies.row_of(self._skip, user=True))
         return found[~np.isin(found, left_out)] if len(found) and left_out else found
+
+    def _beside(self, shape: Shape, pose: Pose, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which bodies (m,) stand beside the avatar: their tops are above the middle of its height.
+
+        pose: of the avatar, relative to the origin.
+        """
+        bodies, own = self._bodies, np.empty((2, 3))
+        bound_body(shape.box, pose, _NO_ORIGIN, shape.model.radius, own)
+        tops = np.maximum(bodies.bounds[rows, 0] * bodies.up, bodies.bounds[rows, 1] * bodies.up).sum(axis=1)
+        heights = np.sort(own * bodies.up, axis=0).sum(axis=1)
+        beside: NDArray[np.bool_] = tops > heights.mean()
+        return beside
 
     def _from_origin(self, pose: Pose) -> Pose:
         """Return a pose with its translation relative to the bodies' origin."""

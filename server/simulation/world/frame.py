@@ -64,10 +64,12 @@ class Obstacle(Protocol):
 
     name: str
 
-    def sweep(self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float) -> Hit | None:
+    def sweep(
+        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
+    ) -> Hit | None:
         """Return the hit that ends the motion at this obstacle, or None.
 
-        Nothing is touched before the hit's fraction.
+        Nothing is touched before the hit's fraction. below: leave out bodies beside the avatar.
         """
 
     def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
@@ -190,8 +192,11 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
     return dot(pose[:3, 3], up) + min_height(avatar.points, rotate_back(pose, up)) - avatar.radius
 
 
-def find_first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
-    """Return the first hit of the motion from frame.pose to a pose with scene or obstacles."""
+def find_first_hit(frame: Frame, to: Pose, tolerance: float, *, below: bool = False) -> Hit | None:
+    """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
+
+    below: for a search for ground, leave out bodies beside the avatar.
+    """
     avatar, found, lacked = frame.body.avatar, None, frame.lacked
     swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget)
     if swept.verdict != Verdict.CLEAR:
@@ -202,7 +207,7 @@ def find_first_hit(frame: Frame, to: Pose, tolerance: float) -> Hit | None:
         if sure:
             found = Hit(swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive)
     for obstacle in frame.obstacles:
-        hit = obstacle.sweep(avatar, frame.pose, to, tolerance)
+        hit = obstacle.sweep(avatar, frame.pose, to, tolerance, below=below)
         if hit is not None and (found is None or hit.fraction < found.fraction):
             found = hit
     return found

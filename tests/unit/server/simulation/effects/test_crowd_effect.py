@@ -10,8 +10,8 @@ import pytest
 from moving_bodies import INTERPRETED, Stage, at, ball, box, staged, touch
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Slide, Stop, Sweep
-from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Slide, Step, Stop, Sweep
+from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.bodies.moving_bodies import BodyScratch
 from solidcloud.server.simulation.effects import crowd_effect as crowd
 from solidcloud.server.simulation.world.frame import Body
@@ -212,3 +212,29 @@ print([name for name in names if "solidcloud.server." + name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_user_pressed_between_two_others_keeps_standing(tmp_path: Path) -> None:
+    person, height = ball_stack(), 0.0
+    with staged(tmp_path, [*CONTINUOUS, Slide(), Step(), Ground(), Crowd()]) as stage:
+        for name, x in (("left", -0.6), ("middle", 0.0), ("right", 0.6)):
+            stage.enter(name, person, at(x, 0.0, 0.0))
+        for frame in range(60):
+            ways = {"left": (0.04, 0.0, 0.0), "middle": (0.0, 0.0, 0.0), "right": (-0.04, 0.0, 0.0)}
+            for name, way in ways.items():
+                stage.step(name, way if frame > 20 else (0.0, 0.0, 0.0))
+            if frame > 20:
+                middle = stage.users["middle"]
+                assert middle.on_ground and middle.fall_speed == 0.0, f"frame {frame}"
+                assert abs(middle.pose[2, 3] - height) < 0.005
+            else:
+                height = stage.users["middle"].pose[2, 3]
+            assert overlapping(stage) == []
+        apart = stage.users["right"].pose[0, 3] - stage.users["left"].pose[0, 3]
+        assert apart < 0.9, "the middle is pressed from both sides"
+
+
+def ball_stack() -> AvatarModel:
+    """Return an upright body of two balls of 60 spheres, whose bumps face the neighbours' bumps."""
+    low, high = SMALL.points, np.add(SMALL.points, [0.0, 0.0, 0.3])
+    return make_avatar(np.concatenate([low, high]), SMALL.radius)

@@ -111,12 +111,10 @@ class GroundRunner:
 
     def begin(self, frame: Frame) -> None:
         """Remove the vertical part of the motion command."""
-        up, begin = frame.world.up, frame.body.pose[:3, 3]
         if self._axis is not None:
-            if frame.target[self._axis, 3] != begin[self._axis]:
-                frame.target = frame.target.copy()
-                frame.target[self._axis, 3] = begin[self._axis]
+            frame.target[self._axis, 3] = frame.body.pose[self._axis, 3]
             return
+        up, begin = frame.world.up, frame.body.pose[:3, 3]
         way = frame.target[:3, 3] - begin
         rises = dot(way, up)
         if rises == 0.0:
@@ -124,7 +122,6 @@ class GroundRunner:
         level = way - rises * up
         if norm(level) <= 1e-12 * abs(rises):  # rounding alone
             level[:] = 0.0
-        frame.target = frame.target.copy()
         frame.target[:3, 3] = begin + level
 
     def run(self, frame: Frame) -> None:

@@ -116,7 +116,8 @@ class Frame:
     """One frame of one user.
 
     body: as the previous frame left it; written once, when the frame is finished.
-    target: the commanded pose (4, 4), of this frame alone: effects may change it.  seconds: time since the previous frame.
+    target: the commanded pose (4, 4), a copy, which effects may change.
+    seconds: time since the previous frame.
     world: answers the queries (collision_world.py).  budget: of the queries.
     pose, verdict: reached so far.  generations: of the archives in use.
     clear: whether nothing is touched at `pose`; queried once, then maintained by `advance`.

@@ -190,7 +190,7 @@ def test_users_are_seen_where_they_are_once_a_frame(
         with game.world as held:
             opened = held[0].opened
         monkeypatch.setattr(
-            opened, "record_user", lambda user, avatar, poses, other: seen.append((user, poses[-1].copy()))
+            opened, "record_user", lambda user, avatar, pose, other: seen.append((user, pose.copy()))
         )
         body = game.body(BALL, at(0, 0, 0.5))
         game.go(body, (0, 0, -1.0))

@@ -95,11 +95,15 @@ SCANS = {
             Route("corridor wall", (-13.0, 1.2), -1.34, _legs(
                 (-12.0, 0.6), (-9.7, 0.7, 20.0), (-9.9, 1.6), (-9.0, 2.2), (-5.5, 2.3, 15.0), (-4.5, 1.2),
             )),
-            # On the upper floor: through the door at the three steps, against its right jamb and then
-            # against its left one, up and down the steps, and along the wall outside.
+            # On the upper floor: up the three steps in the door, out against its left jamb, and along
+            # the wall outside.
             Route("door", (-8.0, 5.2), 4.49, _legs(
-                (-8.6, 6.2), (-10.1, 7.5), (-10.6, 5.7), (-13.0, 5.2, 20.0), (-10.2, 5.2),
+                (-9.5, 5.8), (-10.1, 7.5), (-10.6, 5.7), (-13.0, 5.2, 20.0), (-10.2, 5.2),
             )),
+            # Against its right jamb, beside the lowest step.
+            Route("right jamb", (-8.0, 5.2), 4.49, _legs((-8.6, 6.2), (-10.4, 7.1), (-10.1, 7.5))),
+            # The same, so that the step is met head on while the jamb is touched.
+            Route("right jamb and step", (-8.0, 5.2), 4.49, _legs((-8.6, 6.2), (-10.1, 7.5))),
             # Around the corner of the gallery, along its railing, and through the door at its end,
             # against its right jamb and back against its left one.
             Route("gallery", (-4.5, 4.0), 4.40, _legs(

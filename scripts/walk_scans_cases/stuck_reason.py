@@ -10,8 +10,9 @@ from .routes import Scan
 
 Floats = NDArray[np.float64]
 
-# The way ahead: this far, and this far to both sides [m].
-_AHEAD, _ASIDE = 0.6, 2.0
+# The way ahead: this far, and this far to both sides [m]. Points lower than _TALL above the feet, such
+# as steps, do not make it narrower [m].
+_AHEAD, _ASIDE, _TALL = 0.6, 2.0, 0.75
 # A push whose share into a surface is larger than this is head on, and slides nowhere.
 _HEAD_ON = 0.99
 # Distances from the touched surface from which the motion is tried again [m].
@@ -73,12 +74,11 @@ def _lift(scene: Scene, pose: Floats, way: Floats, normal: Floats) -> float | No
 def _gap(scan: Scan, points: Floats, place: Floats, feet: float, way: Floats) -> dict[str, float]:
     """Return the gap across the way around the person's axis; its ends from the axis, left positive.
 
-    An end of 2 m means that there is none. Only points that no step climbs and that no head passes
-    under count.
+    An end of 2 m means that there is none.
     """
     side = np.cross(scan.up_vector(), way)
     high = points[:, scan.up] - feet
-    near = points[(high > scan.step) & (high < HEIGHT)] - place
+    near = points[(high > _TALL) & (high < HEIGHT)] - place
     ahead, aside = near @ way, near @ side
     aside = aside[(ahead > 0.0) & (ahead < _AHEAD) & (np.abs(aside) < _ASIDE)]
     low = float(aside[aside < 0.0].max(initial=-_ASIDE))

@@ -119,7 +119,7 @@ SCANS = {
             # Against the left jamb of the portal and through it, back against its right jamb, and
             # along the wall beside it.
             Route("portal", (1.5, 0.0), -0.05, _legs(
-                (3.8, 4.0), (5.4, 5.9), (6.6, 5.9), (7.3, 4.2), (5.0, 4.2), (3.7, 4.9, -20.0),
+                (3.8, 4.0), (5.4, 5.9), (6.6, 5.9), (7.3, 4.2), (5.0, 4.2), (3.7, 4.72, -20.0),
             )),
             # Against the pillar at the end of the wall, and through the opposite portal.
             Route("opposite portal", (1.5, 0.0), -0.05, _legs(

@@ -20,7 +20,7 @@ from walk_scans_cases.routes import SCANS
 STUCK = {
     ("indoor_atrium", "door"): "an edge of a step with few points behind it is not ground",
     ("indoor_atrium", "right jamb and step"): "a climb does not slide along a jamb",
-    ("octomap_hall", "stairs"): "the treads are scanned more thinly than ground is looked for",
+    ("octomap_hall", "stairs"): "an edge of a step without points of its tread within 8 cm is not ground",
 }
 CYLINDERS = [
     pytest.param(
@@ -121,4 +121,4 @@ def test_the_feet_stay_a_few_centimetres_above_a_level_floor(walk: Walks, name: 
 def test_walks_go_along_walls(walk: Walks) -> None:
     """Otherwise the tests above would show little."""
     assert walk("indoor_atrium", "corridor wall", "cylinder").figures["frames along walls"] > 60
-    assert walk("octomap_hall", "portal", "cylinder").figures["frames along walls"] > 20
+    assert walk("octomap_hall", "portal", "cylinder").figures["frames along walls"] > 10

@@ -8,13 +8,15 @@ frame is restored. The effect `ground` handles steps down: it searches for groun
 
 from ....schemas.scene.effect_table import Ground, Step
 from ..world.collision_world import World
-from ..world.frame import MIN_MOTION, Frame, Pose, Vec, lowest_height, translated
+from ..world.frame import MIN_MOTION, Frame, Pose, Vec, lowest_height
 from ..world.vectors import dot, norm
 from .ground_effect import DEAD_BAND, GroundRunner
 from .ground_effect import make as make_ground
 
 # The climb must lead this much farther than sliding [m], and by this share of the remainder.
 _MIN_GAIN, _MIN_GAIN_SHARE = 2e-4, 0.02
+# If sliding led along this share of the motion command, only its first obstacle may be a step.
+_SLID_SHARE = 0.5
 
 
 class StepRunner:
@@ -30,9 +32,6 @@ class StepRunner:
         hit, blocked_pose = frame.blocked, frame.blocked_pose
         if hit is None or blocked_pose is None or not frame.body.on_ground or hit.cloud is None:
             return
-        feet = lowest_height(frame.body.avatar, blocked_pose, frame.world.up)
-        if dot(hit.cloud, frame.world.up) - feet > self._height:
-            return  # a wall
         begin = frame.body.pose[:3, 3]
         command = frame.target[:3, 3] - begin
         length = norm(command)
@@ -40,6 +39,11 @@ class StepRunner:
             return
         along = command / length
         so_far = dot(frame.pose[:3, 3] - begin, along)
+        # Beside a wall that is touched first, a step is touched while sliding.
+        obstacles = [hit] if so_far > _SLID_SHARE * length else [hit, *frame.hits]
+        top = lowest_height(frame.body.avatar, blocked_pose, frame.world.up) + self._height
+        if all(each.cloud is None or dot(each.cloud, frame.world.up) > top for each in obstacles):
+            return  # walls
         least = so_far + max(_MIN_GAIN, _MIN_GAIN_SHARE * (length - so_far))
         if least >= length:
             return
@@ -65,7 +69,9 @@ class StepRunner:
         rose = self._rise(start, frame.pose, up)
         if rose < MIN_MOTION:
             return None
-        frame.advance(frame, translated(frame.pose, (length - dot(frame.pose[:3, 3] - begin, along)) * along))
+        self._ground.slide(
+            frame, (length - dot(frame.pose[:3, 3] - begin, along)) * along, upright=True
+        )  # along a jamb beside the step
         if dot(frame.pose[:3, 3] - begin, along) < least:
             return None
         below = self._ground.search_below(frame, rose + 2.0 * self._ground.clearance)

@@ -153,6 +153,27 @@ def test_what_is_too_steep_is_slid_down_and_not_climbed(tmp_path: Path, degrees:
         assert (np.diff(heights) < 1e-9).all() and heights[-1] < heights[0] - 0.05
 
 
+@pytest.mark.parametrize(("degrees", "slope"), [(40.0, 20.0), (40.0, 30.0), (44.0, 30.0)])
+def test_who_is_pushed_at_a_slope_that_is_too_steep_stands_at_its_foot(
+    tmp_path: Path, degrees: float, slope: float
+) -> None:
+    up = np.round(np.arange(0.0, 1.0, APART), 6)
+    x, y = (axis.ravel() for axis in np.meshgrid(up, np.round(np.arange(-0.5, 0.5, APART), 6)))
+    rise = np.stack([x, y, x * np.tan(np.radians(degrees))], axis=1)
+    flat = effect_rooms.plane((-1.0, -0.5, 0), (-APART, 0.5, 0))
+    case = effect_rooms.build(tmp_path, np.concatenate([flat, rise]))
+    with play(case.archive, Stop(), Sweep(), Slide(), Step(), Ground(slope=slope)) as game:
+        body = game.body(PERSON, at(-0.6, 0, 0.1))
+        settled(game, body, 15)
+        places = []
+        for _ in range(60):
+            game.go(body, (0.03, 0, 0))
+            assert body.on_ground and not game.touches(body)
+            places.append(body.pose[:3, 3].copy())
+        assert np.ptp(places[-30:], axis=0).max() < 1e-4, "it does not tremble"
+        assert places[-1][0] > -0.35 and places[-1][2] < 0.1
+
+
 def stairs(riser: float, tread: float = 0.3, count: int = 3) -> NDArray[np.float64]:
     """Stairs up along x from x = 0, floors before and behind."""
     apart = APART

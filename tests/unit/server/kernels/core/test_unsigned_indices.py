@@ -15,8 +15,13 @@ FILES = sorted(Path(kernels.__file__).parent.rglob("*.py"))
 
 def signed_reads(source: str) -> list[int]:
     """Return the lines where a loop over LANES reads `halves` at a sum without U(...)."""
-    found = []
-    for loop in ast.walk(ast.parse(source)):
+    found, tree = [], ast.parse(source)
+    unsigned = {
+        ast.unparse(node.targets[0])
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and ast.unparse(node.value).startswith("U(")
+    }
+    for loop in ast.walk(tree):
         if not isinstance(loop, ast.For) or ast.unparse(loop.iter) != "range(LANES)":
             continue
         for node in ast.walk(loop):
@@ -26,6 +31,7 @@ def signed_reads(source: str) -> list[int]:
                 and node.value.id == "halves"
                 and not isinstance(node.slice, ast.Name)
                 and not ast.unparse(node.slice).endswith(")")
+                and ast.unparse(node.slice).rpartition(" + ")[2] not in unsigned
             ):
                 found.append(node.lineno)
     return found

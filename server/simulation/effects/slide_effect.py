@@ -38,7 +38,10 @@ from ..world.vectors import dot, norm
 # Smoothed normals are wrong by a few degrees: at 0.02, an avatar pushed straight at a flat wall
 # crept along it.
 MIN_SLIDE_SHARE = 0.1
-# The same on flat surfaces, whose normal is estimated from points within FLAT_REACH_FACTOR times the
+# Below this share, 11 degrees, a push is nearly head on: the normals of flat surfaces are estimated
+# more exactly. With 2 mm of noise, bumps stopped half of the pushes of 6 to 8 degrees before.
+NEARLY_HEAD_ON = 0.2
+# Least share on flat surfaces, whose normal is estimated from points within FLAT_REACH_FACTOR times the
 # reach: a degree. With 2 mm of noise, normals of points within 8 cm are wrong by up to 0.5 degrees
 # at 5 mm spacing, 1.4 at 2 cm and 3.9 at 4 cm; within 24 cm by up to 0, 0.2 and 0.7. The code of a
 # normal adds up to 0.6.
@@ -132,14 +135,18 @@ class SlideRunner:
                     planes.append(plane)
                     touched.append(ended)
             way = clip(rest, planes)
-            if way is not None and norm(way) < MIN_SLIDE_SHARE * norm(rest):
-                flat, bump_height = self._flat_planes(frame, touched, planes) if upright else ([], 0.0)
-                way = clip(rest, flat) if flat else None
-                if way is None or norm(way) < MIN_FLAT_SHARE * norm(rest):
+            if way is not None and upright and norm(way) < NEARLY_HEAD_ON * norm(rest):
+                flat, bump_height = self._flat_planes(frame, touched, planes)
+                flat_way = clip(rest, flat) if flat else None
+                if flat_way is not None and norm(flat_way) >= max(MIN_FLAT_SHARE * norm(rest), MIN_SLIDE):
+                    way, planes = flat_way, flat
+                    if len(flat) == 1:
+                        into = dot(start - frame.pose[:3, 3], flat[0])
+                        self._back_off(frame, flat[0], min(bump_height, into))
+                elif norm(way) < MIN_SLIDE_SHARE * norm(rest) or flat:
                     return ended
-                planes = flat
-                if len(flat) == 1:
-                    self._back_off(frame, flat[0], min(bump_height, dot(start - frame.pose[:3, 3], flat[0])))
+            elif way is not None and norm(way) < MIN_SLIDE_SHARE * norm(rest):
+                return ended
             if way is not None:
                 way = limit_displacement(frame.pose[:3, 3] - start, way, most)
             if way is None or norm(way) < MIN_SLIDE or dot(way, command) <= 0.0:

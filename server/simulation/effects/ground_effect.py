@@ -46,6 +46,11 @@ DEAD_BAND = 1e-4
 HEIGHT_BAND = 0.2
 # The same band beside a wall, whose bumps obstruct motion up and down [m].
 WALL_BAND = 5e-3
+# An avatar that pushes against something is not lowered again within this distance of the place where
+# it was raised [m], which is kept under the name RAISED. With a part wedged under a slope or over the
+# edge of a sheet, the heights of the ground a millimetre apart may differ by centimetres. It would
+# rise and sink in turn.
+SAME_PLACE, RAISED = 5e-3, "ground raised"
 # Longest time for which gravity acts in one frame [s].
 LONGEST_FRAME = 0.1
 # Points within this distance of the touched point determine the ground's normal [m]. With `slide`,
@@ -149,9 +154,11 @@ class GroundRunner:
             if below.aside:
                 band = max(band, WALL_BAND)
             if lower > band:
-                self.lower(frame, below, lower)
+                if not _was_raised_here(frame):
+                    self.lower(frame, below, lower)
             elif lower < -band:
                 self.slide(frame, -lower * frame.world.up)
+                frame.effect_state[RAISED] = frame.pose[:3, 3].copy()
         else:
             self._fall_along(frame, fall, seconds)
         normal = None if below.normal is None else tuple(below.normal.tolist())
@@ -307,6 +314,14 @@ class GroundRunner:
         fell = -dot(frame.pose[:3, 3] - begin, frame.world.up)
         if seconds > 0.0:
             frame.fall_speed = min(frame.fall_speed, max(fell, 0.0) / seconds)
+
+
+def _was_raised_here(frame: Frame) -> bool:
+    """Return whether the avatar pushes against something where it was raised before."""
+    place = frame.body.effect_state.get(RAISED)
+    if place is None or frame.blocked is None or not frame.body.on_ground:
+        return False
+    return norm(frame.pose[:3, 3] - place) <= SAME_PLACE
 
 
 def make(effect: Ground, world: World) -> GroundRunner:

@@ -117,7 +117,7 @@ class SlideRunner:
         # Distinct planes touched so far. A plane that is touched again, or that the motion did not
         # lead into, is taken for a bump.
         planes: list[Vec] = []
-        touched: list[Hit] = []
+        touched = hit  # on the last of the planes
         ended: Hit | None = hit
         for _ in range(_MOTIONS_PER_SURFACE * self.surfaces):
             bump: Vec | None = None
@@ -133,17 +133,19 @@ class SlideRunner:
                     return ended
                 else:
                     planes.append(plane)
-                    touched.append(ended)
+                    touched = ended
             way = clip(rest, planes)
-            if way is not None and upright and norm(way) < NEARLY_HEAD_ON * norm(rest):
-                flat, bump_height = self._flat_planes(frame, touched, planes)
-                flat_way = clip(rest, flat) if flat else None
-                if flat_way is not None and norm(flat_way) >= max(MIN_FLAT_SHARE * norm(rest), MIN_SLIDE):
-                    way, planes = flat_way, flat
-                    if len(flat) == 1:
-                        into = dot(start - frame.pose[:3, 3], flat[0])
-                        self._back_off(frame, flat[0], min(bump_height, into))
-                elif norm(way) < MIN_SLIDE_SHARE * norm(rest) or flat:
+            if len(planes) == 1 and way is not None and upright and norm(way) < NEARLY_HEAD_ON * norm(rest):
+                flat, bump_height = self._flat_plane(frame, touched, planes[0])
+                flat_way = None if flat is None else clip(rest, [flat])
+                if (
+                    flat is not None
+                    and flat_way is not None
+                    and norm(flat_way) >= max(MIN_FLAT_SHARE * norm(rest), MIN_SLIDE)
+                ):
+                    way, planes = flat_way, [flat]
+                    self._back_off(frame, flat, min(bump_height, dot(start - frame.pose[:3, 3], flat)))
+                elif norm(way) < MIN_SLIDE_SHARE * norm(rest) or flat is not None:
                     return ended
             elif way is not None and norm(way) < MIN_SLIDE_SHARE * norm(rest):
                 return ended
@@ -194,28 +196,22 @@ class SlideRunner:
             del frame.hits[hits:]
         return False, ended
 
-    def _flat_planes(
-        self, frame: Frame, touched: list[Hit], planes: list[Vec]
-    ) -> tuple[list[Vec], float]:
-        """Return the planes' more exact normals (3,), from wider surroundings of the touched points.
+    def _flat_plane(self, frame: Frame, hit: Hit, plane: Vec) -> tuple[Vec | None, float]:
+        """Return the more exact normal (3,) of a plane, from wider surroundings of the touched point.
 
-        Also return by how much bumps ahead may exceed the touched ones [m]. Return no normals unless
-        the scan is flat there, and the normals agree with those of the planes.
-        touched: hits on the planes.
+        Also return by how much bumps ahead may exceed this point [m]. The normal is None unless the
+        scan is flat there, and the normal agrees with that of the plane.
+        hit: on the plane.  plane: (3,), its normal.
         """
         reach = min(FLAT_REACH_FACTOR * self.normal_reach, MAX_NORMAL_REACH)
-        found: list[Vec] = []
-        bumps = 0.0
-        for hit, plane in zip(touched, planes, strict=True):
-            normal = None if hit.archive < 0 else frame.world.normal(hit, reach, frame.budget)
-            if normal is None:
-                return [], 0.0
-            high, low = frame.world.highest(hit, np.array([normal, -normal]), reach, frame.budget).tolist()
-            found.append(self._wall(normal))
-            if max(high, low) > MAX_FLAT_HEIGHT_SHARE * reach or dot(found[-1], plane) < SAME_PLANE_COSINE:
-                return [], 0.0
-            bumps = max(bumps, high + MORE_BUMP_SHARE * (high + low))
-        return found, bumps
+        normal = None if hit.archive < 0 else frame.world.normal(hit, reach, frame.budget)
+        if normal is None:
+            return None, 0.0
+        high, low = frame.world.highest(hit, np.array([normal, -normal]), reach, frame.budget).tolist()
+        wall = self._wall(normal)
+        if max(high, low) > MAX_FLAT_HEIGHT_SHARE * reach or dot(wall, plane) < SAME_PLANE_COSINE:
+            return None, 0.0
+        return wall, high + MORE_BUMP_SHARE * (high + low)
 
     def _back_off(self, frame: Frame, out: Vec, way: float) -> None:
         """Move away from a flat surface, along its normal `out` (3,), by a distance [m].

@@ -1,7 +1,6 @@
 """Test pushes at a flat wall that are nearly head on: the avatar slides; head on, it stays."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import effect_rooms
 import numpy as np

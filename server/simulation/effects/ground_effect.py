@@ -12,6 +12,9 @@ the last frame and has no ground below falls only if its feet would land. It kee
 instead if nothing below was scanned, or if the rim of a hole, or the ledge just left, would catch
 the rest of the body. It then falls or stands again when there is ground or it has left the ledge.
 
+An avatar that pushes against something, and was raised where it is, is not lowered again: it would
+rise and sink in turn where the heights of the ground differ nearby, as at the edge of a sheet.
+
 The vertical part of a motion command is ignored, both when standing and when falling.
 """
 

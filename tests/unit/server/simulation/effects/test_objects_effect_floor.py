@@ -50,7 +50,6 @@ def test_an_object_that_touches_the_floor_is_pushed_along_it(
         assert abs(where(stage, "crate")[2, 3] - before) < 0.006
 
 
-@pytest.mark.interpreted
 def test_an_object_that_touches_a_wall_is_pushed_along_it_but_not_into_it(tmp_path: Path) -> None:
     side = 0.3
     beside = side - RADIUS - BOTTOM + 0.002  # 2 mm deep in the wall
@@ -68,7 +67,6 @@ def test_an_object_that_touches_a_wall_is_pushed_along_it_but_not_into_it(tmp_pa
         assert np.abs(where(stage, "crate")[:3, 3] - stood[:3, 3]).max() < 0.02
 
 
-@pytest.mark.interpreted
 def test_an_object_too_deep_in_the_floor_or_before_a_step_is_not_pushed(tmp_path: Path) -> None:
     points = floor()
     points[:, 2] += np.where(points[:, 0] > 1.0, 0.06, 0.0)

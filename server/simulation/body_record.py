@@ -19,6 +19,8 @@ if TYPE_CHECKING:  # only scenes whose users can collide import it
 
 # Name under which the effect `ground` keeps the plane that the avatar stands on.
 _GROUND = "ground"
+# Name under which it keeps the place where the avatar was raised last.
+_RAISED = "ground raised"
 
 
 class BodyRecord(msgspec.Struct, frozen=True, array_like=True):
@@ -26,6 +28,7 @@ class BodyRecord(msgspec.Struct, frozen=True, array_like=True):
 
     pose: as in `TurnResult`.  ground: point and normal of the plane that it stands on, 6 float64,
     little-endian; b"" for none.  pushed: poses of the objects that users push, by name.
+    raised: place where `ground` raised it last, 3 float64, little-endian; b"" for none.
     """
 
     pose: bytes
@@ -34,6 +37,7 @@ class BodyRecord(msgspec.Struct, frozen=True, array_like=True):
     clear: bool
     ground: bytes = b""
     pushed: dict[str, bytes] = {}
+    raised: bytes = b""
 
 
 def pose_bytes(pose: Any) -> bytes:
@@ -48,7 +52,7 @@ def _pose(data: bytes) -> Pose:
 
 def record_of(body: Body, bodies: "Bodies | None") -> BodyRecord:
     """Return the record of a body. bodies: of the scene; None if users cannot collide."""
-    stood = body.effect_state.get(_GROUND)
+    stood, raised = body.effect_state.get(_GROUND), body.effect_state.get(_RAISED)
     pushed = {}
     if bodies is not None:
         from .world.bodies import PUSHED
@@ -62,6 +66,7 @@ def record_of(body: Body, bodies: "Bodies | None") -> BodyRecord:
         body.clear,
         b"" if stood is None else np.concatenate(stood).astype("<f8").tobytes(),
         pushed,
+        b"" if raised is None else raised.astype("<f8").tobytes(),
     )
 
 
@@ -77,6 +82,9 @@ def take_record(record: BodyRecord, body: Body, world: Any, bodies: "Bodies | No
     if record.ground:
         plane = np.frombuffer(record.ground, "<f8").astype(np.float64)
         body.effect_state[_GROUND] = plane[:3], plane[3:]
+    body.effect_state.pop(_RAISED, None)
+    if record.raised:
+        body.effect_state[_RAISED] = np.frombuffer(record.raised, "<f8").astype(np.float64)
     if bodies is not None:
         bodies.begin()
         for name, pose in record.pushed.items():

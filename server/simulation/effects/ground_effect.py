@@ -12,6 +12,9 @@ the last frame and has no ground below falls only if its feet would land. It kee
 instead if nothing below was scanned, or if the rim of a hole, or the ledge just left, would catch
 the rest of the body. It then falls or stands again when there is ground or it has left the ledge.
 
+An avatar that pushes against something, and was raised where it is, is not lowered again: it would
+rise and sink in turn where the heights of the ground differ nearby, as at the edge of a sheet.
+
 The vertical part of a motion command is ignored, both when standing and when falling. A body whose
 top is above the middle of the avatar stands beside it and is no ground: a user pressed between two
 others would otherwise fall.
@@ -48,6 +51,11 @@ DEAD_BAND = 1e-4
 HEIGHT_BAND = 0.2
 # The same band beside a wall, whose bumps obstruct motion up and down [m].
 WALL_BAND = 5e-3
+# An avatar that pushes against something is not lowered again within this distance of the place where
+# it was raised [m], which is kept under the name RAISED. With a part wedged under a slope or over the
+# edge of a sheet, the heights of the ground a millimetre apart may differ by centimetres. It would
+# rise and sink in turn.
+SAME_PLACE, RAISED = 5e-3, "ground raised"
 # Longest time for which gravity acts in one frame [s].
 LONGEST_FRAME = 0.1
 # Points within this distance of the touched point determine the ground's normal [m]. With `slide`,
@@ -162,9 +170,11 @@ class GroundRunner:
             if below.aside:
                 band = max(band, WALL_BAND)
             if lower > band:
-                self.lower(frame, below, lower)
+                if not _was_raised_here(frame):
+                    self.lower(frame, below, lower)
             elif lower < -band:
                 self.slide(frame, -lower * frame.world.up)
+                frame.effect_state[RAISED] = frame.pose[:3, 3].copy()
         else:
             self._fall_along(frame, fall, seconds)
         normal = None if below.normal is None else tuple(below.normal.tolist())
@@ -359,6 +369,14 @@ class GroundRunner:
         fell = -dot(frame.pose[:3, 3] - begin, frame.world.up)
         if seconds > 0.0:
             frame.fall_speed = min(frame.fall_speed, max(fell, 0.0) / seconds)
+
+
+def _was_raised_here(frame: Frame) -> bool:
+    """Return whether the avatar pushes against something where it was raised before."""
+    place = frame.body.effect_state.get(RAISED)
+    if place is None or frame.blocked is None or not frame.body.on_ground:
+        return False
+    return norm(frame.pose[:3, 3] - place) <= SAME_PLACE
 
 
 def make(effect: Ground, world: World) -> GroundRunner:

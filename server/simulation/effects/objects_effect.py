@@ -3,8 +3,12 @@
 Motion commands place a kinematic object (`Bodies.place_objects`), even into users. The user whose
 motion ends at a pushable object moves it: by the horizontal part of the remaining translation, as
 far as the object touches nothing. Then the user follows. The object has no momentum: it never moves
-farther than the motion command, and does not move by itself. An object that touches the scene at
-its pose, for example the floor, cannot be pushed, so it must be placed clear of the scene.
+farther than the motion command, and does not move by itself.
+
+A rough floor would stop an object that stands on it or just above it. An object that is stopped low
+down is therefore lifted over the floor, by at most the last of _LIFTS, and put down again. Contacts
+with the scan that exist when the push begins, such as that with the floor, block only motions that
+lead deeper: the object first leaves them, along their normals, by as little.
 
 Contacts are recomputed only for objects that have moved. server/queries/objects.py defines contact.
 """
@@ -21,7 +25,7 @@ from ....schemas.wire.motion_messages import ObjectsReport
 from ...queries.context.query_budget import QueryBudget
 from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
 from ..world.body_obstacles import BodyObstacle, warm_kernels
-from ..world.frame import Frame, Hit, Pose, Vec, translated
+from ..world.frame import Frame, Hit, Pose, Vec, lowest_height, translated
 from ..world.vectors import dot, horizontal, norm
 
 # A pushed object stops this far before whatever stops it, along its way [m], as `stop` does for
@@ -34,6 +38,22 @@ _MIN_PUSH = 1e-4
 # Cosine of 60 degrees, the largest angle between a push and the surface's inward normal. At larger
 # angles users slide along the object.
 _HEAD_ON_COSINE = 0.5
+# Heights by which a pushed object is lifted, tried in turn [m]. A floor with 2 mm of noise has bumps
+# of 6 to 8 mm; an object 2 cm deep in the floor is stuck.
+_LIFTS = (0.005, 0.01, 0.02)
+# A pushed object that is this far above the floor, or less, is not put down [m].
+_PUT_DOWN = 1e-3
+# Points within this distance determine the normal of a touched surface [m].
+_SURFACE = 0.08
+# A contact opposes a push if the push leads into its surface at more than 6 degrees. Normals of
+# floors with noise are wrong by a few degrees.
+_OPPOSES = 0.1
+# A lifted object is put down only where the floor's normal has at least this vertical component:
+# slopes up to 20 degrees. With steeper ones, an object climbs steps over their rounded edges.
+_LEVEL = 0.94
+# Largest number of contacts that an object leaves before a push, and least cosine between normals
+# of one of them.
+_MAX_CONTACTS, _SAME_CONTACT = 4, 0.9
 
 
 def make(effect: Objects, world: Any) -> "ObjectsRunner":
@@ -122,35 +142,148 @@ class ObjectsRunner:
             self._computed_for[row] = now
         return sorted(self._contacts)
 
-    def push(self, name: str, way: Vec, user: str, budget: QueryBudget) -> bool:
+    def push(self, name: str, way: Vec, pusher: Frame) -> bool:
         """Move an object by a horizontal displacement (3,) [m], as far as it touches nothing.
 
         Return whether it moved.
-        user: name of the user that pushes and follows; it is not an obstacle of the object.
+        pusher: frame of the user that pushes and follows, who is not an obstacle of the object.
         """
-        bodies = self.bodies
+        bodies, budget = self.bodies, pusher.budget
         row, length = bodies.row_of(name, user=False), norm(way)
         if length < _MIN_PUSH:
             return False
-        model, pose = bodies.shapes[row].model, bodies.poses[row].copy()
-        to = translated(pose, way)
-        swept = self._world.sweep(model, pose, to, _TOLERANCE, budget)
-        clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
-        others = BodyObstacle(
-            self.name, bodies, USER | KINEMATIC | PUSHED, name, model, pose, user=False, skip=user, stop=budget.stop
-        )  # fmt: skip
-        hit = others.sweep(model, pose, to, _TOLERANCE)
-        if hit is not None:
-            clear = min(clear, hit.fraction)
-        if clear < 1.0:
-            clear -= _SKIN / length
-            if clear * length < _MIN_PUSH:
-                return False
-            to = translated(pose, way * clear)
-        if budget.stop:
-            return False  # the result may be incomplete
+        push = ObjectPush(self, row, way, pusher)
+        to = push.result()
+        if to is None or budget.stop:
+            return False  # if stopped, the result may be incomplete
         bodies.put(row, to)
         return True
+
+
+class ObjectPush:
+    """One push of an object: where the object ends."""
+
+    def __init__(self, runner: ObjectsRunner, row: int, way: Vec, pusher: Frame) -> None:
+        """Prepare the push. row: of the object.  way: (3,) horizontal [m].  pusher: frame."""
+        bodies, user = runner.bodies, pusher.body.name
+        self._bodies, self._row, self._way, self._length = bodies, row, way, norm(way)
+        self._world, self._budget, self._pusher = pusher.world, pusher.budget, pusher
+        self._model, self._pose = bodies.shapes[row].model, bodies.poses[row].copy()
+        self._others = BodyObstacle(
+            runner.name, bodies, USER | KINEMATIC | PUSHED, bodies.names[row], self._model, self._pose,
+            user=False, skip=user, stop=pusher.budget.stop,
+        )  # fmt: skip
+
+    def result(self) -> Pose | None:
+        """Return the pose (4, 4) where the object ends; None if it does not move."""
+        to, low = self._along(self._pose)
+        best = to if self._gain(to) >= _MIN_PUSH else None
+        if low:
+            for lift in _LIFTS:
+                begin = self._lifted(lift)
+                if begin is None:
+                    continue
+                over, low = self._along(begin)
+                if self._gain(over) >= max(_MIN_PUSH, self._gain(to) + _MIN_PUSH):
+                    put = self._put_down(over, dot(begin[:3, 3] - self._pose[:3, 3], self._bodies.up))
+                    best = to = to if put is None else put
+                if not low:
+                    break
+        elif best is not None:
+            put = self._put_down(best, 0.0)
+            best = best if put is None else put
+        return best
+
+    def _gain(self, pose: Pose) -> float:
+        """Return how far a pose is along the push [m]."""
+        return dot(pose[:3, 3] - self._pose[:3, 3], self._way) / self._length
+
+    def _along(self, begin: Pose) -> tuple[Pose, bool]:
+        """Return the pose reached from a pose along the push, and whether the scan ended it low down.
+
+        `Low down` is within the greatest lift above the lowest sphere.
+        """
+        to = translated(begin, self._way)
+        low = lowest_height(self._model, begin, self._bodies.up) if len(self._model.points) else 0.0
+        swept = self._world.sweep(self._model, begin, to, _TOLERANCE, self._budget)
+        clear = 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
+        stumbles = swept.cloud is not None and (
+            swept.lower == 0.0 or dot(swept.cloud, self._bodies.up) - low <= _LIFTS[-1]
+        )
+        hit = self._others.sweep(self._model, begin, to, _TOLERANCE)
+        if hit is not None and hit.fraction <= clear:
+            clear, stumbles = hit.fraction, False
+        if clear < 1.0:
+            clear = max(0.0, clear - _SKIN / self._length)
+            to = translated(begin, self._way * clear)
+        return to, stumbles
+
+    def _lifted(self, lift: float) -> Pose | None:
+        """Return the object's pose lifted off the floor, clear of all; None if there is none.
+
+        An object that touches the scan leaves each contact along its normal by `lift` [m]. There is
+        none if the push leads into one of them.
+        """
+        directions: list[Vec] = [self._bodies.up]
+        for _ in range(_MAX_CONTACTS):
+            pose = translated(self._pose, lift * np.sum(directions, axis=0))
+            verdict = self._world.collide(self._model, pose, self._budget)
+            if verdict == Verdict.CLEAR:
+                return None if self._is_obstructed(pose) else pose
+            hit = self._world.deepest(self._model, pose, self._budget) if verdict == Verdict.CONTACT else None
+            if hit is None or hit.avatar is None or hit.cloud is None:
+                return None
+            out = self._world.normal(hit, _SURFACE, self._budget)
+            if out is None:
+                out = hit.avatar - hit.cloud
+            if (
+                dot(out, self._way) < -_OPPOSES * self._length * norm(out)
+                or norm(out) == 0.0
+                or any(dot(out, each) > _SAME_CONTACT * norm(out) for each in directions)
+            ):
+                return None
+            directions.append(out / norm(out))
+        return None
+
+    def _is_obstructed(self, pose: Pose) -> bool:
+        """Return whether another body obstructs the way from the object's pose to a pose."""
+        return self._others.sweep(self._model, self._pose, pose, _TOLERANCE) is not None
+
+    def _put_down(self, pose: Pose, rose: float) -> Pose | None:
+        """Return the pose that results if the object is lowered; None if it would stand on an edge.
+
+        The object ends just above the floor if that is at most the least lift below the height at
+        which the push began, otherwise at this height.
+        rose: height above that one [m].
+        """
+        up, deep = self._bodies.up, rose + _LIFTS[0]
+        down = translated(pose, -deep * up)
+        swept = self._world.sweep(self._model, pose, down, _TOLERANCE, self._budget)
+        hit = self._others.sweep(self._model, pose, down, _TOLERANCE)
+        lower = rose
+        if swept.avatar is not None and swept.cloud is not None:
+            touched = Hit(swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive)
+            normal = self._world.normal(touched, _SURFACE, self._budget)
+            if normal is not None and dot(normal, up) < _LEVEL:
+                return None
+        if swept.verdict != Verdict.CLEAR or hit is not None:
+            free = min(
+                1.0 if hit is None else hit.fraction, 1.0 if swept.verdict == Verdict.CLEAR else swept.lower
+            )
+            lower = free * deep - _SKIN
+        if lower < _PUT_DOWN or self._touches_pusher(lowered := translated(pose, -lower * up)):
+            return pose
+        return lowered
+
+    def _touches_pusher(self, pose: Pose) -> bool:
+        """Return whether the object touches the user that pushes it."""
+        frame, bodies = self._pusher, self._bodies
+        shape, rows = bodies.shape_of(frame.body.avatar), np.array([self._row])
+        before = bodies.poses[self._row].copy()
+        bodies.poses[self._row] = pose
+        touches = bodies.touching(shape, frame.pose, rows, 0, frame.budget.stop)
+        bodies.poses[self._row] = before
+        return bool(touches[0])
 
 
 class ObjectObstacle(BodyObstacle):
@@ -182,7 +315,7 @@ class ObjectObstacle(BodyObstacle):
             inward = horizontal(hit.cloud - hit.avatar, bodies.up)
             if not dot(left, inward) > _HEAD_ON_COSINE * norm(left) * norm(inward):
                 return False
-            if not self._runner.push(hit.what, left, frame.body.name, frame.budget):
+            if not self._runner.push(hit.what, left, frame):
                 return False
             frame.reports[self._runner.name] = self._runner.report(self._since, frame.budget)
             return True

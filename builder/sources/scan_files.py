@@ -225,14 +225,19 @@ def open_input_files(
         used = [entry for entry in read_scan_list(path) if entry.use]
         if not used:
             raise BadRequestError(f"{path}: no scan to use, expected at least one: set use = true")
-        files: dict[Path, list[ScanEntry]] = {}
-        for entry in used:
-            files.setdefault(entry.path, []).append(entry)
-        found += [_open_input(file, entries, spacing) for file, entries in files.items()]
+        found += open_entries(used, spacing)
     _check_once((item.path, index) for item in found for index in [scan.index for scan in item.scans] or [0])
     for scan in (scan for item in found for scan in item.scans):
         scan.wanted = frozenset(wanted)
     return found
+
+
+def open_entries(entries: Iterable[ScanEntry], spacing: float | None = None) -> list[InputFile]:
+    """Open the scans of entries, placed in metres with z up, a file at a time; see open_input_files."""
+    files: dict[Path, list[ScanEntry]] = {}
+    for entry in entries:
+        files.setdefault(entry.path, []).append(entry)
+    return [_open_input(file, listed, spacing) for file, listed in files.items()]
 
 
 def _check_once(scans: Iterable[tuple[Path, int]]) -> None:

@@ -10,6 +10,7 @@ import typer
 from .command_options import AsJson, interruptible, print_error, print_json, print_warning
 
 if TYPE_CHECKING:
+    from ....builder.plan.stray_points import StrayPoints
     from ....builder.sources.scan_list import ScanEntry
 
 DEFAULT_LIST = Path("scans.toml")
@@ -24,6 +25,14 @@ def inspect(
     with_sha256: Annotated[
         bool, typer.Option("--sha256", help="Also hash every file, which reads the whole file.")
     ] = False,
+    stray: Annotated[
+        bool,
+        typer.Option(
+            "--stray",
+            help="Also read all points, count those that hang in the air up to 2 m above floors, and propose options "
+            "of build that leave them out.",
+        ),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan list.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -31,6 +40,8 @@ def inspect(
 
     The description comes from the headers of the scans. Exit code 3: a scan is broken.
     """
+    from dataclasses import replace
+
     from ....builder.sources.scan_files import inspect_scans
     from ....builder.sources.scan_list import write_scan_list
     from ....schemas.errors import BadRequestError
@@ -39,12 +50,20 @@ def inspect(
 
     if output and output.exists() and not overwrite:
         raise BadRequestError(f"{output}: exists, expected no such file: give another -o, or --overwrite")
+    found: StrayPoints | None = None
     with progress_listener() as bars:
         entries = inspect_scans(scans, with_sha256=with_sha256, progress=bars)
+        if stray:
+            from ....builder.plan.stray_points import find_stray_points
+
+            with interruptible():
+                found = find_stray_points(entries, bars)
+            for number, fault in found.faults.items():
+                entries[number] = replace(entries[number], fault=fault)
     if as_json:
-        print_json([_plain(entry) for entry in entries])
+        print_json([{**_plain(entry), "stray": _plain_stray(found, k)} for k, entry in enumerate(entries)])
     else:
-        print("\n".join(_lines(entries)))
+        print("\n".join([*_lines(entries), *([] if found is None else _stray_lines(entries, found))]))
     # Without --output the list is only a convenience, and an existing list may hold hours of edits.
     if not as_json and not output and DEFAULT_LIST.exists() and not overwrite:
         print(
@@ -85,6 +104,55 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
     }
 
 
+def _plain_stray(found: "StrayPoints | None", number: int) -> dict[str, Any] | None:
+    """Convert the hanging points of a scan to JSON types; None if they were not counted."""
+    scan = found and found.scans[number]
+    if found is None or scan is None:
+        return None
+    advice = found.advice if scan.points else None
+    return {
+        "points": scan.points,
+        "share": scan.share,
+        "groups": scan.groups,
+        "largest": {"points": scan.largest, "place": scan.place} if scan.points else None,
+        "outliers": _option(advice and advice.outliers),
+        "moving": _option(advice and advice.moving),
+    }
+
+
+def _stray_lines(entries: "list[ScanEntry]", found: "StrayPoints") -> list[str]:
+    """Format the hanging points, a line for each scan that has some, and what to do about them."""
+    lines = [
+        f"{_name(entry)}: {scan.points:,} points ({scan.share:.2g} of all) hang in the air above floors, in "
+        f"{scan.groups:,} groups; the largest, of {scan.largest:,}, at {_place(list(scan.place))}"
+        for entry, scan in zip(entries, found.scans, strict=True)
+        if scan and scan.place
+    ]
+    advice = found.advice
+    if advice is None:
+        return ["no points hang in the air above floors"]
+    said = []
+    if advice.outliers:
+        said.append(
+            f"--outliers {_option(advice.outliers)} leaves out at least {advice.left_out:,} of {advice.points:,}"
+        )
+    if advice.moving:
+        said.append(f"--moving {_option(advice.moving)} what only one of the overlapping scans saw")
+    if not said:
+        said.append("--outliers would leave out surfaces too: they are scanned as thinly as these points")
+    return [*lines, f"solidcloud build: {'; '.join(said)}"]
+
+
+def _option(rule: tuple[float, int] | None) -> str | None:
+    """Format the value of an option METRES,NUMBER."""
+    return rule and f"{rule[0]:g},{rule[1]}"
+
+
+def _name(entry: "ScanEntry") -> str:
+    """Return the path, with the scan's number in its file unless it is the first."""
+    return str(entry.path) + (f" [{entry.index}]" if entry.index else "")
+
+
 def _lines(entries: "list[ScanEntry]") -> list[str]:
     """Format entries as a table, one line each. The path is last because it may be long."""
     head = ("format", "points", "low corner", "high corner", "scanner at", "", "columns", "scan")
@@ -116,7 +184,6 @@ def _row(entry: "ScanEntry") -> tuple[str, ...]:
     low, high = ("", "") if entry.bounds is None else (_place(corner) for corner in entry.bounds.tolist())
     other = [entry.units] if entry.units != "m" else []
     other += [f"{entry.up} up"] if entry.up != "z" else []
-    name = str(entry.path) + (f" [{entry.index}]" if entry.index else "")
     return (
         "broken" if entry.fault else entry.format,
         "" if entry.fault else "?" if entry.count is None else f"{entry.count:,}",
@@ -125,7 +192,7 @@ def _row(entry: "ScanEntry") -> tuple[str, ...]:
         "" if entry.pose is None else _place(entry.pose[:3, 3].tolist()),
         ", ".join(other),
         ", ".join(entry.columns),
-        name,
+        _name(entry),
     )
 
 

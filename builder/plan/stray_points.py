@@ -52,9 +52,9 @@ DEPTH = 2.0
 DISC_SHARE = np.pi / 9
 # Most of the points of surfaces that advised options may leave out, by estimate.
 MOST_LOST = 0.001
-# Options of --moving: within this distance [m], another scan. Eight times as far it must have seen
-# the place, which is less than a body is wide.
-MOVING = (0.05, 1)
+# Values of --moving. Scans must have points within eight times the distance [m] of what they did not see:
+# 0.8 m reaches the middle of a door from its jambs, 0.4 m does not.
+MOVING = (0.1, 1)
 
 
 class HangingPoints(NamedTuple):

@@ -63,7 +63,8 @@ class HangingPoints(NamedTuple):
     read: number of its points.  points: of these, those that hang.  groups: number of groups they
     are in.
     largest, place: the number of its points in the group with most of them, and their centre (3,)
-    world [m], within EDGE / 2; 0 and None without hanging points.
+    world [m], within EDGE / 2; of equal groups the one with the least x, y, z; 0 and None without
+    hanging points.
     """
 
     read: int
@@ -97,7 +98,7 @@ class StrayAdvice(NamedTuple):
 class StrayPoints(NamedTuple):
     """Result of `find_stray_points`.
 
-    scans: of each entry; None for one that cannot be read.  faults: number of an entry -> why it
+    scans: of each entry; None for one that is not used or cannot be read.  faults: number of an entry -> why it
     cannot be read.  advice: None if no point hangs.
     """
 
@@ -181,14 +182,15 @@ class _ScanCubes(NamedTuple):
 def find_stray_points(entries: Sequence[ScanEntry], progress: Progress | None = None) -> StrayPoints:
     """Read the points of all entries, once, and find those that hang in the air.
 
-    The entries are placed as a build of a list of them does; those with a fault are not read.
+    The entries are placed as a build of a list of them does. Those with a fault, and those that a
+    build does not use, are not read.
     """
     progress = progress or Silent()
     whole = CubeTable()
     cubes: dict[int, _ScanCubes] = {}
     faults: dict[int, str] = {}
-    progress.start("read", sum(entry.count or 0 for entry in entries if not entry.fault), "points")
-    sound = [number for number, entry in enumerate(entries) if not entry.fault]
+    progress.start("read", sum(entry.count or 0 for entry in entries if _is_read(entry)), "points")
+    sound = [number for number, entry in enumerate(entries) if _is_read(entry)]
     # A file is opened once: to find the scans in a text file takes as long as reading it.
     for _, same in groupby(sound, key=lambda number: entries[number].path):
         numbers = list(same)
@@ -209,6 +211,10 @@ def find_stray_points(entries: Sequence[ScanEntry], progress: Progress | None = 
         (each.box, bool(scan and scan.points)) for number, each in cubes.items() for scan in [scans[number]]
     ]
     return StrayPoints(scans, faults, _advice(whole, groups, hangs, _overlap(boxes)))
+
+
+def _is_read(entry: ScanEntry) -> bool:
+    return entry.use and not entry.fault
 
 
 def _read(scan: Scan, whole: CubeTable, progress: Progress) -> _ScanCubes:
@@ -248,13 +254,13 @@ def _of_scan(scan: _ScanCubes, whole: CubeTable, groups: _Groups, hangs: NDArray
     if not mine.any():
         return HangingPoints(scan.read, 0, 0, 0, None)
     names, of = np.unique(roots[mine], return_inverse=True)
-    points = np.bincount(of, scan.numbers[mine]).astype(np.int64)
-    best = of == int(points.argmax())
-    centres = (scan.cubes[mine][best] + whole.origin + 0.5) * EDGE
-    x, y, z = np.average(centres, axis=0, weights=scan.numbers[mine][best]).tolist()
-    return HangingPoints(
-        scan.read, int(points.sum()), len(names), int(points.max()), (round(x, 3), round(y, 3), round(z, 3))
-    )
+    numbers = scan.numbers[mine]
+    points = np.bincount(of, numbers).astype(np.int64)
+    centres = (scan.cubes[mine] + whole.origin + 0.5) * EDGE
+    centres = np.stack([np.bincount(of, numbers * axis) for axis in centres.T], axis=1) / points[:, None]
+    most = int(points.max())
+    x, y, z = min(np.round(centres[points == most], 3).tolist())
+    return HangingPoints(scan.read, int(points.sum()), len(names), most, (x, y, z))
 
 
 def _overlap(boxes: Sequence[tuple[NDArray[np.int32], bool]]) -> bool:

@@ -112,7 +112,8 @@ def outliers(folder: Path) -> Case:
     """Walk without outliers."""
     made, kept, walk = walked(folder, "outliers")
     return _case(
-        "outliers", f"--outliers {_value(made.advice.outliers)}", "the dust is gone: stops at what is left of a person", kept, walk,
+        "outliers", f"--outliers {_value(made.advice.outliers)}", "stops in the air, at what is left of a person",
+        kept, walk,
         {"it stops in the air": stands_in_the_air(made, walk), **_gone(made, kept, 0.3, 0.4)},
     )  # fmt: skip
 
@@ -121,7 +122,7 @@ def moving(folder: Path) -> Case:
     """Walk without outliers and without what only one scan saw."""
     made, kept, walk = walked(folder, "outliers", "moving")
     return _case(
-        "moving", f"--moving {_value(made.advice.moving)} too", "what one scan saw of the person is gone: passes", kept, walk,
+        "moving", f"--moving {_value(made.advice.moving)} too", "passes", kept, walk,
         {"it passes": passes(walk), **_gone(made, kept, 0.99, 1.0)},
     )  # fmt: skip
 
@@ -146,7 +147,7 @@ def _value(rule: tuple[float, int] | None) -> str:
 
 def _case(name: str, title: str, text: str, kept: Floats, walk: Walk, claims: dict[str, bool]) -> Case:
     """Return the panel of a build."""
-    row = Row("plan", section("plan", kept), [walk], (-1.5, -1.2), (1.5, 1.4), 6)
+    row = Row("plan", section("plan", kept), [walk], (-1.5, -1.35), (1.5, 1.55), 6)
     return Case(name, title, text, (row,), claims)
 
 

@@ -17,7 +17,7 @@ DEFAULT_LIST = Path("scans.toml")
 
 
 def inspect(
-    scans: Annotated[list[Path], typer.Argument(help="Scans or folders of scans.")],
+    scans: Annotated[list[Path], typer.Argument(help="Scans, folders of scans, or a scans.toml.")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Scan list to write, for solidcloud build; default: scans.toml."),

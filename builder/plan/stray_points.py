@@ -251,7 +251,7 @@ def _of_scan(scan: _ScanCubes, whole: CubeTable, groups: _Groups, hangs: NDArray
     find_slots(scan.cubes, whole.cubes, whole.counts, slots)
     roots = groups.parents[slots]
     mine = hangs[roots]
-    if not mine.any():
+    if whole.origin is None or not mine.any():
         return HangingPoints(scan.read, 0, 0, 0, None)
     names, of = np.unique(roots[mine], return_inverse=True)
     numbers = scan.numbers[mine]

@@ -191,7 +191,8 @@ def _as_listed(
 
     found: the entries of the file.  scans: those of the file; none if it cannot be opened.
     """
-    known, lost = [], []
+    known: list[ScanEntry] = []
+    lost: list[ScanEntry] = []
     for entry in listed:
         if scans and entry.index >= len(scans):
             lost.append(replace(entry, fault=_missing_text(entry, len(scans))))

@@ -74,9 +74,9 @@ def make_office(
     seed: Seed = 2012,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make two scans of an office with stray points.
+    """Make two scans of an office.
 
-    The stray points are dust, and what one of the scans saw of a person in the door. The ground
+    They hold stray points: dust, and what one of the scans saw of a person in the door. The ground
     truth, which says which points they are, is written beside the scans, as NAME.truth.json.
     """
     _check_new(output, overwrite)

@@ -50,8 +50,10 @@ DEPTH = 2.0
 # Share of the points of a surface in 27 cubes that lie within EDGE of one in the middle: a disc of
 # radius EDGE in a square of three EDGE.
 DISC_SHARE = np.pi / 9
-# Most of the points of surfaces that advised options may leave out, by estimate.
-MOST_LOST = 0.001
+# --outliers is advised with the COUNT that leaves out the largest share of hanging points, less the
+# share of the points of surfaces times LOSS_WEIGHT. That share is at
+# most MOST_LOST.
+LOSS_WEIGHT, MOST_LOST = 10.0, 0.01
 # Values of --moving. Scans must have points within eight times the distance [m] of what they did not see:
 # 0.8 m reaches the middle of a door from its jambs, 0.4 m does not.
 MOVING = (0.1, 1)
@@ -83,15 +85,16 @@ class StrayAdvice(NamedTuple):
     """Options of a build that leave hanging points out.
 
     points: number of hanging points of all scans.
-    outliers: (R, COUNT) of `--outliers`; None where it would leave out more than MOST_LOST of the
-    points of surfaces, by estimate.
+    outliers: (R, COUNT) of `--outliers`; None where it would leave out too many points of surfaces.
     left_out: number of hanging points that it leaves out at least.
+    lost: number of points of surfaces that it leaves out, an estimate.
     moving: (R, SCANS) of `--moving`; None if no scan with hanging points overlaps another.
     """
 
     points: int
     outliers: tuple[float, int] | None
     left_out: int
+    lost: int
     moving: tuple[float, int] | None
 
 
@@ -275,7 +278,7 @@ def _overlap(boxes: Sequence[tuple[NDArray[np.int32], bool]]) -> bool:
 
 
 def _advice(table: CubeTable, groups: _Groups, hangs: NDArray[np.bool_], overlap: bool) -> StrayAdvice | None:
-    """Return the options that leave out hanging points, but hardly any of the surfaces.
+    """Return the options that leave out hanging points, and few of the points of surfaces.
 
     A hanging point has within EDGE no others than those of its own cube and the 26 around it, which
     are in its group. If they are COUNT together, it has fewer than COUNT others. A point of a
@@ -291,13 +294,16 @@ def _advice(table: CubeTable, groups: _Groups, hangs: NDArray[np.bool_], overlap
     near = around[held]
     expected = DISC_SHARE * near[surface]
     order = np.argsort(expected, kind="stable")
-    lost = np.cumsum(numbers[surface][order])
-    # The least number of others within EDGE, without the points that may be lost.
-    most = expected[order][np.searchsorted(lost, MOST_LOST * lost[-1], side="right")]
-    possible = near[mine][near[mine] <= most]
+    lost = np.concatenate([[0], np.cumsum(numbers[surface][order])])
+    counts = np.unique(near[mine])
+    costs = lost[np.searchsorted(expected[order], counts, side="left")]
+    by_near = np.argsort(near[mine], kind="stable")
+    gone = np.cumsum(numbers[mine][by_near])
+    gains = gone[np.searchsorted(near[mine][by_near], counts, side="right") - 1]
+    benefit = gains / gone[-1] - LOSS_WEIGHT * costs / lost[-1]
+    benefit[costs > MOST_LOST * lost[-1]] = 0.0
+    best = int(benefit.argmax())
     moving = MOVING if overlap else None
-    points = int(numbers[mine].sum())
-    if not len(possible):
-        return StrayAdvice(points, None, 0, moving)
-    count = int(possible.max())
-    return StrayAdvice(points, (EDGE, count), int(numbers[mine & (near <= count)].sum()), moving)
+    if benefit[best] <= 0:
+        return StrayAdvice(int(gone[-1]), None, 0, 0, moving)
+    return StrayAdvice(int(gone[-1]), (EDGE, int(counts[best])), int(gains[best]), int(costs[best]), moving)

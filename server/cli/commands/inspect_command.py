@@ -111,7 +111,10 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
 
 
 def _plain_stray(found: "StrayPoints | None", number: int) -> dict[str, Any] | None:
-    """Convert the hanging points of a scan to JSON types; None if they were not counted."""
+    """Convert the hanging points of a scan to JSON types; None if they were not counted.
+
+    left_out and lost are of all scans: what `outliers` leaves out of hanging points, and of surfaces.
+    """
     scan = found and found.scans[number]
     if found is None or scan is None:
         return None
@@ -122,6 +125,8 @@ def _plain_stray(found: "StrayPoints | None", number: int) -> dict[str, Any] | N
         "groups": scan.groups,
         "largest": {"points": scan.largest, "place": scan.place} if scan.points else None,
         "outliers": _option(advice and advice.outliers),
+        "left_out": advice.left_out if advice else 0,
+        "lost": advice.lost if advice else 0,
         "moving": _option(advice and advice.moving),
     }
 
@@ -139,8 +144,9 @@ def _stray_lines(entries: "list[ScanEntry]", found: "StrayPoints") -> list[str]:
         return ["no points hang in the air above floors"]
     said = []
     if advice.outliers:
+        also = f" and about {advice.lost:,} of surfaces" if advice.lost else ""
         said.append(
-            f"--outliers {_option(advice.outliers)} leaves out at least {advice.left_out:,} of {advice.points:,}"
+            f"--outliers {_option(advice.outliers)} leaves out at least {advice.left_out:,} of {advice.points:,}{also}"
         )
     if advice.moving:
         said.append(

@@ -149,7 +149,7 @@ def test_scans_without_points_are_no_error(tmp_path: Path) -> None:
 def test_outliers_leave_out_what_is_said_and_moving_is_proposed_where_scans_overlap(tmp_path: Path) -> None:
     dust = np.array([[0.2, 0.2, 1.0], [0.8, 0.8, 1.4], [0.8, 0.81, 1.4]])
     found = find_stray_points(entries_of(tmp_path / "a", np.concatenate([floor(), dust])))
-    assert found.advice == (3, (EDGE, 2), 3, None)
+    assert found.advice == (3, (EDGE, 2), 3, 0, None)
     far = floor() + np.array([50.0, 0.0, 0.0])
     found = find_stray_points(entries_of(tmp_path / "b", np.concatenate([floor(), dust]), far))
     assert found.advice and found.advice.moving is None
@@ -157,10 +157,40 @@ def test_outliers_leave_out_what_is_said_and_moving_is_proposed_where_scans_over
     assert found.advice and found.advice.moving == rule.MOVING
 
 
+def test_the_count_is_proposed_that_leaves_out_most_and_costs_least(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = floor(1.5, 0.05), rng.uniform(0.0, 1.5, (60, 3)), rng.uniform(0.5, 0.8, (40, 3))
+    scan = np.round(np.concatenate(parts), 4)
+    entries = entries_of(tmp_path, scan)
+    (hanging,) = judge([scan], rule.FEW)
+    cubes = np.floor(scan / EDGE).astype(int)
+    near = np.array([(np.abs(cubes - cube) <= 1).all(axis=1).sum() for cube in cubes])
+    mine = np.isin(np.arange(len(scan)), list(hanging))
+    edge = {tuple(cube) for cube in cubes[:961].tolist()}
+    while True:  # the group of the floor
+        more = {tuple(c) for c in cubes.tolist() if any(max(abs(np.subtract(c, e))) <= 1 for e in edge)}
+        if more == edge:
+            break
+        edge = more
+    surface = np.array([tuple(cube) in edge for cube in cubes.tolist()])
+    sums = {}
+    for count in set(near[mine].tolist()):
+        left, lost = (near[mine] <= count).sum(), (rule.DISC_SHARE * near[surface] < count).sum()
+        sums[count] = left, lost, left / mine.sum() - rule.LOSS_WEIGHT * lost / surface.sum()
+    for most in (1.0, 0.01, 0.001):
+        monkeypatch.setattr(rule, "MOST_LOST", most)
+        advice = find_stray_points(entries).advice
+        assert advice and advice.outliers and advice.points == mine.sum()
+        left, lost, benefit = sums[advice.outliers[1]]
+        assert (advice.left_out, advice.lost) == (left, lost) and lost <= most * surface.sum()
+        assert benefit == max(each[2] for each in sums.values() if each[1] <= most * surface.sum())
+
+
 def test_outliers_are_not_proposed_where_surfaces_are_as_thin(tmp_path: Path) -> None:
     heap = np.random.default_rng(2).uniform(0.41, 0.49, (60, 3)) + np.array([0.0, 0.0, 0.5])
     found = find_stray_points(entries_of(tmp_path, np.concatenate([floor(3.0, 0.09), heap])))
-    assert found.advice == (60, None, 0, None)
+    assert found.advice == (60, None, 0, 0, None)
 
 
 def test_memory_is_that_of_cubes() -> None:

@@ -45,11 +45,12 @@ def test_a_scan_with_hanging_points_has_a_line(folder: Path, capsys: pytest.Capt
 def test_json_has_the_same_fields(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean, dusty = json.loads(said(capsys, "a.ply", "b.ply", "--stray", "--json"))
     assert clean["stray"] == {
-        "points": 0, "share": 0.0, "groups": 0, "largest": None, "outliers": None, "moving": None,
+        "points": 0, "share": 0.0, "groups": 0, "largest": None, "outliers": None, "left_out": 0,
+        "lost": 0, "moving": None,
     }  # fmt: skip
     assert dusty["stray"] == {
         "points": 3, "share": 3 / 628, "groups": 2, "largest": {"points": 2, "place": [0.55, 0.55, 1.05]},
-        "outliers": "0.1,2", "moving": "0.1,1",
+        "outliers": "0.1,2", "left_out": 3, "lost": 0, "moving": "0.1,1",
     }  # fmt: skip
     (plain,) = json.loads(said(capsys, "b.ply", "--json"))
     assert plain["stray"] is None

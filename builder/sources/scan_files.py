@@ -147,24 +147,34 @@ def _check_exists(path: Path) -> None:
 def inspect_scans(
     paths: Iterable[Path], *, with_sha256: bool = False, progress: Progress | None = None
 ) -> list[ScanEntry]:
-    """List the scans of files and folders by their headers, in the order of `find_scan_files`.
+    """List the scans of files, folders and lists (.toml) by their headers, in this order.
 
     A file that cannot be read, or that holds no scan (possible in E57), becomes an entry with a
-    fault. An entry also has the warnings about its scan (scan_warnings.py). Raise ScanError for a
-    path that does not exist and a folder without scans, BadRequestError for a file that is named
-    twice.
+    fault. An entry also has the warnings about its scan (scan_warnings.py). That of a list keeps
+    the list's use, units, scale, up, pose and crs. Raise ScanError for a path that does not exist
+    and a folder without scans, BadRequestError for a file that is named twice.
     """
-    files = find_scan_files(paths)
-    _check_once((path, 0) for path in files)
+    inputs: list[tuple[Path, list[ScanEntry] | None]] = []
+    for path in map(Path, paths):
+        if path.suffix.lower() == LIST_SUFFIX and path.is_file():
+            inputs += _by_file(read_scan_list(path)).items()
+        else:
+            inputs += [(file, None) for file in find_scan_files([path])]
+    _check_once((path, entry.index) for path, listed in inputs for entry in listed or [ScanEntry(path)])
     progress = progress or Silent()
-    progress.start("inspect", len(files), "files")
+    progress.start("inspect", len(inputs), "files")
     entries: list[ScanEntry] = []
     numbers: list[int] = []
     facts: list[ScanFacts] = []
-    for path in files:
+    for path, listed in inputs:
         found, scans = _inspect_file(path, with_sha256)
-        numbers += range(len(entries), len(entries) + len(scans))
-        facts += [ScanFacts(place_scan(scan)) for scan in scans]
+        if listed is not None:
+            found, scans = _as_listed(listed, found, scans)
+        for number, (scan, entry) in enumerate(zip(scans, found, strict=False), len(entries)):
+            if entry.use:
+                placed = place_scan(scan, pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale)
+                numbers.append(number)
+                facts.append(ScanFacts(placed))
         entries += found
         progress.advance(1)
     progress.finish()
@@ -172,6 +182,29 @@ def inspect_scans(
         entry = entries[numbers[warning.number]]
         entries[numbers[warning.number]] = replace(entry, warnings=(*entry.warnings, warning.text))
     return entries
+
+
+def _as_listed(
+    listed: list[ScanEntry], found: list[ScanEntry], scans: list[Scan]
+) -> tuple[list[ScanEntry], list[Scan]]:
+    """Return the entries of a list for one file, described by its headers; first those with a scan.
+
+    found: the entries of the file.  scans: those of the file; none if it cannot be opened.
+    """
+    known: list[ScanEntry] = []
+    lost: list[ScanEntry] = []
+    for entry in listed:
+        if scans and entry.index >= len(scans):
+            lost.append(replace(entry, fault=_missing_text(entry, len(scans))))
+            continue
+        header = found[entry.index if scans else 0]
+        (known if scans else lost).append(
+            replace(
+                header, index=entry.index, use=entry.use, units=entry.units, scale=entry.scale, up=entry.up,
+                pose=entry.pose, crs=entry.crs or header.crs, sha256=header.sha256 or entry.sha256,
+            )
+        )  # fmt: skip
+    return [*known, *lost], [scans[entry.index] for entry in known]
 
 
 def _inspect_file(path: Path, with_sha256: bool) -> tuple[list[ScanEntry], list[Scan]]:
@@ -225,14 +258,29 @@ def open_input_files(
         used = [entry for entry in read_scan_list(path) if entry.use]
         if not used:
             raise BadRequestError(f"{path}: no scan to use, expected at least one: set use = true")
-        files: dict[Path, list[ScanEntry]] = {}
-        for entry in used:
-            files.setdefault(entry.path, []).append(entry)
-        found += [_open_input(file, entries, spacing) for file, entries in files.items()]
+        found += open_entries(used, spacing)
     _check_once((item.path, index) for item in found for index in [scan.index for scan in item.scans] or [0])
     for scan in (scan for item in found for scan in item.scans):
         scan.wanted = frozenset(wanted)
     return found
+
+
+def open_entries(entries: Iterable[ScanEntry], spacing: float | None = None) -> list[InputFile]:
+    """Open the scans of entries, placed in metres with z up, a file at a time; see open_input_files."""
+    return [_open_input(file, listed, spacing) for file, listed in _by_file(entries).items()]
+
+
+def _by_file(entries: Iterable[ScanEntry]) -> dict[Path, list[ScanEntry]]:
+    """Return the entries of each file, in their order."""
+    files: dict[Path, list[ScanEntry]] = {}
+    for entry in entries:
+        files.setdefault(entry.path, []).append(entry)
+    return files
+
+
+def _missing_text(entry: ScanEntry, count: int) -> str:
+    """Return the fault of an entry whose file holds only `count` scans."""
+    return f"{entry.path}: holds {count} scans, expected one of index {entry.index}: correct the list"
 
 
 def _check_once(scans: Iterable[tuple[Path, int]]) -> None:
@@ -262,9 +310,7 @@ def _open_input(path: Path, entries: list[ScanEntry] | None, spacing: float | No
         for entry in entries:
             listed = scans_spaced(METRES[entry.units] * entry.scale)
             if entry.index >= len(listed):
-                raise ScanError(
-                    f"{path}: holds {len(listed)} scans, expected one of index {entry.index}: correct the list"
-                )
+                raise ScanError(_missing_text(entry, len(listed)))
             scan = place_scan(
                 listed[entry.index], pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
             )

@@ -123,15 +123,17 @@ def plan_stations(scene: RayScene, places: Sequence[ScannerPose], points: int) -
 
 
 def simulate_scan(
-    scene: RayScene, place: ScannerPose, step: float, quota: int, key: Sequence[int]
+    scene: RayScene, place: ScannerPose, step: float, quota: int, key: Sequence[int], *, mixed: bool = True
 ) -> SimulatedScan:
     """Return exactly `quota` points from one station: one scan, thinned evenly by a seeded choice.
+
+    mixed: with mixed returns; without them, every point is one of a surface.
 
     A scan with too few points (the plan is based on a trial) is repeated with a step 3 % finer.
     `key` seeds all random numbers: the same key gives the same points.
     """
     while True:
-        blocks = list(_blocks(scene, place, step, key))
+        blocks = list(_blocks(scene, place, step, key, mixed))
         xyz = np.concatenate([block[0] for block in blocks])
         if len(xyz) >= quota:
             break
@@ -158,7 +160,7 @@ def _grid(step: float, first: int, last: int) -> tuple[NDArray[np.float64], NDAr
 
 
 def _blocks(
-    scene: RayScene, place: ScannerPose, step: float, key: Sequence[int]
+    scene: RayScene, place: ScannerPose, step: float, key: Sequence[int], mixed: bool
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint16]]]:
     """Yield blocks of returned points (xyz, intensity) of one whole turn, a few columns at a time."""
     columns = int(2 * np.pi / step)
@@ -175,8 +177,9 @@ def _blocks(
         rim = rng.uniform(0, 2 * np.pi, azimuth.shape)
         azimuth += FOOTPRINT / 2 * np.cos(rim) / np.cos(elevation)
         elevation += FOOTPRINT / 2 * np.sin(rim)
-        reach = _mixed(returns, scene.cast(place, azimuth, elevation), rng)
-        yield _points(place, returns._replace(range=reach), rng)
+        if mixed:
+            returns = returns._replace(range=_mixed(returns, scene.cast(place, azimuth, elevation), rng))
+        yield _points(place, returns, rng)
 
 
 def _points(

@@ -7,10 +7,13 @@ from, before any noise.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
 from ...schemas.errors import ScanError
+
+Truth = TypeVar("Truth")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,15 +134,55 @@ class SceneTruth:
     facades: tuple[FacadeTruth, ...]
 
 
-def write_truth(path: Path, truth: SceneTruth) -> None:
+@dataclass(frozen=True, slots=True)
+class StrayTruth:
+    """Stray points of one scan: points `first` to `first + count` of the scan, from 0.
+
+    kind: "dust" or "person".
+    station: the station's number.
+    """
+
+    kind: str
+    station: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class OfficeTruth:
+    """Content of the file `<name>.truth.json` beside the scans of an office.
+
+    door: from the room to the corridor.
+    strays: the stray points; all others are points of surfaces.
+    """
+
+    seed: int
+    points: int
+    noise: float
+    stations: tuple[StationTruth, ...]
+    door: DoorTruth
+    strays: tuple[StrayTruth, ...]
+
+
+def write_truth(path: Path, truth: SceneTruth | OfficeTruth) -> None:
     """Write the truth as indented JSON; the same truth gives the same bytes."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(truth), indent=1) + b"\n")
 
 
 def read_truth(path: Path) -> SceneTruth:
-    """Read a file of `write_truth`. Raises ScanError where the file is something else."""
+    """Read the truth of façades. Raises ScanError where the file is something else."""
+    return _read(path, SceneTruth)
+
+
+def read_office_truth(path: Path) -> OfficeTruth:
+    """Read the truth of an office. Raises ScanError where the file is something else."""
+    return _read(path, OfficeTruth)
+
+
+def _read(path: Path, kind: type[Truth]) -> Truth:
+    """Read a file of `write_truth`."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=SceneTruth)
+        return msgspec.json.decode(path.read_bytes(), type=kind)
     except OSError as error:
         raise ScanError(
             f"{path}: cannot be read ({error.strerror}): give the .truth.json of a generated scene"

@@ -123,12 +123,28 @@ def opened(
         place / "archive",
         BuildConfig(voxel=8.0, resolution=1e-4, radius=SPACING / 2, jobs=1),
     )
+    with entered(place, points, options, extra=extra, objects=objects, shapes=shapes) as scene:
+        yield scene
+
+
+@contextmanager
+def entered(
+    place: Path,
+    points: Floats,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    archive: str = "archive",
+    extra: Sequence[str] = (),
+    objects: Sequence[Mapping[str, Any]] = (),
+    shapes: Mapping[str, Floats] | None = None,
+) -> Iterator[Ground]:
+    """Open the archive of a folder with the mover. points: (n, 3), of the archive; else as `opened`."""
     shapes = {"visitor": body(), **(shapes or {})}
     for name, centres in shapes.items():
         np.savetxt(place / f"{name}.xyz", centres, fmt="%.5f")
     file = {
         "format": 1,
-        "archives": [{"path": "archive"}],
+        "archives": [{"path": archive}],
         "avatars": [{"name": name, "file": f"{name}.xyz", "radius": SPHERE} for name in shapes],
         "objects": [dict(each) for each in objects],
         "effects": [{"effect": name, **(options or {}).get(name, {})} for name in (*MOVER, *extra)],

@@ -120,6 +120,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "builder/kernels/points/representatives.py": (BUILDER + "passes/test_level_pass.py",),
     "builder/kernels/points/voxel_records.py": (BUILDER + "kernels/points/test_voxel_records.py",),
     "builder/kernels/points/occupied_cubes.py": (BUILDER + "kernels/points/test_occupied_cubes.py",),
+    "builder/kernels/points/cube_components.py": (BUILDER + "kernels/points/test_cube_components.py",),
     "builder/kernels/points/lzf_decoder.py": (BUILDER + "kernels/points/test_lzf_decoder.py",),
     "builder/kernels/neighbours/estimate_normals.py": (
         BUILDER + "voxel/test_point_normals.py::test_codes_are_those_of_the_definition",

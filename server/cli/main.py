@@ -50,6 +50,7 @@ makers = typer.Typer(
 app.add_typer(makers, name="make")
 makers.command("facade")(make.make_facade)
 makers.command("town")(make.make_town)
+makers.command("office")(make.make_office)
 makers.command("figure")(make.make_figure)
 makers.command("walk")(make.make_walk)
 scenes = typer.Typer(help="Create a scene file, or check one.", rich_markup_mode=None)

@@ -30,7 +30,16 @@ VERBS = [
     "make",
     "doctor",
 ]
-NESTED = ["make facade", "make town", "make figure", "make walk", "scene", "scene new", "scene check"]
+NESTED = [
+    "make facade",
+    "make town",
+    "make office",
+    "make figure",
+    "make walk",
+    "scene",
+    "scene new",
+    "scene check",
+]
 
 
 @pytest.fixture
@@ -120,6 +129,7 @@ def test_help_loads_no_numpy(verb: str) -> None:
         ("replay {out}", 3, "expected a log written by serve --log"),
         ("replay {scan}", 3, "expected a log written by serve --log"),
         ("make facade -o {out}.obj", 2, "cannot write '.obj'"),
+        ("make office -o {out}.laz", 2, "one file for two scans"),
     ],
 )
 def test_error_is_one_line_with_its_exit_code(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from kill_cases.interrupted_reading import FORMATS
+from solidcloud.builder.plan import stray_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.cli.main import run
 
@@ -163,3 +164,20 @@ def test_every_verb_that_reads_can_be_interrupted(
     said = capsys.readouterr().err
     assert said.count("interrupted") == 1 and "error" not in said, said
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_counting_stray_points_can_be_interrupted(
+    laz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    count = stray_points.count_points
+
+    def interrupting(*arguments: Any) -> int:
+        os.kill(os.getpid(), signal.SIGINT)
+        return count(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stray_points, "count_points", interrupting)
+        assert run(["inspect", str(laz), "--stray", "-o", str(tmp_path / "scans.toml")]) == 130
+    said = capsys.readouterr()
+    assert said.err.count("interrupted") == 1 and "error" not in said.err and said.out == ""
+    assert not (tmp_path / "scans.toml").exists()

@@ -56,6 +56,7 @@ def verbs(place: Path, out: Path) -> dict[str, list[str]]:
         "export vtkhdf": ["export", hall, "-o", str(out / "door.vtkhdf")],
         "make facade": ["make", "facade", "-o", str(out / "f.laz"), "--points", "2000"],
         "make town": ["make", "town", "-o", str(out / "town"), "--points", "2000"],
+        "make office": ["make", "office", "-o", str(out / "office")],
         "make figure": ["make", "figure", "-o", str(out / "f.obj"), "--points", "50"],
         "make walk": ["make", "walk", truth, "-o", str(out / "walk.csv"), "--frames", "5"],
         "scene new": ["scene", "new", hall, "-o", str(out / "hall.toml")],

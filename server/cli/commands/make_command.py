@@ -66,6 +66,30 @@ def make_town(
     print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
 
 
+def make_office(
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help=".e57 file, or a folder for one LAZ file per scanner station."),
+    ],
+    seed: Seed = 2012,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make two scans of an office.
+
+    They hold stray points: dust, and what one of the scans saw of a person in the door. The ground
+    truth, which says which points they are, is written beside the scans, as NAME.truth.json.
+    """
+    _check_new(output, overwrite)
+    with needs_extra("made"):
+        from ....builder.synthetic.office import make_office as make_it
+    from ....schemas.process.os_errors import naming_write_errors
+    from ..output.progress_display import progress_listener
+
+    with interruptible(), naming_write_errors(output), progress_listener() as bars:
+        made = make_it(output, seed=seed, progress=bars.made)
+    print(f"{made.points:,} points in {output}, ground truth in {made.truth}")
+
+
 def make_figure(
     output: Annotated[Path, typer.Option("-o", "--output", help=".obj or .ply file to write.")],
     points: Annotated[int, typer.Option(help="Exact number of points of the figure.")] = 3617,

@@ -111,7 +111,7 @@ def test_pictures_are_legible_and_small(picture: str, folder: Path, tmp_path: Pa
         assert path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size < MAX_BYTES
 
 
-def test_the_guide_shows_both_pictures() -> None:
+def test_the_guide_shows_all_pictures() -> None:
     guide = (ROOT / "schemas" / "SCENE.md").read_text()
     assert all(f"(../.github/{picture})" in guide for picture in PICTURES)
 

@@ -60,7 +60,7 @@ def test_output_and_overwrite_have_one_spelling() -> None:
         assert not names & {"--out", "--force", "-f", "--replace"}, words
         assert ("-o" in names) == ("--output" in names), words
     replacing = {words for words, each in found.items() if any("--overwrite" in p.opts for p in each.params)}
-    made = {f"make {what}" for what in ("facade", "town", "figure", "walk")}
+    made = {f"make {what}" for what in ("facade", "town", "office", "figure", "walk")}
     assert replacing == {"build", "export", "inspect", "scene new", *made}
 
 

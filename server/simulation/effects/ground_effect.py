@@ -141,11 +141,12 @@ class GroundRunner:
 
     def run(self, frame: Frame) -> None:
         """Move the avatar to its height above the ground, or let it fall."""
-        near: Hit | bool | None = None
+        near: tuple[Hit | None] | None = None
         if frame.body.on_ground and not frame.hits:
-            near = self._first_below(frame, _NEAR_CLEARANCES * self.clearance) or False
-            if near and self._keeps_height(frame, near):
+            first = self._first_below(frame, _NEAR_CLEARANCES * self.clearance)
+            if first is not None and self._keeps_height(frame, first):
                 return
+            near = (first,)
         stood, seconds = frame.body.on_ground, min(frame.seconds, LONGEST_FRAME)
         speed = 0.0 if stood else frame.body.fall_speed
         after = min(speed + self._gravity * seconds, self._max_speed)
@@ -221,11 +222,10 @@ class GroundRunner:
             point = point - dot(point - stood[0], normal) * normal
         frame.effect_state[self.name] = point, normal
 
-    def search_below(self, frame: Frame, reach: float, near: Hit | bool | None = None) -> GroundSearch:
+    def search_below(self, frame: Frame, reach: float, near: tuple[Hit | None] | None = None) -> GroundSearch:
         """Find the first contact straight down from frame.pose within `reach` [m].
 
-        near: the contact within the near reach, if the caller has searched it; False if there is
-        none.
+        near: result of the search within the near reach, if the caller has made it.
         Bumps of a wall beside the avatar may end the motion. After a contact that is too steep, the
         search is therefore repeated slightly away from it.
         """
@@ -241,7 +241,7 @@ class GroundRunner:
                 frame.pose = translated(begin, aside)
             # Ground is nearly always near, and a short sweep takes half the time.
             far = min(reach, _NEAR_CLEARANCES * self.clearance)
-            hit = self._first_below(frame, far) if near is None else near or None
+            hit = self._first_below(frame, far) if near is None else near[0]
             near = None
             if hit is None and far < reach:
                 far = reach

@@ -176,6 +176,9 @@ class GroundRunner:
             elif lower < -band:
                 self.slide(frame, -lower * frame.world.up)
                 frame.effect_state[RAISED] = frame.pose[:3, 3].copy()
+        elif stood and (held := self._held_above_ground(frame, hit)) is not None:
+            frame.on_ground, frame.fall_speed = True, 0.0
+            below = below._replace(normal=held)
         else:
             self._fall_along(frame, fall, seconds)
         normal = None if below.normal is None else tuple(below.normal.tolist())
@@ -197,6 +200,23 @@ class GroundRunner:
         self._store_ground(frame, hit, normal)
         frame.reports["ground"] = GroundReport(True, 0.0, tuple(normal.tolist()))
         return True
+
+    def _held_above_ground(self, frame: Frame, hit: Hit) -> Vec | None:
+        """Return the normal of the last ground, if only the body is held, above that ground; else None.
+
+        A body that is wedged, for example between two stray points, has no clear way down, although
+        its feet are at the floor. It would fall a little in each frame, and be raised again.
+        hit: the contact below, higher than a step.
+        """
+        stood, avatar, up = frame.body.effect_state.get(self.name), frame.body.avatar, frame.world.up
+        if stood is None or hit.cloud is None or not len(avatar.points):
+            return None
+        feet, place = lowest_height(avatar, frame.pose, up), frame.pose[:3, 3]
+        if dot(hit.cloud, up) - feet <= self._down:
+            return None
+        way = place + (feet - dot(place, up)) * up - stood[0]
+        near = 0.0 <= dot(way, stood[1]) <= self._down and norm(way) <= _SAME_FLOOR_REACH
+        return stood[1] if near else None
 
     def _last_normal(self, frame: Frame, hit: Hit) -> Vec | None:
         """Return the normal of the ground that the avatar stood on if a hit is of its plane, else None."""

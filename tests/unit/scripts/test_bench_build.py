@@ -88,7 +88,7 @@ def test_linearity_is_time_a_point_over_that_of_the_size_before() -> None:
 
 
 def test_a_failed_build_says_why(tmp_path: Path) -> None:
-    with pytest.raises(build_runs.BuildError, match=r"exit code 3.*no\.las"):
+    with pytest.raises(build_runs.BuildError, match=r"(?s)exit code 3.*no\.las"):
         build_runs.build(tmp_path / "no.las", tmp_path / "archive", memory="1GB", jobs=1)
 
 

@@ -41,6 +41,7 @@ from ..world.frame import (
     settle_before,
     translated,
 )
+from ..world.ground_plane import held_above_ground, last_normal, store_ground
 from ..world.vectors import dot, norm
 
 # Feet this near to their target height are not moved [m], so that an avatar at rest stays at rest.
@@ -77,10 +78,6 @@ _NEAR_CLEARANCES = 2.0
 # aside at 30 degrees.
 _WALL_OFFSETS = (0.01, 0.05)
 _MAX_WALLS = 3
-# A point belongs to the last ground if it is within these distances of its plane and of the point of
-# it that was touched last [m]: a person's feet are 0.3 to 0.65 m apart. With 0.3 m, 639 of the 1,200
-# frames of the façade's walk estimated a normal; with 0.75 m, 61 do.
-_SAME_FLOOR, _SAME_FLOOR_REACH = 5e-3, 0.75
 # Error of a cosine that results from storing normals to a third of a degree.
 _ROUNDING = 0.005
 # A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
@@ -166,7 +163,7 @@ class GroundRunner:
         elif below.normal is not None:
             frame.on_ground, frame.fall_speed = True, 0.0
             lower = below.free - self.clearance
-            self._store_ground(frame, hit, below.normal)
+            store_ground(frame, hit, below.normal)
             band = max(DEAD_BAND, HEIGHT_BAND * self.clearance) if stood else DEAD_BAND
             if below.aside:
                 band = max(band, WALL_BAND)
@@ -176,7 +173,7 @@ class GroundRunner:
             elif lower < -band:
                 self.slide(frame, -lower * frame.world.up)
                 frame.effect_state[RAISED] = frame.pose[:3, 3].copy()
-        elif stood and (held := self._held_above_ground(frame, hit)) is not None:
+        elif stood and (held := held_above_ground(frame, hit, self._down)) is not None:
             frame.on_ground, frame.fall_speed = True, 0.0
             below = below._replace(normal=held)
         else:
@@ -193,54 +190,13 @@ class GroundRunner:
         lower = hit.fraction * (_NEAR_CLEARANCES * self.clearance) - self.clearance
         if hit.verdict == Verdict.UNKNOWN or abs(lower) > max(DEAD_BAND, HEIGHT_BAND * self.clearance):
             return False
-        normal = self._last_normal(frame, hit)
+        normal = last_normal(frame, hit)
         if normal is None:
             return False
         frame.on_ground, frame.fall_speed = True, 0.0
-        self._store_ground(frame, hit, normal)
+        store_ground(frame, hit, normal)
         frame.reports["ground"] = GroundReport(True, 0.0, tuple(normal.tolist()))
         return True
-
-    def _held_above_ground(self, frame: Frame, hit: Hit) -> Vec | None:
-        """Return the normal of the last ground, if only the body is held, above that ground; else None.
-
-        A body that is wedged, for example between two stray points, has no clear way down, although
-        its feet are at the floor. It would fall a little in each frame, and be raised again.
-        hit: the contact below, higher than a step.
-        """
-        stood, avatar, up = frame.body.effect_state.get(self.name), frame.body.avatar, frame.world.up
-        if stood is None or hit.cloud is None or not len(avatar.points):
-            return None
-        feet, place = lowest_height(avatar, frame.pose, up), frame.pose[:3, 3]
-        if dot(hit.cloud, up) - feet <= self._down:
-            return None
-        way = place + (feet - dot(place, up)) * up - stood[0]
-        near = 0.0 <= dot(way, stood[1]) <= self._down and norm(way) <= _SAME_FLOOR_REACH
-        return stood[1] if near else None
-
-    def _last_normal(self, frame: Frame, hit: Hit) -> Vec | None:
-        """Return the normal of the ground that the avatar stood on if a hit is of its plane, else None."""
-        stood = frame.body.effect_state.get(self.name)
-        if stood is None or hit.archive < 0 or hit.cloud is None:
-            return None
-        point, normal = stood
-        (x, y, z), (a, b, c), (u, v, w) = hit.cloud.tolist(), point.tolist(), normal.tolist()
-        x, y, z = x - a, y - b, z - c
-        same = abs(x * u + y * v + z * w) <= _SAME_FLOOR and x * x + y * y + z * z <= _SAME_FLOOR_REACH**2
-        return normal if same else None
-
-    def _store_ground(self, frame: Frame, hit: Hit, normal: Vec) -> None:
-        """Store the plane that the avatar stands on, and the point of it that was touched.
-
-        If the normal is that of the last ground, the plane stays the same and only the point moves
-        on it: ground that goes on in one plane is one ground.
-        """
-        if hit.archive < 0 or hit.cloud is None:
-            return
-        stood, point = frame.body.effect_state.get(self.name), hit.cloud
-        if stood is not None and normal is stood[1]:
-            point = point - dot(point - stood[0], normal) * normal
-        frame.effect_state[self.name] = point, normal
 
     def search_below(self, frame: Frame, reach: float, near: tuple[Hit | None] | None = None) -> GroundSearch:
         """Find the first contact straight down from frame.pose within `reach` [m].
@@ -352,7 +308,7 @@ class GroundRunner:
         """
         if hit.avatar is None or hit.cloud is None:
             return None
-        last = self._last_normal(frame, hit)
+        last = last_normal(frame, hit)
         if last is not None:
             return last  # estimating a normal takes half a sweep's time
         up, out = frame.world.up, hit.avatar - hit.cloud

@@ -27,6 +27,7 @@ from ..kernels.collide.collide_poses import collide_resident
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.array_references import Held, refer_to_avatar
 from ..kernels.motion import sweep_resident as _swept
+from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
@@ -53,7 +54,8 @@ _SIGNED, _LOWER = slice(_nearest.SIGNED, _nearest.LOWER), slice(_nearest.LOWER, 
 _NORMAL, _AVATAR = slice(_nearest.NORMAL, _nearest.AVATAR), slice(_nearest.AVATAR, _nearest.CLOUD)
 _CLOUD = slice(_nearest.CLOUD, None)
 _SWEPT_BOUNDS, _SWEPT_AVATAR = slice(_swept.AVATAR), slice(_swept.AVATAR, _swept.CLOUD)
-_SWEPT_CLOUD = slice(_swept.CLOUD, None)
+_SWEPT_CLOUD, _POINT = slice(_swept.CLOUD, _swept.ENDED), slice(_swept.POINT, _swept.END)
+_END = slice(_swept.END, None)
 # This many consecutive queries of `ResidentQueries` in the same voxels count as one use of them.
 _QUERIES_PER_USE = 16
 
@@ -150,6 +152,9 @@ class SweepResult(NamedTuple):
     visits: node visits.  missing: voxels that could not be examined.
     unknown: whether something in reach was not examined. If it is false, a contact that is not
     exact may be a graze.
+    point: (3,), the avatar's centre of the witness, avatar frame [m]; end: (4, 4), a clear pose the
+    skin before the contact, or where the motion began if that is nearer than a motion. None if not
+    requested or not known.
     """
 
     verdict: Verdict
@@ -162,6 +167,8 @@ class SweepResult(NamedTuple):
     visits: int = 0
     missing: int = 0
     unknown: bool = False
+    point: Vec | None = None
+    end: Pose | None = None
 
 
 class ResidentQueries:
@@ -180,6 +187,7 @@ class ResidentQueries:
         "_poses",
         "_result",
         "_rows",
+        "_scratch",
         "_small",
         "_used",
         "_verdict",
@@ -192,6 +200,7 @@ class ResidentQueries:
         self.body = Held(refer_to_avatar(avatar.arrays))
         self._small = 0 < len(avatar.points) <= MAX_FAST_POINTS
         self._box = box_of(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
+        self._scratch = make_scratch(avatar.arrays) if self._small else None
         self._poses, self._first, self._last = np.empty((1, 4, 4)), np.empty((4, 4)), np.empty((4, 4))
         self._rows, self._result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_swept.COLUMNS)
         self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
@@ -200,18 +209,27 @@ class ResidentQueries:
         self._again = 0
 
     def sweep(
-        self, data: SceneData, pose_from: Pose, pose_to: Pose, tolerance: float, budget: QueryBudget
+        self,
+        data: SceneData,
+        pose_from: Pose,
+        pose_to: Pose,
+        tolerance: float,
+        budget: QueryBudget,
+        skin: float = -1.0,
     ) -> SweepResult:
-        """Find when the avatar first touches between two poses (4, 4); errors as for `sweep`."""
+        """Find when the avatar first touches between two poses (4, 4); errors as for `sweep`.
+
+        skin: distance to keep from a contact [m], for `SweepResult.end`; negative: not requested.
+        """
         if self._small and not budget.limited:
             residency, rows, result = data.residency, self._rows, self._result
             self._first[:], self._last[:] = pose_from, pose_to
             held = data.references.to(data.arrays, data.broad)
             with residency.frozen():
                 needed, verdict, visits, _, _ = held.call(
-                    sweep_resident, self._first, self._last, self.body.reference, self.avatar.radius, data.radius_units,
-                    self._box, held.reference, data.arrays.stop, data.unknown, data.nothing_clear,
-                    max(tolerance, budget.tolerance), rows, result,
+                    sweep_resident, self._first, self._last, self.body.reference, self._scratch, self.avatar.radius,
+                    data.radius_units, self._box, held.reference, data.arrays.stop, data.unknown, data.nothing_clear,
+                    max(tolerance, budget.tolerance), skin, rows, result,
                 )  # fmt: skip
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
@@ -225,7 +243,17 @@ class ResidentQueries:
                 own, cloud = result[_SWEPT_AVATAR].copy(), result[_SWEPT_CLOUD].copy()
                 exact = upper == lower or speed * (upper - lower) <= max(tolerance, budget.tolerance)
                 unknown = not exact and _has_unknown(data)
-                return SweepResult(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown)
+                if skin < 0.0:
+                    return SweepResult(
+                        Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown
+                    )
+                ended, end = result[_swept.ENDED], None
+                if ended != _swept.OPEN:
+                    end = result[_END].reshape(4, 4).copy() if ended == _swept.PROVED else pose_from
+                point = result[_POINT].copy()
+                return SweepResult(
+                    Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown, point, end
+                )
         answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, budget=budget)
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
         touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])

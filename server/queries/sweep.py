@@ -12,6 +12,7 @@ from ...schemas.errors import BadRequestError, BadTransformError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE, VoxelsInReach, check_poses
+from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
@@ -203,6 +204,7 @@ def _sweep(
     by_level: NDArray[np.bool_] = np.zeros(k, bool)  # motions about which the level was asked
     # A round plans the next segment of each unfinished motion, loads the voxels that only the index
     # excludes, and advances the motions through the segment's voxels, piece by piece.
+    scratch = make_scratch(avatar.arrays)
     while len(which):
         begun = progress.at.copy()
         unproved = bounds.unproved
@@ -260,8 +262,8 @@ def _sweep(
                         progress.visits[part[at:]] = -1
                     advance_segments(
                         box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
-                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, progress,
-                        counts,
+                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, scratch,
+                        progress, counts,
                     )  # fmt: skip
             spent.add(held)
         which = _next_round(which, progress, proved)

@@ -7,7 +7,7 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import place
 from ..core.scene_arrays import stopped
 from .contact_times import INFINITE, scan_coordinate, touches_at
-from .moving_avatar import AvatarSweep, make_moving
+from .moving_avatar import AvatarSweep
 from .screw_motion import make_motion, pose_at
 from .sweep_interval import search
 from .sweep_segments import avatar_size, entry_fraction, longest_part, place_root_sphere, sagitta_of
@@ -22,20 +22,19 @@ MAX_REFUSED = 512
 @nb.njit(nogil=True, cache=True)
 def advance_segments(
     box, first, last, avatar, radius, other_units, scales, units, loose, scene, index, starts, rows, which, tolerance,
-    progress, counts,
+    scratch, progress, counts,
 ):  # fmt: skip
     """Advance the motions numbered in `which` along their segments: one call for all of a piece.
 
     box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
     the way.  starts, rows: the voxels of each motion's segment that this piece holds.  tolerance:
-    [m].
+    [m].  scratch: `make_scratch` of the avatar.
     Lowers progress.lower and upper, sets a witness with upper, and adds to counts (4, k): voxels
     missing, node visits, point tests, advances.
     A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
     it. Once the scene's stop flag is set, a motion is unknown from its current position on.
     """
-    moving = make_moving(avatar, scene.radius_deficit)
-    begin, end = np.empty(3), np.empty(3)
+    moving, begin, end = scratch.moving, scratch.space.begin, scratch.space.end
     for number in range(which.shape[0]):
         i = which[number]
         if starts[i + 1] == starts[i]:

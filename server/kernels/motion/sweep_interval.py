@@ -37,7 +37,7 @@ import math
 import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ..core.kernel_decorators import njit_no_refcount
+from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_boxes import has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
 from ..core.scene_arrays import (
@@ -61,7 +61,7 @@ LEAST_SAGITTA = 0.25
 U = np.uint64  # see placed_avatar.py
 
 
-@njit_no_refcount
+@njit_inlined
 def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, threshold):
     """Return whether a moving sphere may come within `threshold` of a node's points.
 
@@ -92,13 +92,13 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     return min(begin, end) <= words[at + U(9)] + wide and max(begin, end) >= words[at + U(8)] - wide
 
 
-@njit_no_refcount
+@njit_inlined
 def _latest(moving):
     """Return the fraction of the chord that still matters, float32, rounded up."""
     return np.float32(min(moving.first[2] * (1.0 + 1e-6) + 1e-30, 1.0))
 
 
-@njit_no_refcount
+@njit_inlined
 def _leaves(sweep, chord, voxel, block, row):
     """Update moving.first with all pairs of a leaf node of the avatar and one of the scene.
 
@@ -176,7 +176,7 @@ def _leaves(sweep, chord, voxel, block, row):
                 latest = _latest(moving)
 
 
-@njit_no_refcount
+@njit_inlined
 def _sweep_voxel(sweep, chord, voxel):
     """Update moving.first with one resident voxel by a joint descent, depth first.
 

@@ -10,19 +10,24 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
+from ..core.kernel_decorators import njit_no_refcount
 from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, SceneArrays, stopped
 from ..core.voxels_in_reach import SIMILARITY_TOLERANCE, VALID, check_poses
+from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
 from .screw_motion import make_motion, pose_at
 from .sweep_advance import advance_segments
-from .sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
+from .sweep_segments import avatar_box, find_unknown_regions, plan_in_space
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
 # Result of `sweep_resident` for a motion that it does not answer.
 _NOT_ANSWERED = (-1, _UNKNOWN, 0, 0, 0)
 # Columns of the output: fractions, upper bound of the distance any point moves [m], the witness's
-# centres, world [m].
-LOWER, UPPER, SPEED, AVATAR, CLOUD, COLUMNS = 0, 1, 2, 3, 6, 9
+# centres, world [m]; with a skin, how the motion ends (below), the touching point, avatar frame [m],
+# and the 16 values of the pose at which it ends, world.
+LOWER, UPPER, SPEED, AVATAR, CLOUD, ENDED, POINT, END, COLUMNS = 0, 1, 2, 3, 6, 9, 10, 13, 29
+# How a motion ends: not known, or the pose may touch; where it began; at a pose that is proved clear.
+OPEN, STAYS, PROVED = 0.0, 1.0, 2.0
 
 
 @nb.njit(nogil=True, cache=True)
@@ -43,47 +48,52 @@ def _rigid(pose):
 
 @nb.njit(nogil=True, cache=True)
 def sweep_resident(
-    pose_from, pose_to, body, radius, other_units, box, held, stop, unknown, unknown_everywhere, tolerance, rows,
-    result,
+    pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown,
+    unknown_everywhere, tolerance, skin, rows, result,
 ):  # fmt: skip
     """Sweep one motion if it is short, of scale 1, and all voxels in its reach are resident.
 
     pose_from, pose_to: (4, 4) world, unchecked.  body, held: references to the arrays of an avatar
-    that is not empty, and of the scene.  box: `box_of` the avatar.  stop: (1,) int64, the request's
-    stop flag.  radius, other_units, tolerance: as in kernels/motion/sweep_advance.py.  The dataset's
-    origin is subtracted from the motion as in server/queries/sweep.py.  unknown: (u, 2, 3) int64,
-    boxes [steps] of excluded scans.
+    that is not empty, and of the scene.  scratch: `make_scratch` of the avatar.  box: `box_of` the
+    avatar.  stop: (1,) int64, the request's stop flag.  radius, other_units, tolerance: as in
+    kernels/motion/sweep_advance.py.  The dataset's origin is subtracted from the motion as in
+    server/queries/sweep.py.  unknown: (u, 2, 3) int64, boxes [steps] of excluded scans.  skin:
+    distance to keep from what is touched [m]; negative: the end of the motion is not computed.
     Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64; the witness
     is written where the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
     this includes invalid poses.
     """
     avatar, scene, index = body.avatar, held.scene, held.index
-    origin, zero = scene.origin, np.zeros(3)
-    first, last = np.empty((1, 4, 4)), np.empty((1, 4, 4))
-    first[0], last[0] = pose_from, pose_to
-    scales, units, others = np.empty(1), np.empty(1, np.int64), np.empty(1, np.int64)
-    for poses, found_units in ((first, others), (last, units)):
-        fault, _, _ = check_poses(poses, avatar.radius, radius, other_units, scene, scales, found_units)
-        if fault != VALID or not _rigid(poses[0]):
-            return _NOT_ANSWERED
-    units[0] = max(units[0], others[0])
+    one, origin = scratch.one, scene.origin
+    first, last, scales, units, progress, counts = (
+        one.first, one.last, one.scales, one.units, one.progress, one.counts,
+    )  # fmt: skip
+    for r in range(4):
+        for c in range(4):
+            first[0, r, c], last[0, r, c] = pose_from[r, c], pose_to[r, c]
+    fault, _, _ = check_poses(first, avatar.radius, radius, other_units, scene, scales, one.units_from)
+    if fault != VALID or not _rigid(first[0]):
+        return _NOT_ANSWERED
+    fault, _, _ = check_poses(last, avatar.radius, radius, other_units, scene, scales, units)
+    if fault != VALID or not _rigid(last[0]):
+        return _NOT_ANSWERED
+    units[0] = max(units[0], one.units_from[0])
     for r in range(3):
         first[0, r, 3] -= origin[r]
         last[0, r, 3] -= origin[r]
     from_zero = SceneArrays(
-        scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, zero, scene.step, scene.units_per_step,
-        scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
+        scene.words, scene.ints, scene.halves, scene.where, scene.coordinates, one.origin, scene.step,
+        scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
-    progress = SweepProgress(
-        np.zeros(1), np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1), np.full((1, 2, 3), np.nan),
-        np.full(1, MAX_RESIDENT_PATH_VISITS, np.int64),
+    progress.at[0], progress.end[0], progress.lower[0], progress.speed[0] = 0.0, 1.0, 1.0, 0.0
+    progress.upper[0], progress.visits[0] = np.inf, MAX_RESIDENT_PATH_VISITS
+    for n in range(4):
+        counts[n, 0] = np.uint32(0)
+    needed = plan_in_space(
+        box, first, last, avatar, scales, units, from_zero, index, one.which, progress, one.starts, rows,
+        scratch.space, one.moved,
     )  # fmt: skip
-    counts, outside, unknown_from = np.zeros((4, 1), np.uint32), np.zeros(1, np.bool_), np.empty(1)
-    starts, which = np.zeros(2, np.int64), np.zeros(1, np.int64)
-    needed = plan_segments(
-        box, first, last, avatar, scales, units, from_zero, index, which, progress, starts, rows
-    )
     if needed < 0 or needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
         return _NOT_ANSWERED
     for at in range(needed):
@@ -93,8 +103,8 @@ def sweep_resident(
     if needed > 0:
         progress.lower[0] = progress.end[0]
         advance_segments(
-            box, first, last, avatar, radius, other_units, scales, units, np.zeros(1), from_zero, index, starts, rows,
-            which, tolerance, progress, counts,
+            box, first, last, avatar, radius, other_units, scales, units, one.loose, from_zero, index, one.starts, rows,
+            one.which, tolerance, scratch, progress, counts,
         )  # fmt: skip
         if progress.visits[0] < 0 or stopped(stop):
             return _NOT_ANSWERED
@@ -103,20 +113,57 @@ def sweep_resident(
     if unknown_everywhere:
         proved = 0.0
     elif unknown.shape[0] > 0:
-        until = np.full(1, min(upper, 1.0))
+        until, outside, unknown_from = np.full(1, min(upper, 1.0)), np.zeros(1, np.bool_), np.empty(1)
         find_unknown_regions(
             box, first, last, avatar, scales, units, from_zero, index, unknown, until, outside, unknown_from
         )
         if unknown_from[0] <= until[0]:
             proved = min(proved, unknown_from[0])
-    result[LOWER], result[UPPER], result[SPEED] = proved, upper, progress.speed[0]
+    result[LOWER], result[UPPER], result[SPEED], result[ENDED] = proved, upper, progress.speed[0], OPEN
     verdict = _CLEAR if proved >= 1.0 else _UNKNOWN
     if upper < np.inf:
         verdict = _CONTACT
         for r in range(3):
             own = np.rint(progress.witness[0, 0, r] * UNITS_PER_METRE) / UNITS_PER_METRE
             result[AVATAR + r], result[CLOUD + r] = own + origin[r], progress.witness[0, 1, r] + origin[r]
+        if skin >= 0.0:
+            _end_motion(pose_from, pose_to, box, avatar, origin, proved, skin, one, result)
     return needed, verdict, np.int64(counts[1, 0]), np.int64(counts[2, 0]), np.int64(counts[3, 0])
+
+
+@nb.njit(nogil=True, cache=True)
+def _end_motion(pose_from, pose_to, box, avatar, origin, lower, skin, one, result):
+    """Write how a motion ends that touches at the fraction `lower`. pose_from, pose_to: (4, 4), world.
+
+    one: `OneMotion`, with the motion from the dataset's origin.
+    """
+    motion = make_motion(one.first[0], one.last[0], box, one.origin)
+    _write_pose(motion, min(lower, 1.0), origin, one.pose)
+    point = result[POINT : POINT + 3]
+    write_point(one.pose, result[AVATAR : AVATAR + 3], point)
+    way = longest_way(pose_from, pose_to, avatar)
+    own, cloud = result[AVATAR : AVATAR + 3], result[CLOUD : CLOUD + 3]
+    fraction = lower - skin_fraction(pose_from, pose_to, own, cloud, point, way, skin)
+    if not fraction * way >= MIN_MOTION:
+        result[ENDED] = STAYS
+        return
+    if fraction < lower and _write_pose(motion, fraction, origin, one.pose):
+        result[ENDED] = PROVED
+        for r in range(4):
+            for c in range(4):
+                result[END + 4 * r + c] = one.pose[r, c]
+
+
+@njit_no_refcount
+def _write_pose(motion, fraction, origin, pose):
+    """Write the pose at a fraction of a motion to pose (4, 4), world, and return as `pose_between`."""
+    pose_at(motion, fraction, pose)
+    same = True
+    for r in range(3):
+        there = pose[r, 3]
+        pose[r, 3] = there + origin[r]
+        same &= pose[r, 3] - origin[r] == there
+    return same
 
 
 @nb.njit(nogil=True, cache=True)
@@ -131,13 +178,7 @@ def pose_between(pose_from, pose_to, fraction, box, origin, pose):
     for r in range(3):
         poses[0, r, 3] -= origin[r]
         poses[1, r, 3] -= origin[r]
-    pose_at(make_motion(poses[0], poses[1], box, np.zeros(3)), fraction, pose)
-    same = True
-    for r in range(3):
-        there = pose[r, 3]
-        pose[r, 3] = there + origin[r]
-        same &= pose[r, 3] - origin[r] == there
-    return same
+    return _write_pose(make_motion(poses[0], poses[1], box, np.zeros(3)), fraction, origin, pose)
 
 
 @nb.njit(nogil=True, cache=True)

@@ -47,6 +47,22 @@ class SweepProgress(NamedTuple):
     visits: NDArray[np.int64]
 
 
+class PlanSpace(NamedTuple):
+    """Scratch of `plan_segments`: pose, shift, two positions, and the range of cells (2, 3)."""
+
+    pose: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    begin: NDArray[np.float64]
+    end: NDArray[np.float64]
+    cells: NDArray[np.int64]
+
+
+@nb.njit(nogil=True, cache=True)
+def make_plan_space():
+    """Allocate a `PlanSpace`."""
+    return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), np.empty((2, 3), np.int64))
+
+
 @nb.njit(nogil=True, cache=True)
 def avatar_box(avatar):
     """Return the least and greatest coordinates (2, 3) of an avatar's points, not empty [m]."""
@@ -150,13 +166,13 @@ def _still_near(center, span, low, high):
     return square <= span * span
 
 
-@nb.njit(nogil=True, cache=True)
-def _list_rows(begin, end, span, still, scene, index, rows, count):
+@njit_no_refcount
+def _list_rows(span, still, scene, index, space, rows, count):
     """Append the voxels that a moving cube meets to rows, from `count` on.
 
-    Returns the new count, which may exceed the capacity.
+    It moves from space.begin to space.end. Returns the new count, which may exceed the capacity.
     """
-    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    begin, end, first, last = space.begin, space.end, space.cells[0], space.cells[1]
     cells = 1.0
     for r in range(3):
         least = max(min(begin[r], end[r]) - span, grid_low(index.scene_low[r], scene.voxel_steps))
@@ -167,16 +183,18 @@ def _list_rows(begin, end, span, still, scene, index, rows, count):
         last[r] = np.int64(math.floor(most / scene.voxel_steps))
         cells *= np.float64(last[r] - first[r] + 1)
     listed = cells > index.keys.shape[0]
-    sides = last - first + 1
-    total = index.keys.shape[0] if listed else sides[0] * sides[1] * sides[2]
+    side_y, side_z = last[1] - first[1] + 1, last[2] - first[2] + 1
+    total = index.keys.shape[0] if listed else (last[0] - first[0] + 1) * side_y * side_z
     for n in range(total):
         if stopped(scene.stop):
             return count
         row = n
         if not listed:
-            ix = first[0] + n // (sides[1] * sides[2])
-            iy = first[1] + n // sides[2] % sides[1]
-            iz = first[2] + n % sides[2]
+            ix, iy, iz = (
+                first[0] + n // (side_y * side_z),
+                first[1] + n // side_z % side_y,
+                first[2] + n % side_z,
+            )
             row = find_key(
                 index.keys,
                 morton_code(np.uint64(ix + KEY_BIAS), np.uint64(iy + KEY_BIAS), np.uint64(iz + KEY_BIAS)),
@@ -207,14 +225,25 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
     Returns the number of rows; those beyond the capacity are not written, and progress.at is then
     unchanged. Returns -1, with progress.at unchanged, when the scene's stop flag is set.
     """
-    pose, shift, begin, end = np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3)
-    moved = np.empty(which.shape[0])
+    return plan_in_space(
+        box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows, make_plan_space(),
+        np.empty(which.shape[0]),
+    )  # fmt: skip
+
+
+@njit_no_refcount
+def plan_in_space(
+    box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows, space, moved
+):
+    """Do the work of `plan_segments`. moved: (w,) float64, one for each of `which`; scratch."""
+    pose, shift, begin, end = space.pose, space.shift, space.begin, space.end
     count, next_start = 0, 0
     for number in range(which.shape[0]):
         if stopped(scene.stop):
             return -1
         i = which[number]
-        starts[next_start : i + 1] = count
+        for n in range(next_start, i + 1):
+            starts[n] = count
         next_start = i + 1
         motion = make_motion(first[i], last[i], box, scene.origin)
         progress.speed[i] = motion.speed
@@ -235,12 +264,12 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
             # proved.
             if (
                 entry_fraction(begin, end, span, index.scene_low, index.scene_high) < INFINITE
-                or _list_rows(begin, end, span, motion.speed == 0.0, scene, index, rows, count) > count
+                or _list_rows(span, motion.speed == 0.0, scene, index, space, rows, count) > count
             ):
                 if length > segment * (1.0 + 1e-9):
                     length = length * 0.5
                     continue
-                count = _list_rows(begin, end, span, motion.speed == 0.0, scene, index, rows, count)
+                count = _list_rows(span, motion.speed == 0.0, scene, index, space, rows, count)
             if count == before:
                 t, length = stop, 2.0 * length
             else:
@@ -248,7 +277,8 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
         moved[number] = t
     if stopped(scene.stop):
         return -1
-    starts[next_start:] = count
+    for n in range(next_start, starts.shape[0]):
+        starts[n] = count
     if count <= rows.shape[0]:
         for number in range(which.shape[0]):
             progress.at[which[number]] = moved[number]

@@ -44,12 +44,17 @@ class SweepRunner:
         for _ in range(_MAX_PUSHES):
             if frame.pose.tobytes() == to.tobytes():
                 return None
-            hit = find_first_hit(frame, to, self.tolerance)
+            hit = find_first_hit(frame, to, self.tolerance, self.skin)
             if hit is None:
                 frame.pose = to
                 return None
-            hit = with_point(frame, to, hit)
-            settle_before(frame, to, hit.fraction - skin_fraction(frame, to, hit, self.skin), hit.fraction)
+            if hit.end is not None and not frame.obstacles:
+                frame.pose = hit.end
+            else:
+                hit = with_point(frame, to, hit)
+                settle_before(
+                    frame, to, hit.fraction - skin_fraction(frame, to, hit, self.skin), hit.fraction
+                )
             if not pushes_on(frame, hit, to):
                 break
         if hit is not None:

@@ -183,15 +183,17 @@ class World:
         pose_to: Pose,
         tolerance: float = 1e-6,
         budget: QueryBudget = EXACT,
+        skin: float = -1.0,
     ) -> SweepResult:
         """Return when the avatar first touches any archive on its way between two poses.
 
         See server/queries/sweep.py. Of several archives, `lower` is the least; `upper` and witness
         are those of the earliest contact, of simultaneous ones that with the least witness.
+        skin: see `ResidentQueries.sweep`; `end` is known only for a single archive.
         """
         probe, held = self._probe(avatar), self._held
         if self._alone and held.depth:
-            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, budget)
+            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, budget, skin)
             self.count(swept.visits, swept.unknown)
             return swept
         with self as seen:

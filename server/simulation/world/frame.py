@@ -9,18 +9,13 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
+from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MIN_MOTION
 from ...queries.context.query_budget import EXACT, QueryBudget
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
 Vec = NDArray[np.float64]  # (3,) [m]
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
-# Least length of a motion [m]. With shorter ones a pushing avatar would tremble by the error of
-# `lower`.
-MIN_MOTION = 2e-5
-# Limit on the distance by which a motion stops before a contact, as a multiple of `skin`. In a
-# grazing motion, the distance that keeps `skin` from the wall would be long.
-MAX_SKIN_FACTOR = 4.0
 # If a motion is undecided for more than this distance before its contact, it ends where the
 # undecided part begins [m].
 MAX_UNDECIDED = 1e-4
@@ -40,6 +35,8 @@ class Hit(NamedTuple):
     the scan, or did not end a motion.
     unloaded: whether it is UNKNOWN because voxels are not in memory.
     rest: length of the motion that was left [m], if `unloaded`.
+    end: (4, 4), pose at which a motion with a skin ends, which is proved clear for the scan; None if
+    not known.
     """
 
     fraction: float
@@ -52,6 +49,7 @@ class Hit(NamedTuple):
     point: Vec | None = None
     unloaded: bool = False
     rest: float = 0.0
+    end: Pose | None = None
 
 
 class Obstacle(Protocol):
@@ -193,20 +191,27 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
     return dot(pose[:3, 3], up) + min_height(avatar.points, rotate_back(pose, up)) - avatar.radius
 
 
-def find_first_hit(frame: Frame, to: Pose, tolerance: float, *, below: bool = False) -> Hit | None:
+def find_first_hit(
+    frame: Frame, to: Pose, tolerance: float, skin: float = -1.0, *, below: bool = False
+) -> Hit | None:
     """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
 
+    skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
     below: for a search for ground, leave out bodies beside the avatar.
     """
     avatar, found, lacked = frame.body.avatar, None, frame.lacked
-    swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget)
+    swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget, skin)
     if swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT
         if sure and not swept.exact:
             sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
-        found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
         if sure:
-            found = Hit(swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive)
+            found = Hit(
+                swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive, None, swept.point, False,
+                0.0, swept.end,
+            )  # fmt: skip
+        else:
+            found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
     for obstacle in frame.obstacles:
         hit = obstacle.sweep(avatar, frame.pose, to, tolerance, below=below)
         if hit is not None and (found is None or hit.fraction < found.fraction):
@@ -254,7 +259,7 @@ def max_displacement(frame: Frame, to: Pose) -> float:
 
 def with_point(frame: Frame, to: Pose, hit: Hit) -> Hit:
     """Return the hit that ended a motion from frame.pose to a pose; one of the scan with its `point`."""
-    if hit.archive < 0 or hit.avatar is None:
+    if hit.archive < 0 or hit.avatar is None or hit.point is not None:
         return hit
     return hit._replace(point=_touching_point(frame, to, hit, hit.avatar))
 

@@ -27,18 +27,22 @@ SCENE = Lattice(np.array([7.0, -50.0, 300.0]), STEP)
 
 @pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e4, 0.25), (1e6, 4.0)])
 @pytest.mark.parametrize(("way", "more"), [(0.0, 0.0), (0.05, 0.0), (3.0, 2.0)])
+@pytest.mark.parametrize("turns", [True, False])
 def test_an_avatar_is_placed_at_both_ends(
-    rng: np.random.Generator, far: float, scale: float, way: float, more: float
+    rng: np.random.Generator, far: float, scale: float, way: float, more: float, turns: bool
 ) -> None:
     """more: by how much farther than its nodes' centres some point may go, a part of the speed given [m]."""
     model = make_avatar(rng.uniform(-0.4, 0.4, (100, 3)), 0.01)
-    avatar, found = model.arrays, kernel.make_moving(model.arrays, np.zeros(1, np.int64))
+    avatar, found = model.arrays, kernel.make_moving(model.arrays)
     at = SCENE.origin + rng.uniform(-1, 1, 3) * far
     ends = [
         archive_cases.pose_of(archive_cases.random_rotation(rng) * scale, at + d * way) for d in (-1.0, 1.0)
     ]
     if not way:
         ends[1] = ends[0]
+    elif not turns:
+        ends[1][:3, :3] = ends[0][:3, :3]
+    moved = way > 0 and turns
     found.ends[0], found.ends[1] = ends
     shifts = [pose[:3, 3] - SCENE.origin for pose in ends]
     exact = [
@@ -57,10 +61,12 @@ def test_an_avatar_is_placed_at_both_ends(
     )
     longest = max(fastest, speed / STEP) * (1 + 1e-6)
     size = avatar.radius[0] * scale / STEP + 1 + longest
-    assert extent == pytest.approx(size + kernel.CHORD_ERROR * longest, rel=1e-7)
-    assert farthest == pytest.approx(largest / STEP + size, rel=1e-7)
+    # Without a turn, a coordinate is the sum of two that were rounded.
+    roundings = 1 if moved else 3
+    assert extent == pytest.approx(roundings * size + kernel.CHORD_ERROR * longest, rel=1e-7)
+    assert farthest == pytest.approx(roundings * (largest / STEP + size), rel=1e-7)
 
-    rounding = size * U32 + farthest * 2.0**-49
+    rounding = roundings * size * U32 + farthest * 2.0**-49
     assert np.abs(found.nodes[:3].T - (exact[0] - found.frame)).max() <= rounding
     assert np.abs(found.nodes[4:7].T - ways).max() <= rounding
     inverse = np.array(
@@ -76,7 +82,28 @@ def test_an_avatar_is_placed_at_both_ends(
         points = [
             avatar.points[block].T @ pose[:3, :3].T + shift for pose, shift in zip(ends, shifts, strict=True)
         ]
-        lanes, moved = points[0] / STEP - found.frame, (points[1] - points[0]) / STEP
+        lanes, along = points[0] / STEP - found.frame, (points[1] - points[0]) / STEP
         assert np.abs(found.lanes[block].T - lanes).max() <= rounding
-        assert np.abs(found.displacements[block, :3].T - moved).max() <= rounding
+        assert np.abs(found.displacements[block, :3].T - along).max() <= rounding
         assert np.isnan(np.delete(found.displacements, block, axis=0)).all()
+
+
+def test_an_avatar_is_turned_once_for_each_orientation_and_step(rng: np.random.Generator) -> None:
+    model = make_avatar(rng.uniform(-0.4, 0.4, (100, 3)), 0.01)
+    avatar, kept = model.arrays, kernel.make_moving(model.arrays)
+    turns = [archive_cases.random_rotation(rng) for _ in range(2)]
+    orientations = []
+    for turn, step in [(0, STEP), (0, STEP), (1, STEP), (0, STEP), (0, 2 * STEP)]:
+        scene, fresh = Lattice(SCENE.origin, step), kernel.make_moving(avatar)
+        begin, end = (
+            archive_cases.pose_of(turns[turn], SCENE.origin + rng.uniform(-1, 1, 3)) for _ in range(2)
+        )
+        for moving in (kept, fresh):
+            moving.ends[0], moving.ends[1] = begin, end
+            kernel.place_nodes(avatar, 1.0, 2.0, moving, scene)
+            for block in range(len(avatar.points)):
+                kernel.place_block(avatar, block, moving, scene)
+        for name in ("nodes", "lanes", "displacements", "frame"):
+            assert getattr(kept, name).tobytes() == getattr(fresh, name).tobytes(), name
+        orientations.append(int(kept.counters[4]))
+    assert orientations == [1, 1, 2, 3, 4]

@@ -1,0 +1,73 @@
+"""Scratch of the motions of one avatar, kept from one to the next: allocating it takes 2 us a motion."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.kernels import compiling as nb
+from .moving_avatar import MovingAvatar, make_moving
+from .sweep_segments import PlanSpace, SweepProgress, make_plan_space
+
+
+class OneMotion(NamedTuple):
+    """Arrays of one motion, as those of k in sweep_segments.py and sweep_advance.py; scratch.
+
+    first, last: (1, 4, 4).  counts: (4, 1).  starts: (2,).  which: (1,), zero.  loose: (1,), zero.
+    origin: (3,), zero.  pose: (4, 4).  The others are (1,).
+    """
+
+    first: NDArray[np.float64]
+    last: NDArray[np.float64]
+    scales: NDArray[np.float64]
+    units: NDArray[np.int64]
+    units_from: NDArray[np.int64]
+    progress: SweepProgress
+    counts: NDArray[np.uint32]
+    starts: NDArray[np.int64]
+    which: NDArray[np.int64]
+    loose: NDArray[np.float64]
+    moved: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    pose: NDArray[np.float64]
+
+
+if nb.config.DISABLE_JIT:
+
+    class MotionScratch(NamedTuple):
+        """Reference to the scratch of an avatar's motions, see array_references.py."""
+
+        moving: MovingAvatar
+        space: PlanSpace
+        one: OneMotion
+
+else:
+
+    @nb.structref.register
+    class _MotionScratchType(nb.types.StructRef):  # type: ignore[misc]
+        """numba's type of a `MotionScratch`."""
+
+    class MotionScratch(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
+        """Reference to the scratch of an avatar's motions, see array_references.py."""
+
+    nb.structref.define_proxy(MotionScratch, _MotionScratchType, ["moving", "space", "one"])
+
+
+@nb.njit(nogil=True, cache=True)
+def make_scratch(avatar):
+    """Allocate the scratch for an avatar, not empty. It serves one motion at a time."""
+    progress = SweepProgress(
+        np.zeros(1),
+        np.ones(1),
+        np.ones(1),
+        np.zeros(1),
+        np.zeros(1),
+        np.zeros((1, 2, 3)),
+        np.zeros(1, np.int64),
+    )
+    one = OneMotion(
+        np.empty((1, 4, 4)), np.empty((1, 4, 4)), np.empty(1), np.empty(1, np.int64), np.empty(1, np.int64),
+        progress, np.zeros((4, 1), np.uint32), np.zeros(2, np.int64), np.zeros(1, np.int64), np.zeros(1),
+        np.empty(1), np.zeros(3), np.empty((4, 4)),
+    )  # fmt: skip
+    return MotionScratch(make_moving(avatar), make_plan_space(), one)

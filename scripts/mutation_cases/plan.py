@@ -227,6 +227,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/nearest/pair_heap.py": work("bounded deep", "collide bounded", "distance bounded"),
     "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
+    "server/kernels/motion/motion_end.py": (SERVER + "simulation/world/test_motion_end.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/rays/level_rays.py": ("tests/property/test_ray_tolerances_naive.py",),
     "server/kernels/core/node_boxes.py": (
@@ -263,6 +264,7 @@ NONE = {
     "schemas/kernels/kernel_files.py": "no kernel: how compiled kernels are kept",
     "schemas/kernels/kernel_sources.py": "no kernel: what compiled kernels depend on",
     "server/kernels/core/array_references.py": "no kernel: how arrays are handed to kernels",
+    "server/kernels/motion/motion_scratch.py": "no kernel: memory that kernels write first",
     "server/kernels/core/kernel_decorators.py": (
         "options of the compiler only, which an interpreted kernel does not see"
     ),

@@ -1,0 +1,74 @@
+"""Test where swept motions end, by the kernel, against the same steps in Python."""
+
+from typing import Any
+
+import archive_cases
+import effect_rooms
+import numpy as np
+import pytest
+from effect_rooms import INTERPRETED
+from solidcloud.schemas.scene.effect_table import AnyEffect, Stop, Sweep
+from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
+from solidcloud.server.archives.placed_archive import PlacedArchive
+from solidcloud.server.scene import Scene
+from solidcloud.server.simulation.effects.sweep_effect import SweepRunner
+from solidcloud.server.simulation.world.collision_world import World
+from solidcloud.server.simulation.world.frame import Body, Frame
+
+EFFECTS: list[AnyEffect] = [Stop(), Sweep()]
+MOTIONS = 6 if INTERPRETED else 300
+
+
+class SweptOnly(World):
+    """World whose sweeps do not say where a motion ends."""
+
+    def sweep(self, *arguments: Any, **options: Any) -> Any:
+        return super().sweep(*arguments, **options)._replace(point=None, end=None)
+
+
+class Counted(World):
+    """World that counts the sweeps that say where a motion ends."""
+
+    ends = 0
+
+    def sweep(self, *arguments: Any, **options: Any) -> Any:
+        swept = super().sweep(*arguments, **options)
+        self.ends += swept.end is not None
+        return swept
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
+    return effect_rooms.build(tmp_path_factory.mktemp("room"), effect_rooms.room(2.4))
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("skin", [0.0, 0.002, 0.05])
+def test_motions_end_where_the_steps_in_python_end_them(
+    room: archive_cases.Case, rng: np.random.Generator, skin: float
+) -> None:
+    placed = PlacedArchive.open(room.archive, budget_bytes=1 << 28)
+    file = SceneFile(format=1, archives=[ArchiveItem(path=str(room.archive))], effects=EFFECTS)
+    runner, person, hits = SweepRunner(skin, 1e-6), effect_rooms.person(), 0
+    with Scene([placed], "room") as scene:
+        fused, apart = Counted(scene, file), SweptOnly(scene, file)
+        scene.add_avatar("person", person.points, person.radius)
+        scene.collide("person", effect_rooms.at(0.125, 0.0625, -0.75), margin=3.0)  # loads the voxels
+        for number in range(MOTIONS):
+            begin = effect_rooms.at(*rng.uniform(-0.3, 0.3, 3) - [0, 0, 0.4])
+            begin[:3, :3] = archive_cases.random_rotation(rng)
+            to = begin.copy()
+            to[:3, 3] += rng.uniform(-1, 1, 3) * rng.choice([1e-5, 0.05, 2.0])
+            if number % 2:
+                to[:3, :3] = archive_cases.random_rotation(rng)
+            results = []
+            for world in (fused, apart):
+                frame = Frame(Body("a/b", person, begin), to, 1 / 30, world, pose=begin)
+                world.begin(frame.budget.stop)
+                with world:
+                    hit = runner.sweep_towards(frame, to)
+                point = None if hit is None or hit.point is None else hit.point.tobytes()
+                results.append((frame.pose.tobytes(), None if hit is None else hit.fraction, point))
+                hits += hit is not None
+            assert results[0] == results[1]
+    assert hits > MOTIONS / 4 and fused.ends > 0

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MIN_MOTION
+from ...kernels.motion.motion_end import MAX_SKIN_FACTOR
+from ...kernels.motion.motion_end import MIN_MOTION as MIN_MOTION
 from ...queries.context.query_budget import EXACT, QueryBudget
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 

@@ -231,7 +231,7 @@ def plan_segments(box, first, last, avatar, scales, units, scene, index, which, 
     )  # fmt: skip
 
 
-@njit_no_refcount
+@nb.njit(nogil=True, cache=True)
 def plan_in_space(
     box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows, space, moved
 ):

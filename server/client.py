@@ -8,7 +8,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -29,6 +29,7 @@ from ..schemas.wire.request_limits import MAX_POSES
 from ..schemas.wire.requests import QuestionOptions, has_tolerance_or_budget, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
+from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .scene_interface import QueryMethods, list_avatars
 from .zenoh_client.client_identity import AddedAvatar
@@ -130,6 +131,21 @@ class Client(QueryMethods):
         Raise BusyError if no server answers. keys: also list the resident voxels.
         """
         return decode_answer(StatsAnswer, self._connection.require("stats", encode(StatsRequest(keys))))
+
+    def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
+        """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`.
+
+        Raise BusyError if no server answers.
+        """
+        request = voxels_request(place, reach, limit)
+        return decode_answer(VoxelsAnswer, self._connection.require("voxels", encode(request)))
+
+    def tile(
+        self, archive: int, voxel: Sequence[int], detail: int = 0, level: int | None = None
+    ) -> TileAnswer:
+        """Return points or spheres of a voxel; see `TileRequest`. Raise BusyError if no server answers."""
+        request = tile_request(archive, voxel, detail, level)
+        return decode_answer(TileAnswer, self._connection.require("tile", encode(request)))
 
     def silence(self, operation: str) -> str:
         """Return a message on why no server answered an operation, and what to do."""

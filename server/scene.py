@@ -41,6 +41,7 @@ from .scenes.scene_archives import (
     sealed_store,
 )
 from .scenes.scene_questions import SceneQuestions
+from .scenes.scene_tiles import SceneTiles
 from .simulation.local_session import LocalSession
 from .simulation.make_simulation import make_simulation
 from .simulation.simulation import Simulation
@@ -48,7 +49,7 @@ from .simulation.simulation import Simulation
 DEFAULT_BUDGET = 512 << 20
 
 
-class Scene(SceneQuestions):
+class Scene(SceneTiles, SceneQuestions):
     """One or more placed archives, queried as one. Thread-safe; a context manager.
 
     name: name of the scene for clients. Until `reload`, answers are those of the archives' content

@@ -13,6 +13,7 @@ from .question_table import QUESTIONS, path_questions
 from .requests import AddAvatarRequest, Request
 from .scene_messages import AvatarInfo, ErrorReply, ReloadAnswer, SceneInfo, ScenesAnswer
 from .stats import StatsAnswer, StatsRequest
+from .tile_messages import TileAnswer, TileRequest, VoxelsAnswer, VoxelsRequest
 
 MESSAGES: tuple[type, ...] = (
     ScenesAnswer,
@@ -26,6 +27,10 @@ MESSAGES: tuple[type, ...] = (
     Moved,
     Wish,
     State,
+    VoxelsRequest,
+    VoxelsAnswer,
+    TileRequest,
+    TileAnswer,
     ReloadAnswer,
     StatsRequest,
     StatsAnswer,

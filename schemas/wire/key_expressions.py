@@ -44,7 +44,7 @@ def check_name(name: str, what: str) -> str:
 
 def operations() -> tuple[str, ...]:
     """Return the names of a scene's operations: all questions, and the other ones."""
-    return ("info", "add_avatar", *QUESTIONS, "path", "move", "reload", "stats")
+    return ("info", "add_avatar", *QUESTIONS, "path", "move", "voxels", "tile", "reload", "stats")
 
 
 def scenes_key() -> str:

@@ -27,6 +27,7 @@ from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from ...schemas.wire.requests import AddAvatarRequest, QuestionRequest
 from ...schemas.wire.scene_messages import WIRE_VERSION, ErrorReply, ReloadAnswer, ScenesAnswer
 from ...schemas.wire.stats import StatsRequest
+from ...schemas.wire.tile_messages import TileRequest, VoxelsRequest
 from ...schemas.wire.warming_parts import MOTION, needed_parts
 from ..runtime.stop_flag import NO_STOP, StopFlag
 from ..scene_interface import EncodedReply, LimitReached, ServedScene, recording_avatars
@@ -63,6 +64,8 @@ _OTHERS = {
             r.avatar, r.pose_from, r.pose_to, r.seconds, late=r.late, client=c, stop=stop
         ),
     ),
+    "voxels": _Operation(VoxelsRequest, "", lambda s, r, c, stop: s.voxels(r.place, r.reach, r.limit)),
+    "tile": _Operation(TileRequest, "", lambda s, r, c, stop: s.tile(r.archive, r.voxel, r.detail, r.level)),
     "path": _Operation(
         PathRequest,
         "poses",

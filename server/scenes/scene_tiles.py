@@ -1,0 +1,39 @@
+"""What a scene looks like: the methods of `Scene` that viewers draw with."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+from numpy.typing import ArrayLike
+
+from ...schemas.errors import BadRequestError
+from ...schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
+from ..archives.placed_archive import PlacedArchive
+from ..tiles.voxel_list import list_voxels
+from ..tiles.voxel_tile import read_tile
+
+
+class SceneTiles:
+    """Voxels and tiles of placed archives. Thread-safe."""
+
+    archives: list[PlacedArchive]
+
+    def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
+        """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`."""
+        request = voxels_request(place, reach, limit)
+        with ExitStack() as stack:
+            opened = [stack.enter_context(archive.take()) for archive in self.archives]
+            return list_voxels(request, self.archives, opened)
+
+    def tile(
+        self, archive: int, voxel: Sequence[int], detail: int = 0, level: int | None = None
+    ) -> TileAnswer:
+        """Return points or spheres of a voxel; see `TileRequest`. Raise BadRequestError, CorruptError.
+
+        The record is read from the archive's file, and not added to the voxels in memory.
+        """
+        request = tile_request(archive, voxel, detail, level)
+        if request.archive >= len(self.archives):
+            raise BadRequestError(f"archive {archive}: expected below {len(self.archives)}")
+        placed = self.archives[request.archive]
+        with placed.take() as opened:
+            return read_tile(request, placed, opened.store.archive)

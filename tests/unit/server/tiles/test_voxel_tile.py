@@ -1,0 +1,96 @@
+"""Tiles: the points of a voxel, every so many of them, or the spheres of a level of its hierarchy."""
+
+from pathlib import Path
+
+import archive_cases
+import numpy as np
+import pytest
+from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.wire.tile_messages import TileAnswer
+from solidcloud.server.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
+    """Points of a wavy floor in several voxels."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-1.5, 1.5, (6000, 3))
+    places[:, 2] = 0.2 * np.sin(3 * places[:, 0]) + rng.normal(0, 0.003, len(places))
+    return archive_cases.build(tmp_path_factory.mktemp("tiles"), places, voxel=1.0)
+
+
+def world(tile: TileAnswer) -> np.ndarray:
+    """Return the places (n, 3) of a tile's points [m]."""
+    pose = tile.pose[0]
+    return tile.points * tile.step @ pose[:3, :3].T + pose[:3, 3]
+
+
+def test_the_tiles_of_all_voxels_hold_all_points(case: archive_cases.Case) -> None:
+    with Scene.open(case.archive) as scene:
+        listed = scene.voxels((0, 0, 0))
+        found = np.concatenate([world(scene.tile(0, voxel)) for voxel in listed.voxel])
+        assert len(found) == scene.info().points == listed.points.sum()
+        step = scene.info().lattice_step
+        expected = case.points[np.lexsort(np.round(case.points / step).T)]
+        np.testing.assert_allclose(found[np.lexsort(np.round(found / step).T)], expected, atol=0.51 * step)
+        assert scene.residency.resident == 0, "tiles load nothing into memory"
+
+
+def test_a_coarser_detail_is_a_part_of_the_finer_one(case: archive_cases.Case) -> None:
+    with Scene.open(case.archive) as scene:
+        voxel = scene.voxels((0, 0, 0)).voxel[0]
+        finer = scene.tile(0, voxel)
+        for detail in (1, 2, 8):
+            tile = scene.tile(0, voxel, detail)
+            np.testing.assert_array_equal(tile.points, finer.points[:: 4**detail])
+            assert tile.total == len(finer.points)
+
+
+def test_the_points_of_a_detail_are_spread(case: archive_cases.Case) -> None:
+    with Scene.open(case.archive) as scene:
+        voxel = scene.voxels((0, 0, 0)).voxel[0]
+        every, some = (world(scene.tile(0, voxel, detail)) for detail in (0, 2))
+        apart = np.linalg.norm(every[:, None] - some[None], axis=2).min(axis=1)
+        assert apart.max() < 0.35, "one of 16 points of a square metre"
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 3, 50])
+def test_spheres_of_a_level_enclose_the_points(case: archive_cases.Case, level: int) -> None:
+    with Scene.open(case.archive) as scene:
+        voxel = scene.voxels((0, 0, 0)).voxel[0]
+        points, tile = world(scene.tile(0, voxel)), scene.tile(0, voxel, level=level)
+        assert len(tile.spheres) == len(tile.points) and (level > 0 or len(tile.points) == 1)
+        assert not len(tile.rgb) and not len(tile.intensity)
+        apart = np.linalg.norm(points[:, None] - world(tile)[None], axis=2)
+        assert (apart <= tile.spheres * tile.step + 1e-9).any(axis=1).all()
+    with Archive(case.archive) as archive:
+        row = int(np.flatnonzero((archive.coordinates == voxel).all(axis=1))[0])
+        leaves = archive.read_voxel(row)[1].is_leaf.sum()
+    assert level < 50 or len(tile.points) == leaves
+
+
+def test_a_tile_that_does_not_exist_is_refused(case: archive_cases.Case) -> None:
+    with Scene.open(case.archive) as scene:
+        voxel = scene.voxels((0, 0, 0)).voxel[0]
+        for wrong, message in (
+            ((1, voxel), "archive 1"),
+            ((0, (400, 0, 0)), "no points"),
+            ((0, (1 << 30, 0, 0)), "expected within"),
+            ((0, (0, 0)), "expected 3"),
+        ):
+            with pytest.raises(BadRequestError, match=message):
+                scene.tile(*wrong)
+
+
+def test_tiles_of_a_placed_archive_are_in_the_world(case: archive_cases.Case, tmp_path: Path) -> None:
+    file = tmp_path / "scene.toml"
+    pose = [[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
+    file.write_text(f'format = 1\n[[archives]]\npath = "{case.archive}"\npose = {pose}\n')
+    with Scene.open(file) as scene:
+        listed = scene.voxels((10.0, 20.0, 5.0), reach=0.4)
+        assert 0 < len(listed.voxel) < scene.info().voxels
+        matrix = np.array(pose)
+        moved = case.points @ matrix[:3, :3].T + matrix[:3, 3]
+        for place in world(scene.tile(0, listed.voxel[0], 3)):
+            assert np.linalg.norm(moved - place, axis=1).min() < 1e-3

@@ -26,7 +26,8 @@ def test_voxels_are_listed_by_the_distance_of_their_boxes(case: archive_cases.Ca
         assert (np.diff(distances) >= 0).all()
         for low, high, voxel, count in zip(every.low, every.high, every.voxel, every.points, strict=True):
             corner = voxel * every.edges[0] + scene.info().origin
-            inside = ((case.points >= low - 1e-9) & (case.points <= high + 1e-9)).all(axis=1)
+            step = scene.info().lattice_step
+            inside = ((case.points >= low - step) & (case.points <= high + step)).all(axis=1)
             assert inside.sum() >= count > 0
             assert (low >= corner - 1e-9).all() and (high <= corner + every.edges[0] + 1e-9).all()
         near = scene.voxels(place, reach=0.6, limit=5)

@@ -102,6 +102,7 @@ ALLOWED = {
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
+    "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
         "builder/sources/common/scan",

@@ -12,6 +12,7 @@ from ..archives.placed_archive import PlacedArchive
 from ..tiles.scene_overview import read_overview
 from ..tiles.voxel_list import list_voxels
 from ..tiles.voxel_tile import read_tile
+from .residency_watch import ResidencyWatch
 
 
 class SceneTiles:
@@ -36,6 +37,10 @@ class SceneTiles:
         with ExitStack() as stack:
             opened = [stack.enter_context(archive.take()) for archive in self.archives]
             return list_voxels(request, self.archives, opened)
+
+    def residency_changes(self) -> ResidencyWatch:
+        """Return the changes of what is resident from now on, for a `with`; see `ResidencyChanges`."""
+        return ResidencyWatch(self.archives)
 
     def tile(
         self, archive: int, voxel: Sequence[int], detail: int = 0, level: int | None = None

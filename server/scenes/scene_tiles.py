@@ -5,7 +5,7 @@ from contextlib import ExitStack
 
 from numpy.typing import ArrayLike
 
-from ...schemas.errors import BadRequestError
+from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ...schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..archives.placed_archive import PlacedArchive
@@ -54,4 +54,9 @@ class SceneTiles:
             raise BadRequestError(f"archive {archive}: expected below {len(self.archives)}")
         placed = self.archives[request.archive]
         with placed.take() as opened:
-            return read_tile(request, placed, opened.store.archive)
+            try:
+                return read_tile(request, placed, opened.store.archive)
+            except OSError as error:
+                raise CorruptError(
+                    f"voxel {request.voxel}: cannot be read ({error}): check the disk"
+                ) from error

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from coloured_scans import Coloured, coloured, write_las
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.passes import level_pass
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import LEVEL_FOLDER, halvings_between
@@ -29,11 +30,13 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
 
 @pytest.fixture(scope="module")
 def leveled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Coloured]:
-    """Coloured points with a level of detail, whose voxels may be smaller than the archive's."""
+    """Coloured points with a level of detail, whose voxels are smaller than the archive's."""
     truth, folder = coloured(4, 30_000), tmp_path_factory.mktemp("level")
     scan = write_las(folder / "scan.las", truth)
     keep = frozenset({"rgb", "intensity", "classification"})
-    build_archive([scan], folder / "archive", BuildConfig(voxel=1.0, resolution=1e-3, keep=keep, jobs=1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(level_pass, "LEVEL_VOXEL", 16)  # so that voxels are halved, as dense ones are
+        build_archive([scan], folder / "archive", BuildConfig(voxel=1.0, resolution=1e-3, keep=keep, jobs=1))
     return folder / "archive", truth
 
 
@@ -144,6 +147,7 @@ def test_a_level_voxel_is_found_in_any_division(
     folder, _ = leveled
     with Archive(folder) as archive, Archive(folder / LEVEL_FOLDER) as level:
         halvings = halvings_between(level.header.lattice, archive.header.lattice)
+        assert halvings > 0
         shown = 0
         for voxel in archive.coordinates:
             request = TileRequest(0, tuple(voxel.tolist()), 3)

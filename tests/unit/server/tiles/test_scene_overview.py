@@ -22,7 +22,7 @@ from solidcloud.schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from solidcloud.server.scene import Scene
 from solidcloud.server.tiles import scene_overview
 
-COUNT = 30_000
+COUNT, KEY = 30_000, bytes(range(32))
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +78,8 @@ def test_no_record_is_read_beside_a_preview(
 
 def test_the_preview_of_a_sealed_archive_is_not_trusted(case: archive_cases.Case, tmp_path: Path) -> None:
     folder, key = copied(case, tmp_path), tmp_path / "key"
-    key.write_text(bytes(32).hex())
-    key.chmod(0o600)
-    seal_archive(folder, bytes(32))
+    key.write_bytes(KEY)
+    seal_archive(folder, KEY)
     with Scene.open(folder, archive_key=key) as scene:
         assert scene.overview(50).previewed.tolist() == [False]
     with Scene.open(folder) as scene:

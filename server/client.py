@@ -8,7 +8,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -22,6 +22,7 @@ from ..schemas.wire import key_expressions
 from ..schemas.wire.answers import Cost, Part, Verdict
 from ..schemas.wire.encoding import decode_answer, encode
 from ..schemas.wire.motion_messages import FRAME_SECONDS, WAIT, Moved, MoveRequest, checked_late
+from ..schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_path_parameters
 from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.question_table import QUESTIONS
@@ -29,10 +30,12 @@ from ..schemas.wire.request_limits import MAX_POSES
 from ..schemas.wire.requests import QuestionOptions, has_tolerance_or_budget, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
+from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .scene_interface import QueryMethods, list_avatars
 from .zenoh_client.client_identity import AddedAvatar
 from .zenoh_client.client_session import ClientSession, CommandNumbers
+from .zenoh_client.residency_stream import ResidencyStream
 from .zenoh_client.server_connection import ServerConnection
 from .zenoh_common.endpoints import DEFAULT_ENDPOINT
 
@@ -130,6 +133,34 @@ class Client(QueryMethods):
         Raise BusyError if no server answers. keys: also list the resident voxels.
         """
         return decode_answer(StatsAnswer, self._connection.require("stats", encode(StatsRequest(keys))))
+
+    def overview(self, limit: int = 100_000) -> OverviewAnswer:
+        """Return a sample of the scene's points; see `OverviewAnswer`. Raise BusyError if no server answers."""
+        request = encode(OverviewRequest(limit))
+        return decode_answer(OverviewAnswer, self._connection.require("overview", request))
+
+    def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
+        """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`.
+
+        Raise BusyError if no server answers.
+        """
+        request = voxels_request(place, reach, limit)
+        return decode_answer(VoxelsAnswer, self._connection.require("voxels", encode(request)))
+
+    def tile(
+        self, archive: int, voxel: Sequence[int], detail: int = 0, level: int | None = None
+    ) -> TileAnswer:
+        """Return points or spheres of a voxel; see `TileRequest`. Raise BusyError if no server answers."""
+        request = tile_request(archive, voxel, detail, level)
+        return decode_answer(TileAnswer, self._connection.require("tile", encode(request)))
+
+    def residency_changes(self) -> ResidencyStream:
+        """Return the changes of what is resident of the scene from now on, for a `with`.
+
+        It yields a `ResidencyChanges` at least every half second while a server answers.
+        """
+        self._connection.check_open()
+        return ResidencyStream(self._connection, self.name)
 
     def silence(self, operation: str) -> str:
         """Return a message on why no server answered an operation, and what to do."""

@@ -8,6 +8,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
 from numpy.typing import ArrayLike
 
 from ..schemas.archive.seal import read_archive_key
@@ -41,6 +42,7 @@ from .scenes.scene_archives import (
     sealed_store,
 )
 from .scenes.scene_questions import SceneQuestions
+from .scenes.scene_tiles import SceneTiles
 from .simulation.local_session import LocalSession
 from .simulation.make_simulation import make_simulation
 from .simulation.simulation import Simulation
@@ -48,7 +50,7 @@ from .simulation.simulation import Simulation
 DEFAULT_BUDGET = 512 << 20
 
 
-class Scene(SceneQuestions):
+class Scene(SceneTiles, SceneQuestions):
     """One or more placed archives, queried as one. Thread-safe; a context manager.
 
     name: name of the scene for clients. Until `reload`, answers are those of the archives' content
@@ -256,7 +258,9 @@ class Scene(SceneQuestions):
         """Return statistics of cache, requests and waits. keys: also list the resident voxels."""
         with ExitStack() as stack:
             each = [stack.enter_context(archive.take()) for archive in self.archives]
-            return make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
+            found = make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
+        effects = [] if self._simulation is None else self._simulation.effect_stats()
+        return structs.replace(found, effects=effects)
 
     def limit_avatars(self, limits: AvatarLimits) -> None:
         """Limit the memory of clients' avatars from now on; existing ones stay."""

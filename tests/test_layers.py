@@ -59,6 +59,7 @@ ALLOWED = {
     "server/queries/context": "kernels runtime avatars residency",
     "server/queries": "kernels runtime avatars residency queries/context",
     "server/archives": "observability runtime avatars residency queries/context queries",
+    "server/tiles": "archives",
     "server/simulation/world": "kernels runtime scene_interface.py avatars queries/context queries archives",
     "server/simulation/effects": (
         "runtime avatars residency queries/context queries archives simulation/world"
@@ -68,7 +69,7 @@ ALLOWED = {
     ),
     "server/scenes": (
         "kernels observability runtime scene_interface.py avatars residency queries/context queries archives "
-        "simulation/effects"
+        "simulation/effects tiles"
     ),
     "server/pictures": "avatars archives",
     "server/scene.py": (
@@ -101,6 +102,7 @@ ALLOWED = {
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
+    "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
         "builder/sources/common/scan",

@@ -8,11 +8,14 @@ import numpy as np
 
 from .arrays import ArrayType, array_fields
 from .motion_messages import Moved, MoveRequest, State, Wish
+from .overview_messages import OverviewAnswer, OverviewRequest
 from .path_messages import PathRequest
 from .question_table import QUESTIONS, path_questions
 from .requests import AddAvatarRequest, Request
+from .residency_messages import ResidencyChanges, ResidencyRequest
 from .scene_messages import AvatarInfo, ErrorReply, ReloadAnswer, SceneInfo, ScenesAnswer
 from .stats import StatsAnswer, StatsRequest
+from .tile_messages import TileAnswer, TileRequest, VoxelsAnswer, VoxelsRequest
 
 MESSAGES: tuple[type, ...] = (
     ScenesAnswer,
@@ -26,6 +29,14 @@ MESSAGES: tuple[type, ...] = (
     Moved,
     Wish,
     State,
+    OverviewRequest,
+    OverviewAnswer,
+    VoxelsRequest,
+    VoxelsAnswer,
+    TileRequest,
+    TileAnswer,
+    ResidencyRequest,
+    ResidencyChanges,
     ReloadAnswer,
     StatsRequest,
     StatsAnswer,

@@ -16,6 +16,10 @@ ROOT = "solidcloud/1"
 _NAME = re.compile(rf"[A-Za-z0-9._-]{{1,{MAX_NAME_LENGTH}}}")
 
 
+# Operations about what a scene looks like.
+_PICTURES = ("overview", "voxels", "tile")
+
+
 class Route(NamedTuple):
     """Parts of a query's key: the scene, the client that sent the query, and the operation."""
 
@@ -44,7 +48,7 @@ def check_name(name: str, what: str) -> str:
 
 def operations() -> tuple[str, ...]:
     """Return the names of a scene's operations: all questions, and the other ones."""
-    return ("info", "add_avatar", *QUESTIONS, "path", "move", "reload", "stats")
+    return ("info", "add_avatar", *QUESTIONS, "path", "move", *_PICTURES, "reload", "stats")
 
 
 def scenes_key() -> str:
@@ -158,6 +162,27 @@ def parse_state_key(key: str) -> User:
     Raises BadRequestError for any other key, wildcards included.
     """
     return User(*_parse(key, "state", ("scene", "client", "avatar of a session"))[1:])
+
+
+def residency_key(scene: str, client: str) -> str:
+    """Return the key under which a client queries the changes of what is resident of a scene.
+
+    The server replies with them under the same key.
+    """
+    return f"{ROOT}/residency/{check_name(scene, 'scene')}/{check_name(client, 'client')}"
+
+
+def all_residency_key(scene: str) -> str:
+    """Return the key expression that a server declares: changes of its scene, for any client."""
+    return f"{ROOT}/residency/{check_name(scene, 'scene')}/*"
+
+
+def parse_residency_key(key: str) -> str:
+    """Return the client that queries changes under a key.
+
+    Raises BadRequestError for any other key, wildcards included.
+    """
+    return _parse(key, "residency", ("scene", "client"))[1]
 
 
 def _user_key(what: str, scene: str, user: User) -> str:

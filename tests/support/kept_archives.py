@@ -2,6 +2,7 @@
 
 import atexit
 import functools
+import hashlib
 import shutil
 import tempfile
 from collections.abc import Hashable, Sequence
@@ -12,7 +13,7 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 
 # Larger archives are not kept [bytes of all scans].
-MOST_BYTES = 1 << 18
+MOST_BYTES = 1 << 20
 _kept: dict[Hashable, Path] = {}
 
 
@@ -21,13 +22,13 @@ def build_or_copy(scans: Sequence[Path], target: Path, config: BuildConfig) -> N
 
     A copy names the paths of the scans that it was built of. Their names are equal, their folders may not be.
     """
-    contents = tuple((scan.name, scan.read_bytes()) for scan in scans)
+    contents = tuple((scan.name, hashlib.sha256(scan.read_bytes()).digest()) for scan in scans)
     key = (contents, repr(config), radius_class_archives.replaced_classes())
     if key in _kept:
         shutil.copytree(_kept[key], target)
         return
     build_archive(scans, target, config)
-    if sum(len(content) for _, content in contents) <= MOST_BYTES:
+    if sum(scan.stat().st_size for scan in scans) <= MOST_BYTES:
         _kept[key] = Path(shutil.copytree(target, _folder() / str(len(_kept))))
 
 

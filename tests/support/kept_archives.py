@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Hashable, Sequence
 from pathlib import Path
 
+import compiled_builds
 import radius_class_archives
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
@@ -27,7 +28,8 @@ def build_or_copy(scans: Sequence[Path], target: Path, config: BuildConfig) -> N
     if key in _kept:
         shutil.copytree(_kept[key], target)
         return
-    build_archive(scans, target, config)
+    if radius_class_archives.replaced_classes() or not compiled_builds.build_compiled(scans, target, config):
+        build_archive(scans, target, config)
     if sum(scan.stat().st_size for scan in scans) <= MOST_BYTES:
         _kept[key] = Path(shutil.copytree(target, _folder() / str(len(_kept))))
 

@@ -23,7 +23,7 @@ MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0.5")
 TOLERANCES = (2.0**-26, 1e-4, 3e-3, 0.05, 0.4, 20.0)
 
 
-@settings(max_examples=sample(8, 25), deadline=None, derandomize=True)
+@settings(max_examples=sample(5, 25), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -129,6 +129,8 @@ def test_workers_end_quietly_when_the_terminal_interrupts_all(tmp_path: Path) ->
         "4000",
         "--formats",
         "laz",
+        "--voxel",
+        "20",
         "--real=--jobs 2",
         "--seed",
         "4",

@@ -116,19 +116,19 @@ def test_it_watches_the_folder_that_kernels_are_kept_in(
     assert "compiling kernels, once on this machine" in said
 
 
-def ignore_of_trees(_: str, names: list[str]) -> list[str]:
-    """Return the kernels of trees, and what another process is about to rename."""
-    return [n for n in names if n.startswith("builder.kernels.trees.") or not n.endswith(".kernel")]
+def cells_and_marks(_: str, names: list[str]) -> list[str]:
+    """Return the kernel of the cells' trees, and what another process is about to rename."""
+    return [n for n in names if ".build_cells-" in n or not n.endswith(".kernel")]
 
 
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels compile nothing")
 def test_the_command_says_that_it_compiles_the_first_time_alone(tmp_path: Path) -> None:
     scan = tmp_path / "scan.xyz"
     scan.write_text("".join(f"{x / 10} {y / 10} 0\n" for x in range(20) for y in range(20)))
-    # All of a build take half a minute to compile, those of its trees some seconds.
+    # All of a build take half a minute to compile, the cells' trees some seconds.
     build_archive([scan], tmp_path / "before", BuildConfig(jobs=1))
     kept = default_folder(os.environ["NUMBA_CACHE_DIR"])
-    folder = shutil.copytree(kept, default_folder(str(tmp_path / "cache")), ignore=ignore_of_trees)
+    folder = shutil.copytree(kept, default_folder(str(tmp_path / "cache")), ignore=cells_and_marks)
     assert set(os.listdir(kept)) - set(os.listdir(folder))
     said = []
     for name in ("first", "second"):

@@ -97,15 +97,28 @@ def pytest_unconfigure() -> None:
 def pytest_report_header() -> list[str]:
     """What decides the outcome beside the code."""
     kernels = "interpreted" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled"
+    many = os.environ.get("SOLIDCLOUD_SAMPLES") == "many"
     bounds = ", indices checked" if os.environ.get("NUMBA_BOUNDSCHECK") == "1" else ""
     scans = os.environ.get("SOLIDCLOUD_SCANS", "none: tests of them are skipped")
-    return [f"kernels: {kernels}{bounds}", f"real scans (SOLIDCLOUD_SCANS): {scans}"]
+    samples = (
+        f"samples (SOLIDCLOUD_SAMPLES): {'many' if many else 'few; many are those that documents state'}"
+    )
+    return [f"kernels: {kernels}{bounds}", samples, f"real scans (SOLIDCLOUD_SCANS): {scans}"]
 
 
 @pytest.fixture
 def rng() -> np.random.Generator:
     """Random numbers, the same in every run."""
     return np.random.default_rng(SEED)
+
+
+@pytest.fixture
+def builds_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Build archives in this process, interpreted where it is: for tests of the builder.
+
+    See tests/support/compiled_builds.py.
+    """
+    monkeypatch.setattr("compiled_builds.here", True)
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ A room is a folder of schemas/, builder/ or server/; a module at the top of one 
 """
 
 import ast
+import functools
 import re
 import sys
 from collections import defaultdict
@@ -209,6 +210,7 @@ def sources() -> list[Path]:
     return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 
+@functools.cache
 def all_imports() -> list[Import]:
     return [
         found

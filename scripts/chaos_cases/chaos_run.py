@@ -69,11 +69,19 @@ class ChaosRun:
     """One chaos run."""
 
     def __init__(
-        self, folder: Path, fixture: Fixture, endpoint: str, seed: int, without: Sequence[str], say: Any
+        self,
+        folder: Path,
+        fixture: Fixture,
+        endpoint: str,
+        seed: int,
+        without: Sequence[str],
+        say: Any,
+        clients: int = CLIENTS,
     ) -> None:
         self.folder, self.fixture, self.endpoint, self.seed, self.say = folder, fixture, endpoint, seed, say
+        self.clients = clients
         self.random = random.Random(seed)
-        self.scoreboard = b.Scoreboard(folder / "board", CLIENTS)
+        self.scoreboard = b.Scoreboard(folder / "board", clients)
         self.server_runs = ServerRuns(fixture, endpoint, self.scoreboard, folder / "server.log")
         self.done: Counter[str] = Counter()
         self.recovery: list[float] = []
@@ -96,7 +104,7 @@ class ChaosRun:
         self._serve(0)
         self.server_runs.start()
         try:
-            for slot in range(CLIENTS):
+            for slot in range(self.clients):
                 self._start_client(slot)
             self._until(
                 lambda: all(self._client_row(slot)[b.RIGHT_AT] > 0 for slot in self._clients), READY_SECONDS
@@ -141,14 +149,18 @@ class ChaosRun:
             self._pause(self.random.uniform(0.0, 1.0))
             self._restart()
         elif kind == "kill client":
-            slot = self.random.randrange(CLIENTS)
+            slot = self.random.randrange(self.clients)
             self._thaw(slot)
             process = self._clients.pop(slot)
             process.kill()
             process.join()
             self._start_client(slot)
         elif kind == "freeze client":
-            slots = range(CLIENTS - SEVERAL, CLIENTS) if self.random.random() < 0.5 else range(CLIENTS)
+            slots = (
+                range(self.clients - SEVERAL, self.clients)
+                if self.random.random() < 0.5
+                else range(self.clients)
+            )
             slot = self.random.choice(slots)
             os.kill(self._clients[slot].pid, signal.SIGSTOP)
             self._frozen[slot] = time.monotonic() + self.random.uniform(2.0, 5.0)
@@ -288,7 +300,7 @@ class ChaosRun:
 
     def _start_client(self, slot: int) -> None:
         """Start the client of a slot."""
-        ids = IDS if slot >= CLIENTS - SEVERAL else 1
+        ids = IDS if slot >= self.clients - SEVERAL else 1
         seed = self.random.randrange(1 << 32)
         process = self._context.Process(
             target=checking_clients.main, args=(self.folder, slot, self.endpoint, seed, ids), daemon=True

@@ -55,6 +55,7 @@ FORMATS: dict[str, tuple[Any, ...]] = {
 # Maximum time from an interrupt to the end of a build of any size, on an otherwise idle machine
 # [s].
 PROMPT = 1.0
+VOXEL = 4.0  # [m]; of scans of 10 m
 FORBIDDEN = ("Traceback", "check the file", "error:", "left out", "Exception ignored")
 
 
@@ -95,7 +96,7 @@ def words(scans: Path, target: Path, options: tuple[str, ...]) -> list[str]:
         "--jobs",
         "1",
         "--voxel",
-        "4",
+        str(VOXEL),
         *options,
     ]  # the last --jobs takes effect
 

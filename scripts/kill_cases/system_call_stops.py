@@ -120,13 +120,17 @@ def one_of_each(calls: list[Call]) -> list[Call]:
 
 
 def all_calls(
-    reference: ReferenceBuild, tally: Tally, every: int | None = 1, say: Callable[[str], None] | None = None
+    reference: ReferenceBuild,
+    tally: Tally,
+    every: int | None = 1,
+    say: Callable[[str], None] | None = None,
+    one_in: int = 2,
 ) -> int:
     """Inject each fault at each call of a build, of one that overwrites, and of `add`.
 
-    every: only each K-th call; None: one call of each name of `build` and `add`. Then `build` and
-        `add` share the faults: each command has every second one, so that each fault occurs at each
-        name that both commands call.
+    every: only each K-th call; None: one call of each name of `build` and `add`.
+    one_in: without `every`, each command has one in so many of the faults at each name, `add` another
+        one than `build`. With 2, each fault occurs at each name that both commands call.
     Returns the number of calls.
     """
     points = 0
@@ -148,7 +152,7 @@ def all_calls(
             for number, fault in enumerate(FAULTS):
                 if fault == "ENOSPC" and call.name not in FULL:
                     continue
-                if not every and (turn + CALLS.index(call.name) + number) % 2:
+                if not every and (turn + CALLS.index(call.name) + number) % one_in:
                     continue
                 points += 1
                 inject(make(), call, fault, tally, command=name)

@@ -12,6 +12,7 @@ import mixed_requests
 import numpy as np
 import pytest
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
 
@@ -34,7 +35,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.interpreted
 @pytest.mark.timeout(900)  # the first run may have to compile everything
 def test_threads_change_no_byte(archive: Path) -> None:
-    count = 40 if INTERPRETED else 2_500
+    count = 40 if INTERPRETED else sample(600, 2_500)
     asked = mixed_requests.requests(count)
     assert len(Counter(op for op, _ in asked)) == 8
     with Archive(archive) as opened, Scene.open(archive) as scene:

@@ -9,10 +9,11 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
 def test_no_answer_is_wrong_whatever_is_done_to_server_and_clients() -> None:
-    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "6", "--points", "20000", "--requests", "180"]
+    command = [sys.executable, SCRIPTS / "chaos", "--seconds", "6", "--clients", "6"]
+    command += ["--points", "10000", "--requests", "90", "--voxel", "1"]
     # With this seed the first fault kills the server.
     done = subprocess.run(
-        [*command, "--seed", "6", "--recovery", "60", "--stop", "30"],
+        [*command, "--seed", "22", "--recovery", "60", "--stop", "30"],
         capture_output=True,
         text=True,
         check=False,

@@ -110,9 +110,9 @@ def interrupt_readers(folder: Path, *arguments: str) -> dict[str, Any]:
 def test_two_interrupts_of_every_format_lose_nothing(group: int, tmp_path: Path) -> None:
     """Interrupt each format once with --skip-bad and once without; the script does it 100 times."""
     names = list(FORMATS)[group::2]
-    found = interrupt_readers(tmp_path, "--count", "2", "--points", "2000", "--formats", ",".join(names))[
-        "formats"
-    ]
+    # Few voxels, so that most of a build is reading.
+    sizes = ("--count", "2", "--points", "2000", "--voxel", "20")
+    found = interrupt_readers(tmp_path, *sizes, "--formats", ",".join(names))["formats"]
     assert list(found) == names
     counts = [part["counts"] for part in found.values()]
     assert all(count["finished"] == 2 for count in counts)
@@ -129,6 +129,8 @@ def test_workers_end_quietly_when_the_terminal_interrupts_all(tmp_path: Path) ->
         "4000",
         "--formats",
         "laz",
+        "--voxel",
+        "20",
         "--real=--jobs 2",
         "--seed",
         "4",

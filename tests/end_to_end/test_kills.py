@@ -33,7 +33,7 @@ def kill_builds(folder: Path, *arguments: str) -> dict[str, Any]:
 
 def test_twenty_builds_killed_at_random_end_as_one_that_was_not(tmp_path: Path) -> None:
     """Kill 20 builds; builder/DESIGN.md records larger runs of the script."""
-    found = kill_builds(tmp_path, "--forked", "20", "--rivals")
+    found = kill_builds(tmp_path, "--forked", "20", "--rivals", "--voxel", "2")
     assert found["forked"]["counts"]["killed"] == 20
     assert found["forked"]["counts"]["finished after kills"] >= 5
     # The kills were spread over the whole build, not only over its beginning.
@@ -49,7 +49,7 @@ def test_twenty_builds_killed_at_random_end_as_one_that_was_not(tmp_path: Path) 
 def test_a_build_stopped_at_a_call_of_each_kind_goes_on(tmp_path: Path) -> None:
     if not has_strace():
         pytest.skip("strace is not installed, or may not trace here")
-    found = kill_builds(tmp_path, "--syscalls", "--few")["syscalls"]["counts"]
+    found = kill_builds(tmp_path, "--syscalls", "--few", "2", "--voxel", "2")["syscalls"]["counts"]
     assert min(found[fault] for fault in ("KILL", "INT", "EIO")) >= 7 and found["ENOSPC"] >= 5
     assert (
         found["finished after an injection"]

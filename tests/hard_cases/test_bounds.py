@@ -22,6 +22,8 @@ from solidcloud.server.kernels.core.scene_arrays import ROW_WORDS
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+# The builder is a subject of these cases.
+pytestmark = pytest.mark.usefixtures("builds_here")
 
 # Whole lattice steps of 2^-10 m, so that a set that is flat or round as written is so as stored.
 _ROUND = [(15, 20, 0), (0, 7, 24), (25, 0, 0)]

@@ -31,6 +31,8 @@ from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+# The builder is a subject of these cases.
+pytestmark = pytest.mark.usefixtures("builds_here")
 UNITS = 2**26
 # Steps and origins [m]: map coordinates, the largest ones, and numbers that no float64 holds exactly.
 STEPS = [1e-6, 1e-4, 0.1 / 3, 2.0**-10, 0.3]

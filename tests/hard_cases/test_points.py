@@ -15,6 +15,8 @@ from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.scene import Scene
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+# The builder is a subject of these cases.
+pytestmark = pytest.mark.usefixtures("builds_here")
 POINT = np.zeros((1, 3))
 
 

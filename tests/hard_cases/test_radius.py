@@ -11,6 +11,8 @@ import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+# The builder is a subject of these cases.
+pytestmark = pytest.mark.usefixtures("builds_here")
 
 
 @pytest.mark.case(

@@ -8,6 +8,7 @@ import judged_sweeps
 import naive_sweep
 import numpy as np
 import pytest
+from sample_sizes import sample
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
@@ -105,10 +106,10 @@ def test_case_26_along_a_wall_and_round_in_place(tmp_path: Path, rng: np.random.
         voxel=2.0,
         resolution=archive_cases.BINARY_STEP,
     )
-    count = 12 if INTERPRETED else 60
+    count = 12 if INTERPRETED else sample(24, 60)
     angle = np.arange(count) * np.pi / (count // 2)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1) * 0.3
-    samples = 15 if INTERPRETED else 60
+    samples = 15 if INTERPRETED else sample(20, 60)
     gaps = {1e-2: 40, 1e-6: 600} if INTERPRETED else {1e-2: 40, 1e-4: 200, 1e-6: 600}
     with judged_sweeps.opened(case) as data:
         for gap, most in gaps.items():

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from judged_distance import judge_collide, judge_distance
 from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
+from sample_sizes import sample
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from solidcloud.server.queries.context import anytime_search as bounded
 from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
@@ -23,7 +24,7 @@ from solidcloud.server.scene import Scene
 BUDGETS = (0, 1, 5, 30, 200, 2000, NO_LIMIT - 1)
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 15), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

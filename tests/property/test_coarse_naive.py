@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from point_clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, cloud
+from sample_sizes import sample
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.radius_model import class_radii
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
@@ -62,7 +63,7 @@ def judge(
     return settled, clear
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=sample(12, 40), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -106,7 +107,7 @@ def test_nothing_in_contact_is_settled(
         judge(open_made(case.archive), None, avatar, poses, rng)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=sample(10, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

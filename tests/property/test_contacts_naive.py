@@ -11,6 +11,7 @@ from contact_cases import ScanCase, compare, open_case, tight
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from point_clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
+from sample_sizes import sample
 from solidcloud.schemas.wire.answers import ContactsAnswers
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
@@ -18,7 +19,7 @@ from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 
 
-@settings(max_examples=35, deadline=None, derandomize=True)
+@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -65,7 +66,7 @@ def test_every_pair_and_cluster_is_the_definitions(
                 compare(case, avatar, float(radius), poses, limit, float(margin), distance)
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), limit=st.sampled_from([1, 5, 64, 1000]), tree=TREES)
 def test_ties_go_by_point_then_centre_then_row_then_scan(seed: int, limit: int, tree: dict[str, Any]) -> None:
     """Points and avatar on one coarse grid, many of them several times, under poses that keep the grid."""

@@ -25,11 +25,12 @@ from point_clouds import (
     cloud,
     signed_permutations,
 )
+from sample_sizes import sample
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=sample(12, 40), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -95,7 +96,7 @@ def test_distance_and_witnesses_are_those_of_the_definition(
                     assert (again[0] is None) == (found.square > (units + radii) ** 2)
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 8), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
 def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -132,7 +133,7 @@ def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -
                     scene.residency.check()
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.tuples(st.sampled_from(KINDS), st.sampled_from(KINDS)))
 def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
     """distance(A, B, M) == distance(B, A, M^-1) for M exactly invertible (NUMERICS.md case 29)."""

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
+from sample_sizes import sample
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget
@@ -40,7 +41,7 @@ def judge(
     return found
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

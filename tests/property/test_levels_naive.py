@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from judged_distance import judge_collide, judge_distance
 from levels_in_memory import level_bytes
 from point_clouds import KINDS, TREES, cloud
+from sample_sizes import sample
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
@@ -27,7 +28,7 @@ TOLERANCES = (0.0, 2.0**-26, 3e-3, 0.05, 0.4, 20.0)
     "25 scenes, six tolerances, radii per point: brute force, with no voxel in memory, and from an empty cache on",
     compiled_only="it opens hundreds of scenes",
 )
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=sample(8, 25), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -1,4 +1,4 @@
-"""What changes no contact: a scene moved, turned, shuffled, or cut up otherwise, 120 draws of each.
+"""What changes no contact: a scene moved, turned, shuffled, or cut up otherwise, 40 or 120 draws of each.
 
 No judge is needed: a scene and its image are asked the same. Lattice points and translations are whole multiples of
 powers of two, so that an image is exact. Sums of a turned body's coordinates are not: the origin of a turned or shifted
@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from point_clouds import KINDS, cloud, signed_permutations
+from sample_sizes import sample
 from solidcloud.server.scene import Scene
 
-# Scenes of an archive, far apart, so that 120 draws take 12 builds.
+# Scenes of an archive, far apart, so that 40 draws take 4 builds.
 SCENES = 10
-ARCHIVES = 2 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else 12
+ARCHIVES = 2 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else sample(4, 12)
 APART = 64 * 1024  # [STEP]
 STEP = archive_cases.BINARY_STEP
 POINTS, BODY = 40, 12

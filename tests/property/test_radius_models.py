@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
+from sample_sizes import sample
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.scene import Scene
 
@@ -34,7 +35,7 @@ def least_margin(a: NDArray[np.int64], scan: NDArray[np.int64], radii: NDArray[n
     return min(found)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=sample(10, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from judged_distance import compare, judge_collide, judge_distance
 from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
+from sample_sizes import sample
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
 from solidcloud.server.queries.context import anytime_search as bounded
@@ -32,7 +33,7 @@ def signed_of(judged: list[naive_distance.Expected | None]) -> NDArray[np.float6
     return np.array([math.inf if found is None else found.signed for found in judged])
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=sample(10, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -91,7 +92,7 @@ def test_distance_is_that_of_the_least_gap(
                     compare(again, [found if within else None], limit)
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

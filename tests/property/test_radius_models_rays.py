@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from point_clouds import TREES, cloud
 from ray_cases import KINDS, opened, same_points, same_rays, some_rays
+from sample_sizes import sample
 from solidcloud.schemas.archive.radius_model import RIM_BIT
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import QueryBudget
@@ -26,7 +27,7 @@ from solidcloud.server.queries.within import within
 MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0")
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -74,7 +75,7 @@ def test_the_first_sphere_is_the_definitions(
             same_points(within(data, o, 1.0), near, lattice)
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

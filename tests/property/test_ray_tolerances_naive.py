@@ -16,6 +16,7 @@ from levels_in_memory import level_bytes
 from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
 from ray_cases import some_rays
+from sample_sizes import sample
 from solidcloud.schemas.wire.answers import RaycastAnswers, Verdict, WithinAnswers
 from solidcloud.server.scene import Scene
 
@@ -53,7 +54,7 @@ def scene_options(tolerance: float, model: str | None) -> dict[str, Any]:
 
 
 @pytest.mark.timeout(900)  # the first run may have to compile everything
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -16,6 +16,7 @@ import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
 import solidcloud.builder.resume.transaction as transaction
 from interrupted_builds import build, content, done_folder, interrupted, two_scans
+from sample_sizes import sample
 from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.sources.common.scan import Scan, library_errors
 from solidcloud.builder.sources.scan_files import open_input_files
@@ -99,8 +100,9 @@ def test_a_build_killed_at_any_deed_goes_on_to_the_same_bytes(
     expected = content(tmp_path / "judge" / "hall")
     assert len([name for name in expected if not name.startswith("level/")]) == 4
     assert deeds > 40
-    # What is overwritten plays a part at the end alone. Else every fourth deed: scripts/kill_builds kills at any.
-    for most in range(deeds - 30, deeds, 2) if overwrite else range(0, deeds, 4):
+    # What is overwritten plays a part at the end alone. Else at most every fourth deed: scripts/kill_builds kills
+    # at any.
+    for most in range(deeds - 30, deeds, sample(5, 2)) if overwrite else range(0, deeds, sample(11, 4)):
         out = tmp_path / f"{most}"
         assert killed(out, most) == most
         # Nothing but a whole archive is ever under the name asked for.

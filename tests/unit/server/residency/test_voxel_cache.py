@@ -12,6 +12,7 @@ import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
 from numpy.typing import NDArray
+from sample_sizes import sample
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
@@ -213,7 +214,7 @@ def test_check_finds_what_is_broken(broken: str) -> None:
 def test_eight_threads_and_a_tiny_budget_change_no_answer(
     tmp_path: Path, rng: np.random.Generator, policy: str
 ) -> None:
-    points, count, requests = (400, 40, 30) if INTERPRETED else (1500, 160, 110)
+    points, count, requests = (400, 40, 30) if INTERPRETED else sample((800, 80, 55), (1500, 160, 110))
     scan = synthetic_scans.make_scan("noise", 9, points)
     case = archive_cases.build(tmp_path, scan, voxel=0.4, leaf=8)
     avatar = rng.uniform(-0.2, 0.2, (40, 3))

@@ -22,6 +22,7 @@ from ..schemas.wire import key_expressions
 from ..schemas.wire.answers import Cost, Part, Verdict
 from ..schemas.wire.encoding import decode_answer, encode
 from ..schemas.wire.motion_messages import FRAME_SECONDS, WAIT, Moved, MoveRequest, checked_late
+from ..schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_path_parameters
 from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.question_table import QUESTIONS
@@ -131,6 +132,11 @@ class Client(QueryMethods):
         Raise BusyError if no server answers. keys: also list the resident voxels.
         """
         return decode_answer(StatsAnswer, self._connection.require("stats", encode(StatsRequest(keys))))
+
+    def overview(self, limit: int = 100_000) -> OverviewAnswer:
+        """Return a sample of the scene's points; see `OverviewAnswer`. Raise BusyError if no server answers."""
+        request = encode(OverviewRequest(limit))
+        return decode_answer(OverviewAnswer, self._connection.require("overview", request))
 
     def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
         """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`.

@@ -104,6 +104,7 @@ CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
     "server/viewer": ("builder/synthetic/figure",),
+    "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
         "builder/sources/common/scan",

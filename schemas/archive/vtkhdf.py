@@ -7,7 +7,9 @@ attributes Version and Type, `NumberOfPoints` and `Points`, four groups of cells
 bounded memory, and without timestamps.
 """
 
-from collections.abc import Iterator, Mapping
+import math
+import zlib
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -26,6 +28,10 @@ _VERSION = (2, 0)
 _CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 # Rows per chunk, the unit of compression and checksums.
 _CHUNK = 1 << 15
+# Limits of a file that `read_sample` reads, in rows and bytes: more than any preview has
+# (builder/build_limits.py, MAX_PREVIEW_POINTS). The filters of its datasets.
+_MAX_SAMPLE, _MAX_SAMPLE_BYTES = 1 << 18, 1 << 25
+_FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 # For numbers that count upwards: shuffled, they compress to a hundredth.
 _SMALL: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
 # Compression with a checksum per chunk, so that a flipped bit is found.
@@ -134,6 +140,75 @@ def read_points(path: Path) -> PointsRead:
             return _read(file)
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise CorruptError(f"{path}: not a complete file of points ({error}): write it anew") from error
+
+
+def read_sample(path: Path, columns: Mapping[str, np.dtype], attributes: Collection[str]) -> PointsRead:
+    """Read points, some of their columns, and some attributes of a small file, in bounded memory.
+
+    Nothing is read before its size is known, and the cells are not looked at.
+    Raises CorruptError for a file that lacks one of them or is larger than a preview, OSError if
+    the file cannot be opened.
+    """
+    if (size := path.stat().st_size) > _MAX_SAMPLE_BYTES:
+        raise CorruptError(f"{path}: {size} bytes, expected at most {_MAX_SAMPLE_BYTES}: write it anew")
+    try:
+        with h5py.File(path, "r") as file:
+            root = file[GROUP]
+            points = _read_rows(root["Points"], np.dtype(("<f8", 3)), None)
+            found = {
+                name: _read_rows(root["PointData"][name], kind, len(points)) for name, kind in columns.items()
+            }
+            return PointsRead(points, found, {name: _read_attribute(file, name) for name in attributes})
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        zlib.error,
+    ) as error:
+        raise CorruptError(f"{path}: not a complete file of points ({error}): write it anew") from error
+
+
+def _read_rows(dataset: h5py.Dataset, kind: np.dtype, rows: int | None) -> NDArray:
+    """Read a dataset of a dtype that `VtkPoints` wrote compressed. Raises ValueError for another one.
+
+    rows: expected number; None: any up to `_MAX_SAMPLE`.
+    HDF5 would inflate a chunk to whatever it holds. Here it cannot grow beyond its size.
+    """
+    shape, tail = dataset.shape, kind.shape
+    if dataset.dtype != kind.base or dataset.chunks != (_CHUNK, *tail) or shape[1:] != tail:
+        raise ValueError(f"{dataset.name}: {dataset.dtype} {shape} in chunks of {dataset.chunks}")
+    count = shape[0]
+    if count != (min(count, _MAX_SAMPLE) if rows is None else rows):
+        raise ValueError(f"{dataset.name}: {count} rows, expected {_MAX_SAMPLE if rows is None else rows}")
+    properties = dataset.id.get_create_plist()
+    if tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters())) != _FILTERS:
+        raise ValueError(f"{dataset.name}: other filters than {_FILTERS}")
+    found, width = np.empty(shape, kind.base), kind.base.itemsize
+    size = _CHUNK * kind.itemsize
+    for begin in range(0, count, _CHUNK):
+        mask, stored = dataset.id.read_direct_chunk((begin, *(0 for _ in tail)))
+        inflater = zlib.decompressobj()
+        # Its Adler-32 is in front of the last four bytes, the checksum of HDF5.
+        data = inflater.decompress(stored[:-4], size + 1)
+        if mask or len(data) != size or not inflater.eof:
+            raise ValueError(f"{dataset.name}: a chunk that is not {size} bytes")
+        block = np.frombuffer(data, np.uint8).reshape(width, -1).T  # undoes the shuffle
+        block = np.ascontiguousarray(block).view(kind.base).reshape(_CHUNK, *tail)
+        found[begin : begin + _CHUNK] = block[: count - begin]
+    return found
+
+
+def _read_attribute(file: h5py.File, name: str) -> NDArray:
+    """Read an attribute of a few numbers. Raises ValueError, or KeyError if it does not exist."""
+    if name not in file.attrs:
+        raise KeyError(name)
+    attribute = file.attrs.get_id(name)
+    if attribute.dtype.kind != "u" or math.prod(attribute.shape) > _CHUNK:
+        raise ValueError(f"attribute {name} {attribute.dtype} {attribute.shape}")
+    return np.asarray(file.attrs[name])
 
 
 def _read(file: h5py.File) -> PointsRead:

@@ -8,6 +8,7 @@ import numpy as np
 
 from .arrays import ArrayType, array_fields
 from .motion_messages import Moved, MoveRequest, State, Wish
+from .overview_messages import OverviewAnswer, OverviewRequest
 from .path_messages import PathRequest
 from .question_table import QUESTIONS, path_questions
 from .requests import AddAvatarRequest, Request
@@ -27,6 +28,8 @@ MESSAGES: tuple[type, ...] = (
     Moved,
     Wish,
     State,
+    OverviewRequest,
+    OverviewAnswer,
     VoxelsRequest,
     VoxelsAnswer,
     TileRequest,

@@ -16,6 +16,10 @@ ROOT = "solidcloud/1"
 _NAME = re.compile(rf"[A-Za-z0-9._-]{{1,{MAX_NAME_LENGTH}}}")
 
 
+# Operations about what a scene looks like.
+_PICTURES = ("overview", "voxels", "tile")
+
+
 class Route(NamedTuple):
     """Parts of a query's key: the scene, the client that sent the query, and the operation."""
 
@@ -44,7 +48,7 @@ def check_name(name: str, what: str) -> str:
 
 def operations() -> tuple[str, ...]:
     """Return the names of a scene's operations: all questions, and the other ones."""
-    return ("info", "add_avatar", *QUESTIONS, "path", "move", "voxels", "tile", "reload", "stats")
+    return ("info", "add_avatar", *QUESTIONS, "path", "move", *_PICTURES, "reload", "stats")
 
 
 def scenes_key() -> str:

@@ -341,14 +341,14 @@ def _check_duration(what: str, value: float) -> None:
         raise BadRequestError(f"{what} is {value}: expected milliseconds, 0 or more")
 
 
-def _check_integer(what: str, value: int, most: int) -> None:
-    """Raise BadRequestError for anything but an integer from 0 to `most`."""
+def _check_integer(what: str, value: int, most: int, least: int = 0) -> None:
+    """Raise BadRequestError for anything but an integer from `least` to `most`."""
     try:
-        fits = 0 <= operator.index(value) <= most
+        fits = least <= operator.index(value) <= most
     except TypeError:
         fits = False
     if not fits:
-        raise BadRequestError(f"{what} is {value}: expected an integer from 0 to {most}")
+        raise BadRequestError(f"{what} is {value}: expected an integer from {least} to {most}")
 
 
 def _same_length(request: Request, first: str, second: str) -> None:
@@ -379,5 +379,8 @@ def _checks(kind: type[Request]) -> tuple[tuple[str, Any], ...]:
             for one in kinds:
                 for meta in getattr(one, "__metadata__", ()):
                     if getattr(meta, "le", None) is not None:
-                        found.append((name, lambda what, value, le=meta.le: _check_integer(what, value, le)))
+                        least, most = meta.ge or 0, meta.le
+                        found.append(
+                            (name, lambda what, value, a=least, b=most: _check_integer(what, value, b, a))
+                        )
     return tuple(found)

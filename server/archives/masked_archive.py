@@ -162,6 +162,10 @@ class MaskedArchive(Archive):
                 )
             yield row, boxes
 
+    def is_masked(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return the mask (n,) of points that are in a box. points: (n, 3), archive frame [m]."""
+        return self._are_in(points, self._boxes)
+
     def _in_boxes(
         self, row: int, local: NDArray[np.int32], boxes: list[NDArray[np.float64]]
     ) -> NDArray[np.bool_]:
@@ -170,7 +174,11 @@ class MaskedArchive(Archive):
         local: (n, 3), points of the voxel [steps from its corner].
         """
         lattice = self.header.lattice
-        world = lattice.to_world(local + self.coordinates[row] * lattice.voxel_steps)
+        return self._are_in(lattice.to_world(local + self.coordinates[row] * lattice.voxel_steps), boxes)
+
+    def _are_in(self, points: NDArray[np.float64], boxes: list[NDArray[np.float64]]) -> NDArray[np.bool_]:
+        """Return the mask (n,) of points that are in a box. points: (n, 3), archive frame [m]."""
+        world = points
         if self._pose is not None:
             world = transform_points(self._pose, world)
         within = np.zeros(len(world), bool)

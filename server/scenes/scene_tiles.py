@@ -6,8 +6,10 @@ from contextlib import ExitStack
 from numpy.typing import ArrayLike
 
 from ...schemas.errors import BadRequestError
+from ...schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ...schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..archives.placed_archive import PlacedArchive
+from ..tiles.scene_overview import read_overview
 from ..tiles.voxel_list import list_voxels
 from ..tiles.voxel_tile import read_tile
 
@@ -16,6 +18,17 @@ class SceneTiles:
     """Voxels and tiles of placed archives. Thread-safe."""
 
     archives: list[PlacedArchive]
+
+    def overview(self, limit: int = 100_000) -> OverviewAnswer:
+        """Return a sample of the points of all archives; see `OverviewAnswer`.
+
+        It is that of the archives' previews: how long it takes does not depend on the number of
+        points.
+        """
+        request = OverviewRequest(limit)
+        with ExitStack() as stack:
+            opened = [stack.enter_context(archive.take()).store.archive for archive in self.archives]
+            return read_overview(request, self.archives, opened)
 
     def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
         """Return the voxels near a place (3,) [m], nearest first; see `VoxelsRequest`."""

@@ -1,8 +1,8 @@
-"""What a scene looks like, for viewers: its voxels near a place, and the points or spheres of one.
+"""What a scene looks like, for viewers: a sample of it, its voxels near a place, and what is in one.
 
 Records are read from the archives' files, and nothing is added to the voxels in memory: a viewer
 that looks far away does not displace what users touch.
 
-May import server.archives, schemas.
+May import server.archives, builder.voxel, schemas.
 Begin with voxel_tile.py.
 """

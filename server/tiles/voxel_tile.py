@@ -8,6 +8,7 @@ that every 4^k-th of them is spread evenly, and a finer detail adds to a coarser
 import numpy as np
 from numpy.typing import NDArray
 
+from ...builder.voxel.record_points import voxel_points
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.voxel import Links, VoxelData, top_shift
 from ...schemas.archive.voxel_grid import voxel_keys
@@ -38,7 +39,7 @@ def read_tile(request: TileRequest, placed: PlacedArchive, archive: Archive) -> 
     kept = slice(0, 0)
     if request.level is None:
         kept = slice(None, None, 4**request.detail)
-        places, radii = _points(voxel, links)[kept], np.empty(0, np.int64)
+        places, radii = voxel_points(voxel, links)[kept], np.empty(0, np.int64)
     else:
         places, radii = _spheres(voxel, links, request.level, top_shift(lattice.voxel_steps))
     # Half a unit is what rounding a centre may move it.
@@ -65,15 +66,6 @@ def _row_of(archive: Archive, voxel: tuple[int, int, int]) -> int:
     if row == len(keys) or keys[row] != key:
         raise BadRequestError(f"voxel {voxel}: it holds no points: take voxels from a list of voxels")
     return row
-
-
-def _points(voxel: VoxelData, links: Links) -> Steps:
-    """Return the points (p, 3) of a voxel, in the order of the record [steps from its corner]."""
-    leaves = np.flatnonzero(links.is_leaf)
-    leaves = leaves[np.argsort(links.first[leaves], kind="stable")]
-    low = voxel.nodes.block_low[leaves].astype(np.int64) + voxel.cells.low[links.cell[leaves]]
-    places: Steps = voxel.points + np.repeat(low, voxel.nodes.count[leaves], axis=0)
-    return places
 
 
 def _spheres(voxel: VoxelData, links: Links, level: int, shift: int) -> tuple[Steps, Steps]:

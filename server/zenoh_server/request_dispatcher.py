@@ -20,6 +20,7 @@ from ...schemas.errors import (
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, decode_request, encode, wire_encoding
 from ...schemas.wire.motion_messages import MoveRequest
+from ...schemas.wire.overview_messages import OverviewRequest
 from ...schemas.wire.path_messages import PathRequest
 from ...schemas.wire.question_rules import Question
 from ...schemas.wire.question_table import QUESTIONS
@@ -64,6 +65,7 @@ _OTHERS = {
             r.avatar, r.pose_from, r.pose_to, r.seconds, late=r.late, client=c, stop=stop
         ),
     ),
+    "overview": _Operation(OverviewRequest, "", lambda s, r, c, stop: s.overview(r.limit)),
     "voxels": _Operation(VoxelsRequest, "", lambda s, r, c, stop: s.voxels(r.place, r.reach, r.limit)),
     "tile": _Operation(TileRequest, "", lambda s, r, c, stop: s.tile(r.archive, r.voxel, r.detail, r.level)),
     "path": _Operation(

@@ -7,12 +7,15 @@ from collections.abc import Callable, Iterable
 from itertools import count
 from typing import Any, Protocol
 
+import numpy as np
+
 from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
 from .browser_user import BrowserUser, state_fields
 from .page_messages import (
     PAGE_VERSION,
     Around,
+    Boom,
     FromPage,
     Hello,
     Intent,
@@ -33,6 +36,8 @@ log = logging.getLogger(__name__)
 _RETRY_SECONDS = 1.0
 # An intent without a following message ends after this time: the page may be hidden or frozen [s].
 _INTENT_SECONDS = 1.0
+# Distance of the outer rays between user and camera from the middle one [m].
+_BOOM_RADIUS = 0.12
 
 
 class PageConnection(Protocol):
@@ -58,12 +63,14 @@ class Browser:
         self.number = next(self._numbers)
         self._intent, self._intended = Intent(), 0.0
         self._user = BrowserUser(f"viewer-{self.number}", parts.avatar, self._deliver, self._problem)
+        self._boom: Boom | None = None
         self._begun = False
         self._at: tuple[float, float, float, float] | None = None
         self._restart = threading.Event()
         self._closed = threading.Event()
         self._wanted: list[TileKey] = []
         self._around: Around | None = None
+        self._overview: OpenScene | None = None  # whose overview the page lacks
         self._work = threading.Condition()
 
     def run(self) -> None:
@@ -98,6 +105,8 @@ class Browser:
         for message in messages:
             if isinstance(message, Intent):
                 self._intent, self._intended = message, time.monotonic()
+            elif isinstance(message, Boom):
+                self._boom = message
             elif isinstance(message, Restart):
                 self._at = message.at
                 self._restart.set()
@@ -124,6 +133,9 @@ class Browser:
                     shown = scene.info
                     self._send(welcome_message(scene, self.number))
                     self._send(avatar_message(self._parts))
+                    with self._work:
+                        self._overview = scene
+                        self._work.notify_all()
             if self._restart.is_set():
                 self._restart.clear()
                 self._user.end()
@@ -135,6 +147,9 @@ class Browser:
             if self._begun:
                 intent = self._intent if now - self._intended < _INTENT_SECONDS else Intent()
                 self._attempt(lambda intent=intent: self._user.command(intent))
+            boom, self._boom = self._boom, None
+            if boom is not None and scene is not None:
+                self._attempt(lambda boom=boom, scene=scene: self._send(boom_message(boom, scene)))
             due = max(due + FRAME_SECONDS, time.monotonic() - FRAME_SECONDS)
             self._closed.wait(max(0.0, due - time.monotonic()))
 
@@ -173,9 +188,14 @@ class Browser:
         """Send voxels and tiles that the page asked for. Runs in a thread."""
         while not self._closed.is_set():
             with self._work:
-                self._work.wait_for(lambda: self._closed.is_set() or self._wanted or self._around)
+                self._work.wait_for(
+                    lambda: self._closed.is_set() or self._overview or self._wanted or self._around
+                )
+                overview, self._overview = self._overview, None
                 around, self._around = self._around, None
                 key = self._wanted.pop(0) if self._wanted and around is None else None
+            if overview is not None:
+                self._attempt(lambda scene=overview: self._send(self._parts.tiles.overview(scene)))
             if around is not None:
                 self._attempt(lambda around=around: self._send(self._parts.tiles.voxels(around.place)))
             elif key is not None:
@@ -187,10 +207,14 @@ class Browser:
             message = self._parts.tiles.tile(key)
         except BusyError as error:
             log.debug("tile %s: %s", key, error)
-            self._send(text_message("missing", key=list(key[:4]), detail=key[4], again=True, message=str(error)))
+            self._send(
+                text_message("missing", key=list(key[:4]), detail=key[4], again=True, message=str(error))
+            )
             self._closed.wait(0.2)
         except SolidcloudError as error:
-            self._send(text_message("missing", key=list(key[:4]), detail=key[4], again=False, message=str(error)))
+            self._send(
+                text_message("missing", key=list(key[:4]), detail=key[4], again=False, message=str(error))
+            )
         else:
             self._send(message)
 
@@ -209,6 +233,28 @@ class Browser:
 def status_message(status: LinkStatus, endpoint: str) -> str:
     """Return the state of the server as a message."""
     return text_message("status", state=status.state, message=status.message, endpoint=endpoint)
+
+
+def boom_message(boom: Boom, scene: OpenScene) -> str:
+    """Return how far a line is free of the scan as a message.
+
+    Four parallel rays beside it are tested too: the camera does not look through a gap.
+    """
+    way = np.array(boom.way)
+    if not way.any():
+        way = np.array([0.0, 0.0, 1.0])
+    way /= np.linalg.norm(way)
+    side = np.cross(way, [0.0, 0.0, 1.0] if abs(way[2]) < 0.9 else [1.0, 0.0, 0.0])
+    side *= _BOOM_RADIUS / np.linalg.norm(side)
+    over = np.cross(side, way)
+    origins = np.array(boom.place) + np.stack([np.zeros(3), side, -side, over, -over])
+    frame = scene.frame
+    answers = scene.reader.raycast(
+        frame.to_world(origins), frame.directions_to_world(np.tile(way, (len(origins), 1))), boom.reach
+    )
+    # A ray that begins at a wall beside the user says nothing about the way back.
+    hits = answers.distance[answers.distance > _BOOM_RADIUS]
+    return text_message("boom", free=float(min(boom.reach, *hits)) if len(hits) else boom.reach)
 
 
 def welcome_message(scene: OpenScene, number: int) -> str:

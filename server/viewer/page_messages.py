@@ -66,6 +66,17 @@ class Around(msgspec.Struct, frozen=True, tag="around"):
     place: Place
 
 
+class Boom(msgspec.Struct, frozen=True, tag="boom"):
+    """Request how far a line from a place of the page's frame is free of the scan.
+
+    place: [m].  way: its direction.  reach: its length [m].
+    """
+
+    place: Place
+    way: tuple[Share, Share, Share]
+    reach: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)]
+
+
 class Restart(msgspec.Struct, frozen=True, tag="restart"):
     """Put the user back to where it began, or to another place.
 
@@ -75,7 +86,7 @@ class Restart(msgspec.Struct, frozen=True, tag="restart"):
     at: tuple[Metres, Metres, Metres, Angle] | None = None
 
 
-FromPage = Hello | Intent | Want | Around | Restart
+FromPage = Hello | Intent | Want | Around | Boom | Restart
 _DECODER = msgspec.json.Decoder(FromPage)
 
 

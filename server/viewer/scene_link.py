@@ -108,9 +108,7 @@ class SceneLink:
             with ExitStack() as opening:
                 client, reader = (
                     opening.enter_context(
-                        Client(
-                            self.endpoint, scene=name, timeout=_ANSWER_SECONDS, key_file=self._key_file
-                        )
+                        Client(self.endpoint, scene=name, timeout=_ANSWER_SECONDS, key_file=self._key_file)
                     )
                     for _ in range(2)
                 )

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 _APART, _RINGS = 1.0, 4
 # Height of the eyes as a share of the avatar's height, how far it looks, and in how many directions.
 _EYES, _SIGHT, _DIRECTIONS = 0.9, 60.0, 32
+# Room that a camera behind the user takes [m].
+_BEHIND = 4.0
 _PROBE = "viewer-start"
 
 
@@ -90,8 +92,11 @@ class StartingPlaces:
             log.debug("no outlook: %s", error)
             return 0.0
         far = np.where(np.isfinite(hits.distance), hits.distance, 0.0)
-        # A direction counts with its neighbours, so that the view is not through a crack.
-        return float(angles[np.argmax(far + np.roll(far, 1) + np.roll(far, -1))])
+        # A direction counts with its neighbours, so that the view is not through a crack, and needs
+        # room behind for the camera.
+        ahead = far + np.roll(far, 1) + np.roll(far, -1)
+        behind = np.roll(np.minimum(hits.distance, _BEHIND), _DIRECTIONS // 2)
+        return float(angles[np.argmax(ahead * behind)])
 
 
 def _above(scene: OpenScene, body: Body) -> Floats:

@@ -1,4 +1,4 @@
-"""What the page draws, as messages: tiles, voxels. Tiles are kept for all browsers, within a budget."""
+"""What the page draws, as messages: overview, tiles, voxels. Tiles are kept for all browsers, within a budget."""
 
 import threading
 from collections import OrderedDict
@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.wire.overview_messages import OverviewAnswer
 from ...schemas.wire.tile_messages import MAX_DETAIL, TileAnswer, VoxelsAnswer
 from .page_messages import Place, TileKey, binary_message
 from .scene_link import OpenScene
@@ -14,8 +15,10 @@ from .view_frame import ViewFrame
 
 # Memory for tiles that a browser may ask for again [bytes].
 TILE_BYTES = 192 << 20
-# Most voxels of a list.
-_MAX_VOXELS = 4096
+# Most voxels of a list, and points of an overview.
+_MAX_VOXELS, _OVERVIEW_POINTS = 4096, 120_000
+# Columns of points.
+_COLUMNS = ("rgb", "intensity", "classification", "scan")
 
 
 class TileSource:
@@ -29,6 +32,7 @@ class TileSource:
         self._scene, self._budget = scene, budget
         self._kept: OrderedDict[tuple[int, TileKey], bytes] = OrderedDict()
         self._bytes = 0
+        self._overview: tuple[int, bytes] | None = None  # generation, message
         self._lock = threading.Lock()
 
     def tile(self, key: TileKey) -> bytes | None:
@@ -51,6 +55,17 @@ class TileSource:
                 self._bytes -= len(dropped)
         return message
 
+    def overview(self, scene: OpenScene) -> bytes:
+        """Return the message of a sample of the scene's points."""
+        with self._lock:
+            kept = self._overview
+        if kept is None or kept[0] != scene.info.generation:
+            message = overview_message(scene.reader.overview(_OVERVIEW_POINTS), scene.frame)
+            kept = (scene.info.generation, message)
+            with self._lock:
+                self._overview = kept
+        return kept[1]
+
     def voxels(self, place: Place) -> bytes | None:
         """Return the message of the voxels near a place of the page's frame; None without a scene."""
         scene = self._scene()
@@ -68,10 +83,7 @@ def tile_message(key: TileKey, tile: TileAnswer, frame: ViewFrame) -> bytes:
     """
     order = coarse_first(len(tile.points))
     arrays: dict[str, NDArray] = {"points": tile.points[order]}
-    for name in ("rgb", "intensity", "classification", "scan"):
-        column = getattr(tile, name)
-        if len(column):
-            arrays[name] = column[order]
+    arrays |= {name: column[order] for name, column in _columns(tile).items()}
     return binary_message(
         "tile",
         arrays,
@@ -81,6 +93,25 @@ def tile_message(key: TileKey, tile: TileAnswer, frame: ViewFrame) -> bytes:
         step=tile.step,
         total=tile.total,
         radius=tile.radius,
+    )
+
+
+def _columns(answer: TileAnswer | OverviewAnswer) -> dict[str, NDArray]:
+    """Return the columns that an answer has. Colours that are all black were in no scan."""
+    found = {name: getattr(answer, name) for name in _COLUMNS}
+    return {name: column for name, column in found.items() if len(column) and (name != "rgb" or column.any())}
+
+
+def overview_message(answer: OverviewAnswer, frame: ViewFrame) -> bytes:
+    """Return an overview as a message. Points are in the page's frame [m]."""
+    points = np.empty((len(answer.points), 3), np.float32)
+    for number, pose in enumerate(answer.poses):
+        own = slice(int(answer.starts[number]), int(answer.starts[number + 1]))
+        local = answer.points[own].astype(np.float64) + answer.low[number]
+        points[own] = frame.points(local @ pose[:3, :3].T + pose[:3, 3])
+    arrays = {"points": points, **_columns(answer)}
+    return binary_message(
+        "overview", arrays, total=answer.total, radius=answer.radius, intensities=answer.intensities
     )
 
 

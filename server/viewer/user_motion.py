@@ -19,9 +19,7 @@ _HELD = 0.01
 def velocity(intent: Intent, frame: ViewFrame) -> NDArray[np.float64]:
     """Return the velocity (3,) that a user wants, world [m/s]."""
     c, s = math.cos(intent.yaw), math.sin(intent.yaw)
-    way = np.array(
-        [intent.forward * c + intent.right * s, intent.forward * s - intent.right * c, intent.up]
-    )
+    way = np.array([intent.forward * c + intent.right * s, intent.forward * s - intent.right * c, intent.up])
     length = float(np.linalg.norm(way))
     # Two keys at once are not faster than one.
     way *= (RUN_SPEED if intent.run else WALK_SPEED) / max(1.0, length)

@@ -6,6 +6,7 @@ to resolve to 127.0.0.1. Both are refused.
 """
 
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -81,7 +82,7 @@ class WebServer:
             )
         except OSError as error:
             raise SolidcloudError(
-                f"port {port}: cannot listen on {HOST} ({error.strerror}): give another --port, or none"
+                f"port {port}: cannot listen on {HOST} ({os.strerror(error.errno or 0)}): give another --port, or none"
             ) from None
         self.port = int(self._server.socket.getsockname()[1])
         self._hosts = {f"{HOST}:{self.port}", f"localhost:{self.port}"}

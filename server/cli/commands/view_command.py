@@ -16,16 +16,16 @@ def view(
             help="Folder of an archive, or a scene file, to serve; default: view a running server's scene.",
         ),
     ] = None,
-    connect: Annotated[
-        str, typer.Option(help="Zenoh endpoint of a running server.")
-    ] = "tcp/127.0.0.1:7447",
+    connect: Annotated[str, typer.Option(help="Zenoh endpoint of a running server.")] = "tcp/127.0.0.1:7447",
     scene: Annotated[
         str | None, typer.Option(help="Name of a running server's scene; default: the only one.")
     ] = None,
     port: Annotated[int, typer.Option(help="TCP port of the page; 0: a free one.")] = 0,
     avatar: Annotated[
         Path | None,
-        typer.Option(help="Points or mesh of the users' avatar, z up, facing +y; default: a figure of 1.75 m."),
+        typer.Option(
+            help="Points or mesh of the users' avatar, z up, facing +y; default: a figure of 1.75 m."
+        ),
     ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     key_file: KeyFile = None,
@@ -49,9 +49,7 @@ def view(
     with ExitStack() as stack:
         if what is not None:
             connect = stack.enter_context(served(stack.enter_context(viewed_scene(what)), None))
-        url = stack.enter_context(
-            viewing(connect, scene, port=port, avatar=avatar, key_file=key_file)
-        )
+        url = stack.enter_context(viewing(connect, scene, port=port, avatar=avatar, key_file=key_file))
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
         if browser:
             # Some browsers return only when they are closed.

@@ -17,7 +17,7 @@ export const VERDICTS = {
 };
 
 // Light over dark, from a deep blue to a warm white: order is seen without colour, too.
-const HEIGHT = [[38, 52, 110], [36, 104, 148], [42, 157, 158], [122, 196, 146], [228, 208, 138], [250, 236, 214]];
+const HEIGHT = [[74, 88, 158], [52, 124, 178], [56, 168, 172], [134, 204, 152], [234, 212, 140], [252, 240, 220]];
 const GREY = [[34, 38, 46], [128, 136, 148], [250, 250, 246]];
 // Okabe and Ito's colours, which people with any kind of colour vision tell apart.
 const PALETTE = [

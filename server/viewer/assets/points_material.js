@@ -18,12 +18,14 @@ uniform float uFog;        // distance at which half of the colour is left [m]
 uniform vec3 uGround;      // colour of the background
 uniform vec3 uUser;        // place of the user's feet
 uniform vec4 uVerdict;     // its colour, and the height of the user
+uniform vec4 uCut;          // place of the user's shoulders; radius of the view to it that is kept free, or 0 [m]
 uniform sampler2D uHeightRamp, uIntensityRamp, uClasses, uScans;
 varying vec3 vColour;
 
 vec3 heightColour(float z) {
   float at = clamp((z - uHeight.x) / max(uHeight.y - uHeight.x, 1e-3), 0.0, 1.0);
-  return texture2D(uHeightRamp, vec2(at, 0.5)).rgb;
+  // Users are near the ground: there the colours change faster.
+  return texture2D(uHeightRamp, vec2(pow(at, 0.7), 0.5)).rgb;
 }
 
 void main() {
@@ -31,6 +33,15 @@ void main() {
   vec4 seen = viewMatrix * world;
   gl_Position = projectionMatrix * seen;
   gl_PointSize = clamp(uSize * uScale / max(-seen.z, 1e-3), uPixels.x, uPixels.y);
+  if (uCut.w > 0.0) {
+    // What is between the camera and the user, not near the user, is left out.
+    vec3 line = uCut.xyz - cameraPosition;
+    float whole = length(line);
+    vec3 way = world.xyz - cameraPosition;
+    float along = dot(way, line) / whole;
+    float beside = length(way - line * (along / whole));
+    if (along < whole - 0.55 && beside < uCut.w * (0.35 + 0.65 * (1.0 - along / whole))) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  }
   vec3 colour;
   if (uMode == 1) {
     colour = rgb;
@@ -65,13 +76,14 @@ void main() {
 export const shared = {
   uMode: { value: 0 },
   uScale: { value: 600 },
-  uPixels: { value: new Vector2(1.6, 24) },
+  uPixels: { value: new Vector2(1.6, 40) },
   uHeight: { value: new Vector2(0, 10) },
   uIntensity: { value: new Vector2(0, 1) },
   uFog: { value: 60 },
-  uGround: { value: new Vector3(0.043, 0.06, 0.09) },
+  uGround: { value: new Vector3(0.039, 0.055, 0.082) },
   uUser: { value: new Vector3(1e6, 0, 0) },
   uVerdict: { value: new Vector4(0.4, 0.8, 0.8, 1.75) },
+  uCut: { value: new Vector4(0, 0, 0, 0) },
   uHeightRamp: { value: textures.height },
   uIntensityRamp: { value: textures.intensity },
   uClasses: { value: textures.classification },

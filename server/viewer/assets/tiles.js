@@ -22,10 +22,11 @@ const BEHIND = 4;
 const LIST_WAY = 1, LIST_MS = 700;
 
 export class Tiles {
-  /** group: object for the points.  send: sends a message to the process. */
-  constructor(group, send) {
+  /** group: object for the points.  send: sends a message.  drawn: called with each voxel whose tile arrives. */
+  constructor(group, send, drawn) {
     this.group = group;
     this.send = send;
+    this.drawn = drawn;
     this.columns = new Set();
     this.pointSize = 1;
     this.clear();
@@ -43,6 +44,7 @@ export class Tiles {
     this.sentWanted = "";
     this.failed = new Map();
     this.version = 0;
+    this.changes = (this.changes ?? 0) + 1;
     this.columns.clear();
   }
 
@@ -96,7 +98,9 @@ export class Tiles {
     Object.assign(voxel, { object, detail, loaded: arrays.points.rows, total, radius });
     this.group.add(object);
     this.radius = Math.max(radius, 1e-4);
+    this.changes += 1;
     this.show(voxel, Math.max(detail, voxel.wanted ?? detail));
+    this.drawn(voxel);
   }
 
   /** Note that a tile cannot be had. */
@@ -120,10 +124,14 @@ export class Tiles {
     voxel.object.geometry.setDrawRange(0, count);
     voxel.object.material.uniforms.uSize.value = 2.6 * voxel.radius * 2 ** shownDetail * this.pointSize;
     voxel.drawn = count;
+    voxel.shownDetail = shownDetail;
   }
 
-  /** Choose details for a camera, and ask for what is missing. budget: of points.  now: [ms]. */
-  choose(camera, focus, budget, now) {
+  /** Choose details for a camera, and ask for what is missing.
+   *
+   * budget: of points that may be drawn when nothing moves.  drawn: that may be drawn now.  now: [ms].
+   */
+  choose(camera, focus, budget, drawn, now) {
     if (!this.listed.waiting && (now - this.listed.time > LIST_MS || !this.listed.place
       || this.listed.place.distanceTo(focus) > LIST_WAY)) {
       this.send({ type: "around", place: focus.toArray() });
@@ -138,9 +146,14 @@ export class Tiles {
       voxel.away = Math.max(0.5, Math.sqrt(distanceTo(voxel.box, camera.position)));
       voxel.factor = frustum.intersectsSphere(voxel.sphere) ? 1 : BEHIND;
     }
-    let pixels = FINE;
-    const cost = (each) => each.points / 4 ** detailOf(each, pixels, spacing);
-    while (pixels < 4096 && ordered.reduce((sum, each) => sum + cost(each), 0) > budget) pixels *= 1.25;
+    const fit = (most) => {
+      let pixels = FINE;
+      const cost = (sum, each) => sum + each.points / 4 ** detailOf(each, pixels, spacing);
+      while (pixels < 4096 && ordered.reduce(cost, 0) > most) pixels *= 1.25;
+      return pixels;
+    };
+    const pixels = fit(budget);
+    const drawnPixels = drawn < budget ? fit(drawn) : pixels;
     this.shown = 0;
     const missing = [];
     let kept = 0;
@@ -150,7 +163,7 @@ export class Tiles {
       const lacks = voxel.object ? voxel.detail - voxel.wanted : MAX_DETAIL;
       if (lacks > 0 && !this.failed.has(voxel.name)) missing.push({ voxel, urgency: (2 ** lacks * voxel.points ** 0.5) / (voxel.away * voxel.factor) });
       if (voxel.object) {
-        this.show(voxel, voxel.wanted);
+        this.show(voxel, detailOf(voxel, drawnPixels, spacing));
         this.shown += voxel.drawn;
         kept += voxel.loaded;
       }
@@ -166,15 +179,30 @@ export class Tiles {
     }
   }
 
-  /** Drop tiles that are finer than wanted, farthest first. */
+  /** Keep of tiles that are finer than wanted only what is drawn, farthest first. */
   forget(ordered, excess) {
-    const spare = ordered.filter((each) => each.object && each.detail < each.wanted);
+    const spare = ordered.filter((each) => each.object && each.detail < each.shownDetail);
     spare.sort((one, other) => other.away - one.away);
     for (const voxel of spare) {
       if (excess <= 0) break;
-      excess -= voxel.loaded;
-      this.drop(voxel);
+      excess -= voxel.loaded - voxel.drawn;
+      this.shrink(voxel);
     }
+  }
+
+  /** Replace the arrays of a tile by their beginning, which is the coarser detail. */
+  shrink(voxel) {
+    const { geometry } = voxel.object;
+    const smaller = new BufferGeometry();
+    for (const [name, { array, itemSize, normalized }] of Object.entries(geometry.attributes)) {
+      smaller.setAttribute(name, new BufferAttribute(array.slice(0, voxel.drawn * itemSize), itemSize, normalized));
+    }
+    smaller.boundingSphere = geometry.boundingSphere;
+    voxel.object.geometry = smaller;
+    geometry.dispose();
+    // What is drawn now may be coarser than what is wanted.
+    voxel.loaded = voxel.drawn;
+    voxel.detail = voxel.shownDetail;
   }
 }
 

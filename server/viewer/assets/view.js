@@ -1,12 +1,14 @@
 // Canvas, renderer and the picture: points with shading by depth, and lines over them.
 
 import {
-  DepthTexture, GLSL3, LinearSRGBColorSpace, Mesh, NearestFilter, OrthographicCamera, PerspectiveCamera, PlaneGeometry,
+  ColorManagement, DepthTexture, GLSL3, LinearSRGBColorSpace, Mesh, NearestFilter, OrthographicCamera, PerspectiveCamera, PlaneGeometry,
   RawShaderMaterial, Scene, UnsignedIntType, Vector2, WebGLRenderTarget, WebGLRenderer,
 } from "./vendor/three.module.min.js";
 import { shared } from "./points_material.js";
 
 const FIELD_OF_VIEW = 62;
+// Colours are written as they are shown.
+ColorManagement.enabled = false;
 
 // Shading by depth (Boucheny 2009): a pixel that lies behind its neighbours is darker, so that edges
 // and corners of a cloud without normals are seen.
@@ -45,7 +47,7 @@ export class View {
   constructor(canvas) {
     this.canvas = canvas;
     const context = canvas.getContext("webgl2", {
-      antialias: false, alpha: false, powerPreference: "high-performance", preserveDrawingBuffer: true,
+      antialias: false, alpha: false, powerPreference: "high-performance",
     });
     if (!context) throw new Error("WebGL 2 is missing");
     this.renderer = new WebGLRenderer({ canvas, context });

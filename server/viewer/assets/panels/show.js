@@ -1,0 +1,30 @@
+// Panel: what is shown besides the scan, and with how many points.
+
+import { panel, slider, toggle } from "./registry.js";
+
+export function addShowPanel() {
+  const section = panel("Show");
+  toggle(section, "firstPerson", "First person", "V");
+  toggle(section, "contacts", "Contact points and normals", "N");
+  toggle(section, "clearance", "Line to the nearest point", "L");
+  toggle(section, "boxes", "Voxels in memory", "B");
+  const list = document.createElement("ul");
+  list.className = "legend";
+  for (const [text, colour] of [["in the server's memory", "rgb(95 211 196)"], ["on disk", "rgb(98 118 148)"]]) {
+    const item = document.createElement("li");
+    const patch = document.createElement("i");
+    patch.style.background = colour;
+    item.append(patch, text);
+    list.append(item);
+  }
+  section.append(list);
+  const count = document.createElement("p");
+  count.id = "boxes-count";
+  section.append(count);
+}
+
+export function addQualityPanel() {
+  const section = panel("Quality");
+  toggle(section, "shading", "Shading by depth");
+  slider(section, "budget", "Points", { min: 0.1, max: 4, step: 0.1 }, (value) => `${value.toFixed(1)} M`);
+}

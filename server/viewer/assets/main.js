@@ -35,6 +35,8 @@ function expose(app) {
     pose: () => app.state?.pose ?? null,
     verdict: () => app.verdict,
     touched: () => app.state?.touched ?? [],
+    contacts: () => app.contacts.marks.filter((mark) => mark.visible).length,
+    complete: () => app.quality.complete && app.tiles.missing === 0,
     frames: () => app.frames,
     fps: () => app.fps,
     roundTrip: () => app.state?.roundTrip ?? null,

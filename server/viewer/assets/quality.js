@@ -16,7 +16,9 @@ export class Quality {
     this.most = software ? FIRST_SOFTWARE : Infinity;
     this.intervals = [];
     this.seen = "";
+    this.chosen = "";
     this.content = "";
+    this.latest = "";
     this.changed = 0;
     this.drawn = 0;
     this.full = false;
@@ -24,11 +26,17 @@ export class Quality {
 
   /** Note what a picture depends on. Returns whether the picture must be drawn.
    *
-   * seen: text of the camera and all that moves.  content: text of all else.  now: [ms].
+   * seen: text of the camera and all that moves.  chosen: text of settings.  content: text of the
+   * scan that has arrived.  now: [ms].
    */
-  look(seen, content, now) {
+  look(seen, chosen, content, now) {
+    this.latest = content;
     if (seen !== this.seen) {
-      Object.assign(this, { seen, content, changed: now, full: false });
+      Object.assign(this, { seen, chosen, content, changed: now, full: false });
+      return true;
+    }
+    if (chosen !== this.chosen) {
+      Object.assign(this, { chosen, content, drawn: now });
       return true;
     }
     // In software a full picture takes a second: new tiles are gathered.
@@ -44,6 +52,11 @@ export class Quality {
   /** Return whether the view is at rest, and drawn in full. */
   get still() {
     return this.full;
+  }
+
+  /** Return whether the view is at rest, and shows everything that has arrived. */
+  get complete() {
+    return this.full && this.content === this.latest;
   }
 
   /** Return how many points may be drawn. wanted: as the settings say. */

@@ -5,7 +5,7 @@ import { panel, slider, toggle } from "./registry.js";
 export function addShowPanel() {
   const section = panel("Show");
   toggle(section, "firstPerson", "First person", "V");
-  toggle(section, "contacts", "Contact points and normals", "N");
+  toggle(section, "contacts", "Contacts and normals", "N");
   toggle(section, "clearance", "Line to the nearest point", "L");
   toggle(section, "boxes", "Voxels in memory", "B");
   const list = document.createElement("ul");

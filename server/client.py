@@ -35,6 +35,7 @@ from .avatars.avatar_shape import MeshLike, avatar_shape
 from .scene_interface import QueryMethods, list_avatars
 from .zenoh_client.client_identity import AddedAvatar
 from .zenoh_client.client_session import ClientSession, CommandNumbers
+from .zenoh_client.residency_stream import ResidencyStream
 from .zenoh_client.server_connection import ServerConnection
 from .zenoh_common.endpoints import DEFAULT_ENDPOINT
 
@@ -152,6 +153,14 @@ class Client(QueryMethods):
         """Return points or spheres of a voxel; see `TileRequest`. Raise BusyError if no server answers."""
         request = tile_request(archive, voxel, detail, level)
         return decode_answer(TileAnswer, self._connection.require("tile", encode(request)))
+
+    def residency_changes(self) -> ResidencyStream:
+        """Return the changes of what is resident of the scene from now on, for a `with`.
+
+        It yields a `ResidencyChanges` at least every half second while a server answers.
+        """
+        self._connection.check_open()
+        return ResidencyStream(self._connection, self.name)
 
     def silence(self, operation: str) -> str:
         """Return a message on why no server answered an operation, and what to do."""

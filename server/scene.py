@@ -8,6 +8,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
 from numpy.typing import ArrayLike
 
 from ..schemas.archive.seal import read_archive_key
@@ -257,7 +258,9 @@ class Scene(SceneTiles, SceneQuestions):
         """Return statistics of cache, requests and waits. keys: also list the resident voxels."""
         with ExitStack() as stack:
             each = [stack.enter_context(archive.take()) for archive in self.archives]
-            return make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
+            found = make_stats(self.name, each, self._metrics, self._avatars.stats(), keys=keys)
+        effects = [] if self._simulation is None else self._simulation.effect_stats()
+        return structs.replace(found, effects=effects)
 
     def limit_avatars(self, limits: AvatarLimits) -> None:
         """Limit the memory of clients' avatars from now on; existing ones stay."""

@@ -31,6 +31,7 @@ from ..schemas.wire.overview_messages import OverviewAnswer
 from ..schemas.wire.question_rules import Question, suggestion_for
 from ..schemas.wire.question_table import COLLIDE, CONTACTS, DISTANCE, OBJECTS, RAYCAST, SWEEP, WITHIN
 from ..schemas.wire.requests import DEFAULT_REACH, QuestionOptions
+from ..schemas.wire.residency_messages import ResidencyChanges
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer
@@ -178,7 +179,7 @@ class LimitReached(Enum):
     REQUESTS = "requests in flight, of all clients"
     OWN_REQUESTS = "requests in flight, of one client"
     PATHS = "paths"
-    STATES = "queries for states"
+    STATES = "queries for states or changes"
 
 
 class EncodedReply(NamedTuple):
@@ -251,6 +252,13 @@ class ServedSimulation(Protocol):
     def end_client(self, client: str) -> None: ...
 
 
+class ServedWatch(Protocol):
+    """Changes of what is resident of a scene, as `Scene.residency_changes` returns them."""
+
+    def take(self, *, always: bool = False) -> ResidencyChanges | None: ...
+    def close(self) -> None: ...
+
+
 class ServedScene(Protocol):
     """Scene that answers a server's requests, or refuses them with a SolidcloudError. Thread-safe.
 
@@ -276,6 +284,7 @@ class ServedScene(Protocol):
     def overview(self, limit: int = 100_000) -> OverviewAnswer: ...
     def voxels(self, place: Any, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer: ...
     def tile(self, archive: int, voxel: Any, detail: int = 0, level: int | None = None) -> TileAnswer: ...
+    def residency_changes(self) -> ServedWatch: ...
     def reload(self) -> ReloadAnswer: ...
     def stats(self, keys: bool = False) -> StatsAnswer: ...
     def warm(self, *parts: str) -> None: ...

@@ -12,6 +12,7 @@ from .overview_messages import OverviewAnswer, OverviewRequest
 from .path_messages import PathRequest
 from .question_table import QUESTIONS, path_questions
 from .requests import AddAvatarRequest, Request
+from .residency_messages import ResidencyChanges, ResidencyRequest
 from .scene_messages import AvatarInfo, ErrorReply, ReloadAnswer, SceneInfo, ScenesAnswer
 from .stats import StatsAnswer, StatsRequest
 from .tile_messages import TileAnswer, TileRequest, VoxelsAnswer, VoxelsRequest
@@ -34,6 +35,8 @@ MESSAGES: tuple[type, ...] = (
     VoxelsAnswer,
     TileRequest,
     TileAnswer,
+    ResidencyRequest,
+    ResidencyChanges,
     ReloadAnswer,
     StatsRequest,
     StatsAnswer,

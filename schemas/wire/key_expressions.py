@@ -164,6 +164,27 @@ def parse_state_key(key: str) -> User:
     return User(*_parse(key, "state", ("scene", "client", "avatar of a session"))[1:])
 
 
+def residency_key(scene: str, client: str) -> str:
+    """Return the key under which a client queries the changes of what is resident of a scene.
+
+    The server replies with them under the same key.
+    """
+    return f"{ROOT}/residency/{check_name(scene, 'scene')}/{check_name(client, 'client')}"
+
+
+def all_residency_key(scene: str) -> str:
+    """Return the key expression that a server declares: changes of its scene, for any client."""
+    return f"{ROOT}/residency/{check_name(scene, 'scene')}/*"
+
+
+def parse_residency_key(key: str) -> str:
+    """Return the client that queries changes under a key.
+
+    Raises BadRequestError for any other key, wildcards included.
+    """
+    return _parse(key, "residency", ("scene", "client"))[1]
+
+
 def _user_key(what: str, scene: str, user: User) -> str:
     check_name(scene, "scene")
     check_name(user.client, "client")

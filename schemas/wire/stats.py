@@ -88,6 +88,20 @@ class AvatarStats(msgspec.Struct, frozen=True):
     max_clients: int = 0
 
 
+class EffectStats(msgspec.Struct, frozen=True):
+    """Cost of one effect in the frames of all users since the scene was opened.
+
+    frames: in which it ran.  skipped: frames whose budget was too small for it.
+    seconds: that it took in all of them. Divide differences between two answers by those of
+    `frames` for its time in a frame.
+    """
+
+    effect: str
+    frames: int = 0
+    skipped: int = 0
+    seconds: float = 0.0
+
+
 class Counters(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of a voxel cache; they count voxels unless the name says bytes.
 
@@ -137,6 +151,7 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     keys: of the resident voxels, ascending; null: not requested.
     avatars: memory of the clients' avatars.
     compiling: as in SceneInfo.
+    effects: cost of each of the scene's effects, in the order in which they run.
     """
 
     scene: str
@@ -159,3 +174,4 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     keys: list[int] | None = None
     avatars: AvatarStats = AvatarStats()
     compiling: list[str] = []
+    effects: list[EffectStats] = []

@@ -22,6 +22,7 @@ MAX_SPHERE_LEVEL = 79
 Voxels = np.ndarray[tuple[int, Literal[3]], np.dtype[np.int32]]
 Offsets = np.ndarray[tuple[int, Literal[3]], np.dtype[np.uint16]]
 Colours = np.ndarray[tuple[int, Literal[3]], np.dtype[np.uint8]]
+Coordinate = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
 Vector = tuple[float, float, float]
 
 
@@ -76,9 +77,14 @@ class TileRequest(Request, frozen=True):
     """
 
     archive: Count
-    voxel: tuple[int, int, int]
+    voxel: tuple[Coordinate, Coordinate, Coordinate]
     detail: Annotated[int, msgspec.Meta(ge=0, le=MAX_DETAIL)] = 0
     level: Annotated[int, msgspec.Meta(ge=0, le=MAX_SPHERE_LEVEL)] | None = None
+
+    def __post_init__(self) -> None:
+        Request.__post_init__(self)
+        if not all(-(1 << 31) <= each < 1 << 31 for each in self.voxel):
+            raise BadRequestError(f"voxel {self.voxel}: expected integers of 32 bits")
 
 
 class TileAnswer(msgspec.Struct, frozen=True):

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
+from ...schemas.wire.residency_messages import Residency
 from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import StopFlag
 from .allocator import VoxelAllocator
 from .arena import ArenaBuffer
 from .cache_stats import CacheStats
+from .change_log import ChangeLog
 from .eviction import EvictionPolicy
 
 # Voxels examined to find room for a prefetched one.
@@ -106,6 +108,7 @@ class VoxelStates:
     is_owed_free: whether the last hold on an abandoned voxel whose load is owed has ended.
     kept: rows at users' positions, evicted only if a request would not fit otherwise.
     where, policy: see `VoxelCache`.  sizes: bytes of each row in the arena.
+    logs: of readers that follow the changes.
     """
 
     def __init__(
@@ -126,6 +129,7 @@ class VoxelStates:
         self.owed: OrderedDict[int, None] = OrderedDict()
         self.is_owed_free = False
         self.kept: frozenset[int] = frozenset()
+        self.logs: tuple[ChangeLog, ...] = ()
         self._describe = describe
         self._faults: dict[int, str] = {}  # of corrupt records: permanent
         # Temporary faults. The voxel is read again only after all holds on it have ended, so that
@@ -239,22 +243,29 @@ class VoxelStates:
         return done == len(rows)
 
     def _allocate(self, row: int, scan: bool) -> bool:
-        evicted = self.stats.evicted
         return any(
-            self.allocator.allocate(row, may_evict, self._is_free, evicted, scan=scan)
+            self.allocator.allocate(row, may_evict, self._is_free, self._evicted, scan=scan)
             for may_evict in (self._is_unneeded, self._is_free)
         )
 
     def allocate_for_prefetch(self, row: int, may_evict: Callable[[int], bool]) -> bool:
         """Make room for one row; see `VoxelCache.load_in_background`."""
         return self.allocator.allocate(
-            row, lambda other: self._is_unneeded(other) and may_evict(other), self._is_free, self.stats.evicted,
+            row, lambda other: self._is_unneeded(other) and may_evict(other), self._is_free, self._evicted,
             scan=False, most=MAX_CANDIDATES,
         )  # fmt: skip
 
     def evict_all_but(self, rows: Sequence[int]) -> None:
         """Evict all voxels but these and move these together; none may be in use or loading."""
-        self.allocator.evict_all_but(set(rows), self.stats.evicted)
+        self.allocator.evict_all_but(set(rows), self._evicted)
+
+    def _evicted(self, row: int) -> None:
+        """Count the eviction of a voxel, and note it for readers."""
+        if self.logs:
+            state = Residency.WASTED if row in self.stats.fresh else Residency.EVICTED
+            for log in self.logs:
+                log.add(row, state)
+        self.stats.evicted(row)
 
     def _is_free(self, row: int) -> bool:
         """Return whether no thread uses or loads a voxel."""
@@ -271,6 +282,10 @@ class VoxelStates:
         self.where[row] = where
         self.loading.discard(row)
         self.stats.times.append(seconds)
+        if self.logs:
+            state = Residency.PREFETCHED if row in self.stats.fresh else Residency.LOADED
+            for log in self.logs:
+                log.add(row, state)
 
     def fail(self, row: int, fault: str, *, corrupt: bool = False) -> None:
         """Record a failed load: permanently if `corrupt`, else for requests that hold the row."""
@@ -329,6 +344,23 @@ class CacheFacts:
     def evictions(self) -> int:
         """Return the number of voxels evicted to make room for others."""
         return self._states.allocator.evictions
+
+    def follow(self) -> ChangeLog:
+        """Return a log of all changes from now on, until `unfollow`."""
+        log = ChangeLog()
+        with self._lock:
+            self._states.logs += (log,)
+        return log
+
+    def unfollow(self, log: ChangeLog) -> None:
+        """End a log."""
+        with self._lock:
+            self._states.logs = tuple(other for other in self._states.logs if other is not log)
+
+    def take_changes(self, log: ChangeLog) -> tuple[dict[int, Residency], bool]:
+        """Return the changes in a log, by index row, and whether some are missing; begin it anew."""
+        with self._lock:
+            return log.take()
 
     def counters(self) -> Counters:
         """Return the statistics of the cache."""

@@ -5,13 +5,14 @@ from contextlib import ExitStack
 
 from numpy.typing import ArrayLike
 
-from ...schemas.errors import BadRequestError
+from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ...schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from ..archives.placed_archive import PlacedArchive
 from ..tiles.scene_overview import read_overview
 from ..tiles.voxel_list import list_voxels
 from ..tiles.voxel_tile import read_tile
+from .residency_watch import ResidencyWatch
 
 
 class SceneTiles:
@@ -37,6 +38,10 @@ class SceneTiles:
             opened = [stack.enter_context(archive.take()) for archive in self.archives]
             return list_voxels(request, self.archives, opened)
 
+    def residency_changes(self) -> ResidencyWatch:
+        """Return the changes of what is resident from now on, for a `with`; see `ResidencyChanges`."""
+        return ResidencyWatch(self.archives)
+
     def tile(
         self, archive: int, voxel: Sequence[int], detail: int = 0, level: int | None = None
     ) -> TileAnswer:
@@ -49,4 +54,9 @@ class SceneTiles:
             raise BadRequestError(f"archive {archive}: expected below {len(self.archives)}")
         placed = self.archives[request.archive]
         with placed.take() as opened:
-            return read_tile(request, placed, opened.store.archive)
+            try:
+                return read_tile(request, placed, opened.store.archive)
+            except OSError as error:
+                raise CorruptError(
+                    f"voxel {request.voxel}: cannot be read ({error}): check the disk"
+                ) from error

@@ -37,6 +37,7 @@ from ...schemas.wire.motion_messages import (
     checked_late,
 )
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
+from ...schemas.wire.stats import EffectStats
 from ..archives.placed_archive import PlacedArchive
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import LateVoxels, QueryBudget
@@ -144,6 +145,10 @@ class Simulation:
     def world(self) -> "World":
         """Return the world that the frames query."""
         return self._pipeline.world
+
+    def effect_stats(self) -> list[EffectStats]:
+        """Return what each effect has cost so far, in the order in which they run."""
+        return self._pipeline.times.stats()
 
     def record(self, recorder: Recorder | None) -> None:
         """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""

@@ -145,10 +145,10 @@ def _read_preview(archive: Archive) -> _Sample | None:
     sample = _Sample(found.points, found.columns, True)
     low, high = header.lattice.to_world(np.stack([header.low, header.high]))
     # The preview is rounded, and not written by this process.
-    kept = np.isfinite(found.points).all(axis=1)
+    kept = np.asarray(np.isfinite(found.points).all(axis=1))
     sample = sample.where(kept)._replace(points=np.clip(found.points[kept], low, high))
     if isinstance(archive, MaskedArchive):
-        sample = sample.where(~archive.is_masked(sample.points))
+        sample = sample.where(np.logical_not(archive.is_masked(sample.points)))
     return sample if len(sample.points) else None
 
 

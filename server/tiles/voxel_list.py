@@ -13,6 +13,9 @@ from ..archives.rigid_transform import transform_points
 
 Floats = NDArray[np.float64]
 
+# Voxels whose boxes are computed at a time, so that a large index takes little memory.
+_BLOCK = 1 << 16
+
 
 def list_voxels(
     request: VoxelsRequest, placed: Sequence[PlacedArchive], opened: Sequence[ArchiveGeneration]
@@ -66,10 +69,14 @@ def _boxes(opened: ArchiveGeneration, rows: NDArray[np.int64] | slice) -> tuple[
 
 def _distances(opened: ArchiveGeneration, place: Floats) -> Floats:
     """Return the distance (v,) of each voxel's box from a place (3,), archive frame [m]."""
-    low, high = _boxes(opened, slice(None))
-    apart = np.maximum(np.maximum(low - place, place - high), 0.0)
-    distance: Floats = np.sqrt((apart * apart).sum(axis=1))
-    return distance
+    count = len(opened.store.archive.voxels)
+    found = np.empty(count)
+    for begin in range(0, count, _BLOCK):
+        rows = slice(begin, begin + _BLOCK)
+        low, high = _boxes(opened, rows)
+        apart = np.maximum(np.maximum(low - place, place - high), 0.0)
+        found[rows] = np.sqrt((apart * apart).sum(axis=1))
+    return found
 
 
 def _columns(opened: ArchiveGeneration, rows: NDArray[np.int64]) -> tuple[NDArray, ...]:

@@ -5,29 +5,42 @@ by the spheres of one level, near ones by their points. Points are in the order 
 that every 4^k-th of them is spread evenly, and a finer detail adds to a coarser one.
 """
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ...builder.voxel.record_points import voxel_points
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.voxel import Links, VoxelData, top_shift
+from ...schemas.archive.voxel import LeafCells, Links, Nodes, VoxelData, top_shift, transpose_columns
 from ...schemas.archive.voxel_grid import voxel_keys
-from ...schemas.errors import BadRequestError
+from ...schemas.errors import BadRequestError, BusyError, TooLargeError
+from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from ...schemas.wire.tile_messages import TileAnswer, TileRequest
 from ..archives.placed_archive import PlacedArchive
 
 Steps = NDArray[np.int64]
 # Coordinates of a tile have this many bits.
 _BITS = 16
+# Types of rgb, intensity, classification and scan.
+_KINDS = (np.dtype(("u1", 3)), np.dtype("f4"), np.dtype("u1"), np.dtype("u2"))
+# Largest voxel whose points, or whose spheres, are read for a tile. A record takes 50 bytes a point
+# while it is decoded: 4 million points 0.2 GB and 0.5 s.
+_MAX_POINTS, _MAX_NODES = 1 << 22, 1 << 21
+# Records of more points are decoded one at a time, so that many requests take no more memory than
+# one. A request waits for its turn for at most this long [s].
+_LARGE_POINTS, _TURN_SECONDS = 1 << 18, 1.0
+_large = threading.Lock()
 
 
 def read_tile(request: TileRequest, placed: PlacedArchive, archive: Archive) -> TileAnswer:
     """Read a tile of an archive. placed: its place in the scene.
 
-    Raise BadRequestError if there is no such voxel, CorruptError if it cannot be read.
+    Raise BadRequestError if there is no such voxel, TooLargeError for a voxel or an answer over the
+    limits, BusyError if other large voxels are being read, CorruptError if it cannot be read.
     """
     row = _row_of(archive, request.voxel)
-    voxel, links = archive.read_voxel(row)
     header = archive.header
     lattice = header.lattice
     shift = max(0, int(lattice.voxel_steps - 1).bit_length() - _BITS)
@@ -36,26 +49,61 @@ def read_tile(request: TileRequest, placed: PlacedArchive, archive: Archive) -> 
     pose[:3, 3] = low
     if placed.pose is not None:
         pose = placed.pose @ pose
+    total = int(archive.voxels["rows"][row, 2])
+    columns: tuple[NDArray | None, ...] = (None, None, None, None)
     kept = slice(0, 0)
+    with _turn(archive, row, request):
+        if request.level is None:
+            kept = slice(None, None, 4**request.detail)
+            voxel, links = archive.read_voxel(row)
+            places, radii = _points(voxel, links, 4**request.detail), np.empty(0, np.int64)
+            columns = voxel.rgb, voxel.intensity, voxel.classification, voxel.scan_index
+        else:
+            tree = archive.open_tree(row)
+            nodes = transpose_columns(tree.nodes)
+            cells, unit = transpose_columns(tree.cells), top_shift(lattice.voxel_steps)
+            places, radii = _spheres(nodes, cells, tree.links, request.level, unit)
+        # Half a unit is what rounding a centre may move it.
+        spheres = -(-radii >> shift) + (shift > 0)
+        return TileAnswer(
+            pose[None],
+            lattice.step * 2**shift,
+            total,
+            header.radius,
+            np.clip((places + (1 << shift >> 1)) >> shift, 0, (1 << _BITS) - 1).astype(np.uint16),
+            np.clip(spheres, 0, (1 << _BITS) - 1).astype(np.uint16),
+            *(_column(values, kind, kept) for values, kind in zip(columns, _KINDS, strict=True)),
+        )
+
+
+@contextmanager
+def _turn(archive: Archive, row: int, request: TileRequest) -> Iterator[None]:
+    """Check the limits before anything is read, and wait for a turn if the voxel is large.
+
+    Raise TooLargeError or BusyError.
+    """
+    _, nodes, points = archive.voxels["rows"][row].tolist()
     if request.level is None:
-        kept = slice(None, None, 4**request.detail)
-        places, radii = voxel_points(voxel, links)[kept], np.empty(0, np.int64)
-    else:
-        places, radii = _spheres(voxel, links, request.level, top_shift(lattice.voxel_steps))
-    # Half a unit is what rounding a centre may move it.
-    spheres = -(-radii >> shift) + (shift > 0)
-    return TileAnswer(
-        pose[None],
-        lattice.step * 2**shift,
-        len(voxel.points),
-        header.radius,
-        np.clip((places + (1 << shift >> 1)) >> shift, 0, (1 << _BITS) - 1).astype(np.uint16),
-        np.clip(spheres, 0, (1 << _BITS) - 1).astype(np.uint16),
-        _column(voxel.rgb, np.dtype(("u1", 3)), kept),
-        _column(voxel.intensity, np.dtype("f4"), kept),
-        _column(voxel.classification, np.dtype("u1"), kept),
-        _column(voxel.scan_index, np.dtype("u2"), kept),
-    )
+        shown = -(-points // 4**request.detail)
+        if points > _MAX_POINTS:
+            raise TooLargeError(
+                f"voxel {request.voxel} of {points} points: at most {_MAX_POINTS} in a tile: ask for its spheres"
+            )
+        if shown * 6 > MAX_MESSAGE_BYTES:
+            raise TooLargeError(
+                f"tile of {shown} points: a message holds {MAX_MESSAGE_BYTES} bytes: ask for less detail"
+            )
+    elif nodes > _MAX_NODES:
+        raise TooLargeError(f"voxel {request.voxel} of {nodes} nodes: at most {_MAX_NODES} in a tile")
+    if points <= _LARGE_POINTS:
+        yield
+        return
+    if not _large.acquire(timeout=_TURN_SECONDS):
+        raise BusyError(f"voxel {request.voxel} of {points} points: others are being read: ask again")
+    try:
+        yield
+    finally:
+        _large.release()
 
 
 def _row_of(archive: Archive, voxel: tuple[int, int, int]) -> int:
@@ -68,7 +116,19 @@ def _row_of(archive: Archive, voxel: tuple[int, int, int]) -> int:
     return row
 
 
-def _spheres(voxel: VoxelData, links: Links, level: int, shift: int) -> tuple[Steps, Steps]:
+def _points(voxel: VoxelData, links: Links, every: int) -> Steps:
+    """Return one of `every` points (p, 3) in the order of the record [steps from the voxel's corner]."""
+    leaves = np.flatnonzero(links.is_leaf)
+    first = links.first[leaves]
+    order = np.argsort(first, kind="stable")
+    chosen = np.arange(0, len(voxel.points), every)
+    leaf = leaves[order[np.searchsorted(first[order], chosen, side="right") - 1]]
+    low = voxel.nodes.block_low[leaf].astype(np.int64) + voxel.cells.low[links.cell[leaf]]
+    places: Steps = voxel.points[chosen] + low
+    return places
+
+
+def _spheres(tree: Nodes, cells: LeafCells, links: Links, level: int, shift: int) -> tuple[Steps, Steps]:
     """Return centres (n, 3) and radii (n,) of the spheres of a level [steps from the voxel's corner].
 
     shift: binary logarithm of the unit of the top hierarchy.
@@ -79,16 +139,16 @@ def _spheres(voxel: VoxelData, links: Links, level: int, shift: int) -> tuple[St
         if not inner.any():
             break
         parents = nodes[inner]
-        counts = voxel.nodes.count[parents].astype(np.int64)
+        counts = tree.count[parents].astype(np.int64)
         starts = np.repeat(links.first[parents] - np.cumsum(counts) + counts, counts)
         nodes = np.concatenate([nodes[~inner], starts + np.arange(counts.sum())])
     nodes = np.sort(nodes)
     cell = links.cell[nodes]
     top = cell < 0
-    centers, radii = voxel.nodes.center[nodes].astype(np.int64), voxel.nodes.radius[nodes].astype(np.int64)
+    centers, radii = tree.center[nodes].astype(np.int64), tree.radius[nodes].astype(np.int64)
     centers[top] <<= shift
     radii[top] <<= shift
-    centers[~top] += voxel.cells.low[cell[~top]]
+    centers[~top] += cells.low[cell[~top]]
     return centers, radii
 
 

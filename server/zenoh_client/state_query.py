@@ -76,6 +76,14 @@ class StateQuery:
         except zenoh.ZError as error:  # the zenoh session was closed before
             log.debug("closing %s: %s", self._key, error)
 
+    def tell(self, payload: bytes) -> None:
+        """Send a message under the key that has no reply."""
+        handler: Any = zenoh.handlers.Callback(lambda _: None)
+        try:
+            self._querier.get(handler, payload=payload, encoding=MSGPACK)
+        except zenoh.ZError as error:  # the zenoh session was closed before
+            log.debug("telling %s: %s", self._key, error)
+
     def take(self, published: Callable[[], float]) -> list[tuple[bool, bytes] | OtherAvatarError] | None:
         """Wait a while for replies and return them; return None after the end.
 

@@ -6,9 +6,9 @@ from typing import Any
 import zenoh
 
 from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
-from .access_control import access_control, state_priority
+from .access_control import access_control, stream_priorities
 
-# Transport of motion commands; states use the same (access_control.state_priority).
+# Transport of motion commands; states use the same (access_control.stream_priorities).
 FRAME_QOS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.INTERACTIVE_HIGH,
@@ -43,7 +43,7 @@ def session_config(*, listen: str | None = None, connect: str | None = None) -> 
     }
     if listen:
         settings["access_control"] = access_control()
-        settings["qos/network"] = state_priority()
+        settings["qos/network"] = stream_priorities()
     config = zenoh.Config()
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))

@@ -31,7 +31,7 @@ from ...schemas.wire.stats import StatsRequest
 from ...schemas.wire.tile_messages import TileRequest, VoxelsRequest
 from ...schemas.wire.warming_parts import MOTION, needed_parts
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from ..scene_interface import EncodedReply, LimitReached, ServedScene, recording_avatars
+from ..scene_interface import EncodedReply, LimitReached, ServedScene, ServedWatch, recording_avatars
 from .command_mailboxes import FrameLoop
 from .server_config import ServerConfig
 from .warming import Warming
@@ -183,9 +183,19 @@ class RequestDispatcher:
                 f"this server answers up to {config.max_paths} paths at a time, {max(1, config.max_paths // 2)} of one "
                 f"client {as_one}: ask again when one has ended"
             ),
-            LimitReached.STATES: "this scene has the maximum number of open queries for states: try again later",
+            LimitReached.STATES: (
+                "this scene has the maximum number of open queries for states or changes: try again later"
+            ),
         }[full]
         return self._error(encoding, ErrorCode.BUSY, message)
+
+    def refuse(self, encoding: str | None, error: SolidcloudError) -> EncodedReply:
+        """Return an error as an answer to a query that is not a request."""
+        return self._error(encoding, error.code, str(error))
+
+    def watch(self, scene: str) -> ServedWatch:
+        """Return the changes of what is resident of a scene from now on."""
+        return self._scenes[scene].residency_changes()
 
     def client_gone(self, scene: str, client: str) -> None:
         """Remove the avatars of a disconnected client, and end its bodies."""

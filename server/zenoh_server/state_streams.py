@@ -101,6 +101,16 @@ class StateStreams:
             if (stream := self._streams.get(user)) is not None:
                 stream.last = None
 
+    def users(self) -> list[User]:
+        """Return the users with an open query."""
+        with self._lock:
+            return list(self._streams)
+
+    def end(self, user: User) -> None:
+        """End the query of a user."""
+        with self._lock:
+            self._end(user)
+
     def end_client(self, client: str) -> None:
         """End the queries of a disconnected client."""
         with self._lock:

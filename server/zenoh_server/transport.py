@@ -25,6 +25,7 @@ from ..zenoh_common.zenoh_settings import session_config
 from .fair_queues import LivelinessTokens
 from .request_dispatcher import RequestDispatcher
 from .request_lanes import Lane
+from .residency_streams import ResidencyStreams
 from .server_config import ServerConfig
 from .session_transport import SceneSessions
 
@@ -143,7 +144,9 @@ class Transport:
         sessions = SceneSessions(session, scene, self._dispatcher, self._start, self._key, tokens)
         self._sessions.append(sessions)
         self._declared += sessions.declared
-        self._start(f"{scene}-watch", _watch, watch.handler, tokens, lane, sessions)
+        streams = ResidencyStreams(session, scene, self._dispatcher, self._start, self._key, tokens.turn)
+        self._declared += streams.declared
+        self._start(f"{scene}-watch", _watch, watch.handler, tokens, lane, sessions, streams)
         lane.start()
         return lane
 
@@ -179,8 +182,10 @@ class Transport:
             self._threads = [other for other in self._threads if other.is_alive()] + [thread]
 
 
-def _watch(samples: Any, tokens: LivelinessTokens, lane: Lane, sessions: SceneSessions) -> None:
-    """Notify lane and sessions of a scene of clients that connect or leave. Runs in a thread."""
+def _watch(
+    samples: Any, tokens: LivelinessTokens, lane: Lane, sessions: SceneSessions, streams: ResidencyStreams
+) -> None:
+    """Notify lane, sessions and streams of a scene of clients that connect or leave. Runs in a thread."""
     for sample in samples:
         try:
             client = key_expressions.parse_client_token(str(sample.key_expr))
@@ -191,6 +196,7 @@ def _watch(samples: Any, tokens: LivelinessTokens, lane: Lane, sessions: SceneSe
             if sample.kind == zenoh.SampleKind.DELETE:
                 tokens.gone(client)
                 sessions.client_gone(client)
+                streams.client_gone(client)
                 lane.client_gone(client)
             else:
                 tokens.here(client)

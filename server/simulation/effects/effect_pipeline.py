@@ -24,6 +24,7 @@ from ...runtime.stop_flag import NO_STOP, StoppedError
 from ..world.collision_world import World
 from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
 from ..world.vectors import norm
+from .effect_times import EffectTimes
 
 # Weight of the last run in the exponential moving average of an effect's cost.
 _SMOOTHING = 0.1
@@ -67,6 +68,7 @@ class Pipeline:
     """Effects of one scene in their order. Thread-safe, except for two frames of one body.
 
     runners: the effects.  costs: cost estimate of each, by name, updated only with a budget.
+    times: what each effect has cost.
     bodies: `Bodies` that all effects which need them share, and that the simulation updates; None
     if no effect needs them.
     """
@@ -75,6 +77,7 @@ class Pipeline:
         """Create a pipeline; callers use `make_pipeline`."""
         self.file, self.world, self.runners = file, world, runners
         self.costs = {runner.name: CostEstimate() for runner in runners}
+        self.times = EffectTimes(self.costs)
         self.bodies: Any = None
         for runner in runners:
             if hasattr(runner, "bodies"):
@@ -137,6 +140,8 @@ class Pipeline:
             if not self._stops:
                 frame.pose = frame.target
             since = world.visits
+            ran: list[tuple[str, float]] = []
+            now = time.perf_counter()
             for runner in self.runners:
                 if budget.stop:
                     raise StoppedError
@@ -145,6 +150,10 @@ class Pipeline:
                     frame.simulated.append(runner.name)
                 else:
                     self._run_one(runner, frame, begin, since, skip)
+                before, now = now, time.perf_counter()
+                if frame.simulated and frame.simulated[-1] == runner.name:
+                    ran.append((runner.name, now - before))
+            self.times.add(ran, frame.skipped)
             if not self._stops:
                 frame.verdict = world.collide(body.avatar, frame.pose, budget)
             # Bodies that overlap the avatar since the frame's start, such as a placed object, do

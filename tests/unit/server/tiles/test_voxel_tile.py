@@ -1,14 +1,17 @@
 """Tiles: the points of a voxel, every so many of them, or the spheres of a level of its hierarchy."""
 
+import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import archive_cases
 import numpy as np
 import pytest
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.errors import BadRequestError
+from solidcloud.schemas.errors import BadRequestError, BusyError, CorruptError, TooLargeError
 from solidcloud.schemas.wire.tile_messages import TileAnswer
 from solidcloud.server.scene import Scene
+from solidcloud.server.tiles import voxel_tile
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +86,74 @@ def test_a_tile_that_does_not_exist_is_refused(case: archive_cases.Case) -> None
         ):
             with pytest.raises(BadRequestError, match=message):
                 scene.tile(*wrong)
+
+
+def test_a_large_voxel_has_limits(case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Scene.open(case.archive) as scene:
+        listed = scene.voxels((0, 0, 0))
+        voxel, points = listed.voxel[0], int(listed.points[0])
+        spheres = len(scene.tile(0, voxel, level=50).spheres)
+        with scene.archives[0].take() as opened:
+            monkeypatch.setattr(opened.store.archive, "read_voxel", None)  # nothing is read
+        monkeypatch.setattr(voxel_tile, "MAX_MESSAGE_BYTES", 6 * points - 1)
+        with pytest.raises(TooLargeError, match="less detail"):
+            scene.tile(0, voxel)
+        monkeypatch.setattr(voxel_tile, "_MAX_POINTS", points - 1)
+        with pytest.raises(TooLargeError, match="ask for its spheres"):
+            scene.tile(0, voxel, detail=8)
+        assert len(scene.tile(0, voxel, level=50).spheres) == spheres
+        monkeypatch.setattr(voxel_tile, "_MAX_NODES", spheres - 1)
+        with pytest.raises(TooLargeError, match="nodes"):
+            scene.tile(0, voxel, level=0)
+
+
+def test_large_voxels_are_read_one_at_a_time(
+    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(voxel_tile, "_LARGE_POINTS", 10)
+    monkeypatch.setattr(voxel_tile, "_TURN_SECONDS", 0.01)
+    with Scene.open(case.archive) as scene:
+        voxel = scene.voxels((0, 0, 0)).voxel[0]
+        with voxel_tile._large, pytest.raises(BusyError, match="others are being read"):
+            scene.tile(0, voxel)
+        monkeypatch.setattr(voxel_tile, "_TURN_SECONDS", 60.0)
+        with ThreadPoolExecutor(4) as pool:
+            tiles = list(pool.map(lambda _: scene.tile(0, voxel), range(12)))
+        assert all(np.array_equal(tile.points, tiles[0].points) for tile in tiles)
+        assert not voxel_tile._large.locked()
+
+
+def test_tiles_evict_nothing(case: archive_cases.Case) -> None:
+    with Scene.open(case.archive) as whole, whole.archives[0].take() as opened:
+        budget = int(opened.store.sizes.max() * 1.2)
+    with Scene.open(case.archive, budget_bytes=budget) as scene:
+        scene.add_avatar("ball", [[0.0, 0.0, 0.0]], 0.1)
+        scene.collide("ball", np.eye(4))
+        held, stats = scene.residency.recent(), scene.stats()
+        assert held
+        for voxel in scene.voxels((0, 0, 0)).voxel:
+            scene.tile(0, voxel, 2)
+            scene.tile(0, voxel, level=3)
+        scene.overview()
+        after = scene.stats()
+        assert scene.residency.recent() == held
+        assert (after.hits, after.misses, after.evicted) == (stats.hits, stats.misses, stats.evicted)
+
+
+def test_a_damaged_record_is_said_to_be_corrupt(case: archive_cases.Case, tmp_path: Path) -> None:
+    shutil.copytree(case.archive, tmp_path / "copy")
+    with Scene.open(tmp_path / "copy") as scene:
+        voxel = scene.voxels((0, 0, 0)).voxel[0]
+        with scene.archives[0].take() as opened:
+            archive = opened.store.archive
+            row = int(np.flatnonzero((archive.coordinates == voxel).all(axis=1))[0])
+            entry, shard = archive.voxels[row], archive.shard_path(int(archive.voxels["shard"][row]))
+        data = bytearray(shard.read_bytes())
+        data[int(entry["frame_offset"][2]) + int(entry["frame_bytes"][2]) // 2] ^= 0xFF
+        shard.write_bytes(data)
+        with pytest.raises(CorruptError, match="voxel"):
+            scene.tile(0, voxel)
+        assert len(scene.tile(0, voxel, level=4).spheres), "its hierarchy is whole"
 
 
 def test_tiles_of_a_placed_archive_are_in_the_world(case: archive_cases.Case, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_what_is_not_declared_is_not_imported(floor: archive_cases.Case, effects
         check=True,
         timeout=200,
     )
-    shared = {"effect_pipeline"}
+    shared = {"effect_pipeline", "effect_times"}
     names = run.stdout.split()
     assert [name for name in names[:-1] if name not in shared] == imported.split()
     assert names[-1] == str("slide" in imported), "normals are for what slides"

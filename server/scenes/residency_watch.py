@@ -1,0 +1,141 @@
+"""Changes of what is resident of a scene, as they happen.
+
+A log (residency/change_log.py) collects the changes of each archive under its cache's lock. A
+reader takes them at its own rate, so no load or eviction waits for a reader.
+"""
+
+import threading
+import weakref
+from collections.abc import Iterator, Sequence
+from time import monotonic
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.errors import BadRequestError
+from ...schemas.wire.residency_messages import (
+    CHANGES_SECONDS,
+    MAX_CHANGED_VOXELS,
+    SILENT_SECONDS,
+    ResidencyChanges,
+)
+from ..archives.archive_generation import ArchiveGeneration
+from ..archives.placed_archive import PlacedArchive
+from ..residency.change_log import ChangeLog
+from ..residency.voxel_cache import VoxelCache
+
+
+class _Followed(NamedTuple):
+    """Generation of an archive that is followed. It must not be kept in memory by this."""
+
+    number: int
+    cache: "weakref.ref[VoxelCache]"
+    log: ChangeLog
+
+
+class ResidencyWatch:
+    """Changes of a scene since this was made; a context manager, thread-safe.
+
+    Made by `Scene.residency_changes`. Iterating over it yields the messages of `changes`.
+    """
+
+    def __init__(self, archives: Sequence[PlacedArchive]) -> None:
+        """Begin to follow archives. Raise BadRequestError if the scene is closed."""
+        self._archives = archives
+        self._followed: list[_Followed | None] = [None] * len(archives)
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._seq, self._said = 0, 0.0
+        for number, archive in enumerate(archives):
+            with archive.take() as opened:
+                self._follow(number, opened)
+        self._lost = True  # the first message is the beginning
+
+    def __enter__(self) -> Self:
+        """Return the watch itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End following."""
+        self.close()
+
+    def close(self) -> None:
+        """End following; `changes` ends. Closing twice is allowed."""
+        self._closed.set()
+        with self._lock:
+            for number in range(len(self._followed)):
+                self._unfollow(number)
+
+    def __iter__(self) -> Iterator[ResidencyChanges]:
+        """Yield the messages of `changes`."""
+        return self.changes()
+
+    def changes(self, timeout: float = 5.0) -> Iterator[ResidencyChanges]:
+        """Yield changes in order, at least one message every half second, until this is closed.
+
+        timeout: as in `Client.residency_changes`; a scene of this process always answers.
+        """
+        while not self._closed.is_set():
+            try:
+                message = self.take()
+            except BadRequestError:  # the scene was closed
+                return
+            if message is not None:
+                yield message
+            self._closed.wait(CHANGES_SECONDS)
+
+    def take(self, *, always: bool = False) -> ResidencyChanges | None:
+        """Return the changes since the last message; None if there is nothing to say yet.
+
+        always: return a message without changes too. Raise BadRequestError if the scene is closed.
+        """
+        with self._lock:
+            states: list[int] = []
+            archives: list[int] = []
+            voxels: list[NDArray[np.int32]] = []
+            lost, resident, resident_bytes = self._lost, 0, 0
+            for number, archive in enumerate(self._archives):
+                with archive.take() as opened:
+                    followed, cache = self._followed[number], opened.data.residency
+                    if followed is None or followed.number != opened.number:
+                        followed, lost = self._follow(number, opened), True
+                    changes, overflowed = cache.take_changes(followed.log)
+                    lost |= overflowed
+                    resident += cache.resident
+                    resident_bytes += cache.resident_bytes
+                    room = MAX_CHANGED_VOXELS - len(states)
+                    if len(changes) > room:
+                        changes, lost = dict(list(changes.items())[:room]), True
+                    if changes:
+                        states += changes.values()
+                        archives += [number] * len(changes)
+                        voxels.append(opened.store.archive.coordinates[list(changes)].astype(np.int32))
+            now = monotonic()
+            if not (always or states or lost or now - self._said >= SILENT_SECONDS):
+                return None
+            self._seq += 1
+            self._said, self._lost = now, False
+            return ResidencyChanges(
+                self._seq,
+                lost,
+                np.array(archives, np.uint16),
+                np.concatenate([np.empty((0, 3), np.int32), *voxels]),
+                np.array(states, np.uint8),
+                resident,
+                resident_bytes,
+            )
+
+    def _follow(self, number: int, opened: ArchiveGeneration) -> _Followed:
+        """Follow a generation of an archive, in place of an earlier one."""
+        self._unfollow(number)
+        cache = opened.data.residency
+        followed = _Followed(opened.number, weakref.ref(cache), cache.follow())
+        self._followed[number] = followed
+        return followed
+
+    def _unfollow(self, number: int) -> None:
+        """End following a generation."""
+        followed, self._followed[number] = self._followed[number], None
+        if followed is not None and (cache := followed.cache()) is not None:
+            cache.unfollow(followed.log)

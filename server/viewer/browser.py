@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from itertools import count
 from typing import Any, Protocol
@@ -38,6 +39,9 @@ _RETRY_SECONDS = 1.0
 _INTENT_SECONDS = 1.0
 # Distance of the outer rays between user and camera from the middle one [m].
 _BOOM_RADIUS = 0.12
+# Changes of residency that wait for a page that takes none: a page that misses some asks again for
+# the voxels near it every few seconds.
+_MOST_CHANGES = 64
 
 
 class PageConnection(Protocol):
@@ -71,6 +75,7 @@ class Browser:
         self._wanted: list[TileKey] = []
         self._around: Around | None = None
         self._overview: OpenScene | None = None  # whose overview the page lacks
+        self._changes: deque[bytes] = deque(maxlen=_MOST_CHANGES)
         self._work = threading.Condition()
 
     def run(self) -> None:
@@ -89,10 +94,12 @@ class Browser:
         ]
         for thread in threads:
             thread.start()
+        self._parts.residency.follow(self.number, self._changed)
         try:
             self._read(messages)
         finally:
             self._closed.set()
+            self._parts.residency.leave(self.number)
             with self._work:
                 self._work.notify_all()
             self._parts.users.leave(self.number)
@@ -184,22 +191,34 @@ class Browser:
 
     # --- what is drawn ---------------------------------------------------------------------------
 
+    def _changed(self, message: bytes) -> None:
+        """Take changes of residency."""
+        with self._work:
+            self._changes.append(message)
+            self._work.notify_all()
+
     def _send_tiles(self) -> None:
         """Send voxels and tiles that the page asked for. Runs in a thread."""
         while not self._closed.is_set():
             with self._work:
-                self._work.wait_for(
-                    lambda: self._closed.is_set() or self._overview or self._wanted or self._around
-                )
+                self._work.wait_for(self._has_work)
                 overview, self._overview = self._overview, None
                 around, self._around = self._around, None
+                changes = [self._changes.popleft() for _ in range(len(self._changes))]
                 key = self._wanted.pop(0) if self._wanted and around is None else None
+            for message in changes:
+                self._send(message)
             if overview is not None:
                 self._attempt(lambda scene=overview: self._send(self._parts.tiles.overview(scene)))
             if around is not None:
                 self._attempt(lambda around=around: self._send(self._parts.tiles.voxels(around.place)))
             elif key is not None:
                 self._send_tile(key)
+
+    def _has_work(self) -> bool:
+        """Return whether there is something to send. The caller holds `_work`."""
+        asked = self._overview or self._wanted or self._around or self._changes
+        return bool(asked) or self._closed.is_set()
 
     def _send_tile(self, key: TileKey) -> None:
         """Send one tile. One that cannot be read is named, so that the page does not ask again."""

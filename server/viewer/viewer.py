@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from .browser import Browser
+from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
 from .tile_source import TileSource
@@ -35,8 +36,9 @@ def viewing(
     Raise SolidcloudError if the port is in use, ScanError for an invalid avatar.
     """
     shape = load_avatar(avatar)
-    with SceneLink(endpoint, scene, key_file) as link:
-        parts = ViewerParts(link, shape, StartingPlaces(shape), TileSource(lambda: link.scene), Users())
+    with SceneLink(endpoint, scene, key_file) as link, ResidencyFeed(lambda: link.scene) as residency:
+        tiles = TileSource(lambda: link.scene)
+        parts = ViewerParts(link, shape, StartingPlaces(shape), tiles, Users(), residency)
         server = WebServer(port, lambda connection: Browser(connection, parts).run())
         with server.running():
             yield server.url

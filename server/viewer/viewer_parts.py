@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
 from .tile_source import TileSource
@@ -64,3 +65,4 @@ class ViewerParts(NamedTuple):
     places: StartingPlaces
     tiles: TileSource
     users: Users
+    residency: ResidencyFeed

@@ -94,6 +94,7 @@ export class App {
         this.overview.take(message, this.tiles.columns);
         this.refreshColours();
       },
+      residency: (message) => this.tiles.change(message),
       voxels: (message) => this.tiles.list(message),
       tile: (message) => {
         const before = this.tiles.columns.size;
@@ -270,6 +271,6 @@ export class App {
       place: place?.slice(0, 3) ?? null,
     });
     document.getElementById("boxes-count").textContent =
-      this.tiles.total ? `${this.tiles.resident} of ${this.tiles.total} voxels in memory` : "";
+      this.tiles.total ? `${this.tiles.resident} of ${this.tiles.total} voxels, ${(this.tiles.residentBytes / 2 ** 20).toFixed(1)} MiB in memory` : "";
   }
 }

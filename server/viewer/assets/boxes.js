@@ -4,7 +4,9 @@ import {
   BufferAttribute, BufferGeometry, LineBasicMaterial, LineSegments,
 } from "./vendor/three.module.min.js";
 
-export const RESIDENT = [0.37, 0.83, 0.77], ABSENT = [0.3, 0.38, 0.5];
+export const COLOURS = {
+  loaded: [0.37, 0.83, 0.77], prefetched: [0.45, 0.66, 1], wasted: [1, 0.42, 0.37], evicted: [0.3, 0.38, 0.5],
+};
 // Nearest voxels that are drawn.
 const MOST = 600;
 // Pairs of a box's corners; bit k of a corner: the high end along axis k.
@@ -38,12 +40,12 @@ export class Boxes {
     let at = 0;
     // Those in memory last: where boxes meet, their lines are seen.
     near.sort((one, other) => one.voxel.resident - other.voxel.resident);
-    for (const { voxel: { box, resident } } of near) {
+    for (const { voxel: { box, state } } of near) {
       for (const corner of EDGES) {
         position.array[at] = corner & 1 ? box.max.x : box.min.x;
         position.array[at + 1] = corner & 2 ? box.max.y : box.min.y;
         position.array[at + 2] = corner & 4 ? box.max.z : box.min.z;
-        color.array.set(resident ? RESIDENT : ABSENT, at);
+        color.array.set(COLOURS[state], at);
         at += 3;
       }
     }

@@ -19,7 +19,9 @@ const FINE = 1.4;
 // Voxels behind the view are kept this much coarser: a turn shows them at once.
 const BEHIND = 4;
 // The list of voxels is asked for again after this way [m] or time [ms].
-const LIST_WAY = 1, LIST_MS = 700;
+const LIST_WAY = 1, LIST_MS = 3000;
+// States of a voxel in a message of changes.
+export const STATES = ["evicted", "loaded", "prefetched", "wasted"];
 
 export class Tiles {
   /** group: object for the points.  send: sends a message.  drawn: called with each voxel whose tile arrives. */
@@ -39,6 +41,8 @@ export class Tiles {
     this.listed = { place: null, time: -Infinity, waiting: false };
     this.total = 0;
     this.resident = 0;
+    this.residentBytes = 0;
+    this.wasted = 0;
     this.shown = 0;
     this.radius = 0.01;
     this.sentWanted = "";
@@ -52,14 +56,13 @@ export class Tiles {
   list({ arrays, total }) {
     this.listed.waiting = false;
     this.total = total;
-    this.resident = 0;
     const { key, low, high, points, resident } = arrays;
     for (let row = 0; row < key.rows; row += 1) {
       const numbers = Array.from(key.array.subarray(4 * row, 4 * row + 4));
       const name = numbers.join("/");
       let voxel = this.voxels.get(name);
       if (!voxel) {
-        voxel = { name, key: numbers, box: new Box3(), sphere: new Sphere(), points: 0, resident: false, object: null, detail: -1 };
+        voxel = { name, key: numbers, box: new Box3(), sphere: new Sphere(), points: 0, resident: false, state: "evicted", object: null, detail: -1 };
         this.voxels.set(name, voxel);
       }
       voxel.box.min.fromArray(low.array, 3 * row);
@@ -67,9 +70,25 @@ export class Tiles {
       voxel.box.getBoundingSphere(voxel.sphere);
       voxel.points = points.array[row];
       voxel.resident = resident.array[row] !== 0;
-      this.resident += voxel.resident;
+      if (voxel.resident !== ["loaded", "prefetched"].includes(voxel.state)) voxel.state = voxel.resident ? "loaded" : "evicted";
     }
     this.version += 1;
+  }
+
+  /** Take changes of what is in the server's memory. */
+  change({ lost, arrays, resident, bytes }) {
+    const { key, state } = arrays;
+    for (let row = 0; row < key.rows; row += 1) {
+      const voxel = this.voxels.get(key.array.subarray(4 * row, 4 * row + 4).join("/"));
+      if (!voxel) continue;
+      voxel.state = STATES[state.array[row]] ?? "evicted";
+      voxel.resident = voxel.state === "loaded" || voxel.state === "prefetched";
+      if (voxel.state === "wasted") this.wasted += 1;
+    }
+    Object.assign(this, { resident, residentBytes: bytes });
+    if (key.rows) this.version += 1;
+    // What was missed is in the next list.
+    if (lost) this.listed.time = -Infinity;
   }
 
   /** Take a tile, unless a better one of its voxel has arrived. */

@@ -1,5 +1,6 @@
 // Panel: what is shown besides the scan, and with how many points.
 
+import { COLOURS } from "../boxes.js";
 import { panel, slider, toggle } from "./registry.js";
 
 export function addShowPanel() {
@@ -9,11 +10,12 @@ export function addShowPanel() {
   toggle(section, "clearance", "Line to the nearest point", "L");
   toggle(section, "boxes", "Voxels in memory", "B");
   const list = document.createElement("ul");
-  list.className = "legend";
-  for (const [text, colour] of [["in the server's memory", "rgb(95 211 196)"], ["on disk", "rgb(98 118 148)"]]) {
+  list.className = "legend two";
+  const entries = [["in memory", "loaded"], ["read ahead", "prefetched"], ["read ahead in vain", "wasted"], ["on disk", "evicted"]];
+  for (const [text, state] of entries) {
     const item = document.createElement("li");
     const patch = document.createElement("i");
-    patch.style.background = colour;
+    patch.style.background = `rgb(${COLOURS[state].map((part) => Math.round(255 * part)).join(" ")})`;
     item.append(patch, text);
     list.append(item);
   }

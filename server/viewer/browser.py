@@ -12,6 +12,7 @@ import numpy as np
 
 from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
+from ...schemas.wire.scene_messages import SceneInfo
 from .browser_user import BrowserUser, state_fields
 from .page_messages import (
     PAGE_VERSION,
@@ -136,7 +137,7 @@ class Browser:
             if status.number != known:
                 known = status.number
                 self._send(status_message(status, self._parts.link.endpoint))
-                if scene is not None and scene.info is not shown:
+                if scene is not None and (shown is None or not same_picture(scene.info, shown)):
                     shown = scene.info
                     self._send(welcome_message(scene, self.number))
                     self._send(avatar_message(self._parts))
@@ -247,6 +248,16 @@ class Browser:
         """Send a message, unless the page is closed."""
         if message is not None and self._connection.is_open():
             self._connection.send(message)
+
+
+def same_picture(one: SceneInfo, other: SceneInfo) -> bool:
+    """Return whether two descriptions of a scene are of the same points in the same frame."""
+    return (one.generation, one.points, one.bounds, one.up) == (
+        other.generation,
+        other.points,
+        other.bounds,
+        other.up,
+    )
 
 
 def status_message(status: LinkStatus, endpoint: str) -> str:

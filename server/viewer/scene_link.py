@@ -17,7 +17,7 @@ from .view_frame import ViewFrame
 log = logging.getLogger(__name__)
 
 # Interval of the questions whether the server still answers, and how long an answer may take [s].
-_CHECK_SECONDS, _ANSWER_SECONDS = 1.0, 5.0
+_CHECK_SECONDS, _ANSWER_SECONDS = 0.7, 5.0
 # Interval of the attempts to find a server [s].
 _SEARCH_SECONDS = 0.5
 
@@ -62,6 +62,7 @@ class SceneLink:
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._status = LinkStatus(0, "searching", f"Looking for a server at {endpoint}.")
+        self._failures = 0  # questions without an answer since the last answer
         self._open: OpenScene | None = None
         self._thread = threading.Thread(target=self._run, name="viewer-link", daemon=True)
 
@@ -137,10 +138,13 @@ class SceneLink:
         try:
             info = opened.reader.info()
         except SolidcloudError as error:
-            self._set("lost", str(error))
+            log.debug("scene %s: %s", opened.info.scene, error)
+            self._failures += 1
+            # A single answer may be late because a large one is on the way.
+            if self._failures > 1:
+                self._set("lost", str(error))
             return
-        if info.generation != opened.info.generation or info.bounds != opened.info.bounds:
-            log.info("scene %s: another generation, %d", info.scene, info.generation)
+        self._failures = 0
         if info != opened.info or self._status.state != "connected":
             self._show(info, opened.client, opened.reader)
         else:

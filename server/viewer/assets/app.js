@@ -92,6 +92,7 @@ export class App {
       avatar: (message) => this.users.shape(message),
       overview: (message) => {
         this.overview.take(message, this.tiles.columns);
+        for (const voxel of this.tiles.voxels.values()) if (voxel.object) this.overview.cover(voxel.name, voxel.box);
         this.refreshColours();
       },
       residency: (message) => this.tiles.change(message),

@@ -11,7 +11,7 @@ export function addShowPanel() {
   toggle(section, "boxes", "Voxels in memory", "B");
   const list = document.createElement("ul");
   list.className = "legend two";
-  const entries = [["in memory", "loaded"], ["read ahead", "prefetched"], ["read ahead in vain", "wasted"], ["on disk", "evicted"]];
+  const entries = [["in memory", "loaded"], ["read ahead", "prefetched"], ["read in vain", "wasted"], ["on disk", "evicted"]];
   for (const [text, state] of entries) {
     const item = document.createElement("li");
     const patch = document.createElement("i");

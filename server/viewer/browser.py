@@ -5,6 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import count
 from typing import Any, Protocol
 
@@ -154,10 +155,10 @@ class Browser:
                 tried = now
             if self._begun:
                 intent = self._intent if now - self._intended < _INTENT_SECONDS else Intent()
-                self._attempt(lambda intent=intent: self._user.command(intent))
+                self._attempt(partial(self._user.command, intent))
             boom, self._boom = self._boom, None
             if boom is not None and scene is not None:
-                self._attempt(lambda boom=boom, scene=scene: self._send(boom_message(boom, scene)))
+                self._attempt(partial(self._send_boom, boom, scene))
             due = max(due + FRAME_SECONDS, time.monotonic() - FRAME_SECONDS)
             self._closed.wait(max(0.0, due - time.monotonic()))
 
@@ -210,11 +211,23 @@ class Browser:
             for message in changes:
                 self._send(message)
             if overview is not None:
-                self._attempt(lambda scene=overview: self._send(self._parts.tiles.overview(scene)))
+                self._attempt(partial(self._send_overview, overview))
             if around is not None:
-                self._attempt(lambda around=around: self._send(self._parts.tiles.voxels(around.place)))
+                self._attempt(partial(self._send_voxels, around))
             elif key is not None:
                 self._send_tile(key)
+
+    def _send_overview(self, scene: OpenScene) -> None:
+        """Send the overview of a scene."""
+        self._send(self._parts.tiles.overview(scene))
+
+    def _send_voxels(self, around: Around) -> None:
+        """Send the voxels near a place."""
+        self._send(self._parts.tiles.voxels(around.place))
+
+    def _send_boom(self, boom: Boom, scene: OpenScene) -> None:
+        """Send how far the camera may be from the user."""
+        self._send(boom_message(boom, scene))
 
     def _has_work(self) -> bool:
         """Return whether there is something to send. The caller holds `_work`."""

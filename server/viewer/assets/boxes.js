@@ -9,6 +9,8 @@ export const COLOURS = {
 };
 // Nearest voxels that are drawn.
 const MOST = 600;
+// Lines are drawn beside the points of walls, and above those of floors, by this much [m].
+const OUT = 0.03;
 // Pairs of a box's corners; bit k of a corner: the high end along axis k.
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7, 0, 2, 1, 3, 4, 6, 5, 7, 0, 4, 1, 5, 2, 6, 3, 7];
 
@@ -42,9 +44,9 @@ export class Boxes {
     near.sort((one, other) => one.voxel.resident - other.voxel.resident);
     for (const { voxel: { box, state } } of near) {
       for (const corner of EDGES) {
-        position.array[at] = corner & 1 ? box.max.x : box.min.x;
-        position.array[at + 1] = corner & 2 ? box.max.y : box.min.y;
-        position.array[at + 2] = corner & 4 ? box.max.z : box.min.z;
+        position.array[at] = corner & 1 ? box.max.x + OUT : box.min.x - OUT;
+        position.array[at + 1] = corner & 2 ? box.max.y + OUT : box.min.y - OUT;
+        position.array[at + 2] = corner & 4 ? box.max.z + OUT : box.min.z + OUT;
         color.array.set(COLOURS[state], at);
         at += 3;
       }

@@ -21,6 +21,8 @@ function labelled(section, text, input, ...more) {
   const label = document.createElement("label");
   const span = document.createElement("span");
   span.textContent = text;
+  // Without the key and the value that the label shows too.
+  input.setAttribute("aria-label", text);
   label.append(span, input, ...more);
   section.append(label);
   return input;

@@ -42,6 +42,7 @@ export class App {
     this.verdict = "none";
     this.server = "none";
     this.connected = false;
+    this.pictured = false;
     this.origin = null;
     this.colour = "height";
     this.refreshColours = () => {};
@@ -92,6 +93,7 @@ export class App {
       avatar: (message) => this.users.shape(message),
       overview: (message) => {
         this.overview.take(message, this.tiles.columns);
+        if (this.overview.object) shared.uHeight.value.set(...this.overview.heights());
         for (const voxel of this.tiles.voxels.values()) if (voxel.object) this.overview.cover(voxel.name, voxel.box);
         this.refreshColours();
       },
@@ -246,6 +248,7 @@ export class App {
     this.times.drawn = now;
     this.drawnBefore = true;
     this.view.draw();
+    this.pictured ||= this.tiles.shown + this.overview.shown > 0;
   }
 
   /** Send the intent when it changes, and again while it lasts. */

@@ -56,6 +56,16 @@ export class Overview {
     this.cells(places, rows);
   }
 
+  /** Return the heights between which most points lie [m]. */
+  heights() {
+    const every = Math.max(1, Math.floor(this.hidden.length / 4000));
+    const found = [];
+    for (let row = 0; row < this.hidden.length; row += every) found.push(this.places[3 * row + 2]);
+    found.sort((one, other) => one - other);
+    const at = (share) => found[Math.round(share * (found.length - 1))];
+    return [at(0.01), Math.max(at(0.01) + 0.5, at(0.97))];
+  }
+
   /** Sort points into cells, to find those of a box quickly. */
   cells(places, rows) {
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];

@@ -195,6 +195,8 @@ export class App {
     this.times.picture = now;
     const firstPerson = settings.get("firstPerson");
     const intent = this.input.read(seconds);
+    // Where there is gravity, it decides.
+    if (this.scene?.effects.includes("ground")) intent.up = 0;
     this.command(intent, now);
     if (this.state && !firstPerson && now - this.times.boom > BOOM_MS) {
       this.times.boom = now;

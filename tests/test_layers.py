@@ -87,12 +87,13 @@ ALLOWED = {
     "server/report/load/page": "report/common report/load/runs report/load/users",
     "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
+    "server/viewer": "avatars client.py cli/scene_files zenoh_client",
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (
         "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency "
         "cli/output archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
-        "report/accuracy report/common report/load/runs report/load"
+        "report/accuracy report/common report/load/runs report/load report/walk viewer"
     ),
     "server/cli": "cli/commands cli/output",
     "server/api": "client.py scene.py",
@@ -103,6 +104,7 @@ ALLOWED = {
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
+    "server/viewer": ("builder/synthetic/figure",),
     "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
@@ -146,6 +148,7 @@ DOORS = {
     "PIL": ("server/report/",),
     "scipy": ("server/report/accuracy/measurement/",),
     "typer": ("server/cli/main.py", "server/cli/commands/"),
+    "websockets": ("server/viewer/web_server.py",),
     "rich": ("server/cli/output/", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.

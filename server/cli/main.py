@@ -34,6 +34,7 @@ from .commands import scene_command as scene
 from .commands import seal_command as seal
 from .commands import serve_command as serve
 from .commands import top_command as top
+from .commands import view_command as view
 from .commands.command_options import print_error
 from .output.compile_notice import compile_notices
 
@@ -76,6 +77,7 @@ for verb in (
     add_remove.remove,
     add_remove.reload,
     plan.plan,
+    view.view,
     top.top,
     loadtest.loadtest,
     replay.replay,
@@ -87,7 +89,7 @@ for verb in (
 _COMPLETION = f"_{NAME.upper()}_COMPLETE"
 # Verbs that wait for a server or for a user: an interrupt ends them immediately. All other verbs
 # compute, and end at their next interrupt check.
-WAITING = frozenset({"serve", "query", "reload", "top", "loadtest"})
+WAITING = frozenset({"serve", "view", "query", "reload", "top", "loadtest"})
 
 
 def _print_version(wanted: bool) -> None:

@@ -6,13 +6,13 @@ floor if scan points surround the avatar's feet at their height.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ....schemas.wire.answers import Verdict
-from ...scene import Scene
+from ....schemas.wire.answers import CollideAnswers, Verdict
+from ....schemas.wire.scene_messages import AvatarInfo, SceneInfo
 
 _Floats = NDArray[np.float64]
 
@@ -39,6 +39,14 @@ _POSES = 20_000
 _PROBE = "spawn-search-probe"
 
 
+class SearchedScene(Protocol):
+    """Scene in which a place is searched: a `Scene`, or a `Client` of a server."""
+
+    def info(self) -> SceneInfo: ...
+    def add_avatar(self, name: str, points: Any, radius: float | None = None) -> AvatarInfo: ...
+    def collide(self, name: str, poses: Any) -> CollideAnswers: ...
+
+
 class Body(NamedTuple):
     """Avatars that must stand at the spawn, as one.
 
@@ -52,7 +60,7 @@ class Body(NamedTuple):
     wide: float
 
 
-def add_body(scene: Scene, avatars: Mapping[str, tuple[ArrayLike, float | None]]) -> Body:
+def add_body(scene: SearchedScene, avatars: Mapping[str, tuple[ArrayLike, float | None]]) -> Body:
     """Add avatars to a scene, points (n, 3) and radius [m] by name, and return them as one body."""
     foot, top, wide = np.inf, -np.inf, 0.0
     for name, (points, radius) in avatars.items():
@@ -64,7 +72,7 @@ def add_body(scene: Scene, avatars: Mapping[str, tuple[ArrayLike, float | None]]
     return Body(list(avatars), foot, top, wide)
 
 
-def find_spawn(scene: Scene, body: Body) -> tuple[float, float, float] | None:
+def find_spawn(scene: SearchedScene, body: Body) -> tuple[float, float, float] | None:
     """Return a position of the avatars' origin where they stand clear on a floor [m].
 
     None if no such place is found.
@@ -87,7 +95,7 @@ def find_spawn(scene: Scene, body: Body) -> tuple[float, float, float] | None:
     return None
 
 
-def _standing_places(scene: Scene, body: Body, columns: _Floats, low: float, high: float) -> _Floats:
+def _standing_places(scene: SearchedScene, body: Body, columns: _Floats, low: float, high: float) -> _Floats:
     """Return the positions (k, 3) in columns (c, 2) where the body stands clear on a floor [m].
 
     low, high: of the scan [m].
@@ -113,7 +121,7 @@ def _standing_places(scene: Scene, body: Body, columns: _Floats, low: float, hig
     return place[clear & _on_floor(scene, body, place)]
 
 
-def _on_floor(scene: Scene, body: Body, places: _Floats) -> NDArray[np.bool_]:
+def _on_floor(scene: SearchedScene, body: Body, places: _Floats) -> NDArray[np.bool_]:
     """Return at which places (k, 3) scan points surround the feet, at their height."""
     angles = np.arange(8) * (np.pi / 4)
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(8)], axis=1) * max(body.wide, _LEAST_RING)
@@ -125,7 +133,7 @@ def _on_floor(scene: Scene, body: Body, places: _Floats) -> NDArray[np.bool_]:
 
 
 def _verdicts(
-    scene: Scene, names: Sequence[str], places: _Floats
+    scene: SearchedScene, names: Sequence[str], places: _Floats
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return at which places (k, 3) all avatars are clear, and at which one is in contact."""
     clear, touching = np.ones(len(places), bool), np.zeros(len(places), bool)

@@ -1,0 +1,31 @@
+// Panel: the keys.
+
+import { panel } from "./registry.js";
+
+const KEYS = [
+  [["W", "A", "S", "D"], "walk; also the arrow keys"],
+  [["Shift"], "run"],
+  [["Q", "E"], "turn; or drag the view"],
+  [["V"], "first or third person"],
+  [["C"], "next colour"],
+  [["H"], "back to the start"],
+  [["R", "F"], "up and down, where nothing holds you to the ground"],
+];
+
+export function addHelpPanel() {
+  const section = panel("Keys");
+  const list = document.createElement("dl");
+  list.className = "keys";
+  for (const [keys, text] of KEYS) {
+    const term = document.createElement("dt");
+    for (const key of keys) {
+      const shown = document.createElement("kbd");
+      shown.textContent = key;
+      term.append(shown, " ");
+    }
+    const meaning = document.createElement("dd");
+    meaning.textContent = text;
+    list.append(term, meaning);
+  }
+  section.append(list);
+}

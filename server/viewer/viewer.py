@@ -1,0 +1,44 @@
+"""The viewer: one process between browsers and the server of a scene.
+
+For the server it is a client like any other, with one session for each browser.
+"""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .browser import Browser
+from .residency_feed import ResidencyFeed
+from .scene_link import SceneLink
+from .starting_place import StartingPlaces
+from .tile_source import TileSource
+from .user_avatar import load_avatar
+from .viewer_parts import Users, ViewerParts
+from .web_server import WebServer
+
+log = logging.getLogger(__name__)
+
+
+@contextmanager
+def viewing(
+    endpoint: str,
+    scene: str | None = None,
+    *,
+    port: int = 0,
+    avatar: Path | None = None,
+    key_file: Path | None = None,
+) -> Iterator[str]:
+    """Serve the viewer during the block; yield the address of its page.
+
+    endpoint: of the server; it need not run yet.  scene: its name; None: the only one there.
+    port: of the page; 0: a free one.  avatar: file of the users' avatar; None: a figure.
+    Raise SolidcloudError if the port is in use, ScanError for an invalid avatar.
+    """
+    shape = load_avatar(avatar)
+    with SceneLink(endpoint, scene, key_file) as link, ResidencyFeed(lambda: link.scene) as residency:
+        tiles = TileSource(lambda: link.scene)
+        parts = ViewerParts(link, shape, StartingPlaces(shape), tiles, Users(), residency)
+        server = WebServer(port, lambda connection: Browser(connection, parts).run())
+        with server.running():
+            yield server.url

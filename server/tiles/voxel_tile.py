@@ -29,7 +29,7 @@ _BITS = 16
 # LEVEL_EVERY of them, because a level has a thirtieth of the points, and the tile one of 64.
 _LEVEL_EVERY = 2
 # Types of rgb, intensity, classification and scan.
-_KINDS = (np.dtype(("u1", 3)), np.dtype("f4"), np.dtype("u1"), np.dtype("u2"))
+_KINDS: tuple[np.dtype, ...] = (np.dtype(("u1", 3)), np.dtype("f4"), np.dtype("u1"), np.dtype("u2"))
 # Largest voxel whose points, or whose spheres, are read for a tile. A record takes 50 bytes a point
 # while it is decoded: 4 million points 0.2 GB and 0.5 s.
 _MAX_POINTS, _MAX_NODES = 1 << 22, 1 << 21

@@ -69,13 +69,20 @@ export class Quality {
     return wanted && (this.full || !this.software);
   }
 
-  /** Take the time between two drawn pictures that moved [ms], and that many points of the last one. */
+  /** Take the time between two drawn pictures that moved [ms], and that many points of the last one.
+   *
+   * Pictures that take several times too long are answered after three of them: twelve take seconds.
+   */
   measure(interval, points) {
     this.intervals.push(interval);
-    if (this.intervals.length < 12) return;
-    const slow = this.intervals.sort((one, other) => one - other)[9];
+    const far = this.intervals.length >= 3 && this.intervals.every((each) => each > 2 * SMOOTH_MS);
+    if (this.intervals.length < 12 && !far) return;
+    const sorted = this.intervals.sort((one, other) => one - other);
+    const slow = sorted[Math.floor(0.75 * sorted.length)];
     this.intervals = [];
-    if (slow > SMOOTH_MS) this.most = Math.max(LEAST_POINTS, Math.min(this.most, points) * 0.8);
-    else if (slow < EASY_MS && this.most < Infinity) this.most *= 1.15;
+    if (slow > SMOOTH_MS) {
+      const share = Math.max(0.25, (0.9 * SMOOTH_MS) / slow);
+      this.most = Math.max(LEAST_POINTS, Math.min(this.most, points) * share);
+    } else if (slow < EASY_MS && this.most < Infinity) this.most *= 1.15;
   }
 }

@@ -75,9 +75,7 @@ class Browser:
         self._intent, self._intended = Intent(), 0.0
         name = f"viewer-{self.number}"
         self._user = BrowserUser(name, parts.avatar, self._deliver, self._problem)
-        self._panels = PanelWork(
-            self.number, name, parts, lambda: self._user.pose, self._send, self._attempt
-        )
+        self._panels = PanelWork(self.number, name, parts, lambda: self._user.pose, self._send, self._attempt)
         self._boom: Boom | None = None
         self._begun = False
         self._at: tuple[float, float, float, float] | None = None

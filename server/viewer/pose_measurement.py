@@ -11,7 +11,7 @@ from .page_messages import text_message
 
 # Repetitions of each question: the least time is that of the engine with the voxels in memory, the
 # others include what else the machine did meanwhile.
-_REPETITIONS = 3
+_REPETITIONS = 5
 # Farthest distance that is measured [m].
 MEASURED_REACH = 1.0
 
@@ -20,9 +20,7 @@ class Asked(Protocol):
     """Client of a scene, as far as a measurement needs it."""
 
     def collide(self, name: str, poses: Any, /, *, tolerance: float) -> CollideAnswers: ...
-    def distance(
-        self, name: str, poses: Any, reach: float, /, *, tolerance: float
-    ) -> DistanceAnswers: ...
+    def distance(self, name: str, poses: Any, reach: float, /, *, tolerance: float) -> DistanceAnswers: ...
 
 
 def measured_message(client: Asked, name: str, pose: NDArray[np.float64], tolerance: float) -> str:

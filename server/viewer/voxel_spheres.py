@@ -17,6 +17,8 @@ from .view_frame import ViewFrame
 _REACH, _MOST_VOXELS = 1.0, 8
 # Spheres that a page is sent, nearest first: in software, a sphere of 80 triangles takes some 10 µs.
 MOST_SPHERES = 6000
+# Share of the spheres that have the colour of the smallest ones.
+_TINY = 0.05
 # Voxels whose depth is kept.
 _MOST_DEPTHS = 4096
 
@@ -90,6 +92,8 @@ def spheres_message(
         total=len(radii),
         points=sum(tile.total for tile in tiles),
         radii=[float(radii.min()), float(radii.max())] if len(radii) else None,
+        # A few tiny leaf nodes would otherwise take most of the range of colours.
+        shades=np.quantile(drawn, [_TINY, 1.0]).tolist() if len(drawn) else None,
     )
 
 
@@ -97,7 +101,8 @@ def placed_spheres(
     tiles: list[TileAnswer], frame: ViewFrame
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return centres (n, 3) in the page's frame and radii (n,) of the spheres of tiles [m]."""
-    centers, radii = [np.empty((0, 3))], [np.empty(0)]
+    centers: list[NDArray[np.float64]] = [np.empty((0, 3))]
+    radii: list[NDArray[np.float64]] = [np.empty(0)]
     for tile in tiles:
         pose = frame.pose(tile.pose[0])
         local = tile.points.astype(np.float64) * tile.step

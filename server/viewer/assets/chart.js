@@ -1,6 +1,6 @@
 // A small chart of the last minute, with its latest values as text.
 
-const SPAN = 60, HEIGHT = 74, LEFT = 34, BOTTOM = 15, TOP = 5;
+const SPAN = 60, HEIGHT = 62, LEFT = 34, BOTTOM = 15, TOP = 5;
 // A longer pause between two samples is a gap: nothing is known of it [s].
 const GAP = 2.6;
 // The axis ends at this multiple of what nine of ten samples stay below.

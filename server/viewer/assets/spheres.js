@@ -68,8 +68,8 @@ export class BoundingSpheres {
     this.mesh.visible = this.boxes.visible = on && this.drawn > 0;
   }
 
-  /** Take spheres and boxes of voxels. radii: least and greatest of all of them, also those that are not drawn. */
-  take({ arrays: { center, radius, low, high }, radii }) {
+  /** Take spheres and boxes of voxels. shades: radii that have the first and the last colour [m]. */
+  take({ arrays: { center, radius, low, high }, shades }) {
     this.mesh.geometry.dispose();
     const count = radius.rows;
     const geometry = new InstancedBufferGeometry();
@@ -77,7 +77,7 @@ export class BoundingSpheres {
     geometry.setAttribute("center", new InstancedBufferAttribute(center.array, 3));
     geometry.setAttribute("radius", new InstancedBufferAttribute(radius.array, 1));
     const tints = new Float32Array(3 * count);
-    for (let k = 0; k < count; k += 1) tints.set(tint(radius.array[k], radii), 3 * k);
+    for (let k = 0; k < count; k += 1) tints.set(tint(radius.array[k], shades), 3 * k);
     geometry.setAttribute("tint", new InstancedBufferAttribute(tints, 3));
     geometry.instanceCount = count;
     this.mesh.geometry = geometry;

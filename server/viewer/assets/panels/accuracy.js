@@ -46,7 +46,7 @@ export function addAccuracyPanel(app) {
     const head = row("th", "", "exact", `within ${(100 * tolerance).toFixed(1)} cm`);
     const rows = Object.entries(answers).flatMap(([question, { exact, tolerant }]) => [
       group(TITLES[question]),
-      row("td", "verdict", ...[exact, tolerant].map(verdict)),
+      row("td", "verdict", ...[exact, tolerant].map((each) => verdict(each, question))),
       ...(question === "distance" ? [row("td", "distance [cm]", ...[exact, tolerant].map((each) => interval(each, reach)))] : []),
       row("td", "node visits", ...[exact, tolerant].map((each) => each.visits.toLocaleString("en"))),
       row("td", "point tests", ...[exact, tolerant].map((each) => each.tests.toLocaleString("en"))),
@@ -67,9 +67,9 @@ function less(value, than) {
   return share >= 0 ? `${share} % less` : `${-share} % more`;
 }
 
-function verdict({ verdict: number, sure }) {
-  const text = VERDICTS[number];
-  return number === 2 || sure ? text : `${text}, perhaps early`;
+/** Return the word for a verdict. Only a contact of `collide` may be early. */
+function verdict({ verdict: number, sure }, question) {
+  return question === "collide" && number === 1 && !sure ? "contact, perhaps early" : VERDICTS[number];
 }
 
 function interval({ lower, upper, sure }, reach) {

@@ -35,7 +35,7 @@ export function addHierarchyPanel(app) {
 
   app.on("spheres", (message) => {
     waiting = false;
-    const { level, total, points, radii, arrays } = message;
+    const { level, total, points, radii, shades, arrays } = message;
     if (depth !== message.depth) {
       depth = Math.max(1, message.depth);
       input.max = depth;
@@ -43,7 +43,7 @@ export function addHierarchyPanel(app) {
       input.nextElementSibling.textContent = `${input.value} of ${depth}`;
       input.setAttribute("aria-valuetext", `${input.value} of ${depth}`);
     }
-    found = { level: Math.min(level, depth), total, points, radii, voxels: arrays.low.rows };
+    found = { level: Math.min(level, depth), total, points, radii, shades, voxels: arrays.low.rows };
     if (radii) spheres.take(message);
     spheres.show(wanted());
     show();
@@ -76,12 +76,13 @@ export function addHierarchyPanel(app) {
     else if (!found) text.textContent = "Reading…";
     else if (!found.radii) text.textContent = "No voxels here.";
     else {
-      const { level, total, points, radii, voxels } = found;
-      [least, greatest].forEach((end, k) => { end.textContent = `radius ${length(radii[k])}`; });
+      const { level, total, points, radii, shades, voxels } = found;
+      [least, greatest].forEach((end, k) => { end.textContent = `radius ${length(shades[k])}`; });
       const all = total.toLocaleString("en");
       const drawn = spheres.drawn < total ? `the nearest ${spheres.drawn.toLocaleString("en")} of ${all} spheres` : `${all} spheres`;
-      text.textContent = `Level ${level}: ${drawn}, for ${points.toLocaleString("en")} points in ${voxels} voxels. `
-        + "Leaf nodes above the level are among them. White: boxes of the voxels.";
+      text.textContent = `Level ${level}: ${drawn} with radii of ${length(radii[0])} to ${length(radii[1])}, around the centres of `
+        + `${points.toLocaleString("en")} points in ${voxels} voxels (white boxes).`
+        + `${level < depth ? " Leaf nodes that end above this level are among them." : " All are leaf nodes."}`;
     }
   }
 }

@@ -70,7 +70,7 @@ def url(endpoint: str) -> Iterator[str]:
 
 
 def test_page_shows_the_scan_and_a_user_on_the_floor(browser: Any, url: str) -> None:
-    with viewed_page(browser, url) as viewed:
+    with viewed_page(browser, url, full=True) as viewed:
         viewed.wait_complete()
         picture = viewed.picture()
         assert coloured(picture) > 0.15
@@ -95,8 +95,10 @@ def test_user_walks_is_stopped_by_the_wall_and_slides_along_it(browser: Any, url
         stopped = viewed.read("s.place")
         assert WALL < stopped[0] < -8.3
         assert touched["normal"] is not None
-        # The view is to the west, so that right is north, along the wall.
-        with viewed.held("w", "d"):
+        # East is behind: turned to the right, the view is to the north-west, obliquely along the wall.
+        with viewed.held("e"):
+            viewed.wait("s.yaw", lambda yaw: 1.6 < yaw < 2.2)
+        with viewed.held("w"):
             slid = viewed.wait("s.place", lambda place: place[1] > stopped[1] + 0.8)
         assert WALL < slid[0] < -8.3
         viewed.check_clean(url)

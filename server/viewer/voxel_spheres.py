@@ -107,7 +107,7 @@ def placed_spheres(
         pose = frame.pose(tile.pose[0])
         local = tile.points.astype(np.float64) * tile.step
         centers.append(local @ pose[:3, :3].T + pose[:3, 3])
-        radii.append(tile.spheres * tile.step)
+        radii.append(tile.spheres.astype(np.float64) * tile.step)
     return np.concatenate(centers), np.concatenate(radii)
 
 

@@ -15,6 +15,7 @@ from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
 from ...schemas.wire.scene_messages import SceneInfo
 from .browser_user import BrowserUser, state_fields
+from .effect_switch import effects_message
 from .page_messages import (
     PAGE_VERSION,
     Around,
@@ -22,13 +23,17 @@ from .page_messages import (
     FromPage,
     Hello,
     Intent,
+    Measure,
     Restart,
+    Spheres,
+    SwitchEffects,
     TileKey,
     Want,
     binary_message,
     read_message,
     text_message,
 )
+from .panel_work import PanelWork
 from .scene_link import LinkStatus, OpenScene
 from .view_frame import ViewFrame
 from .viewer_parts import ViewerParts
@@ -57,8 +62,8 @@ class PageConnection(Protocol):
 class Browser:
     """One browser's page, from its first message until it is closed.
 
-    Four threads work for it: the caller of `run` reads, one sends motion commands at 30 Hz, one
-    delivers the states, and one reads tiles.
+    Five threads work for it: the caller of `run` reads, one sends motion commands at 30 Hz, one
+    delivers the states, one reads tiles, and one works for the panels.
     """
 
     _numbers = count(1)
@@ -68,7 +73,9 @@ class Browser:
         self._connection, self._parts = connection, parts
         self.number = next(self._numbers)
         self._intent, self._intended = Intent(), 0.0
-        self._user = BrowserUser(f"viewer-{self.number}", parts.avatar, self._deliver, self._problem)
+        name = f"viewer-{self.number}"
+        self._user = BrowserUser(name, parts.avatar, self._deliver, self._problem)
+        self._panels = PanelWork(self.number, name, parts, lambda: self._user.pose, self._send, self._attempt)
         self._boom: Boom | None = None
         self._begun = False
         self._at: tuple[float, float, float, float] | None = None
@@ -92,7 +99,11 @@ class Browser:
         self._at = hello.at
         threads = [
             threading.Thread(target=target, name=f"viewer-{self.number}-{name}", daemon=True)
-            for name, target in (("commands", self._pace), ("tiles", self._send_tiles))
+            for name, target in (
+                ("commands", self._pace),
+                ("tiles", self._send_tiles),
+                ("panels", self._panels.run),
+            )
         ]
         for thread in threads:
             thread.start()
@@ -101,6 +112,7 @@ class Browser:
             self._read(messages)
         finally:
             self._closed.set()
+            self._panels.close()
             self._parts.residency.leave(self.number)
             with self._work:
                 self._work.notify_all()
@@ -119,6 +131,8 @@ class Browser:
             elif isinstance(message, Restart):
                 self._at = message.at
                 self._restart.set()
+            elif isinstance(message, Measure | Spheres | SwitchEffects):
+                self._panels.ask(message)
             else:
                 with self._work:
                     if isinstance(message, Want):
@@ -138,6 +152,8 @@ class Browser:
             if status.number != known:
                 known = status.number
                 self._send(status_message(status, self._parts.link.endpoint))
+                if scene is not None:
+                    self._send(effects_message(scene.info.effects, self._parts.switch))
                 if scene is not None and (shown is None or not same_picture(scene.info, shown)):
                     shown = scene.info
                     self._send(welcome_message(scene, self.number))

@@ -59,6 +59,12 @@ class BrowserUser:
         latest = self._latest
         return None if latest is None else latest.pose[0, :3, 3]
 
+    @property
+    def pose(self) -> Floats | None:
+        """Return its pose (4, 4), avatar to world; None while it is not in the scene."""
+        latest = self._latest
+        return None if latest is None or self._session is None else latest.pose[0]
+
     def begin(self, scene: OpenScene, pose: Floats) -> None:
         """Enter the scene at a pose (4, 4). Raise the server's errors, BusyError without a server."""
         scene.client.add_avatar(self._name, self._avatar.points, self._avatar.radius)

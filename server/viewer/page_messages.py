@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
+from ...schemas.wire.tile_messages import MAX_SPHERE_LEVEL
 
 # Version of these messages; a page of another version asks its user to reload it.
 PAGE_VERSION = 1
@@ -86,7 +87,26 @@ class Restart(msgspec.Struct, frozen=True, tag="restart"):
     at: tuple[Metres, Metres, Metres, Angle] | None = None
 
 
-FromPage = Hello | Intent | Want | Around | Boom | Restart
+class Measure(msgspec.Struct, frozen=True, tag="measure"):
+    """Request the answers for the user's pose: exact, and with a tolerance [m]."""
+
+    tolerance: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+class Spheres(msgspec.Struct, frozen=True, tag="spheres"):
+    """Request the bounding spheres of a level in the voxels at a place of the page's frame [m]."""
+
+    place: Place
+    level: Annotated[int, msgspec.Meta(ge=0, le=MAX_SPHERE_LEVEL)]
+
+
+class SwitchEffects(msgspec.Struct, frozen=True, tag="switch"):
+    """Serve the scene with these effects."""
+
+    names: Annotated[list[Annotated[str, msgspec.Meta(max_length=64)]], msgspec.Meta(max_length=32)]
+
+
+FromPage = Hello | Intent | Want | Around | Boom | Restart | Measure | Spheres | SwitchEffects
 _DECODER = msgspec.json.Decoder(FromPage)
 
 

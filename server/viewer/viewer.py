@@ -9,12 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from .browser import Browser
+from .effect_switch import EffectSwitch, NoSwitch
 from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
+from .statistics_feed import StatisticsFeed
 from .tile_source import TileSource
 from .user_avatar import load_avatar
 from .viewer_parts import Users, ViewerParts
+from .voxel_spheres import SphereSource
 from .web_server import WebServer
 
 log = logging.getLogger(__name__)
@@ -28,17 +31,26 @@ def viewing(
     port: int = 0,
     avatar: Path | None = None,
     key_file: Path | None = None,
+    switch: EffectSwitch | None = None,
 ) -> Iterator[str]:
     """Serve the viewer during the block; yield the address of its page.
 
     endpoint: of the server; it need not run yet.  scene: its name; None: the only one there.
     port: of the page; 0: a free one.  avatar: file of the users' avatar; None: a figure.
+    switch: changes the effects of the server; None: they are shown only.
     Raise SolidcloudError if the port is in use, ScanError for an invalid avatar.
     """
     shape = load_avatar(avatar)
-    with SceneLink(endpoint, scene, key_file) as link, ResidencyFeed(lambda: link.scene) as residency:
+    with (
+        SceneLink(endpoint, scene, key_file) as link,
+        ResidencyFeed(lambda: link.scene) as residency,
+        StatisticsFeed(lambda: link.scene) as statistics,
+    ):
         tiles = TileSource(lambda: link.scene)
-        parts = ViewerParts(link, shape, StartingPlaces(shape), tiles, Users(), residency)
+        places, users = StartingPlaces(shape), Users()
+        parts = ViewerParts(
+            link, shape, places, tiles, users, residency, statistics, switch or NoSwitch(), SphereSource()
+        )
         server = WebServer(port, lambda connection: Browser(connection, parts).run())
         with server.running():
             yield server.url

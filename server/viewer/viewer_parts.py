@@ -6,11 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .effect_switch import EffectSwitch
 from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
+from .statistics_feed import StatisticsFeed
 from .tile_source import TileSource
 from .user_avatar import UserAvatar
+from .voxel_spheres import SphereSource
 
 
 class UserPlace(NamedTuple):
@@ -66,3 +69,6 @@ class ViewerParts(NamedTuple):
     tiles: TileSource
     users: Users
     residency: ResidencyFeed
+    statistics: StatisticsFeed
+    switch: EffectSwitch
+    spheres: SphereSource

@@ -29,7 +29,7 @@ HOST = "127.0.0.1"
 SOCKET_PATH = "/socket"
 # Largest message of a page [bytes]: a list of 256 tiles takes a tenth of it.
 MAX_MESSAGE_BYTES = 64 << 10
-# Browsers at a time: each is a user of the scene with four threads.
+# Browsers at a time: each is a user of the scene with five threads.
 MAX_BROWSERS = 16
 # A browser that takes no data for this long is considered gone [s].
 _STALLED_SECONDS = 20.0

@@ -33,7 +33,8 @@ def view(
     """Walk through a scene in the browser, until Ctrl-C.
 
     The page is served to this host only. The server moves the users: it stops them at the scan, and an
-    archive is served such that they stand on the ground and climb steps.
+    archive is served such that they stand on the ground and climb steps. The page can switch the
+    effects of a server that this command has started.
     """
     import signal
     import threading
@@ -42,14 +43,18 @@ def view(
 
     with needs_extra("view"):
         from ...viewer.viewer import viewing
-    from ...report.walk.server_process import served
     from ..scene_files.viewed_scene import viewed_scene
+    from .viewed_server import ViewedServer
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    server: ViewedServer | None = None
     with ExitStack() as stack:
         if what is not None:
-            connect = stack.enter_context(served(stack.enter_context(viewed_scene(what)), None))
-        url = stack.enter_context(viewing(connect, scene, port=port, avatar=avatar, key_file=key_file))
+            server = stack.enter_context(ViewedServer(stack.enter_context(viewed_scene(what))))
+            connect = server.endpoint
+        url = stack.enter_context(
+            viewing(connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server)
+        )
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
         if browser:
             # Some browsers return only when they are closed.

@@ -18,15 +18,15 @@ STOP_SECONDS = 15.0
 
 
 @contextmanager
-def served(what: Path, name: str | None, *options: str) -> Iterator[str]:
+def served(what: Path, name: str | None, *options: str, endpoint: str | None = None) -> Iterator[str]:
     """Serve an archive or a scene file during the block; yield the endpoint.
 
     At the end of the block the server is terminated, and killed if it does not stop.
     name: of the scene, for clients; None: that of the file or folder.
-    options: further options of the command.
+    options: further options of the command.  endpoint: where it listens; None: at a free port.
     Raises SolidcloudError if the server does not start; its own error is on standard error.
     """
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = endpoint or f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(what)]
     process = subprocess.Popen(
         [*command, *(["--name", name] if name else []), "--listen", endpoint, *options],

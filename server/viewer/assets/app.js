@@ -52,6 +52,14 @@ export class App {
     this.fps = 0;
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
+    // For panels: called with each state of the user, and with each refusal of the server; what else
+    // is drawn, each with a `signature` that changes with it; functions by name that tests may call.
+    this.frameListeners = new Set();
+    this.problemListeners = new Set();
+    this.drawings = new Set();
+    this.readable = {};
+    // Names of the effects that the server is being started with, or null.
+    this.switching = null;
     this.input = new Input(view.canvas, this.rig, {
       KeyV: () => settings.toggle("firstPerson"),
       KeyB: () => settings.toggle("boxes"),
@@ -86,7 +94,7 @@ export class App {
     return {
       boom: ({ free }) => this.rig.bound(free),
       status: (message) => {
-        showServer(message, this.server);
+        if (!this.switching || message.state === "connected") showServer(message, this.server);
         this.server = message.state;
       },
       welcome: (message) => this.welcome(message),
@@ -113,8 +121,24 @@ export class App {
         clear("problem");
       },
       frame: (message) => this.frame(message),
-      problem: ({ message }) => notify("problem", "The server refused", message, "warn", 6),
+      problem: ({ message }) => {
+        for (const listener of this.problemListeners) listener(message);
+        notify("problem", "The server refused", message, "warn", 6);
+      },
     };
+  }
+
+  /** Call a function with each message of a type, after those that are called already. */
+  on(type, handler) {
+    const before = this.link.handlers[type];
+    this.link.handlers[type] = before ? (message) => { before(message); handler(message); } : handler;
+  }
+
+  /** Call a function whenever a panel of "What is going on" comes into sight. seen: whether it is. */
+  whenSeen(seen, appears) {
+    for (const name of ["instruments", "openPlots", "openEffects", "openAccuracy", "openHierarchy"]) {
+      settings.follow(name, () => { if (seen()) appears(); });
+    }
   }
 
   welcome({ scene, frame, number }) {
@@ -150,6 +174,7 @@ export class App {
     const now = performance.now();
     this.users.frame(message, this.verdict, NAMES, now);
     this.contacts.take(state, now);
+    for (const listener of this.frameListeners) listener(state);
     showVerdict(this.verdict);
     showState(state);
     if (first || this.entered) {
@@ -234,7 +259,7 @@ export class App {
     ].join();
     const chosen = [
       this.boxes.version, this.boxes.object.visible, this.verdict, this.colour, settings.get("pointSize"),
-      settings.get("shading"), settings.get("budget"),
+      settings.get("shading"), settings.get("budget"), ...[...this.drawings].map((each) => each.signature),
     ].join();
     const content = `${this.tiles.changes},${this.overview.shown}`;
     this.pictures += 1;

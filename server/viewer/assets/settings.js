@@ -5,6 +5,8 @@ const KEY = "solidcloud.settings";
 const DEFAULTS = {
   colour: "auto", pointSize: 1, budget: 1.2, shading: true, firstPerson: false,
   contacts: true, clearance: true, boxes: false, panel: true,
+  instruments: false, openPlots: true, openEffects: false, openAccuracy: false, openHierarchy: false,
+  tolerance: 3, spheres: true, level: 4,
 };
 
 const listeners = new Map();

@@ -8,6 +8,7 @@ const KEYS = [
   [["Q", "E"], "turn; or drag the view"],
   [["V"], "first or third person"],
   [["C"], "next colour"],
+  [["G"], "what is going on: plots, effects, accuracy, hierarchy"],
   [["H"], "back to the start"],
   [["R", "F"], "up and down, where nothing holds you to the ground"],
 ];

@@ -1,10 +1,18 @@
 // The panels, in the order in which the page shows them.
 
+import { addAccuracyPanel } from "./accuracy.js";
 import { addColourPanel } from "./colour.js";
+import { addEffectsPanel } from "./effects.js";
+import { instrumentsToggle } from "./folding.js";
 import { addHelpPanel } from "./help.js";
+import { addHierarchyPanel } from "./hierarchy.js";
 import { addPlacePanel } from "./place.js";
+import { addPlotsPanel } from "./plots.js";
 import { addQualityPanel, addShowPanel } from "./show.js";
 
 export function addPanels(app) {
   for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addHelpPanel]) add(app);
+  // What is going on, beside the settings.
+  instrumentsToggle(app);
+  for (const add of [addPlotsPanel, addEffectsPanel, addAccuracyPanel, addHierarchyPanel]) add(app);
 }

@@ -15,10 +15,12 @@ from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
 from ...schemas.wire.scene_messages import SceneInfo
 from .browser_user import BrowserUser, state_fields
+from .clash_session import ClashSession
 from .page_messages import (
     PAGE_VERSION,
     Around,
     Boom,
+    ClashMessage,
     FromPage,
     Hello,
     Intent,
@@ -69,6 +71,7 @@ class Browser:
         self.number = next(self._numbers)
         self._intent, self._intended = Intent(), 0.0
         self._user = BrowserUser(f"viewer-{self.number}", parts.avatar, self._deliver, self._problem)
+        self._clash = ClashSession(self.number, parts, self._send)
         self._boom: Boom | None = None
         self._begun = False
         self._at: tuple[float, float, float, float] | None = None
@@ -108,6 +111,7 @@ class Browser:
             for thread in threads:
                 thread.join()
             self._user.end()
+            self._clash.end()
 
     def _read(self, messages: Iterable[FromPage]) -> None:
         """Take the page's messages."""
@@ -119,6 +123,8 @@ class Browser:
             elif isinstance(message, Restart):
                 self._at = message.at
                 self._restart.set()
+            elif isinstance(message, ClashMessage):
+                self._clash.take(message)
             else:
                 with self._work:
                     if isinstance(message, Want):
@@ -142,6 +148,7 @@ class Browser:
                     shown = scene.info
                     self._send(welcome_message(scene, self.number))
                     self._send(avatar_message(self._parts))
+                    self._clash.begin()
                     with self._work:
                         self._overview = scene
                         self._work.notify_all()

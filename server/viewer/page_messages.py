@@ -6,7 +6,7 @@ copying them.
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -18,6 +18,8 @@ from ...schemas.errors import BadRequestError
 PAGE_VERSION = 1
 # Arrays begin at multiples of this, as typed arrays of 8 bytes require [bytes].
 _ALIGNMENT = 8
+# Longest part of a file of poses [characters]: a character takes at most 6 bytes of a message.
+PATH_PART = 10_000
 
 Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 Angle = Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)]
@@ -86,7 +88,37 @@ class Restart(msgspec.Struct, frozen=True, tag="restart"):
     at: tuple[Metres, Metres, Metres, Angle] | None = None
 
 
-FromPage = Hello | Intent | Want | Around | Boom | Restart
+class PathText(msgspec.Struct, frozen=True, tag="path"):
+    """Part of a file of poses, whose clashes are wanted.
+
+    name: of the file; its suffix selects the format.  first, last: whether it is the file's first
+    part, and its last.
+    """
+
+    name: Annotated[str, msgspec.Meta(max_length=255)]
+    text: Annotated[str, msgspec.Meta(max_length=PATH_PART)]
+    first: bool
+    last: bool
+
+
+class StopCheck(msgspec.Struct, frozen=True, tag="stop"):
+    """End the check of a path, or the writing of a file."""
+
+
+class ShowClash(msgspec.Struct, frozen=True, tag="show"):
+    """Request the contacts of a clash and a viewpoint. number: in the list, from 1."""
+
+    number: Number
+
+
+class SaveClashes(msgspec.Struct, frozen=True, tag="save"):
+    """Request the clashes as a file."""
+
+    form: Literal["csv", "json", "bcf"]
+
+
+ClashMessage = PathText | StopCheck | ShowClash | SaveClashes
+FromPage = Hello | Intent | Want | Around | Boom | Restart | ClashMessage
 _DECODER = msgspec.json.Decoder(FromPage)
 
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from .browser import Browser
+from .path_source import read_given_path
 from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
@@ -28,17 +29,21 @@ def viewing(
     port: int = 0,
     avatar: Path | None = None,
     key_file: Path | None = None,
+    poses: Path | None = None,
 ) -> Iterator[str]:
     """Serve the viewer during the block; yield the address of its page.
 
     endpoint: of the server; it need not run yet.  scene: its name; None: the only one there.
     port: of the page; 0: a free one.  avatar: file of the users' avatar; None: a figure.
-    Raise SolidcloudError if the port is in use, ScanError for an invalid avatar.
+    poses: file of a path whose clashes the page shows.
+    Raise SolidcloudError if the port is in use, ScanError for an invalid avatar, and the errors of
+    `read_path`.
     """
     shape = load_avatar(avatar)
+    path = None if poses is None else read_given_path(poses)
     with SceneLink(endpoint, scene, key_file) as link, ResidencyFeed(lambda: link.scene) as residency:
         tiles = TileSource(lambda: link.scene)
-        parts = ViewerParts(link, shape, StartingPlaces(shape), tiles, Users(), residency)
+        parts = ViewerParts(link, shape, StartingPlaces(shape), tiles, Users(), residency, path)
         server = WebServer(port, lambda connection: Browser(connection, parts).run())
         with server.running():
             yield server.url

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .path_source import GivenPath
 from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
@@ -58,7 +59,10 @@ class Users:
 
 
 class ViewerParts(NamedTuple):
-    """What the browsers of one viewer share."""
+    """What the browsers of one viewer share.
+
+    path: whose clashes each page shows from the beginning, or None.
+    """
 
     link: SceneLink
     avatar: UserAvatar
@@ -66,3 +70,4 @@ class ViewerParts(NamedTuple):
     tiles: TileSource
     users: Users
     residency: ResidencyFeed
+    path: GivenPath | None = None

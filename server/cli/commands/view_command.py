@@ -27,6 +27,12 @@ def view(
             help="Points or mesh of the users' avatar, z up, facing +y; default: a figure of 1.75 m."
         ),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Path whose clashes are shown: CSV file t,x,y,z,qw,qx,qy,qz, or TUM trajectory (.tum, .txt)."
+        ),
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     key_file: KeyFile = None,
 ) -> None:
@@ -49,7 +55,9 @@ def view(
     with ExitStack() as stack:
         if what is not None:
             connect = stack.enter_context(served(stack.enter_context(viewed_scene(what)), None))
-        url = stack.enter_context(viewing(connect, scene, port=port, avatar=avatar, key_file=key_file))
+        url = stack.enter_context(
+            viewing(connect, scene, port=port, avatar=avatar, key_file=key_file, poses=poses)
+        )
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
         if browser:
             # Some browsers return only when they are closed.

@@ -28,8 +28,13 @@ def sources() -> set[str]:
         path.relative_to(ROOT).as_posix().removeprefix("server/api/")
         for package in ("schemas", "builder", "server")
         for path in (ROOT / package).rglob("*")
-        if path.suffix in (".py", ".md", ".json") or path.name == "py.typed"
+        if path.suffix in (".py", ".md", ".json") or path.name == "py.typed" or is_asset(path)
     }
+
+
+def is_asset(path: Path) -> bool:
+    """Return whether a file belongs to the viewer's page."""
+    return path.is_file() and path.is_relative_to(ROOT / "server/viewer/assets")
 
 
 @wheel

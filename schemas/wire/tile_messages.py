@@ -16,6 +16,8 @@ from .requests import Count, Length, Request
 
 # Most voxels that an answer lists, and the least detail: of 4^8 points, one.
 MAX_LISTED_VOXELS, MAX_DETAIL = 1 << 16, 8
+# From this detail on, the points may be those of the archive's level of detail (FORMAT.md).
+LEVEL_DETAIL = 3
 # Largest level of `TileRequest.level`.
 MAX_SPHERE_LEVEL = 79
 
@@ -71,7 +73,8 @@ class TileRequest(Request, frozen=True):
 
     archive, voxel: as in `VoxelsAnswer`.
     detail: 0 for all points; k: of every 4^k points in the order of the hierarchy, one. The points
-    of a detail are among those of the next finer one.
+    of a detail are among those of the next finer one, except from LEVEL_DETAIL to the finer one:
+    from there on they are about as many of the archive's level of detail, if it has one.
     level: null for points; a number: the bounding spheres of the hierarchy at this level instead, 0
     for the root. Leaf nodes above the level are included.
     """

@@ -54,6 +54,7 @@ def widths(scene: str, client: str) -> list[str]:
         f"solidcloud/1/*/{scene}/*/{AVATAR}",
         f"solidcloud/1/state/{scene}/*/*",
         f"solidcloud/1/wish/{scene}/*/*",
+        f"solidcloud/1/residency/{scene}/*",
         f"solidcloud/1/client/{scene}/*",
     ]
 

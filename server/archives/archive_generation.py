@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from ...schemas.archive.archive import Archive
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, FormatError
@@ -170,6 +171,11 @@ class ArchiveGeneration:
         """Return the memory of coarse bounds and of the level of detail [bytes]."""
         coarse = self.data.coarse
         return (0 if coarse is None else coarse.bytes) + (0 if self._level is None else self._level.bytes)
+
+    @property
+    def level_archive(self) -> Archive | None:
+        """Return the level of detail; None if none is open. Only readers may use it."""
+        return None if self._level is None else self._level.store.archive
 
     @property
     def has_level(self) -> bool:

@@ -55,7 +55,7 @@ class SceneTiles:
         placed = self.archives[request.archive]
         with placed.take() as opened:
             try:
-                return read_tile(request, placed, opened.store.archive)
+                return read_tile(request, placed, opened.store.archive, opened.level_archive)
             except OSError as error:
                 raise CorruptError(
                     f"voxel {request.voxel}: cannot be read ({error}): check the disk"

@@ -139,6 +139,8 @@ class ResidencyStreams:
                     self._closed.wait(CHANGES_SECONDS)
         except BadRequestError as error:  # the scene is closed
             log.debug("changes end: %s", error)
+        except Exception:  # affects these queries only
+            log.exception("changes of %s end", self._scene)
         finally:
             self._streams.close()
             if watch is not None:

@@ -70,7 +70,7 @@ def url(endpoint: str) -> Iterator[str]:
 
 
 def test_page_shows_the_scan_and_a_user_on_the_floor(browser: Any, url: str) -> None:
-    with viewed_page(browser, url) as viewed:
+    with viewed_page(browser, url, full=True) as viewed:
         viewed.wait_complete()
         picture = viewed.picture()
         assert coloured(picture) > 0.15

@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import archive_cases
@@ -204,7 +205,7 @@ def test_every_operation_speaks_json(raw: Raw, client: Client) -> None:
     replies = raw.session.get(
         key, encoding=JSON, timeout=DEADLINE, consolidation=zenoh.ConsolidationMode.NONE
     )
-    for number, reply in zip(range(3), replies, strict=False):
+    for number, reply in enumerate(islice(replies, 3)):
         message = decode_answer(ResidencyChanges, reply.ok.payload.to_bytes(), JSON)
         assert message.lost == (number == 0)
 

@@ -45,7 +45,7 @@ function expose(app) {
     missing: () => app.tiles.missing ?? null,
     voxels: () => [...app.tiles.voxels.values()].map(({ name, resident, detail }) => ({ name, resident, detail })),
     boxes: () => app.boxes.object.visible,
-    others: () => [...app.users.others.values()].map((each) => each.position.toArray()),
+    others: () => [...app.users.others.values()].map((each) => each.poses.at(-1).place.toArray()),
     colour: () => app.colour,
     columns: () => [...app.tiles.columns],
     yaw: () => app.rig.yaw,

@@ -18,6 +18,8 @@ def test_keys_look_as_in_the_document():
     assert key_expressions.all_commands_key("hall") == "solidcloud/1/wish/hall/*/*"
     assert key_expressions.state_key("hall", user) == "solidcloud/1/state/hall/c-1/al"
     assert key_expressions.all_states_key("hall") == "solidcloud/1/state/hall/*/*"
+    assert key_expressions.residency_key("hall", "c-1") == "solidcloud/1/residency/hall/c-1"
+    assert key_expressions.all_residency_key("hall") == "solidcloud/1/residency/hall/*"
     assert f"solidcloud/{WIRE_VERSION}" == key_expressions.ROOT
 
 
@@ -38,6 +40,17 @@ def test_a_token_is_read_as_it_was_written_and_no_wider_one():
     for key in ("solidcloud/1/client/hall/*", "solidcloud/1/client/**", "solidcloud/1/client/hall/c/x", "**"):
         with pytest.raises(BadRequestError):
             key_expressions.parse_client_token(key)
+
+
+def test_a_query_for_changes_is_read_as_it_was_written_and_no_wider_one():
+    assert key_expressions.parse_residency_key(key_expressions.residency_key("hall", "c-1")) == "c-1"
+    for key in (
+        "solidcloud/1/residency/hall/*",
+        "solidcloud/1/residency/hall/c/x",
+        "solidcloud/1/client/hall/c",
+    ):
+        with pytest.raises(BadRequestError):
+            key_expressions.parse_residency_key(key)
 
 
 def test_others_are_told_a_name_that_the_id_cannot_be_found_from():

@@ -11,7 +11,9 @@ import pytest
 from coloured_scans import coloured, write_las
 from scipy.spatial import cKDTree
 from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.edit.seal_archive import seal_archive
 from solidcloud.builder.pipeline import build_archive
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
@@ -20,7 +22,7 @@ from solidcloud.schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from solidcloud.server.scene import Scene
 from solidcloud.server.tiles import scene_overview
 
-COUNT = 30_000
+COUNT, KEY = 30_000, bytes(range(32))
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +66,24 @@ def test_an_overview_is_a_sample_of_the_preview(case: archive_cases.Case) -> Non
             assert len(fewer.points) == limit
             check_sampled(fewer, case.points)
         assert scene.residency.resident == 0
+
+
+def test_no_record_is_read_beside_a_preview(
+    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Scene.open(case.archive) as scene:
+        monkeypatch.setattr(Archive, "_read_frame", None)
+        assert len(scene.overview(50).points) == 50
+
+
+def test_the_preview_of_a_sealed_archive_is_not_trusted(case: archive_cases.Case, tmp_path: Path) -> None:
+    folder, key = copied(case, tmp_path), tmp_path / "key"
+    key.write_bytes(KEY)
+    seal_archive(folder, KEY)
+    with Scene.open(folder, archive_key=key) as scene:
+        assert scene.overview(50).previewed.tolist() == [False]
+    with Scene.open(folder) as scene:
+        assert scene.overview(50).previewed.tolist() == [True]
 
 
 def test_few_points_of_an_overview_are_spread(case: archive_cases.Case) -> None:

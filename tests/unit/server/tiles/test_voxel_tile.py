@@ -7,9 +7,14 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import pytest
+from coloured_scans import Coloured, coloured, write_las
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.passes import level_pass
+from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
+from solidcloud.schemas.archive.level import LEVEL_FOLDER, halvings_between
 from solidcloud.schemas.errors import BadRequestError, BusyError, CorruptError, TooLargeError
-from solidcloud.schemas.wire.tile_messages import TileAnswer
+from solidcloud.schemas.wire.tile_messages import TileAnswer, TileRequest
 from solidcloud.server.scene import Scene
 from solidcloud.server.tiles import voxel_tile
 
@@ -20,7 +25,19 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
     rng = np.random.default_rng(3)
     places = rng.uniform(-1.5, 1.5, (6000, 3))
     places[:, 2] = 0.2 * np.sin(3 * places[:, 0]) + rng.normal(0, 0.003, len(places))
-    return archive_cases.build(tmp_path_factory.mktemp("tiles"), places, voxel=1.0)
+    return archive_cases.build(tmp_path_factory.mktemp("tiles"), places, voxel=1.0, level=False)
+
+
+@pytest.fixture(scope="module")
+def leveled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Coloured]:
+    """Coloured points with a level of detail, whose voxels are smaller than the archive's."""
+    truth, folder = coloured(4, 30_000), tmp_path_factory.mktemp("level")
+    scan = write_las(folder / "scan.las", truth)
+    keep = frozenset({"rgb", "intensity", "classification"})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(level_pass, "LEVEL_VOXEL", 16)  # so that voxels are halved, as dense ones are
+        build_archive([scan], folder / "archive", BuildConfig(voxel=1.0, resolution=1e-3, keep=keep, jobs=1))
+    return folder / "archive", truth
 
 
 def world(tile: TileAnswer) -> np.ndarray:
@@ -86,6 +103,60 @@ def test_a_tile_that_does_not_exist_is_refused(case: archive_cases.Case) -> None
         ):
             with pytest.raises(BadRequestError, match=message):
                 scene.tile(*wrong)
+
+
+def test_coarse_details_are_read_from_the_level(
+    leveled: tuple[Path, Coloured], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, truth = leveled
+    rows = zip(np.rint(truth.xyz * 1e3).astype(int).tolist(), truth.rgb.tolist(), truth.classes, strict=True)
+    expected = {(*place, *rgb, int(kind)) for place, rgb, kind in rows}
+    with Scene.open(folder) as scene, scene.archives[0].take() as opened:
+        level = opened.level_archive
+        assert level is not None
+        monkeypatch.setattr(opened.store.archive, "read_voxel", None)
+        found, counts = set(), [0] * 6
+        for voxel in scene.voxels((0, 0, 0)).voxel:
+            before: set[tuple[int, ...]] | None = None
+            for detail in (3, 4, 5):
+                tile = scene.tile(0, voxel, detail)
+                places = np.rint(world(tile) * 1e3).astype(int).tolist()
+                assert len(tile.rgb) == len(tile.intensity) == len(tile.classification) == len(tile.points)
+                assert not len(tile.scan) and not len(tile.spheres)
+                own = {
+                    (*place, *rgb, int(kind))
+                    for place, rgb, kind in zip(places, tile.rgb.tolist(), tile.classification, strict=True)
+                }
+                assert own <= expected
+                low = np.array(voxel) * 1000 + np.rint(np.array(scene.info().origin) * 1e3)
+                assert ((places >= low) & (places < low + 1000)).all(), "in its voxel"
+                assert before is None or own <= before, "of the finer detail"
+                before = own
+                counts[detail] += len(tile.points)
+                found |= own if detail == 3 else set()
+        assert counts[3] == pytest.approx(level.header.points / 2, abs=0.5 * len(level.voxels) + 9)
+        assert counts[3] > counts[4] > counts[5] > 0
+        monkeypatch.setattr(voxel_tile, "_MAX_LEVEL_POINTS", 3)
+        with pytest.raises(TooLargeError, match="level of detail"):
+            scene.tile(0, scene.voxels((0, 0, 0)).voxel[0], 3)
+
+
+def test_a_level_voxel_is_found_in_any_division(
+    leveled: tuple[Path, Coloured],
+) -> None:
+    folder, _ = leveled
+    with Archive(folder) as archive, Archive(folder / LEVEL_FOLDER) as level:
+        halvings = halvings_between(level.header.lattice, archive.header.lattice)
+        assert halvings > 0
+        shown = 0
+        for voxel in archive.coordinates:
+            request = TileRequest(0, tuple(voxel.tolist()), 3)
+            places, _, _ = voxel_tile._representatives(request, archive, level)
+            inside = ((level.coordinates >> halvings) == voxel).all(axis=1)
+            count = int(level.voxels["rows"][inside, 2].sum())
+            assert len(places) == -(-count // 2)
+            shown += count
+        assert shown == level.header.points
 
 
 def test_a_large_voxel_has_limits(case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch) -> None:

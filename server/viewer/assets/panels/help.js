@@ -8,6 +8,7 @@ const KEYS = [
   [["Q", "E"], "turn; or drag the view"],
   [["V"], "first or third person"],
   [["C"], "next colour"],
+  [[",", "."], "previous or next clash; Esc: back to the user"],
   [["H"], "back to the start"],
   [["R", "F"], "up and down, where nothing holds you to the ground"],
 ];

@@ -85,7 +85,8 @@ def _markup(
         "Description",
         f"Poses {clash.first} to {clash.last} ({times}) of {path} are in contact with the scan {scene}. "
         f"Greatest depth {clash.depth:.4f} m at pose {clash.deepest}; "
-        f"up to {clash.contacts} pairs of points in contact, {len(clash.clusters)} clusters.",
+        f"up to {clash.contacts} pairs of points in contact at a pose; "
+        f"clusters of contacts: {len(clash.clusters)}.",
     )
     pictures = ElementTree.SubElement(root, "Viewpoints", {"Guid": view})
     _text(pictures, "Viewpoint", "viewpoint.bcfv")

@@ -18,9 +18,10 @@ Colours = NDArray[np.uint8]
 
 SIZE = (960, 540)
 _GROUND = (10, 14, 21)
-_NEAR = 0.1
+# Nearer points hide too much [m].
+_NEAR = 0.6
 # Largest half width of a point [pixels].
-_LARGEST = 6
+_LARGEST = 8
 _SHADE = 2.5
 
 

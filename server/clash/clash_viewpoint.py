@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 FIELD_OF_VIEW = 60.0
 # Candidates: directions about the up axis, angles above the horizon, and distances [m] as shares of
 # the avatar's height above 2 m.
-_DIRECTIONS, _RISES, _DISTANCES = 24, (12.0, 28.0, 50.0), (3.4, 2.2)
+_DIRECTIONS, _RISES, _DISTANCES = 24, (12.0, 28.0, 50.0), (3.0, 2.1)
 # Room that a camera needs [m], and how near a hit may be to the place that the ray goes to: the scan
 # there is what is to be seen.
 _ROOM, _BESIDE = 0.25, 0.25
@@ -60,10 +60,16 @@ def find_viewpoint(
         for rise in np.radians(_RISES):
             offsets.append(size * distance * (np.cos(rise) * back + np.sin(rise) * up))
             # Obliquely from behind: the avatar does not hide what it touches.
-            scores.append(0.6 * np.cos(np.abs(angles) - np.radians(35.0)) + (0.3 if distance > 3 else 0.0))
+            scores.append(
+                0.6 * np.cos(np.abs(angles) - np.radians(35.0))
+                + (0.3 if distance > 2.5 else 0.0)
+                - 0.4 * np.sin(rise)
+            )
     eyes = target + np.concatenate(offsets)
     score = np.concatenate(scores)
-    score = score + np.tile(0.6 * (np.concatenate(offsets[:1]) @ clash.normal) / size / 3.4, len(offsets))
+    score = score + np.tile(
+        0.6 * (np.concatenate(offsets[:1]) @ clash.normal) / size / _DISTANCES[0], len(offsets)
+    )
     for aim, worth in ((contact, 2.0), (body, 1.5), (body + 0.35 * height * up, 1.0)):
         score += worth * _seen(scene, eyes, aim)
     score += 2.0 * (scene.within(eyes, _ROOM).verdict == Verdict.CLEAR)

@@ -10,7 +10,7 @@ export class ClashCheck {
   constructor(app) {
     this.app = app;
     this.line = new PathLine(app.view.lines);
-    this.ghost = new Ghost(app.view.points, app.view.lines);
+    this.ghost = new Ghost(app.view.lines);
     this.listeners = [];
     this.reset();
   }

@@ -18,26 +18,27 @@ void main() {
   gl_PointSize = max(2.0, uSize * uScale / max(-seen.z, 1e-3));
 }`;
 
-// Every second pixel is left out: the scan is seen through the ghost, and depths stay right.
 const FRAGMENT = /* glsl */ `
 uniform vec3 uColour;
+uniform float uOpacity;
 void main() {
   vec2 at = 2.0 * gl_PointCoord - 1.0;
   float square = dot(at, at);
-  if (square > 1.0 || mod(floor(gl_FragCoord.x) + floor(gl_FragCoord.y), 2.0) < 0.5) discard;
+  if (square > 1.0) discard;
   vec3 normal = vec3(at.x, -at.y, sqrt(1.0 - square));
-  gl_FragColor = vec4(uColour * (0.5 + 0.55 * max(0.0, dot(normal, normalize(vec3(-0.35, 0.75, 0.6))))), 1.0);
+  gl_FragColor = vec4(uColour * (0.5 + 0.55 * max(0.0, dot(normal, normalize(vec3(-0.35, 0.75, 0.6))))), uOpacity);
 }`;
 
 export class Ghost {
-  /** bodies, marks: objects for the body, and for what is drawn over the scan. */
-  constructor(bodies, marks) {
-    this.bodies = bodies;
-    this.body = null;
-    this.bodyMaterial = new ShaderMaterial({
-      vertexShader: VERTEX, fragmentShader: FRAGMENT,
-      uniforms: { uSize: { value: 0.05 }, uScale: shared.uScale, uColour: { value: new Color(COLOURS.body) } },
-    });
+  /** group: object for what is drawn over the scan. */
+  constructor(group) {
+    this.group = group;
+    this.body = [];
+    const uniforms = { uSize: { value: 0.05 }, uScale: shared.uScale, uColour: { value: new Color(COLOURS.body) }, uOpacity: { value: 0.62 } };
+    // First the depths alone: of a translucent body, only its near side is seen.
+    this.bodyMaterials = [false, true].map((colorWrite) => new ShaderMaterial({
+      vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms, colorWrite, depthWrite: !colorWrite, transparent: true,
+    }));
     const over = { depthTest: false, transparent: true };
     this.places = new InstancedMesh(
       new SphereGeometry(0.016, 10, 8), new MeshBasicMaterial({ ...over, color: COLOURS.contact, opacity: 0.9 }), MOST_PLACES);
@@ -50,10 +51,10 @@ export class Ghost {
       const arrow = new Group();
       arrow.add(new Mesh(shaft, material), new Mesh(head, material));
       for (const part of arrow.children) part.renderOrder = 4;
-      marks.add(arrow);
+      group.add(arrow);
       return arrow;
     });
-    marks.add(this.places);
+    group.add(this.places);
     this.version = 0;
     this.hide();
   }
@@ -62,12 +63,16 @@ export class Ghost {
   show({ pose, places, clusters }, geometry, radius) {
     this.hide();
     if (geometry) {
-      this.bodyMaterial.uniforms.uSize.value = 2 * radius;
-      this.body = new Points(geometry, this.bodyMaterial);
-      this.body.frustumCulled = false;
-      this.body.matrixAutoUpdate = false;
-      this.body.matrix.set(...pose.flat());
-      this.bodies.add(this.body);
+      this.bodyMaterials[0].uniforms.uSize.value = 2 * radius;
+      this.body = this.bodyMaterials.map((material, k) => {
+        const body = new Points(geometry, material);
+        body.frustumCulled = false;
+        body.matrixAutoUpdate = false;
+        body.matrix.set(...pose.flat());
+        body.renderOrder = -2 + k;
+        this.group.add(body);
+        return body;
+      });
     }
     const shown = places.slice(0, MOST_PLACES);
     shown.forEach((place, k) => this.places.setMatrixAt(k, new Matrix4().makeTranslation(...place)));
@@ -85,8 +90,8 @@ export class Ghost {
   }
 
   hide() {
-    if (this.body) this.bodies.remove(this.body);
-    this.body = null;
+    this.group.remove(...this.body);
+    this.body = [];
     this.places.visible = false;
     for (const arrow of this.arrows) arrow.visible = false;
     this.version += 1;
@@ -95,7 +100,7 @@ export class Ghost {
   /** Return how many contact points and contact normals are shown. */
   get counts() {
     return {
-      body: this.body !== null,
+      body: this.body.length > 0,
       places: this.places.visible ? this.places.count : 0,
       normals: this.arrows.filter((arrow) => arrow.visible).length,
     };

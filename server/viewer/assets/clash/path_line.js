@@ -8,7 +8,7 @@ import { CLASSES, classOf } from "./clearance.js";
 
 // A longer path is drawn with this many pieces, each in the colour of its worst pose.
 const MOST_PIECES = 3000;
-const RADIUS = 0.024;
+const RADIUS = 0.02;
 
 const VERTEX = /* glsl */ `
 attribute vec3 begin;

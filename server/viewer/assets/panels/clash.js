@@ -35,7 +35,7 @@ export function addClashPanel(app) {
 
   const found = make("div");
   section.append(found);
-  slider(found, "near", "Near below", { min: 0.05, max: 1, step: 0.05 }, (value) => `${value.toFixed(2)} m`);
+  slider(found, "near", "Near", { min: 0.05, max: 1, step: 0.05 }, (value) => `${value.toFixed(2)} m`);
   const legend = make("ul", { className: "legend" });
   const list = make("ol", { id: "clash-list" });
   list.setAttribute("aria-label", "Clashes, deepest first");
@@ -55,10 +55,12 @@ export function addClashPanel(app) {
     clash.line.colour(value);
     clash.changed();
   });
-  let listed = null;
+  let listed = null, begun = "";
   clash.follow(() => {
     const { state, result, line } = clash;
     running.hidden = state !== "running" && state !== "saving";
+    if (state === "running" && begun !== state) section.scrollIntoView({ block: "start" });
+    begun = state;
     bar.value = clash.done;
     bar.setAttribute("aria-label", state === "saving" ? "Drawing the pictures of the file" : "Checking the path");
     message.textContent = text(clash);

@@ -80,7 +80,7 @@ def test_page_shows_the_scan_and_a_user_on_the_floor(browser: Any, url: str) -> 
         assert ((green > 1.5 * red) & (green >= blue)).sum() > 500
         assert viewed.read("s.verdict") == "clear"
         assert viewed.read("s.voxels.length") > 20
-        assert viewed.page.inner_text("#scene-name").startswith("viewer · 60,000 points")
+        assert viewed.page.inner_text("#scene-name").startswith("archive · 60,000 points")
         viewed.check_clean(url)
 
 
@@ -157,7 +157,7 @@ def test_loss_and_return_of_the_server_are_shown_and_the_user_continues(
     browser: Any, scene_file: Path, free_endpoint: Any
 ) -> None:
     where = free_endpoint()
-    with viewing(where, "viewer") as url, viewed_page(browser, f"{url}?at={BY_WALL}") as viewed:
+    with viewing(where, "archive") as url, viewed_page(browser, f"{url}?at={BY_WALL}") as viewed:
         viewed.wait("s.server === 'searching'")
         assert "No server yet" in viewed.page.inner_text("#notices")
         with running(scene_file, where) as process:

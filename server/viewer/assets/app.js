@@ -229,6 +229,8 @@ export class App {
     const seconds = Math.min(0.2, (now - this.times.picture) / 1000);
     this.times.picture = now;
     const intent = this.input.read(seconds);
+    // Where there is gravity, it decides.
+    if (this.scene?.effects.includes("ground")) intent.up = 0;
     // Who walks looks at the user again.
     if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
     const { watched } = this.rig;
@@ -259,9 +261,10 @@ export class App {
     this.times.choose = now;
     const focus = this.rig.watched ? this.rig.watched.target : own ? own.position : this.rig.focus;
     const budget = 1e6 * settings.get("budget");
-    this.tiles.choose(this.view.camera, focus, budget, this.quality.budget(budget), now);
+    const drawn = this.quality.budget(budget);
+    this.tiles.choose(this.view.camera, focus, budget, drawn, now);
     this.boxes.update(this.tiles, focus, settings.get("boxes"));
-    this.overview.update(settings.get("pointSize"), now);
+    this.overview.update(settings.get("pointSize"), drawn - this.tiles.shown, now);
   }
 
   /** Draw, if the picture differs from the one before. */
@@ -269,14 +272,14 @@ export class App {
     const { camera } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
-      this.contacts.signature, this.users.signature,
+      this.contacts.signature, this.users.signature, this.verdict,
     ].join();
     const chosen = [
-      this.boxes.version, this.boxes.object.visible, this.verdict, this.colour, settings.get("pointSize"),
+      this.boxes.version, this.boxes.object.visible, this.colour, settings.get("pointSize"),
       settings.get("shading"), settings.get("budget"), this.clash.signature,
       ...[...this.drawings].map((each) => each.signature),
     ].join();
-    const content = `${this.tiles.changes},${this.overview.shown}`;
+    const content = `${this.tiles.changes},${this.overview.count}`;
     this.pictures += 1;
     if (!this.quality.look(seen, chosen, content, now)) {
       this.drawnBefore = false;
@@ -284,7 +287,7 @@ export class App {
     }
     if (this.quality.still && this.scene) this.choose(now, this.users.own);
     this.view.shading = this.quality.shading(settings.get("shading"));
-    if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown);
+    if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown + this.overview.shown);
     this.times.drawn = now;
     this.drawnBefore = true;
     this.view.draw();

@@ -53,7 +53,6 @@ class PanelWork:
 
     def close(self) -> None:
         """End `run`."""
-        self._parts.statistics.leave(self._number)
         with self._work:
             self._closed = True
             self._work.notify()
@@ -61,6 +60,13 @@ class PanelWork:
     def run(self) -> None:
         """Answer requests until `close`. Runs in a thread."""
         self._parts.statistics.follow(self._number, self._sampled)
+        try:
+            self._serve()
+        finally:
+            self._parts.statistics.leave(self._number)
+
+    def _serve(self) -> None:
+        """Answer requests until `close`."""
         while True:
             with self._work:
                 self._work.wait_for(lambda: self._closed or self._asked or self._samples)

@@ -15,7 +15,8 @@ from .view_frame import ViewFrame
 # Voxels whose boxes are within this distance of the user's middle belong to where it stands [m], at
 # most this many, nearest first.
 _REACH, _MOST_VOXELS = 1.0, 8
-# Spheres that a page is sent, nearest first: in software, a sphere of 80 triangles takes some 10 µs.
+# Spheres that a page is sent, nearest first: a picture of more would take seconds without a graphics
+# processor, and none of them would be seen among the others.
 MOST_SPHERES = 6000
 # Share of the spheres that have the colour of the smallest ones.
 _TINY = 0.05

@@ -55,7 +55,8 @@ export class App {
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
     // For panels: called with each state of the user, and with each refusal of the server; what else
-    // is drawn, each with a `signature` that changes with it; functions by name that tests may call.
+    // is drawn, each with a `signature` that changes with it and a method `prepare`; functions by name
+    // that tests may call.
     this.frameListeners = new Set();
     this.problemListeners = new Set();
     this.drawings = new Set();
@@ -286,6 +287,7 @@ export class App {
       return;
     }
     if (this.quality.still && this.scene) this.choose(now, this.users.own);
+    for (const each of this.drawings) each.prepare(!this.quality.software || this.quality.still);
     this.view.shading = this.quality.shading(settings.get("shading"));
     if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown + this.overview.shown);
     this.times.drawn = now;

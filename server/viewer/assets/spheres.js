@@ -57,15 +57,22 @@ export class BoundingSpheres {
     }
     this.drawn = 0;
     this.version = 0;
+    this.wanted = false;
   }
 
   /** Text that changes with what is drawn. */
   get signature() {
-    return `${this.version}${this.mesh.visible}`;
+    return `${this.version}${this.wanted}`;
   }
 
-  show(on) {
-    this.mesh.visible = this.boxes.visible = on && this.drawn > 0;
+  show(wanted) {
+    this.wanted = wanted && this.drawn > 0;
+  }
+
+  /** Choose what the next picture has. full: all; else only what takes little time. */
+  prepare(full) {
+    this.mesh.visible = this.wanted && full;
+    this.boxes.visible = this.wanted;
   }
 
   /** Take spheres and boxes of voxels. shades: radii that have the first and the last colour [m]. */

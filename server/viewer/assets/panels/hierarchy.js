@@ -82,7 +82,8 @@ export function addHierarchyPanel(app) {
       const drawn = spheres.drawn < total ? `the nearest ${spheres.drawn.toLocaleString("en")} of ${all} spheres` : `${all} spheres`;
       text.textContent = `Level ${level}: ${drawn} with radii of ${length(radii[0])} to ${length(radii[1])}, around the centres of `
         + `${points.toLocaleString("en")} points in ${voxels} voxels (white boxes).`
-        + `${level < depth ? " Leaf nodes that end above this level are among them." : " All are leaf nodes."}`;
+        + `${level < depth ? " Leaf nodes that end above this level are among them." : " All are leaf nodes."}`
+        + `${app.view.software ? " This browser draws without a graphics processor: spheres are drawn while the view rests." : ""}`;
     }
   }
 }

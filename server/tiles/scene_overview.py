@@ -17,7 +17,6 @@ from ...schemas.archive.index import Header
 from ...schemas.archive.vtkhdf import PREVIEW_NAME, read_sample
 from ...schemas.errors import CorruptError
 from ...schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
-from ..archives.masked_archive import MaskedArchive
 from ..archives.placed_archive import PlacedArchive
 
 log = logging.getLogger(__name__)
@@ -147,7 +146,10 @@ def _read_preview(archive: Archive) -> _Sample | None:
     # The preview is rounded, and not written by this process.
     kept = np.asarray(np.isfinite(found.points).all(axis=1))
     sample = sample.where(kept)._replace(points=np.clip(found.points[kept], low, high))
-    if isinstance(archive, MaskedArchive):
+    if not archive.is_as_stored:
+        from ..archives.masked_archive import MaskedArchive  # loads the builder's code
+
+        assert isinstance(archive, MaskedArchive)
         sample = sample.where(np.logical_not(archive.is_masked(sample.points)))
     return sample if len(sample.points) else None
 

@@ -6,7 +6,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
-from itertools import count
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,12 +62,10 @@ class Browser:
     delivers the states, and one reads tiles.
     """
 
-    _numbers = count(1)
-
     def __init__(self, connection: PageConnection, parts: ViewerParts) -> None:
         """Make a browser."""
         self._connection, self._parts = connection, parts
-        self.number = next(self._numbers)
+        self.number = parts.users.enter()
         self._intent, self._intended = Intent(), 0.0
         self._user = BrowserUser(f"viewer-{self.number}", parts.avatar, self._deliver, self._problem)
         self._clash = ClashSession(self.number, parts, self._send)
@@ -85,6 +82,13 @@ class Browser:
 
     def run(self) -> None:
         """Serve the page until it is closed. Raise BadRequestError for an invalid message."""
+        try:
+            self._serve()
+        finally:
+            self._parts.users.free(self.number)
+
+    def _serve(self) -> None:
+        """Serve the page, from its first message."""
         messages = map(read_message, self._connection)
         hello = next(messages, None)
         if not isinstance(hello, Hello):
@@ -165,7 +169,7 @@ class Browser:
                 self._attempt(partial(self._user.command, intent))
             boom, self._boom = self._boom, None
             if boom is not None and scene is not None:
-                self._attempt(partial(self._send_boom, boom, scene))
+                self._attempt(partial(self._send_boom, boom, scene), again=True)
             due = max(due + FRAME_SECONDS, time.monotonic() - FRAME_SECONDS)
             self._closed.wait(max(0.0, due - time.monotonic()))
 
@@ -180,13 +184,16 @@ class Browser:
 
         self._attempt(enter)
 
-    def _attempt(self, work: Callable[[], None]) -> None:
-        """Do something that the server may refuse; the page shows why."""
+    def _attempt(self, work: Callable[[], None], *, again: bool = False) -> None:
+        """Do something that the server may refuse; the page shows why.
+
+        again: the page asks again by itself, so that a busy server needs no words.
+        """
         try:
             work()
         except BusyError as error:
             # Without a server the page already shows this.
-            if self._parts.link.status.state == "connected":
+            if self._parts.link.status.state == "connected" and not again:
                 self._problem(str(error))
         except SolidcloudError as error:
             self._problem(str(error))
@@ -220,7 +227,7 @@ class Browser:
             if overview is not None:
                 self._attempt(partial(self._send_overview, overview))
             if around is not None:
-                self._attempt(partial(self._send_voxels, around))
+                self._attempt(partial(self._send_voxels, around), again=True)
             elif key is not None:
                 self._send_tile(key)
 

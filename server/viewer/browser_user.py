@@ -15,7 +15,7 @@ from ..zenoh_client.client_session import ClientSession
 from .page_messages import Intent
 from .scene_link import OpenScene
 from .user_avatar import UserAvatar
-from .user_motion import eased, turn, velocity
+from .user_motion import Easing, turn, velocity
 from .view_frame import ViewFrame
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class BrowserUser:
         self._frame: ViewFrame | None = None
         self._thread: threading.Thread | None = None
         self._latest: State | None = None
-        self._moved = 0.0  # way of the last frame [m]
+        self._easing = Easing()
 
     @property
     def place(self) -> Floats | None:
@@ -80,8 +80,10 @@ class BrowserUser:
         session, frame, latest = self._session, self._frame, self._latest
         if session is None or frame is None or latest is None:
             return
-        speed = eased(velocity(intent, frame), latest, self._moved)
-        session.wish(velocity=speed, turn=turn(intent, frame.yaw(latest.pose[0])))
+        speed, is_off = self._easing.ease(velocity(intent, frame), latest)
+        # A turn would push the hand into the wall again.
+        turning = 0.0 if is_off else turn(intent, frame.yaw(latest.pose[0]))
+        session.wish(velocity=speed, turn=turning)
 
     def end(self) -> None:
         """Leave the scene. Ending twice is allowed."""
@@ -96,9 +98,6 @@ class BrowserUser:
         while session is self._session:
             try:
                 for state in session.states(_STATES_SECONDS):
-                    if self._latest is not None:
-                        way = state.pose[0, :3, 3] - self._latest.pose[0, :3, 3]
-                        self._moved = float(np.linalg.norm(way))
                     self._latest = state
                     self._deliver(state, frame)
             except BusyError as error:

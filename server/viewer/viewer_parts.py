@@ -1,6 +1,7 @@
 """What the browsers of one viewer share: the scene, the avatar, tiles, and where the users are."""
 
 import threading
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,18 @@ class Users:
     def __init__(self) -> None:
         """Begin without users."""
         self._places: dict[int, UserPlace] = {}
+        self._numbers: set[int] = set()
         self._lock = threading.Lock()
+
+    def enter(self) -> int:
+        """Return the least free number, for a new user.
+
+        Numbers are used again, because a server keeps the avatar of each until the viewer ends.
+        """
+        with self._lock:
+            number = next(each for each in count(1) if each not in self._numbers)
+            self._numbers.add(number)
+            return number
 
     def moved(self, number: int, place: NDArray[np.float64], pose: list[list[float]], verdict: int) -> None:
         """Store where a user is."""
@@ -39,9 +51,15 @@ class Users:
             self._places[number] = UserPlace(place, pose, verdict)
 
     def leave(self, number: int) -> None:
-        """Forget a user."""
+        """Forget where a user is."""
         with self._lock:
             self._places.pop(number, None)
+
+    def free(self, number: int) -> None:
+        """Let another user have a number."""
+        with self._lock:
+            self._places.pop(number, None)
+            self._numbers.discard(number)
 
     def places(self, number: int) -> list[NDArray[np.float64]]:
         """Return where the other users are, world [m]."""

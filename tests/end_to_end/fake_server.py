@@ -39,6 +39,7 @@ from solidcloud.schemas.wire.warming_parts import MOTION
 from solidcloud.server.archives.archive_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene_interface import record_avatar
+from solidcloud.server.scenes.scene_tiles import SceneTiles
 from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import Begin, FrameLog
 from solidcloud.server.simulation.simulation import Simulation
@@ -92,7 +93,7 @@ def floor_simulation(name="floor", users=64, **fields):
     return scene.simulation
 
 
-class FloorScene:
+class FloorScene(SceneTiles):
     """The scene methods that a service calls.
 
     Avatars named "crash" raise, those named "wait" wait for `gate`.

@@ -80,7 +80,7 @@ def test_page_shows_the_scan_and_a_user_on_the_floor(browser: Any, url: str) -> 
         assert ((green > 1.5 * red) & (green >= blue)).sum() > 500
         assert viewed.read("s.verdict") == "clear"
         assert viewed.read("s.voxels.length") > 20
-        assert viewed.page.inner_text("#scene-name").startswith("viewer · 60,000 points")
+        assert viewed.page.inner_text("#scene-name").startswith("archive · 60,000 points")
         viewed.check_clean(url)
 
 
@@ -95,8 +95,10 @@ def test_user_walks_is_stopped_by_the_wall_and_slides_along_it(browser: Any, url
         stopped = viewed.read("s.place")
         assert WALL < stopped[0] < -8.3
         assert touched["normal"] is not None
-        # The view is to the west, so that right is north, along the wall.
-        with viewed.held("w", "d"):
+        # East is behind: turned to the right, the view is to the north-west, obliquely along the wall.
+        with viewed.held("e"):
+            viewed.wait("s.yaw", lambda yaw: 1.6 < yaw < 2.2)
+        with viewed.held("w"):
             slid = viewed.wait("s.place", lambda place: place[1] > stopped[1] + 0.8)
         assert WALL < slid[0] < -8.3
         viewed.check_clean(url)
@@ -155,7 +157,7 @@ def test_loss_and_return_of_the_server_are_shown_and_the_user_continues(
     browser: Any, scene_file: Path, free_endpoint: Any
 ) -> None:
     where = free_endpoint()
-    with viewing(where, "viewer") as url, viewed_page(browser, f"{url}?at={BY_WALL}") as viewed:
+    with viewing(where, "archive") as url, viewed_page(browser, f"{url}?at={BY_WALL}") as viewed:
         viewed.wait("s.server === 'searching'")
         assert "No server yet" in viewed.page.inner_text("#notices")
         with running(scene_file, where) as process:

@@ -1,5 +1,6 @@
 """Scene file of an archive for the viewer: its users walk on the ground, and every report is on."""
 
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,8 @@ from .scene_text import toml_value
 # Effects of a person who walks, with what a viewer shows: the nearest point and the contacts.
 VIEWER_EFFECTS = ("stop", "sweep", "slide", "step", "ground", "proximity", "contacts")
 _NAME = "viewer"
+# Characters that the name of a scene must not contain, and its maximum length.
+_NO_NAME, _LONGEST_NAME = re.compile(r"[^A-Za-z0-9._-]+"), 64
 
 
 @contextmanager
@@ -26,9 +29,11 @@ def viewed_scene(what: Path) -> Iterator[Path]:
 
 
 def archive_scene(archive: Path) -> str:
-    """Return the text of a scene file of one archive, whose users walk."""
-    lines = [f"format = {FORMAT}", f"name = {toml_value(_NAME)}", "", "[[archives]]"]
-    lines.append(f"path = {toml_value(str(archive.resolve()))}")
-    for name in VIEWER_EFFECTS:
-        lines += ["", "[[effects]]", f"effect = {toml_value(name)}"]
+    """Return the text of a scene file of one archive, named as its folder, whose users walk."""
+    folder = archive.resolve()
+    name = _NO_NAME.sub("-", folder.name)[:_LONGEST_NAME] or _NAME
+    lines = [f"format = {FORMAT}", f"name = {toml_value(name)}", "", "[[archives]]"]
+    lines.append(f"path = {toml_value(str(folder))}")
+    for effect in VIEWER_EFFECTS:
+        lines += ["", "[[effects]]", f"effect = {toml_value(effect)}"]
     return "\n".join(lines) + "\n"

@@ -44,6 +44,7 @@ export class App {
     this.verdict = "none";
     this.server = "none";
     this.connected = false;
+    this.pictured = false;
     this.origin = null;
     this.colour = "height";
     this.refreshColours = () => {};
@@ -101,6 +102,7 @@ export class App {
       avatar: (message) => this.users.shape(message),
       overview: (message) => {
         this.overview.take(message, this.tiles.columns);
+        if (this.overview.object) shared.uHeight.value.set(...this.overview.heights());
         for (const voxel of this.tiles.voxels.values()) if (voxel.object) this.overview.cover(voxel.name, voxel.box);
         this.refreshColours();
       },
@@ -206,6 +208,8 @@ export class App {
     if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
     const { watched } = this.rig;
     const firstPerson = settings.get("firstPerson") && !watched;
+    // Where there is gravity, it decides.
+    if (this.scene?.effects.includes("ground")) intent.up = 0;
     this.command(watched ? { ...intent, face: false } : intent, now);
     if (this.state && !watched && !firstPerson && now - this.times.boom > BOOM_MS) {
       this.times.boom = now;
@@ -232,9 +236,10 @@ export class App {
     this.times.choose = now;
     const focus = this.rig.watched ? this.rig.watched.target : own ? own.position : this.rig.focus;
     const budget = 1e6 * settings.get("budget");
-    this.tiles.choose(this.view.camera, focus, budget, this.quality.budget(budget), now);
+    const drawn = this.quality.budget(budget);
+    this.tiles.choose(this.view.camera, focus, budget, drawn, now);
     this.boxes.update(this.tiles, focus, settings.get("boxes"));
-    this.overview.update(settings.get("pointSize"), now);
+    this.overview.update(settings.get("pointSize"), drawn - this.tiles.shown, now);
   }
 
   /** Draw, if the picture differs from the one before. */
@@ -242,13 +247,13 @@ export class App {
     const { camera } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
-      this.contacts.signature, this.users.signature,
+      this.contacts.signature, this.users.signature, this.verdict,
     ].join();
     const chosen = [
-      this.boxes.version, this.boxes.object.visible, this.verdict, this.colour, settings.get("pointSize"),
+      this.boxes.version, this.boxes.object.visible, this.colour, settings.get("pointSize"),
       settings.get("shading"), settings.get("budget"), this.clash.signature,
     ].join();
-    const content = `${this.tiles.changes},${this.overview.shown}`;
+    const content = `${this.tiles.changes},${this.overview.count}`;
     this.pictures += 1;
     if (!this.quality.look(seen, chosen, content, now)) {
       this.drawnBefore = false;
@@ -256,10 +261,11 @@ export class App {
     }
     if (this.quality.still && this.scene) this.choose(now, this.users.own);
     this.view.shading = this.quality.shading(settings.get("shading"));
-    if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown);
+    if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown + this.overview.shown);
     this.times.drawn = now;
     this.drawnBefore = true;
     this.view.draw();
+    this.pictured ||= this.tiles.shown + this.overview.shown > 0;
   }
 
   /** Send the intent when it changes, and again while it lasts. */

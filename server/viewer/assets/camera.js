@@ -6,6 +6,8 @@ const EYES = 0.93, SHOULDERS = 0.86;
 const NEAR = 1.2, FAR = 40;
 // Least distance of the camera from the user, and from the scan behind it [m].
 const CLOSEST = 0.7, CLEAR = 0.5;
+// Least distance to the right of the user: from near, it does not hide where it goes [m].
+const BESIDE = 0.3;
 
 export class CameraRig {
   constructor(camera) {
@@ -109,7 +111,7 @@ export class CameraRig {
       if (Math.abs(wanted - this.used) < 0.01) this.used = wanted;
       this.camera.position.addScaledVector(ahead, -this.used);
       // Over the shoulder: the user does not hide where it goes.
-      const right = 0.07 * this.used;
+      const right = Math.max(BESIDE, 0.07 * this.used);
       this.camera.position.x += Math.sin(this.yaw) * right;
       this.camera.position.y -= Math.cos(this.yaw) * right;
       const floor = place.z + 0.12;

@@ -42,6 +42,7 @@ function expose(app) {
     roundTrip: () => app.state?.roundTrip ?? null,
     shown: () => app.tiles.shown,
     overview: () => app.overview.shown,
+    pictured: () => app.pictured,
     missing: () => app.tiles.missing ?? null,
     voxels: () => [...app.tiles.voxels.values()].map(({ name, resident, detail }) => ({ name, resident, detail })),
     boxes: () => app.boxes.object.visible,

@@ -7,12 +7,27 @@ import { pointsMaterial, shared } from "./points_material.js";
 const LARGEST = 0.12;
 // Points that tiles now show are removed at most this often [ms].
 const INTERVAL_MS = 300;
+// Points that are drawn in any case.
+const LEAST = 10e3;
+
+/** Return the numbers below a count in an order that looks random and is always the same. */
+function shuffled(count) {
+  const found = Uint32Array.from({ length: count }, (_, k) => k);
+  let state = 2012;
+  for (let k = count - 1; k > 0; k -= 1) {
+    state = (Math.imul(state, 1664525) + 1013904223) >>> 0;
+    const other = Math.floor((state / 2 ** 32) * (k + 1));
+    [found[k], found[other]] = [found[other], found[k]];
+  }
+  return found;
+}
 
 export class Overview {
   /** group: object for the points. */
   constructor(group) {
     this.group = group;
     this.object = null;
+    this.count = 0;
     this.covered = new Set();
   }
 
@@ -22,6 +37,7 @@ export class Overview {
     this.object.geometry.dispose();
     this.object.material.dispose();
     this.object = null;
+    this.count = 0;
     this.covered.clear();
   }
 
@@ -41,8 +57,11 @@ export class Overview {
       columns.add(name);
     }
     if (intensities) shared.uIntensity.value.set(...intensities);
-    geometry.setIndex(new BufferAttribute(Uint32Array.from({ length: rows }, (_, k) => k), 1));
-    geometry.setDrawRange(0, rows);
+    // In a random order, so that any beginning shows the whole scene.
+    this.order = shuffled(rows);
+    this.count = rows;
+    geometry.setIndex(new BufferAttribute(this.order.slice(), 1));
+    geometry.setDrawRange(0, Math.min(rows, LEAST));
     // A surface that n of N points show has a spacing larger by the root of N / n.
     const spacing = 2 * radius * Math.sqrt(Math.max(1, total / Math.max(1, rows)));
     this.size = Math.min(LARGEST, 1.6 * spacing);
@@ -54,6 +73,16 @@ export class Overview {
     this.changed = false;
     this.time = 0;
     this.cells(places, rows);
+  }
+
+  /** Return the heights between which most points lie [m]. */
+  heights() {
+    const every = Math.max(1, Math.floor(this.hidden.length / 4000));
+    const found = [];
+    for (let row = 0; row < this.hidden.length; row += every) found.push(this.places[3 * row + 2]);
+    found.sort((one, other) => one - other);
+    const at = (share) => found[Math.round(share * (found.length - 1))];
+    return [at(0.01), Math.max(at(0.01) + 0.5, at(0.97))];
   }
 
   /** Sort points into cells, to find those of a box quickly. */
@@ -100,20 +129,22 @@ export class Overview {
     }
   }
 
-  /** Draw what is not hidden. size: factor of the points' size.  now: [ms]. */
-  update(size, now) {
+  /** Draw what is not hidden. size: factor of the points' size.  most: points.  now: [ms]. */
+  update(size, most, now) {
     if (!this.object) return;
     this.object.material.uniforms.uSize.value = this.size * size;
+    this.object.geometry.setDrawRange(0, Math.min(this.count, Math.max(LEAST, most)));
     if (!this.changed || now - this.time < INTERVAL_MS) return;
     this.changed = false;
     this.time = now;
     const { index } = this.object.geometry;
     let count = 0;
-    for (let row = 0; row < this.hidden.length; row += 1) {
+    for (const row of this.order) {
       if (!this.hidden[row]) index.array[count++] = row;
     }
     index.needsUpdate = true;
-    this.object.geometry.setDrawRange(0, count);
+    this.count = count;
+    this.object.geometry.setDrawRange(0, Math.min(count, Math.max(LEAST, most)));
     this.object.visible = count > 0;
   }
 }

@@ -49,7 +49,7 @@ function draw(legend, mode, app) {
     const unit = mode === "height" ? " m" : "";
     for (const value of range.toArray()) {
       const end = document.createElement("span");
-      end.textContent = `${Number((value + lift).toPrecision(4))}${unit}`;
+      end.textContent = `${mode === "height" ? (Math.round(10 * (value + lift)) / 10 + 0).toFixed(1) : Number(value.toPrecision(4))}${unit}`;
       ends.append(end);
     }
     legend.append(ramp, ends);

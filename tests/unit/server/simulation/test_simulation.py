@@ -262,6 +262,6 @@ def test_it_has_all_that_a_scene_has():
 def test_a_simulation_has_frames_and_no_questions():
     public = {name for name in dir(Simulation) if not name.startswith("_")}
     assert public == {
-        "drop_client", "end", "end_client", "most_users", "move", "record", "reloaded", "step", "users", "warm",
-        "world",
+        "drop_client", "effect_stats", "end", "end_client", "most_users", "move", "record", "reloaded", "step", "users",
+        "warm", "world",
     }  # fmt: skip

@@ -1,0 +1,26 @@
+"""Test where the users of a viewer are: others see them, numbers are used again."""
+
+import numpy as np
+from solidcloud.server.viewer.viewer_parts import Users
+
+POSE = np.eye(4).tolist()
+
+
+def test_others_see_a_user_from_its_first_state_until_it_leaves() -> None:
+    users = Users()
+    one, other = users.enter(), users.enter()
+    assert users.others(one) == []
+    users.moved(other, np.array([1.0, 2.0, 3.0]), POSE, 0)
+    assert users.others(one) == [{"number": other, "pose": POSE, "verdict": 0}]
+    assert users.others(other) == []
+    assert [place.tolist() for place in users.places(one)] == [[1.0, 2.0, 3.0]]
+    users.leave(other)
+    assert users.others(one) == []
+
+
+def test_least_free_number_is_used_again() -> None:
+    users = Users()
+    assert [users.enter() for _ in range(3)] == [1, 2, 3]
+    users.free(2)
+    assert users.enter() == 2
+    assert users.enter() == 4

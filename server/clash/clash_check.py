@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError, BusyError, TooLargeError
-from ...schemas.wire.answers import ContactsAnswers, Verdict
+from ...schemas.wire.answers import ContactsAnswers, Cost, Verdict
 from ...schemas.wire.question_table import join_answers
 from ...schemas.wire.request_limits import MAX_POSES
 from ..scene_interface import QueryMethods
@@ -19,10 +19,12 @@ from .clash_list import Clash, list_clashes, runs
 
 Floats = NDArray[np.float64]
 
-_A = TypeVar("_A")
+_A = TypeVar("_A", bound=Cost)
 
 # Poses of one request: a fraction of a second, after which a check can be stopped.
 BATCH_POSES = 128
+# Reasons that a result lists.
+MOST_FAULTS = 5
 
 
 class Clearances(NamedTuple):
@@ -43,6 +45,7 @@ class CheckedPath(NamedTuple):
     signed_distance: (k,) [m], inf beyond reach.  verdict: (k,); UNKNOWN for poses that were not
     examined.
     clashes: deepest first.  complete: False if the check was stopped.
+    faults: why poses are unknown, if the server says so.
     """
 
     times: Floats
@@ -52,6 +55,7 @@ class CheckedPath(NamedTuple):
     verdict: NDArray[np.uint8]
     clashes: list[Clash]
     complete: bool
+    faults: tuple[str, ...] = ()
 
     def count(self, verdict: Verdict) -> int:
         """Return the number of poses with a verdict."""
@@ -105,20 +109,22 @@ def check_path(
         raise TooLargeError(f"path of {len(poses)} poses: at most {MAX_POSES}: check it in pieces")
     distance = np.full(len(poses), np.inf)
     verdict = np.full(len(poses), Verdict.UNKNOWN, np.uint8)
-    answered = _Answered(scene)
+    questions = _Questions(scene, watcher.stopped)
     # `contacts` takes about as long as `distance`; how many poses it is asked for is not known yet.
     for batch in _batches(np.arange(len(poses)), watcher, 0.0):
-        found = answered(scene.distance(avatar, poses[batch], reach))
+        found = questions.ask(lambda some: scene.distance(avatar, some, reach), poses[batch])
         distance[batch], verdict[batch] = found.signed_distance, found.verdict
         watcher.clearances(Clearances(int(batch[0]), found.signed_distance, found.verdict))
     touching = np.flatnonzero(verdict == Verdict.CONTACT)
     parts: list[ContactsAnswers] = []
     for batch in _batches(touching, watcher, 0.5):
-        parts.append(answered(scene.contacts(avatar, poses[batch], limit=0)))
+        parts.append(questions.ask(lambda some: scene.contacts(avatar, some, limit=0), poses[batch]))
     done = touching[: sum(map(len, parts))]
     clashes = list_clashes(done, join_answers(parts)) if parts else []
     watcher.progress(1.0)
-    return CheckedPath(times, poses, reach, distance, verdict, clashes, not watcher.stopped())
+    return CheckedPath(
+        times, poses, reach, distance, verdict, clashes, not watcher.stopped(), tuple(questions.faults)
+    )
 
 
 def _batches(items: NDArray[np.int64], watcher: Watcher, begin: float) -> Iterator[NDArray[np.int64]]:
@@ -131,15 +137,34 @@ def _batches(items: NDArray[np.int64], watcher: Watcher, begin: float) -> Iterat
         watcher.progress(begin + 0.5 * done)
 
 
-class _Answered:
-    """Refuse answers that no server gave: a `Client` makes them up, and counts them."""
+class _Questions:
+    """Questions to a scene whose answers are whole.
 
-    def __init__(self, scene: QueryMethods) -> None:
-        self._scene, self._before = scene, getattr(scene, "unanswered", 0)
+    faults: reasons why poses are unknown, each once.
+    """
 
-    def __call__(self, answers: _A) -> _A:
-        """Return answers. Raise BusyError if no server gave them."""
+    def __init__(self, scene: QueryMethods, stopped: Callable[[], bool]) -> None:
+        self._scene, self._stopped = scene, stopped
+        self._before = getattr(scene, "unanswered", 0)
+        self.faults: dict[str, None] = {}
+
+    def ask(self, question: Callable[[Floats], _A], poses: Floats) -> _A:
+        """Return the answers for poses. Raise BusyError if no server gave them.
+
+        A server ends a request that takes too long, such as the first one, for which it reads much
+        of the archive. The poses are then asked for again, in halves.
+        """
+        answers = question(poses)
+        # A client makes up answers that no server gave, and counts them.
         if getattr(self._scene, "unanswered", 0) > self._before:
             silence: Callable[[str], str] = getattr(self._scene, "silence", lambda _: "")
             raise BusyError(f"the check ended early: {silence('distance')}")
+        half = len(poses) // 2
+        if answers.stopped and half and not self._stopped():
+            parts = [self.ask(question, poses[:half]), self.ask(question, poses[half:])]
+            joined: _A = join_answers(parts)
+            return joined
+        for fault in (*answers.faults, answers.stopped):
+            if fault and len(self.faults) < MOST_FAULTS:
+                self.faults[fault] = None
         return answers

@@ -23,6 +23,12 @@ _NEAR = 0.6
 # Largest half width of a point [pixels].
 _LARGEST = 8
 _SHADE = 2.5
+# Pixels of a point around its middle: squared distance, columns, rows; nearest first.
+_OFFSETS = sorted(
+    (dx * dx + dy * dy, dx, dy)
+    for dx in range(-_LARGEST, _LARGEST + 1)
+    for dy in range(-_LARGEST, _LARGEST + 1)
+)
 
 
 class Cloud(NamedTuple):
@@ -66,17 +72,24 @@ def _paint(view: Viewpoint, cloud: Cloud, size: tuple[int, int], depth: Floats, 
     x, y, z = seen[order].T
     column = np.round(width / 2 + scale * x / z).astype(np.int64)
     row = np.round(height / 2 - scale * y / z).astype(np.int64)
-    half = np.clip(scale * cloud.radius / z, 0.5, _LARGEST)
-    for dx in range(-_LARGEST, _LARGEST + 1):
-        for dy in range(-_LARGEST, _LARGEST + 1):
-            wide = np.flatnonzero(half * half >= dx * dx + dy * dy - 0.01)
-            across, down = column[wide] + dx, row[wide] + dy
-            wide = wide[(across >= 0) & (across < width) & (down >= 0) & (down < height)]
-            pixel = (row[wide] + dy) * width + column[wide] + dx
-            nearer = z[wide] < depth[pixel]
-            wide, pixel = wide[nearer], pixel[nearer]
-            depth[pixel] = z[wide]
-            colour[pixel] = cloud.colours[order[wide]]
+    # Points that no pixel shows are left out before anything else is computed.
+    seen_row = (row >= -_LARGEST) & (row < height + _LARGEST)
+    kept = np.flatnonzero(seen_row & (column >= -_LARGEST) & (column < width + _LARGEST))
+    order, column, row, z = order[kept], column[kept], row[kept], z[kept]
+    square = np.clip(scale * cloud.radius / z, 0.5, _LARGEST) ** 2 + 0.01
+    wide = np.arange(len(z))
+    for reach, dx, dy in _OFFSETS:
+        # The offsets are in ascending order: each is for fewer points than the one before.
+        wide = wide[square[wide] >= reach]
+        if not len(wide):
+            break
+        across, down = column[wide] + dx, row[wide] + dy
+        inside = (across >= 0) & (across < width) & (down >= 0) & (down < height)
+        drawn, pixel = wide[inside], (down * width + across)[inside]
+        nearer = z[drawn] < depth[pixel]
+        drawn, pixel = drawn[nearer], pixel[nearer]
+        depth[pixel] = z[drawn]
+        colour[pixel] = cloud.colours[order[drawn]]
 
 
 def _shaded(depth: Floats, colour: Colours, size: tuple[int, int]) -> Floats:

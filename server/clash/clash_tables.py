@@ -38,6 +38,7 @@ def clashes_json(checked: CheckedPath, **about: str) -> str:
         "complete": checked.complete,
         "reach": checked.reach,
         "verdicts": {verdict.name.lower(): checked.count(verdict) for verdict in Verdict},
+        "faults": list(checked.faults),
         "least_clearance": checked.clearance,
         "clashes": [clash_values(checked, number, clash) for number, clash in enumerate(checked.clashes, 1)],
         "unknown": [{"poses": list(ends)} for ends in checked.unknown],

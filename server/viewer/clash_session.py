@@ -244,6 +244,7 @@ def clashes_message(last: CheckedScene) -> str:
         complete=checked.complete,
         reach=checked.reach,
         clearance=checked.clearance,
+        faults=list(checked.faults),
         counts={verdict.name.lower(): checked.count(verdict) for verdict in Verdict},
         total=len(checked.clashes),
         clashes=listed,

@@ -89,13 +89,14 @@ function text({ state, name, message, done, result, line }) {
   if (state === "running") return `${name}: ${Math.round(100 * done)} % checked`;
   if (state === "saving") return `BCF: ${Math.round(100 * done)} % of the pictures drawn`;
   if (!result) return "";
-  const { counts, poses, total, clearance, reach, complete } = result;
+  const { counts, poses, total, clearance, reach, complete, faults } = result;
   const parts = [total ? `${count(total, "clash").replace("clashs", "clashes")}.` : "No clash."];
   parts.push(`${counts.contact.toLocaleString("en")} of ${count(poses, "pose")} in contact`);
   if (counts.unknown) parts.push(`, ${counts.unknown.toLocaleString("en")} unknown`);
   parts.push(".");
   if (!total) parts.push(clearance === null ? ` Nothing within ${reach} m.` : ` Least clearance ${clearance.toFixed(3)} m.`);
   if (!complete) parts.push(" Cancelled: the rest was not examined.");
+  if (faults.length) parts.push(` Unknown because: ${faults.join("; ")}`);
   return `${name}: ${parts[0]} ${parts.slice(1).join("")}`;
 }
 

@@ -6,6 +6,7 @@ from typing import Any
 import archive_cases
 import numpy as np
 import pytest
+from msgspec import structs
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.clash import clash_check
@@ -97,7 +98,9 @@ class FakeScene:
         if self.left < 0:
             self.unanswered += len(poses)
         touching = np.full(len(poses), Verdict.CLEAR, np.uint8)
-        return SimpleNamespace(signed_distance=np.full(len(poses), 0.25), verdict=touching)
+        return SimpleNamespace(
+            signed_distance=np.full(len(poses), 0.25), verdict=touching, stopped="", faults=()
+        )
 
     def silence(self, operation: str) -> str:
         return f"{operation}: no answer within 5 s"
@@ -113,6 +116,45 @@ def test_stopped_check_leaves_the_rest_unknown() -> None:
     assert checked.count(Verdict.UNKNOWN) == 1000 - examined
     assert checked.unknown == [(examined, 999)]
     assert checked.clearance == 0.25
+
+
+def test_request_that_the_server_ends_is_asked_again_in_halves(case: archive_cases.Case) -> None:
+    times, poses = path_through(64)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        expected = check_path(scene, "body", times, poses, reach=0.5)
+        for most, faults in ((9, ()), (0, ("it took too long",))):
+            hasty = HastyScene(scene, most)
+            checked = check_path(hasty, "body", times, poses, reach=0.5)  # type: ignore[arg-type]
+            assert checked.faults == faults
+            if most:
+                assert np.array_equal(checked.verdict, expected.verdict)
+                assert [each.depth for each in checked.clashes] == [each.depth for each in expected.clashes]
+                assert 64 in hasty.asked
+            else:
+                assert checked.unknown == [(0, 63)]
+                assert checked.clashes == []
+
+
+class HastyScene:
+    """Scene that ends requests of more than `most` poses."""
+
+    def __init__(self, scene: Scene, most: int) -> None:
+        self.scene, self.most = scene, most
+        self.asked: list[int] = []
+
+    def distance(self, name: str, poses: np.ndarray, reach: float) -> Any:
+        return self.limited(self.scene.distance(name, poses, reach))
+
+    def contacts(self, name: str, poses: np.ndarray, limit: int) -> Any:
+        return self.limited(self.scene.contacts(name, poses, limit))
+
+    def limited(self, answers: Any) -> Any:
+        self.asked.append(len(answers))
+        if len(answers) <= self.most:
+            return answers
+        unknown = np.full(len(answers), Verdict.UNKNOWN, np.uint8)
+        return structs.replace(answers, verdict=unknown, stopped="it took too long")
 
 
 def test_check_without_an_answer_fails() -> None:

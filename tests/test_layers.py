@@ -87,7 +87,8 @@ ALLOWED = {
     "server/report/load/page": "report/common report/load/runs report/load/users",
     "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
-    "server/viewer": "avatars client.py cli/scene_files zenoh_client",
+    "server/clash": "scene_interface.py",
+    "server/viewer": "avatars clash client.py cli/input cli/scene_files zenoh_client",
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (

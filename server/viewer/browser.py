@@ -14,11 +14,13 @@ from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
 from ...schemas.wire.scene_messages import SceneInfo
 from .browser_user import BrowserUser, state_fields
+from .clash_session import ClashSession
 from .effect_switch import effects_message
 from .page_messages import (
     PAGE_VERSION,
     Around,
     Boom,
+    ClashMessage,
     FromPage,
     Hello,
     Intent,
@@ -73,6 +75,7 @@ class Browser:
         name = f"viewer-{self.number}"
         self._user = BrowserUser(name, parts.avatar, self._deliver, self._problem)
         self._panels = PanelWork(self.number, name, parts, lambda: self._user.pose, self._send, self._attempt)
+        self._clash = ClashSession(self.number, parts, self._send)
         self._boom: Boom | None = None
         self._begun = False
         self._at: tuple[float, float, float, float] | None = None
@@ -124,6 +127,7 @@ class Browser:
             for thread in threads:
                 thread.join()
             self._user.end()
+            self._clash.end()
 
     def _read(self, messages: Iterable[FromPage]) -> None:
         """Take the page's messages."""
@@ -137,6 +141,8 @@ class Browser:
                 self._restart.set()
             elif isinstance(message, Measure | Spheres | SwitchEffects):
                 self._panels.ask(message)
+            elif isinstance(message, ClashMessage):
+                self._clash.take(message)
             else:
                 with self._work:
                     if isinstance(message, Want):
@@ -162,6 +168,7 @@ class Browser:
                     shown = scene.info
                     self._send(welcome_message(scene, self.number))
                     self._send(avatar_message(self._parts))
+                    self._clash.begin()
                     with self._work:
                         self._overview = scene
                         self._work.notify_all()

@@ -6,7 +6,7 @@ copying them.
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -19,6 +19,8 @@ from ...schemas.wire.tile_messages import MAX_SPHERE_LEVEL
 PAGE_VERSION = 1
 # Arrays begin at multiples of this, as typed arrays of 8 bytes require [bytes].
 _ALIGNMENT = 8
+# Longest part of a file of poses [characters]: a character takes at most 6 bytes of a message.
+PATH_PART = 10_000
 
 Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 Angle = Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)]
@@ -106,7 +108,37 @@ class SwitchEffects(msgspec.Struct, frozen=True, tag="switch"):
     names: Annotated[list[Annotated[str, msgspec.Meta(max_length=64)]], msgspec.Meta(max_length=32)]
 
 
-FromPage = Hello | Intent | Want | Around | Boom | Restart | Measure | Spheres | SwitchEffects
+class PathText(msgspec.Struct, frozen=True, tag="path"):
+    """Part of a file of poses, whose clashes are wanted.
+
+    name: of the file; its suffix selects the format.  first, last: whether it is the file's first
+    part, and its last.
+    """
+
+    name: Annotated[str, msgspec.Meta(max_length=255)]
+    text: Annotated[str, msgspec.Meta(max_length=PATH_PART)]
+    first: bool
+    last: bool
+
+
+class StopCheck(msgspec.Struct, frozen=True, tag="stop"):
+    """End the check of a path, or the writing of a file."""
+
+
+class ShowClash(msgspec.Struct, frozen=True, tag="show"):
+    """Request the contacts of a clash and a viewpoint. number: in the list, from 1."""
+
+    number: Number
+
+
+class SaveClashes(msgspec.Struct, frozen=True, tag="save"):
+    """Request the clashes as a file."""
+
+    form: Literal["csv", "json", "bcf"]
+
+
+ClashMessage = PathText | StopCheck | ShowClash | SaveClashes
+FromPage = Hello | Intent | Want | Around | Boom | Restart | Measure | Spheres | SwitchEffects | ClashMessage
 _DECODER = msgspec.json.Decoder(FromPage)
 
 

@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 
 # Interval of the questions whether the server still answers, and how long an answer may take [s].
 _CHECK_SECONDS, _ANSWER_SECONDS = 0.7, 5.0
+# How long an answer to long work may take [s].
+_LONG_SECONDS = 30.0
 # Interval of the attempts to find a server [s].
 _SEARCH_SECONDS = 0.5
 
@@ -85,6 +87,10 @@ class SceneLink:
     def scene(self) -> OpenScene | None:
         """Return the scene; None before it was found."""
         return self._open
+
+    def another_client(self, scene: str) -> Client:
+        """Return a client of its own for long work, for a `with`: it delays neither users nor tiles."""
+        return Client(self.endpoint, scene=scene, timeout=_LONG_SECONDS, key_file=self._key_file)
 
     def wait_for_change(self, number: int, seconds: float) -> LinkStatus:
         """Return the status once it is another than that of this number, or after this time."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from .browser import Browser
 from .effect_switch import EffectSwitch, NoSwitch
+from .path_source import read_given_path
 from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
@@ -32,24 +33,35 @@ def viewing(
     avatar: Path | None = None,
     key_file: Path | None = None,
     switch: EffectSwitch | None = None,
+    poses: Path | None = None,
 ) -> Iterator[str]:
     """Serve the viewer during the block; yield the address of its page.
 
     endpoint: of the server; it need not run yet.  scene: its name; None: the only one there.
     port: of the page; 0: a free one.  avatar: file of the users' avatar; None: a figure.
     switch: changes the effects of the server; None: they are shown only.
-    Raise SolidcloudError if the port is in use, ScanError for an invalid avatar.
+    poses: file of a path whose clashes the page shows.
+    Raise SolidcloudError if the port is in use, ScanError for an invalid avatar, and the errors of
+    `read_path`.
     """
     shape = load_avatar(avatar)
+    path = None if poses is None else read_given_path(poses)
     with (
         SceneLink(endpoint, scene, key_file) as link,
         ResidencyFeed(lambda: link.scene) as residency,
         StatisticsFeed(lambda: link.scene) as statistics,
     ):
-        tiles = TileSource(lambda: link.scene)
-        places, users = StartingPlaces(shape), Users()
         parts = ViewerParts(
-            link, shape, places, tiles, users, residency, statistics, switch or NoSwitch(), SphereSource()
+            link,
+            shape,
+            StartingPlaces(shape),
+            TileSource(lambda: link.scene),
+            Users(),
+            residency,
+            statistics,
+            switch or NoSwitch(),
+            SphereSource(),
+            path,
         )
         server = WebServer(port, lambda connection: Browser(connection, parts).run())
         with server.running():

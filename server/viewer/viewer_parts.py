@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .effect_switch import EffectSwitch
+from .path_source import GivenPath
 from .residency_feed import ResidencyFeed
 from .scene_link import SceneLink
 from .starting_place import StartingPlaces
@@ -79,7 +80,10 @@ class Users:
 
 
 class ViewerParts(NamedTuple):
-    """What the browsers of one viewer share."""
+    """What the browsers of one viewer share.
+
+    path: whose clashes each page shows from the beginning, or None.
+    """
 
     link: SceneLink
     avatar: UserAvatar
@@ -90,3 +94,4 @@ class ViewerParts(NamedTuple):
     statistics: StatisticsFeed
     switch: EffectSwitch
     spheres: SphereSource
+    path: GivenPath | None = None

@@ -27,6 +27,12 @@ def view(
             help="Points or mesh of the users' avatar, z up, facing +y; default: a figure of 1.75 m."
         ),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Path whose clashes are shown: CSV file t,x,y,z,qw,qx,qy,qz, or TUM trajectory (.tum, .txt)."
+        ),
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     key_file: KeyFile = None,
 ) -> None:
@@ -53,7 +59,9 @@ def view(
             server = stack.enter_context(ViewedServer(stack.enter_context(viewed_scene(what))))
             connect = server.endpoint
         url = stack.enter_context(
-            viewing(connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server)
+            viewing(
+                connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server, poses=poses
+            )
         )
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
         if browser:

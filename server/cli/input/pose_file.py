@@ -4,6 +4,7 @@ This is the only module that converts between quaternions and matrices.
 """
 
 import csv
+import io
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,8 @@ OBJECT_COLUMNS = ("avatar", "x", "y", "z", "qw", "qx", "qy", "qz", "group", "mas
 UNIT_WITHIN = 1e-6
 # In TUM files, which round to four digits.
 TUM_UNIT_WITHIN = 1e-3
+# Suffixes of files in the format of the TUM RGB-D benchmark; others are CSV.
+TUM_SUFFIXES = (".tum", ".txt")
 
 
 class ObjectRow(NamedTuple):
@@ -42,11 +45,7 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     Raises ScanError if the file cannot be read, BadRequestError naming the line if a line is
     invalid.
     """
-    rows = [
-        _unit_quaternion(where, _numbers(where, row), 4) for where, row in _read_rows(path, COLUMNS, "poses")
-    ]
-    table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
-    return table[:, 0].copy(), _matrices(table)
+    return _csv_poses(str(path), _text(path, "a CSV file of poses"))
 
 
 def read_tum_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -56,18 +55,52 @@ def read_tum_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
     within 1e-3 of unit length are normalised.
     Raises the same errors as `read_poses`.
     """
-    rows = []
+    return _tum_poses(str(path), _text(path, "a TUM file of poses"))
+
+
+def read_path(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read times (k,) [s] and poses (k, 4, 4) from a file of either format, by its suffix.
+
+    Raises the same errors as `read_poses`.
+    """
+    return (read_tum_poses if path.suffix.lower() in TUM_SUFFIXES else read_poses)(path)
+
+
+def parse_path(name: str, text: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return times (k,) [s] and poses (k, 4, 4) of a file's text, as `read_path` does.
+
+    name: of the file; its suffix selects the format, and errors name it.
+    """
+    return (_tum_poses if Path(name).suffix.lower() in TUM_SUFFIXES else _csv_poses)(name, text)
+
+
+def _text(path: Path, expected: str) -> str:
+    """Return the text of a file. Raise ScanError."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        return path.read_bytes().decode("utf-8-sig")
     except OSError as error:
-        raise ScanError(f"{path}: {error.strerror}: expected a TUM file of poses: check the path") from None
+        raise ScanError(f"{path}: {error.strerror}: expected {expected}: check the path") from None
     except UnicodeDecodeError as error:
-        raise ScanError(f"{path}: {error}: expected a TUM file of poses: check the file") from None
-    for number, line in enumerate(lines, 1):
+        raise ScanError(f"{path}: {error}: expected {expected}: check the file") from None
+
+
+def _csv_poses(name: str, text: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the times and poses of a CSV file."""
+    rows = [
+        _unit_quaternion(where, _numbers(where, row), 4) for where, row in _rows(name, text, COLUMNS, "poses")
+    ]
+    table = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+    return table[:, 0].copy(), _matrices(table)
+
+
+def _tum_poses(name: str, text: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the times and poses of a file in the TUM format."""
+    rows = []
+    for number, line in enumerate(text.splitlines(), 1):
         values = line.split()
         if not values or values[0].startswith("#"):
             continue
-        where = f"{path}, line {number}"
+        where = f"{name}, line {number}"
         if len(values) != len(COLUMNS):
             raise BadRequestError(f"{where}: {len(values)} values: expected timestamp tx ty tz qx qy qz qw")
         t, x, y, z, qx, qy, qz, qw = _numbers(where, values)
@@ -107,28 +140,28 @@ def read_objects(path: Path) -> list[ObjectRow]:
 
 def _read_rows(path: Path, columns: tuple[str, ...], what: str) -> Iterator[tuple[str, list[str]]]:
     """Yield the location (file and line) and the values, ordered as `columns`, of each CSV row."""
+    return _rows(str(path), _text(path, f"a CSV file of {what}"), columns, what)
+
+
+def _rows(name: str, text: str, columns: tuple[str, ...], what: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the location and the values of each row of a CSV file's text."""
+    reader = csv.reader(io.StringIO(text, newline=""))
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = [name.strip() for name in next(reader, [])]
-            if sorted(header) != sorted(columns):
-                raise BadRequestError(
-                    f"{path}, line 1: columns {','.join(header) or 'missing'}: expected {','.join(columns)}"
-                )
-            order = [header.index(name) for name in columns]
-            for row in reader:
-                if not row:
-                    continue
-                where = f"{path}, line {reader.line_num}"
-                if len(row) != len(columns):
-                    raise BadRequestError(
-                        f"{where}: {len(row)} values: expected {len(columns)}, one per column"
-                    )
-                yield where, [row[column].strip() for column in order]
-    except OSError as error:
-        raise ScanError(f"{path}: {error.strerror}: expected a CSV file of {what}: check the path") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ScanError(f"{path}: {error}: expected a CSV file of {what}: check the file") from None
+        header = [each.strip() for each in next(reader, [])]
+        if sorted(header) != sorted(columns):
+            raise BadRequestError(
+                f"{name}, line 1: columns {','.join(header)[:80] or 'missing'}: expected {','.join(columns)}"
+            )
+        order = [header.index(each) for each in columns]
+        for row in reader:
+            if not row:
+                continue
+            where = f"{name}, line {reader.line_num}"
+            if len(row) != len(columns):
+                raise BadRequestError(f"{where}: {len(row)} values: expected {len(columns)}, one per column")
+            yield where, [row[column].strip() for column in order]
+    except csv.Error as error:
+        raise ScanError(f"{name}: {error}: expected a CSV file of {what}: check the file") from None
 
 
 def write_poses(path: Path, times: NDArray[np.float64], poses: NDArray[np.float64]) -> None:

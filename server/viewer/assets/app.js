@@ -4,6 +4,7 @@ import { Vector3 } from "./vendor/three.module.min.js";
 import { Users } from "./avatar.js";
 import { Boxes } from "./boxes.js";
 import { CameraRig } from "./camera.js";
+import { ClashCheck } from "./clash/check.js";
 import { VERDICTS } from "./colours.js";
 import { Contacts } from "./contacts.js";
 import { Input } from "./input.js";
@@ -36,6 +37,7 @@ export class App {
     this.users = new Users(view.points);
     this.boxes = new Boxes(view.lines);
     this.contacts = new Contacts(view.lines);
+    this.clash = new ClashCheck(this);
     this.quality = new Quality(view.software);
     this.scene = null;
     this.state = null;
@@ -68,10 +70,16 @@ export class App {
       KeyL: () => settings.toggle("clearance"),
       KeyC: () => this.nextColour(),
       KeyH: () => this.restart(null),
+      Period: () => this.clash.step(1),
+      Comma: () => this.clash.step(-1),
+      Escape: () => this.clash.leave(),
     });
     this.link = new Link(at, this.handlers(), (connected, reason) => {
       this.connected = connected;
-      if (!connected) this.forgetUser();
+      if (!connected) {
+        this.forgetUser();
+        this.clash.reset();
+      }
       showProcess(connected, reason);
     });
     this.follow();
@@ -93,6 +101,7 @@ export class App {
 
   handlers() {
     return {
+      ...this.clash.handlers(),
       boom: ({ free }) => this.rig.bound(free),
       status: (message) => {
         if (!this.switching || message.state === "connected") showServer(message, this.server);
@@ -154,6 +163,7 @@ export class App {
     if (another) {
       this.tiles.clear();
       this.overview.clear();
+      this.clash.reset();
     }
     this.tiles.radius = Math.max(scene.radius, 1e-4);
     const height = scene.high[2] - scene.low[2];
@@ -219,24 +229,28 @@ export class App {
   picture(now) {
     const seconds = Math.min(0.2, (now - this.times.picture) / 1000);
     this.times.picture = now;
-    const firstPerson = settings.get("firstPerson");
     const intent = this.input.read(seconds);
     // Where there is gravity, it decides.
     if (this.scene?.effects.includes("ground")) intent.up = 0;
-    this.command(intent, now);
-    if (this.state && !firstPerson && now - this.times.boom > BOOM_MS) {
+    // Who walks looks at the user again.
+    if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
+    const { watched } = this.rig;
+    const firstPerson = settings.get("firstPerson") && !watched;
+    this.command(watched ? { ...intent, face: false } : intent, now);
+    if (this.state && !watched && !firstPerson && now - this.times.boom > BOOM_MS) {
       this.times.boom = now;
       this.link.send({ type: "boom", ...this.rig.boom() });
     }
     this.users.update(now, firstPerson);
     const own = this.users.own;
     if (own && this.state) {
-      this.rig.follow(own.position, this.users.height, firstPerson, seconds);
+      if (!watched) this.rig.follow(own.position, this.users.height, firstPerson, seconds);
       shared.uUser.value.copy(own.position);
-      shared.uCut.value.set(own.position.x, own.position.y, own.position.z + 0.6 * this.users.height, firstPerson ? 0 : CUT);
+      shared.uCut.value.set(own.position.x, own.position.y, own.position.z + 0.6 * this.users.height, firstPerson || watched ? 0 : CUT);
       const [r, g, b] = VERDICTS[this.verdict] ?? VERDICTS.unknown;
       shared.uVerdict.value.set(r / 255, g / 255, b / 255, this.users.height);
     }
+    if (watched) this.rig.orbit();
     this.contacts.update(now);
     if (this.scene && now - this.times.choose > CHOOSE_MS) this.choose(now, own);
     this.draw(now);
@@ -246,7 +260,7 @@ export class App {
   /** Choose the details of voxels, and what is missing. */
   choose(now, own) {
     this.times.choose = now;
-    const focus = own ? own.position : this.rig.focus;
+    const focus = this.rig.watched ? this.rig.watched.target : own ? own.position : this.rig.focus;
     const budget = 1e6 * settings.get("budget");
     const drawn = this.quality.budget(budget);
     this.tiles.choose(this.view.camera, focus, budget, drawn, now);
@@ -263,7 +277,8 @@ export class App {
     ].join();
     const chosen = [
       this.boxes.version, this.boxes.object.visible, this.colour, settings.get("pointSize"),
-      settings.get("shading"), settings.get("budget"), ...[...this.drawings].map((each) => each.signature),
+      settings.get("shading"), settings.get("budget"), this.clash.signature,
+      ...[...this.drawings].map((each) => each.signature),
     ].join();
     const content = `${this.tiles.changes},${this.overview.count}`;
     this.pictures += 1;

@@ -20,6 +20,35 @@ export class CameraRig {
     this.started = false;
     this.free = Infinity;
     this.used = this.distance;
+    // What is looked at instead of the user: its place, and how far the camera is from it.
+    this.watched = null;
+    this.before = null;
+  }
+
+  /** Look at a place from another, both (3,) [m]; the view can be turned about it. */
+  watch(eye, target) {
+    const way = new Vector3(...target).sub(new Vector3(...eye));
+    this.before ??= { yaw: this.yaw, pitch: this.pitch };
+    this.watched = { target: new Vector3(...target), distance: way.length() };
+    this.yaw = Math.atan2(way.y, way.x);
+    this.pitch = Math.asin(MathUtils.clamp(way.z / way.length(), -1, 1));
+    this.orbit();
+  }
+
+  /** Place the camera for what is looked at. */
+  orbit() {
+    const level = Math.cos(this.pitch);
+    const ahead = new Vector3(Math.cos(this.yaw) * level, Math.sin(this.yaw) * level, Math.sin(this.pitch));
+    this.camera.position.copy(this.watched.target).addScaledVector(ahead, -this.watched.distance);
+    this.camera.lookAt(this.watched.target);
+  }
+
+  /** Look at the user again. */
+  leave() {
+    if (!this.watched) return;
+    Object.assign(this, this.before);
+    this.watched = this.before = null;
+    this.started = false;
   }
 
   /** Return the line from the user to the camera, for the server to test. */
@@ -42,6 +71,10 @@ export class CameraRig {
 
   /** Go nearer or farther. steps: of a wheel. */
   zoom(steps) {
+    if (this.watched) {
+      this.watched.distance = MathUtils.clamp(this.watched.distance * 1.12 ** steps, 0.3, FAR);
+      return;
+    }
     this.distance = MathUtils.clamp(this.distance * 1.12 ** steps, NEAR, FAR);
   }
 

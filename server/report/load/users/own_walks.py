@@ -6,21 +6,18 @@ from pathlib import Path
 import numpy as np
 
 from .....schemas.errors import BadRequestError
-from ....cli.input.pose_file import read_poses, read_tum_poses
+from ....cli.input.pose_file import read_path
 from .user_traces import Trace, merged
 from .walking_motion import RATE
-
-# Suffixes of files in the format of the TUM RGB-D benchmark; others are CSV.
-TUM_SUFFIXES = (".tum", ".txt")
 
 
 def read_walk(path: Path) -> Trace:
     """Read a walk: the trace of one user, from time 0 on.
 
     Poses without times that ascend come RATE times a second.
-    Raises ScanError and BadRequestError as `read_poses` does, and for fewer than two poses.
+    Raises ScanError and BadRequestError as `read_path` does, and for fewer than two poses.
     """
-    time, pose = (read_tum_poses if path.suffix.lower() in TUM_SUFFIXES else read_poses)(path)
+    time, pose = read_path(path)
     if len(time) < 2:
         raise BadRequestError(f"{path}: {len(time)} poses, expected a walk of at least two")
     if not (np.diff(time) > 0).all():

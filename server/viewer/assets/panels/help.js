@@ -9,6 +9,7 @@ const KEYS = [
   [["V"], "first or third person"],
   [["C"], "next colour"],
   [["G"], "what is going on: plots, effects, accuracy, hierarchy"],
+  [[",", "."], "previous or next clash; Esc: back to the user"],
   [["H"], "back to the start"],
   [["R", "F"], "up and down, where nothing holds you to the ground"],
 ];

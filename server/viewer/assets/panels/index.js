@@ -1,6 +1,7 @@
 // The panels, in the order in which the page shows them.
 
 import { addAccuracyPanel } from "./accuracy.js";
+import { addClashPanel } from "./clash.js";
 import { addColourPanel } from "./colour.js";
 import { addEffectsPanel } from "./effects.js";
 import { instrumentsToggle } from "./folding.js";
@@ -11,7 +12,7 @@ import { addPlotsPanel } from "./plots.js";
 import { addQualityPanel, addShowPanel } from "./show.js";
 
 export function addPanels(app) {
-  for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addHelpPanel]) add(app);
+  for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addClashPanel, addHelpPanel]) add(app);
   // What is going on, beside the settings.
   instrumentsToggle(app);
   for (const add of [addPlotsPanel, addEffectsPanel, addAccuracyPanel, addHierarchyPanel]) add(app);

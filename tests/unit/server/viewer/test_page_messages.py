@@ -53,6 +53,9 @@ def test_texts_of_a_page_are_read() -> None:
         '{"type":"want","tiles":[[0,0,0,4294967296,1]]}',
         text_message("want", tiles=[[0, 0, 0, 0, 0]] * 257),
         '{"type":"boom","place":[0,0,0],"way":[0,0,1],"reach":0}',
+        '{"type":"save","form":"exe"}',
+        text_message("path", name="a" * 256, text="", first=True, last=True),
+        text_message("path", name="a.csv", text="a" * 10_001, first=True, last=True),
         b'{"type":"intent"}',
     ],
 )

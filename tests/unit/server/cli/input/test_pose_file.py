@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.server.cli.input.pose_file import read_poses, write_poses
+from solidcloud.server.cli.input.pose_file import parse_path, read_path, read_poses, write_poses
 
 HEADER = "t,x,y,z,qw,qx,qy,qz\n"
 
@@ -90,3 +90,16 @@ def test_columns_may_stand_in_any_order_but_must_be_these(tmp_path: Path) -> Non
 def test_file_without_poses_gives_none(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(HEADER)
     assert read_poses(tmp_path / "a.csv")[1].shape == (0, 4, 4)
+
+
+def test_suffix_selects_the_format_of_a_path(tmp_path: Path) -> None:
+    tum, table = "# time tx ty tz qx qy qz qw\n2.5 1 2 3 0 0 0 1\n", HEADER + "2.5,1,2,3,1,0,0,0\n"
+    for name, text in (("a.tum", tum), ("a.TXT", tum), ("a.csv", table), ("a", table)):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        for times, poses in (read_path(tmp_path / name), parse_path(name, text)):
+            assert times.tolist() == [2.5]
+            assert poses[0, :3, 3].tolist() == [1, 2, 3]
+    with pytest.raises(BadRequestError, match=r"walk\.tum, line 1: 1 values: expected timestamp tx ty tz"):
+        parse_path("walk.tum", table)
+    with pytest.raises(BadRequestError, match=r"walk\.csv, line 1: columns .*: expected t,x,y,z,qw,qx,qy,qz"):
+        parse_path("walk.csv", tum)

@@ -1,0 +1,165 @@
+"""Test the check of a path on a small archive against brute force, and its end before time."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import archive_cases
+import numpy as np
+import pytest
+from msgspec import structs
+from solidcloud.schemas.errors import BadRequestError, BusyError
+from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.server.clash import clash_check
+from solidcloud.server.clash.clash_check import Watcher, check_path
+from solidcloud.server.clash.clash_snapshot import draw
+from solidcloud.server.clash.clash_surroundings import surroundings
+from solidcloud.server.clash.clash_viewpoint import find_viewpoint
+from solidcloud.server.scene import Scene
+
+RADIUS = 0.05
+BODY = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.3], [0.1, 0.0, 0.1]])
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
+    """Two walls at x = 0 and x = 1, from y = -1 to 1 and z = -1 to 1."""
+    rng = np.random.default_rng(5)
+    walls = rng.uniform(-1, 1, (3000, 3))
+    walls[:, 0] = np.repeat([0.0, 1.0], 1500)
+    return archive_cases.build(tmp_path_factory.mktemp("clash"), walls, voxel=1.0, level=False)
+
+
+def path_through(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and poses of a straight way through both walls."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.linspace(-0.7, 1.7, count)
+    return np.arange(count) / 10, poses
+
+
+def test_clashes_are_those_of_brute_force(case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clash_check, "BATCH_POSES", 7)
+    times, poses = path_through(97)
+    told: list[Any] = []
+    shares: list[float] = []
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        step, radius = scene.info().lattice_step, scene.info().radius
+        checked = check_path(
+            scene, "body", times, poses, reach=0.5, watcher=Watcher(told.append, shares.append)
+        )
+        contacts = scene.contacts("body", poses)
+        pictures = []
+        for clash in checked.clashes:
+            view = find_viewpoint(scene, clash, poses, np.array([0.0, 0.0, 0.15]), 0.3, (0, 0, 1))
+            # Both sides of the wall are free; the camera is on one of them, and sees the clash.
+            assert abs(view.eye[0] - clash.place[0]) > 0.25
+            pose = poses[clash.deepest]
+            clouds = surroundings(scene, clash, pose, BODY, clash.place[None], np.array([0.0, 0.0, 1.0]))
+            assert sum(len(cloud.points) for cloud in clouds) == scene.info().points + len(BODY) + 1
+            pictures.append(draw(view, clouds, (160, 90)))
+    gaps = np.array([
+        np.linalg.norm((BODY + pose[:3, 3])[:, None] - case.points[None], axis=2).min() for pose in poses
+    ]) - RADIUS - radius  # fmt: skip
+    known = gaps < 0.5
+    # Archives keep whole lattice steps.
+    assert np.allclose(checked.signed_distance[known], gaps[known], atol=2 * step)
+    assert np.isinf(checked.signed_distance[~known]).all()
+    assert np.array_equal(checked.verdict, np.where(gaps <= 0, Verdict.CONTACT, Verdict.CLEAR))
+    assert len(checked.clashes) == 2
+    for clash in checked.clashes:
+        own = slice(clash.first, clash.last + 1)
+        assert (gaps[own] <= 0).all()
+        assert gaps[clash.first - 1] > 0
+        assert gaps[clash.last + 1] > 0
+        assert clash.depth == pytest.approx(-gaps[own].min(), abs=2 * step)
+        assert clash.contacts == contacts.pairs_found[own].max()
+        assert clash.place[0] == pytest.approx(round(clash.place[0]), abs=step)
+    assert np.array_equal(np.concatenate([each.verdict for each in told]), checked.verdict)
+    assert [each.first for each in told] == list(range(0, 97, 7))
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert checked.complete
+    assert checked.clearance == checked.signed_distance.min()
+    # The contact is drawn in red over everything, near the middle of the picture.
+    for picture in pictures:
+        red = np.argwhere((picture[..., 0] > 200) & (picture[..., 1] < 100))
+        assert len(red)
+        assert np.abs(red.mean(axis=0) - (45, 80)).max() < 25
+
+
+class FakeScene:
+    """Scene in which every pose touches; it stops answering after some requests."""
+
+    def __init__(self, answers: int) -> None:
+        self.left, self.unanswered = answers, 0
+
+    def distance(self, name: str, poses: np.ndarray, reach: float) -> Any:
+        self.left -= 1
+        if self.left < 0:
+            self.unanswered += len(poses)
+        touching = np.full(len(poses), Verdict.CLEAR, np.uint8)
+        return SimpleNamespace(
+            signed_distance=np.full(len(poses), 0.25), verdict=touching, stopped="", faults=()
+        )
+
+    def silence(self, operation: str) -> str:
+        return f"{operation}: no answer within 5 s"
+
+
+def test_stopped_check_leaves_the_rest_unknown() -> None:
+    times, poses = path_through(1000)
+    told: list[Any] = []
+    watcher = Watcher(told.append, stopped=lambda: len(told) == 2)
+    checked = check_path(FakeScene(99), "body", times, poses, watcher=watcher)  # type: ignore[arg-type]
+    examined = 2 * clash_check.BATCH_POSES
+    assert not checked.complete
+    assert checked.count(Verdict.UNKNOWN) == 1000 - examined
+    assert checked.unknown == [(examined, 999)]
+    assert checked.clearance == 0.25
+
+
+def test_request_that_the_server_ends_is_asked_again_in_halves(case: archive_cases.Case) -> None:
+    times, poses = path_through(64)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        expected = check_path(scene, "body", times, poses, reach=0.5)
+        for most, faults in ((9, ()), (0, ("it took too long",))):
+            hasty = HastyScene(scene, most)
+            checked = check_path(hasty, "body", times, poses, reach=0.5)  # type: ignore[arg-type]
+            assert checked.faults == faults
+            if most:
+                assert np.array_equal(checked.verdict, expected.verdict)
+                assert [each.depth for each in checked.clashes] == [each.depth for each in expected.clashes]
+                assert 64 in hasty.asked
+            else:
+                assert checked.unknown == [(0, 63)]
+                assert checked.clashes == []
+
+
+class HastyScene:
+    """Scene that ends requests of more than `most` poses."""
+
+    def __init__(self, scene: Scene, most: int) -> None:
+        self.scene, self.most = scene, most
+        self.asked: list[int] = []
+
+    def distance(self, name: str, poses: np.ndarray, reach: float) -> Any:
+        return self.limited(self.scene.distance(name, poses, reach))
+
+    def contacts(self, name: str, poses: np.ndarray, limit: int) -> Any:
+        return self.limited(self.scene.contacts(name, poses, limit))
+
+    def limited(self, answers: Any) -> Any:
+        self.asked.append(len(answers))
+        if len(answers) <= self.most:
+            return answers
+        unknown = np.full(len(answers), Verdict.UNKNOWN, np.uint8)
+        return structs.replace(answers, verdict=unknown, stopped="it took too long")
+
+
+def test_check_without_an_answer_fails() -> None:
+    times, poses = path_through(1000)
+    with pytest.raises(BusyError, match="ended early: distance: no answer within 5 s"):
+        check_path(FakeScene(3), "body", times, poses)  # type: ignore[arg-type]
+    with pytest.raises(BadRequestError, match="no poses"):
+        check_path(FakeScene(3), "body", times[:0], poses[:0])  # type: ignore[arg-type]

@@ -31,7 +31,7 @@ from viewed_page import CHROMIUM, DEADLINE, ViewedPage, browsing, viewed_page
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
 
-POINTS, VOXEL = 60_000, 2.0
+POINTS, VOXEL, SCENE = 60_000, 2.0, "facade"
 # The user stands far from the clashes: what is seen of them is seen by the jump.
 AT = "4,-9,0.1,90"
 WAY = [(2.6, -3.0, 0.7), (2.6, 3.0, 0.7), (-6.0, 3.0, 0.7), (-6.0, -9.0, 0.7), (-10.5, -9.0, 0.7)]
@@ -58,8 +58,8 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Any) -> It
     """Serve the façade."""
     folder, where = tmp_path_factory.mktemp("viewer"), free_endpoint()
     make_facade(folder / "facade.laz", points=POINTS)
-    build_archive([folder / "facade.laz"], folder / "archive", BuildConfig(voxel=VOXEL, jobs=1))
-    (folder / "viewer.toml").write_text(archive_scene(folder / "archive"))
+    build_archive([folder / "facade.laz"], folder / SCENE, BuildConfig(voxel=VOXEL, jobs=1))
+    (folder / "viewer.toml").write_text(archive_scene(folder / SCENE))
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve"]
     process = subprocess.Popen(
         [*command, str(folder / "viewer.toml"), "--listen", where], stdout=subprocess.PIPE, text=True
@@ -83,7 +83,7 @@ def expected(endpoint: str, path_file: Path) -> list[tuple[float, int, int, int]
     """Return depth, first and last pose, and contacts of each clash, as `contacts` of every pose finds them."""
     avatar = load_avatar(None)
     _, poses = read_path(path_file)
-    with Client(endpoint, scene="viewer") as client:
+    with Client(endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
         # One at a time: a server ends requests that take long.
         answers = [client.contacts("judge", pose) for pose in poses]
@@ -178,7 +178,7 @@ def expected_pairs(endpoint: str, path_file: Path, clash: dict[str, Any]) -> int
     """Return how many pairs are in contact at the deepest pose of a clash."""
     avatar = load_avatar(None)
     pose = read_path(path_file)[1][clash["pose_deepest"]]
-    with Client(endpoint, scene="viewer") as client:
+    with Client(endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
         return int(client.contacts("judge", pose, limit=0).pairs_found[0])
 
@@ -207,7 +207,7 @@ def check_files(viewed: ViewedPage, listed: list[dict[str, Any]]) -> None:
             red, green, _ = np.moveaxis(picture, -1, 0)
             assert ((red > 200) & (green < 120)).any()
     name, content = saved(viewed, "Save the view as PNG")
-    assert name == "viewer.png"
+    assert name == f"{SCENE}.png"
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 

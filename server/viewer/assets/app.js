@@ -52,6 +52,11 @@ export class App {
     this.fps = 0;
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
+    // For panels: called with each state of the user; what moves by itself, each with `update` and a
+    // `signature` that changes with what is drawn; functions by name that tests may call.
+    this.frameListeners = new Set();
+    this.movers = new Set();
+    this.readable = {};
     this.input = new Input(view.canvas, this.rig, {
       KeyV: () => settings.toggle("firstPerson"),
       KeyB: () => settings.toggle("boxes"),
@@ -150,6 +155,7 @@ export class App {
     const now = performance.now();
     this.users.frame(message, this.verdict, NAMES, now);
     this.contacts.take(state, now);
+    for (const listener of this.frameListeners) listener(state);
     showVerdict(this.verdict);
     showState(state);
     if (first || this.entered) {
@@ -212,6 +218,7 @@ export class App {
       shared.uVerdict.value.set(r / 255, g / 255, b / 255, this.users.height);
     }
     this.contacts.update(now);
+    for (const mover of this.movers) mover.update(now);
     if (this.scene && now - this.times.choose > CHOOSE_MS) this.choose(now, own);
     this.draw(now);
     if (now - this.times.figures > FIGURES_MS) this.figures(now);
@@ -232,7 +239,7 @@ export class App {
     const { camera } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
-      this.contacts.signature, this.users.signature,
+      this.contacts.signature, this.users.signature, ...[...this.movers].map((mover) => mover.signature),
     ].join();
     const chosen = [
       this.boxes.version, this.boxes.object.visible, this.verdict, this.colour, settings.get("pointSize"),

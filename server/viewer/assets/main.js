@@ -52,6 +52,7 @@ function expose(app) {
     yaw: () => app.rig.yaw,
     notices: () => subjects(),
     software: () => app.view.software,
+    ...app.readable,
   };
   const state = {};
   for (const [name, get] of Object.entries(read)) Object.defineProperty(state, name, { get, enumerable: true });

@@ -9,6 +9,8 @@ const KEYS = [
   [["V"], "first or third person"],
   [["C"], "next colour"],
   [["H"], "back to the start"],
+  [["T"], "record the walk, or stop"],
+  [["P"], "play the walk, or pause"],
   [["R", "F"], "up and down, where nothing holds you to the ground"],
 ];
 

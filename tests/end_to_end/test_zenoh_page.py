@@ -21,8 +21,8 @@ from fake_server import FloorScene, floor_verdicts
 from solidcloud.schemas.wire.answers import CollideAnswers
 from solidcloud.schemas.wire.encoding import JSON, decode_request, encode
 from solidcloud.schemas.wire.key_expressions import client_token_key, query_key
-from solidcloud.schemas.wire.requests import CollideRequest
-from solidcloud.schemas.wire.scene_messages import AddAvatarRequest, AvatarInfo, ErrorReply
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest
+from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 from viewed_page import CHROMIUM, browsing

@@ -116,6 +116,7 @@ def state_fields(state: State, frame: ViewFrame) -> dict[str, Any]:
     """Return a state for the page, in the page's frame."""
     fields: dict[str, Any] = {
         "seq": state.seq,
+        "time": state.time,
         "frame": state.frame,
         "pose": rounded(frame.pose(state.pose[0])),
         "verdict": state.verdict,

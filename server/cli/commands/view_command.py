@@ -59,9 +59,7 @@ def view(
             server = stack.enter_context(ViewedServer(stack.enter_context(viewed_scene(what))))
             connect = server.endpoint
         url = stack.enter_context(
-            viewing(
-                connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server, poses=poses
-            )
+            viewing(connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server, poses=poses)
         )
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
         if browser:

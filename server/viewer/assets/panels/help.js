@@ -11,6 +11,8 @@ const KEYS = [
   [["G"], "what is going on: plots, effects, accuracy, hierarchy"],
   [[",", "."], "previous or next clash; Esc: back to the user"],
   [["H"], "back to the start"],
+  [["T"], "record the walk, or stop"],
+  [["P"], "play the walk, or pause"],
   [["R", "F"], "up and down, where nothing holds you to the ground"],
 ];
 

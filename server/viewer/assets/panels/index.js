@@ -10,10 +10,15 @@ import { addHierarchyPanel } from "./hierarchy.js";
 import { addPlacePanel } from "./place.js";
 import { addPlotsPanel } from "./plots.js";
 import { addQualityPanel, addShowPanel } from "./show.js";
+import { addWalkPanel } from "./walk.js";
 
 export function addPanels(app) {
+<<<<<<< HEAD
   for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addClashPanel, addHelpPanel]) add(app);
   // What is going on, beside the settings.
   instrumentsToggle(app);
   for (const add of [addPlotsPanel, addEffectsPanel, addAccuracyPanel, addHierarchyPanel]) add(app);
+=======
+  for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addWalkPanel, addHelpPanel]) add(app);
+>>>>>>> h-replay
 }

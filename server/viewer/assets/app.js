@@ -54,23 +54,16 @@ export class App {
     this.fps = 0;
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
-<<<<<<< HEAD
     // For panels: called with each state of the user, and with each refusal of the server; what else
-    // is drawn, each with a `signature` that changes with it and a method `prepare`; functions by name
-    // that tests may call.
+    // is drawn, each with a `signature` that changes with it and a method `prepare`; what moves by
+    // itself, each with `update` and a `signature`; functions by name that tests may call.
     this.frameListeners = new Set();
     this.problemListeners = new Set();
     this.drawings = new Set();
+    this.movers = new Set();
     this.readable = {};
     // Names of the effects that the server is being started with, or null.
     this.switching = null;
-=======
-    // For panels: called with each state of the user; what moves by itself, each with `update` and a
-    // `signature` that changes with what is drawn; functions by name that tests may call.
-    this.frameListeners = new Set();
-    this.movers = new Set();
-    this.readable = {};
->>>>>>> h-replay
     this.input = new Input(view.canvas, this.rig, {
       KeyV: () => settings.toggle("firstPerson"),
       KeyB: () => settings.toggle("boxes"),
@@ -282,11 +275,7 @@ export class App {
     const { camera } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
-<<<<<<< HEAD
-      this.contacts.signature, this.users.signature, this.verdict,
-=======
-      this.contacts.signature, this.users.signature, ...[...this.movers].map((mover) => mover.signature),
->>>>>>> h-replay
+      this.contacts.signature, this.users.signature, this.verdict, ...[...this.movers].map((mover) => mover.signature),
     ].join();
     const chosen = [
       this.boxes.version, this.boxes.object.visible, this.colour, settings.get("pointSize"),

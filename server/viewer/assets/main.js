@@ -53,15 +53,12 @@ function expose(app) {
     notices: () => subjects(),
     software: () => app.view.software,
     ...app.readable,
-<<<<<<< HEAD
     camera: () => app.view.camera.position.toArray(),
     watching: () => app.rig.watched !== null,
     clash: () => ({
       state: app.clash.state, message: app.clash.message, result: app.clash.result, selected: app.clash.selected,
       shown: app.clash.shown, ghost: app.clash.ghost.counts, classes: [...app.clash.line.counts],
     }),
-=======
->>>>>>> h-replay
   };
   const state = {};
   for (const [name, get] of Object.entries(read)) Object.defineProperty(state, name, { get, enumerable: true });

@@ -13,12 +13,11 @@ import { addQualityPanel, addShowPanel } from "./show.js";
 import { addWalkPanel } from "./walk.js";
 
 export function addPanels(app) {
-<<<<<<< HEAD
-  for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addClashPanel, addHelpPanel]) add(app);
+  const settings = [
+    addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addWalkPanel, addClashPanel, addHelpPanel,
+  ];
+  for (const add of settings) add(app);
   // What is going on, beside the settings.
   instrumentsToggle(app);
   for (const add of [addPlotsPanel, addEffectsPanel, addAccuracyPanel, addHierarchyPanel]) add(app);
-=======
-  for (const add of [addColourPanel, addShowPanel, addQualityPanel, addPlacePanel, addWalkPanel, addHelpPanel]) add(app);
->>>>>>> h-replay
 }

@@ -54,7 +54,8 @@ export function addAccuracyPanel(app) {
     ]);
     table.replaceChildren(head, ...rows);
     const sum = (kind, name) => Object.values(answers).reduce((all, each) => all + each[kind][name], 0);
-    const [visits, seconds] = ["visits", "seconds"].map((name) => less(sum("tolerant", name), sum("exact", name)));
+    const [visits, seconds] = [["visits", "fewer"], ["seconds", "less"]].map(([name, word]) => (
+      less(sum("tolerant", name), sum("exact", name), word)));
     saved.textContent = tolerance > 0
       ? `With this tolerance both answers together take ${visits} node visits and ${seconds} time.`
       : "At tolerance 0 both answers are exact.";
@@ -62,9 +63,9 @@ export function addAccuracyPanel(app) {
 }
 
 /** Return how one number compares to another, as text. */
-function less(value, than) {
+function less(value, than, word) {
   const share = than ? Math.round(100 * (1 - value / than)) : 0;
-  return share >= 0 ? `${share} % less` : `${-share} % more`;
+  return share >= 0 ? `${share} % ${word}` : `${-share} % more`;
 }
 
 /** Return the word for a verdict. Only a contact of `collide` may be early. */

@@ -118,7 +118,7 @@ export function addPlotsPanel(app) {
     if (!last) return;
     const { totals, memory: { voxels, bounds, budget, resident, total } } = last;
     const share = (100 * (voxels + bounds)) / budget;
-    text.textContent = `${resident.toLocaleString("en")} of ${total.toLocaleString("en")} voxels in memory; with the bounds of the others ${bytes((voxels + bounds) / MIB)} of `
+    text.textContent = `${resident.toLocaleString("en")} of ${total.toLocaleString("en")} voxels in memory; with bounds and levels of detail ${bytes((voxels + bounds) / MIB)} of `
       + `the budget of ${bytes(budget / MIB)} (${share < 1 ? share.toFixed(2) : share.toFixed(0)} %). Since the server began: `
       + `${totals.hits.toLocaleString("en")} hits, ${totals.misses.toLocaleString("en")} misses, ${totals.prefetched.toLocaleString("en")} prefetched, `
       + `${totals.wasted.toLocaleString("en")} of them wasted, ${totals.evicted.toLocaleString("en")} evicted.`;

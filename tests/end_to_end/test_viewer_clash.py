@@ -31,7 +31,7 @@ from viewed_page import CHROMIUM, DEADLINE, ViewedPage, browsing, viewed_page
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
 
-POINTS, VOXEL = 60_000, 2.0
+POINTS, VOXEL, SCENE = 60_000, 2.0, "facade"
 # The user stands far from the clashes: what is seen of them is seen by the jump.
 AT = "4,-9,0.1,90"
 WAY = [(2.6, -3.0, 0.7), (2.6, 3.0, 0.7), (-6.0, 3.0, 0.7), (-6.0, -9.0, 0.7), (-10.5, -9.0, 0.7)]
@@ -58,8 +58,8 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Any) -> It
     """Serve the façade."""
     folder, where = tmp_path_factory.mktemp("viewer"), free_endpoint()
     make_facade(folder / "facade.laz", points=POINTS)
-    build_archive([folder / "facade.laz"], folder / "archive", BuildConfig(voxel=VOXEL, jobs=1))
-    (folder / "viewer.toml").write_text(archive_scene(folder / "archive"))
+    build_archive([folder / "facade.laz"], folder / SCENE, BuildConfig(voxel=VOXEL, jobs=1))
+    (folder / "viewer.toml").write_text(archive_scene(folder / SCENE))
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve"]
     process = subprocess.Popen(
         [*command, str(folder / "viewer.toml"), "--listen", where], stdout=subprocess.PIPE, text=True
@@ -83,7 +83,7 @@ def expected(endpoint: str, path_file: Path) -> list[tuple[float, int, int, int]
     """Return depth, first and last pose, and contacts of each clash, as `contacts` of every pose finds them."""
     avatar = load_avatar(None)
     _, poses = read_path(path_file)
-    with Client(endpoint, scene="viewer") as client:
+    with Client(endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
         # One at a time: a server ends requests that take long.
         answers = [client.contacts("judge", pose) for pose in poses]
@@ -178,7 +178,7 @@ def expected_pairs(endpoint: str, path_file: Path, clash: dict[str, Any]) -> int
     """Return how many pairs are in contact at the deepest pose of a clash."""
     avatar = load_avatar(None)
     pose = read_path(path_file)[1][clash["pose_deepest"]]
-    with Client(endpoint, scene="viewer") as client:
+    with Client(endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
         return int(client.contacts("judge", pose, limit=0).pairs_found[0])
 
@@ -207,7 +207,7 @@ def check_files(viewed: ViewedPage, listed: list[dict[str, Any]]) -> None:
             red, green, _ = np.moveaxis(picture, -1, 0)
             assert ((red > 200) & (green < 120)).any()
     name, content = saved(viewed, "Save the view as PNG")
-    assert name == "viewer.png"
+    assert name == f"{SCENE}.png"
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
@@ -250,4 +250,23 @@ def test_malformed_file_is_named_on_the_page(
         viewed.page.get_by_label("Load a path").set_input_files(path_file)
         viewed.wait("s.clash.state === 'done'")
         assert viewed.read("s.clash.message") == ""
+        viewed.check_clean(url)
+
+
+def test_cancelled_check_lists_what_was_found(browser: Any, endpoint: str, path_file: Path) -> None:
+    _, *rows = path_file.read_text().splitlines()
+    # Longer than any machine checks before the button is pressed.
+    content = "\n".join(rows * (30_000 // len(rows))).encode()
+    with viewing(endpoint) as url, viewed_page(browser, url) as viewed:
+        viewed.wait("s.server === 'connected'")
+        file = {"name": "long.tum", "mimeType": "text/plain", "buffer": content}
+        viewed.page.get_by_label("Load a path").set_input_files(file)
+        # Some poses have an answer, and others do not.
+        viewed.wait("s.clash.state === 'running' && s.clash.classes[0] > 0 && s.clash.classes[4] > 0")
+        viewed.page.get_by_role("button", name="Cancel").click()
+        result = viewed.wait("s.clash.state === 'done' && s.clash.result")
+        assert not result["complete"]
+        assert result["counts"]["unknown"] > 0
+        assert "Cancelled: the rest was not examined" in viewed.page.inner_text("#clash-message")
+        assert viewed.read("s.clash.classes[4]") == result["counts"]["unknown"]
         viewed.check_clean(url)

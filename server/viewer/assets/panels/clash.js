@@ -4,6 +4,7 @@ import { CLASSES } from "../clash/clearance.js";
 import { settings } from "../settings.js";
 import { buttons, panel, slider } from "./registry.js";
 
+const metres = (value) => value.toFixed(2).replace(/^-(?=0\.00$)/, "");
 const centimetres = (value) => `${(100 * value).toFixed(1)} cm`;
 const count = (number, one) => `${number.toLocaleString("en")} ${number === 1 ? one : `${one}s`}`;
 
@@ -16,7 +17,7 @@ function make(kind, properties = {}, ...children) {
 export function addClashPanel(app) {
   const { clash } = app;
   const section = panel("Clash check");
-  section.append(make("p", { textContent: "Finds where the avatar touches the scan along a path of poses." }));
+  section.append(make("p", { textContent: "Finds where the avatar touches the scan along a path of poses. Depth is how far two of their spheres overlap." }));
   const input = make("input", { type: "file", accept: ".csv,.tum,.txt" });
   input.addEventListener("change", async () => {
     const [file] = input.files;
@@ -122,11 +123,11 @@ function drawList(list, clash) {
       make("strong", { textContent: `${each.clash}. ${centimetres(each.depth)} deep` }),
       make("span", { textContent: count(each.contacts, "contact") }),
       make("span", { textContent: `${from === to ? `pose ${from}` : `poses ${from} to ${to}`}${when}` }),
-      make("span", { textContent: `at ${each.place.map((value) => value.toFixed(2)).join(" ")}` }));
+      make("span", { textContent: `at ${each.place.map(metres).join(" ")}` }));
     button.setAttribute("aria-current", "false");
     button.addEventListener("click", () => clash.show(each.clash));
     const clusters = make("ul", { hidden: true }, ...each.clusters.slice(0, 8).map((cluster) => make("li", {
-      textContent: `${centimetres(cluster.depth)} · ${count(cluster.contacts, "contact")} · at ${cluster.place.map((value) => value.toFixed(2)).join(" ")}`,
+      textContent: `${centimetres(cluster.depth)} · ${count(cluster.contacts, "contact")} · at ${cluster.place.map(metres).join(" ")}`,
     })));
     if (each.clusters.length > 8) clusters.append(make("li", { textContent: `${each.clusters.length - 8} more clusters` }));
     clusters.setAttribute("aria-label", "Clusters of contacts");

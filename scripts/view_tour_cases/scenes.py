@@ -44,8 +44,9 @@ def touch(browser: Any, url: str) -> Image.Image:
 
 def door(browser: Any, url: str) -> Image.Image:
     """Return the user in the main door."""
-    with tour_page(browser, url, "0,-3.4,0.1,90") as page:
-        page.hold("w", "s.place[1] > -0.9")
+    with tour_page(browser, url, "0.1,-0.6,0.5,90") as page:
+        page.look(-4, 5)
+        page.zoom(2)
         return page.picture()
 
 

@@ -1,15 +1,18 @@
 """Scenes of the tour, in order: each drives a page and returns its picture."""
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from PIL import Image
 
-from .tour_page import tour_page
+from .tour_page import TourPage, tour_page
 
 # Opens the panel of one instrument.
 _INSTRUMENTS = {"instruments": True, "openEffects": False, "openAccuracy": False, "openHierarchy": False}
+# The panels of the plots and of the clash check fit.
+_LARGE = (1920, 1080)
 # Way of the clash check: waypoints (x, y) [m] past a column, through the door, through a column
 # of the nave and along its wall.
 _WAYPOINTS = ((-7.0, -9.0), (-4.7, -5.4), (-0.2, -3.2), (0.0, 2.4), (3.4, 3.2), (5.6, 6.5), (7.3, 9.0))
@@ -59,28 +62,32 @@ def residency(browser: Any, url: str) -> Image.Image:
 
 def hierarchy(browser: Any, url: str) -> Image.Image:
     """Return the bounding spheres at a column."""
-    with tour_page(browser, url, "-4.1,-6.7,0.1,112", **{**_INSTRUMENTS, "openHierarchy": True, "level": 3}) as page:
+    with tour_page(
+        browser, url, "-4.1,-6.7,0.1,112", **{**_INSTRUMENTS, "openHierarchy": True, "level": 3}
+    ) as page:
         page.wait("s.spheres && s.spheres.level === 3 && s.spheres.drawn > 0")
         return page.picture()
 
 
 def plots(browser: Any, url: str) -> Image.Image:
-    """Return the page with the live plots after a walk into the nave."""
-    with tour_page(browser, url, "0,-8,0.1,90", **{**_INSTRUMENTS, "openPlots": True}) as page:
-        page.hold("w", "s.place[1] > 3 && s.samples.length > 20")
+    """Return the page with the live plots after walks before the portal."""
+    options = {**_INSTRUMENTS, "openPlots": True, "size": _LARGE}
+    with tour_page(browser, url, "1.2,-11,0.1,97", **options) as page:
+        pace(page)
         return page.picture(bare=False)
 
 
-def accuracy(browser: Any, url: str) -> Image.Image:
-    """Return the page with the dial of accuracy, close to the door's jamb."""
-    with tour_page(browser, url, "0.35,0.5,0.5,100", **{**_INSTRUMENTS, "openAccuracy": True}) as page:
-        page.wait("s.measured && s.measured.tolerance > 0")
-        return page.picture(bare=False)
+def pace(page: TourPage) -> None:
+    """Walk to and fro before the portal, until the plots have something to show."""
+    for _ in range(3):
+        page.hold("w", "s.place[1] > -7.5")
+        page.hold("s", "s.place[1] < -10")
+    page.hold("w", "s.place[1] > -9 && s.samples.length > 20")
 
 
 def clash(browser: Any, url: str) -> Image.Image:
     """Return the page at the deepest clash of a path."""
-    with tour_page(browser, url, "-2,-7,0.1,75", panel=True, near=0.05) as page:
+    with tour_page(browser, url, "-2,-7,0.1,75", size=_LARGE, panel=True, near=0.05) as page:
         check(page, clash_path())
         return page.picture(bare=False)
 
@@ -96,7 +103,7 @@ def meet(browser: Any, url: str) -> Image.Image:
         return page.picture()
 
 
-def check(page: Any, path: str) -> None:
+def check(page: TourPage, path: str) -> None:
     """Check a path, and go to its deepest clash."""
     page.page.locator("#panel input[type=file]").set_input_files(
         {"name": "cart.csv", "mimeType": "text/csv", "buffer": path.encode()}
@@ -109,7 +116,7 @@ def check(page: Any, path: str) -> None:
 def clash_path() -> str:
     """Return the path of the clash check as the text of a CSV file, upright poses each 5 cm."""
     rows = ["t,x,y,z,qw,qx,qy,qz"]
-    for (x0, y0), (x1, y1) in zip(_WAYPOINTS, _WAYPOINTS[1:], strict=False):
+    for (x0, y0), (x1, y1) in pairwise(_WAYPOINTS):
         steps = round(((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5 / _STEP)
         for step in range(steps):
             x, y = (a + (b - a) * step / steps for a, b in ((x0, x1), (y0, y1)))
@@ -142,15 +149,19 @@ def panel_pictures(browser: Any, url: str, folder: Path) -> list[Path]:
 
     # A high page: no panel scrolls.
     light = {"size": (1000, 1800), "budget": 0.3, "shading": False}
-    with tour_page(browser, url, "0,-8,0.1,90", **light, **{**_INSTRUMENTS, "openPlots": True}, panel=True) as page:
-        page.hold("w", "s.place[1] > 3 && s.samples.length > 20")
+    with tour_page(
+        browser, url, "1.2,-11,0.1,97", **light, **{**_INSTRUMENTS, "openPlots": True}, panel=True
+    ) as page:
+        pace(page)
         write("plots", page.panel("#instruments section:nth-of-type(1)"))
         write("settings", page.panel("#panel section:nth-of-type(2)"))
         write("colour", page.panel("#panel section:nth-of-type(1)"))
         write("status", page.panel("#status"))
         for number, name in enumerate(("Effects", "Accuracy", "Hierarchy"), 2):
             page.page.locator(f"#instrument-open{name}-title button").click()
-            page.wait({"Effects": "s.effects.length", "Accuracy": "s.measured", "Hierarchy": "s.spheres"}[name])
+            page.wait(
+                {"Effects": "s.effects.length", "Accuracy": "s.measured", "Hierarchy": "s.spheres"}[name]
+            )
             page.page.wait_for_timeout(1500)
             write(name.lower(), page.panel(f"#instruments section:nth-of-type({number})"))
         check(page, clash_path())

@@ -26,7 +26,5 @@ def strip(frames: Sequence[tuple[Image.Image, str]]) -> Image.Image:
         row, column = divmod(number, _COLUMNS)
         place = (_GAP + column * (width + _GAP), _GAP + row * (height + _CAPTION + _GAP))
         made.paste(image.resize(_FRAME, Image.Resampling.LANCZOS), place)
-        draw.text(
-            (place[0] + 2, place[1] + height + _CAPTION / 2), caption, _TEXT, font, anchor="lm"
-        )
+        draw.text((place[0] + 2, place[1] + height + _CAPTION / 2), caption, _TEXT, font, anchor="lm")
     return made.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)

@@ -71,7 +71,7 @@ def hierarchy(browser: Any, url: str) -> Image.Image:
 
 def plots(browser: Any, url: str) -> Image.Image:
     """Return the page with the live plots after walks before the portal."""
-    options = {**_INSTRUMENTS, "openPlots": True, "size": _LARGE}
+    options = {**_INSTRUMENTS, "openPlots": True, "size": _LARGE, "budget": 0.8}
     with tour_page(browser, url, "1.2,-11,0.1,97", **options) as page:
         pace(page)
         return page.picture(bare=False)
@@ -79,15 +79,14 @@ def plots(browser: Any, url: str) -> Image.Image:
 
 def pace(page: TourPage) -> None:
     """Walk to and fro before the portal, until the plots have something to show."""
-    for _ in range(3):
-        page.hold("w", "s.place[1] > -7.5")
-        page.hold("s", "s.place[1] < -10")
-    page.hold("w", "s.place[1] > -9 && s.samples.length > 20")
+    page.hold("w", "s.place && s.place[1] > -7.5")
+    page.hold("s", "s.place && s.place[1] < -10")
+    page.hold("w", "s.place && s.place[1] > -9 && s.samples.length > 12")
 
 
 def clash(browser: Any, url: str) -> Image.Image:
     """Return the page at the deepest clash of a path."""
-    with tour_page(browser, url, "-2,-7,0.1,75", size=_LARGE, panel=True, near=0.05) as page:
+    with tour_page(browser, url, "-2,-7,0.1,75", size=_LARGE, budget=0.8, panel=True, near=0.05) as page:
         check(page, clash_path())
         return page.picture(bare=False)
 
@@ -148,7 +147,7 @@ def panel_pictures(browser: Any, url: str, folder: Path) -> list[Path]:
         written.append(path)
 
     # A high page: no panel scrolls.
-    light = {"size": (1000, 1800), "budget": 0.3, "shading": False}
+    light = {"size": (700, 1500), "budget": 0.1, "shading": False}
     with tour_page(
         browser, url, "1.2,-11,0.1,97", **light, **{**_INSTRUMENTS, "openPlots": True}, panel=True
     ) as page:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import matplotlib
 from PIL import Image, ImageDraw, ImageFont
 
-_FRAME, _COLUMNS = (480, 270), 4
-_GAP, _CAPTION, _SIZE = 10, 44, 21
+_FRAME, _COLUMNS = (448, 252), 4
+_GAP, _CAPTION, _SIZE = 10, 42, 20
 _GROUND, _TEXT = (10, 14, 21), (230, 237, 245)
 
 
@@ -27,4 +27,5 @@ def strip(frames: Sequence[tuple[Image.Image, str]]) -> Image.Image:
         place = (_GAP + column * (width + _GAP), _GAP + row * (height + _CAPTION + _GAP))
         made.paste(image.resize(_FRAME, Image.Resampling.LANCZOS), place)
         draw.text((place[0] + 2, place[1] + height + _CAPTION / 2), caption, _TEXT, font, anchor="lm")
-    return made.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    # Few points are red or yellow: they keep their colours.
+    return made.quantize(240, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)

@@ -31,8 +31,9 @@ SOCKET_PATH = "/socket"
 MAX_MESSAGE_BYTES = 64 << 10
 # Browsers at a time: each is a user of the scene with five threads.
 MAX_BROWSERS = 16
-# A browser that takes no data for this long is considered gone [s].
-_STALLED_SECONDS = 20.0
+# A browser that takes no data for this long is considered gone [s]. Where graphics are computed in
+# software beside other work, one was silent for 20 s.
+_STALLED_SECONDS = 60.0
 
 
 class _Page:

@@ -10,7 +10,7 @@ NAME = "solidcloud"
 # Subcommands, by which messages name the command; server/cli/main.py declares them.
 VERBS = (
     *("accuracy", "add", "build", "doctor", "export", "info", "inspect", "level", "loadtest", "make", "plan"),
-    *("query", "reload", "remove", "replay", "scene", "seal", "serve", "top", "validate"),
+    *("query", "reload", "remove", "replay", "scene", "seal", "serve", "top", "validate", "view"),
 )
 _MENTION = re.compile(rf"(?<![\w./-]){NAME} (?=(?:{'|'.join(VERBS)})\b|--)")
 

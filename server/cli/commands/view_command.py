@@ -36,11 +36,11 @@ def view(
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     key_file: KeyFile = None,
 ) -> None:
-    """Walk through a scene in the browser, until Ctrl-C.
+    """Walk through a scene in the browser.
 
-    The page is served to this host only. The server moves the users: it stops them at the scan, and an
-    archive is served such that they stand on the ground and climb steps. The page can switch the
-    effects of a server that this command has started.
+    Ctrl-C ends it. The page is served to this host only. The server moves the users: it stops them at
+    the scan, and an archive is served such that they stand on the ground and climb steps. The page can
+    switch the effects of a server that this command has started.
     """
     import signal
     import threading

@@ -16,6 +16,7 @@ EXTRAS = {
     "report": "draws the charts of accuracy",
     "cluster": "builds on dask workers",
     "metrics": "serves Prometheus metrics",
+    "view": "walks through a scene in the browser",
 }
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(?:\[[\w,]+\])?(?P<versions>[^;]*)(?:;(?P<marker>.*))?")
 _COMPARE = re.compile(r"(>=|<=|==|<|>)\s*([\d.]+)")

@@ -29,6 +29,7 @@ from ..kernels.core.array_references import Held, refer_to_avatar
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
+from ..kernels.motion.walk_resident import walk_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
 from ..residency.voxel_cache import VoxelCache
@@ -171,6 +172,9 @@ class SweepResult(NamedTuple):
     end: Pose | None = None
 
 
+_STILL = SweepResult(Verdict.CLEAR, 1.0, np.inf)
+
+
 class ResidentQueries:
     """Queries of one avatar, frame after frame. Not thread-safe: it reuses its arrays.
 
@@ -179,6 +183,7 @@ class ResidentQueries:
 
     __slots__ = (
         "_again",
+        "_below",
         "_box",
         "_counts",
         "_first",
@@ -186,7 +191,9 @@ class ResidentQueries:
         "_outside",
         "_poses",
         "_result",
+        "_result_below",
         "_rows",
+        "_rows_below",
         "_scratch",
         "_small",
         "_used",
@@ -203,6 +210,8 @@ class ResidentQueries:
         self._scratch = make_scratch(avatar.arrays) if self._small else None
         self._poses, self._first, self._last = np.empty((1, 4, 4)), np.empty((4, 4)), np.empty((4, 4))
         self._rows, self._result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_swept.COLUMNS)
+        self._rows_below, self._result_below = self._rows.copy(), self._result.copy()
+        self._below = np.empty((4, 4))
         self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
         self._counts = np.zeros((3, 1), np.uint32)
         self._used: list[int] = []
@@ -234,25 +243,8 @@ class ResidentQueries:
                 if needed > 0:
                     self._use(residency, rows[:needed].tolist())
             if needed >= 0:
-                lower, upper, speed = result[_SWEPT_BOUNDS].tolist()
-                if verdict != Verdict.CONTACT:
-                    clear = verdict == _CLEAR
-                    return SweepResult(
-                        _VERDICTS[verdict], lower, upper, None, None, 0, clear, visits, 0, not clear
-                    )
-                own, cloud = result[_SWEPT_AVATAR].copy(), result[_SWEPT_CLOUD].copy()
-                exact = upper == lower or speed * (upper - lower) <= max(tolerance, budget.tolerance)
-                unknown = not exact and _has_unknown(data)
-                if skin < 0.0:
-                    return SweepResult(
-                        Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown
-                    )
-                ended, end = result[_swept.ENDED], None
-                if ended != _swept.OPEN:
-                    end = result[_END].reshape(4, 4).copy() if ended == _swept.PROVED else pose_from
-                point = result[_POINT].copy()
-                return SweepResult(
-                    Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown, point, end
+                return self._swept(
+                    data, pose_from, verdict, visits, max(tolerance, budget.tolerance), skin, result
                 )
         answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, budget=budget)
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
@@ -270,6 +262,77 @@ class ResidentQueries:
             int(answers.node_visits[0]),
             missing,
             missing > 0 or verdict == Verdict.UNKNOWN or (not exact and partial),
+        )
+
+    def walk(
+        self,
+        data: SceneData,
+        pose_from: Pose,
+        pose_to: Pose,
+        down: Vec,
+        tolerance: float,
+        budget: QueryBudget,
+        skin: float,
+    ) -> tuple[SweepResult | None, SweepResult | None]:
+        """Sweep a motion and, if it is clear, the translation `down` (3,) [m] from its end, in one call.
+
+        The results equal those of two calls of `sweep`, the second without a skin. None: not known,
+        call `sweep`. A motion between equal poses is clear.
+        """
+        if not self._small or budget.limited:
+            return None, None
+        residency, first, last = data.residency, self._first, self._last
+        first[:], last[:] = pose_from, pose_to
+        moves, tolerance = first.tobytes() != last.tobytes(), max(tolerance, budget.tolerance)
+        held = data.references.to(data.arrays, data.broad)
+        with residency.frozen():
+            needed, verdict, visits, needed_below, verdict_below, visits_below = held.call(
+                walk_resident, first, last, moves, down, self._below, self.body.reference, self._scratch,
+                self.avatar.radius, data.radius_units, self._box, held.reference, data.arrays.stop, data.unknown,
+                data.nothing_clear, tolerance, skin, self._rows, self._result, self._rows_below, self._result_below,
+            )  # fmt: skip
+            used = self._rows[:needed].tolist() if needed > 0 else []
+            if needed_below > 0:
+                used += [row for row in self._rows_below[:needed_below].tolist() if row not in used]
+            if used:
+                self._use(residency, used)
+        if needed < 0:
+            return None, None
+        moved = (
+            self._swept(data, pose_from, verdict, visits, tolerance, skin, self._result) if moves else _STILL
+        )
+        if needed_below < 0:
+            return moved, None
+        return moved, self._swept(
+            data, pose_to, verdict_below, visits_below, tolerance, -1.0, self._result_below
+        )
+
+    @staticmethod
+    def _swept(
+        data: SceneData,
+        pose_from: Pose,
+        verdict: int,
+        visits: int,
+        tolerance: float,
+        skin: float,
+        result: NDArray[np.float64],
+    ) -> SweepResult:
+        """Return the answer in a `result` of `sweep_resident`. Other arguments as there."""
+        lower, upper, speed = result[_SWEPT_BOUNDS].tolist()
+        if verdict != _CONTACT:
+            clear = verdict == _CLEAR
+            return SweepResult(_VERDICTS[verdict], lower, upper, None, None, 0, clear, visits, 0, not clear)
+        own, cloud = result[_SWEPT_AVATAR].copy(), result[_SWEPT_CLOUD].copy()
+        exact = upper == lower or speed * (upper - lower) <= tolerance
+        unknown = not exact and _has_unknown(data)
+        if skin < 0.0:
+            return SweepResult(Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown)
+        ended, end = result[_swept.ENDED], None
+        if ended != _swept.OPEN:
+            end = result[_END].reshape(4, 4).copy() if ended == _swept.PROVED else pose_from
+        point = result[_POINT].copy()
+        return SweepResult(
+            Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown, point, end
         )
 
     def _use(self, residency: VoxelCache, rows: list[int]) -> None:

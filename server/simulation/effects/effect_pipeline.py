@@ -89,6 +89,7 @@ class Pipeline:
         self._seconds = None if limits.frame_ms is None else limits.frame_ms / 1e3
         self._visits = limits.frame_visits
         self._free = self._seconds is None and self._visits is None  # no budget, no measurement
+        self._walk = self._make_walk() if self._free else None
 
     def run(
         self,
@@ -142,9 +143,17 @@ class Pipeline:
             since = world.visits
             ran: list[tuple[str, float]] = []
             now = time.perf_counter()
+            walked: dict[str, float] = {}
             for runner in self.runners:
                 if budget.stop:
                     raise StoppedError
+                if runner.name == "stop" and self._walk is not None and not skip:
+                    walked = self._walk.run(frame) or {}
+                    ran.extend(walked.items())
+                    frame.simulated.extend(walked)
+                    now = time.perf_counter()
+                if runner.name in walked:
+                    continue
                 if self._free and not skip:
                     runner.run(frame)
                     frame.simulated.append(runner.name)
@@ -163,6 +172,15 @@ class Pipeline:
             if budget.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError
             world.saw(body.user, body.avatar, frame.pose)
+
+    def _make_walk(self) -> Any:
+        """Return the `FreeWalk` of the scene; None if it lacks an effect for it."""
+        if not {runner.name for runner in self.runners} >= {"stop", "sweep", "ground"}:
+            return None
+        # Imported here, so that scenes without these effects do not import them.
+        from .free_walk import make_free_walk
+
+        return make_free_walk(self.runners, self.world)
 
     def _poses_to_restore(self, body: Body, budget: QueryBudget) -> Any:
         """Return the poses of pushed objects that a stopped frame must restore; None if there are none.

@@ -29,6 +29,7 @@ from ....schemas.scene.effect_table import Ground, Slide, Step
 from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import GroundReport
+from ...queries.resident_fast_path import SweepResult
 from ...queries.surface_normals import warm
 from ..world.collision_world import World
 from ..world.frame import (
@@ -102,7 +103,10 @@ class GroundSearch(NamedTuple):
 
 
 class GroundRunner:
-    """Effect `ground` of one scene. clearance: height of the feet above the ground [m]."""
+    """Effect `ground` of one scene.
+
+    clearance: height of the feet above the ground [m].  near_reach: of the first search [m].
+    """
 
     name = "ground"
 
@@ -117,6 +121,7 @@ class GroundRunner:
         self.clearance, self._gravity, self._max_speed = effect.clearance, effect.gravity, effect.fall_speed
         snap = step if effect.snap is None else effect.snap
         self._down = effect.clearance + max(snap, effect.clearance)
+        self.near_reach = _NEAR_CLEARANCES * effect.clearance
         self._tolerance, self._sliding = tolerance, sliding
         self._normal_reach = NORMAL_REACH if sliding is None else sliding.normal_reach
         self._walkable = math.cos(math.radians(effect.slope)) - _ROUNDING
@@ -140,8 +145,10 @@ class GroundRunner:
         """Move the avatar to its height above the ground, or let it fall."""
         near: tuple[Hit | None] | None = None
         if frame.body.on_ground and not frame.hits:
-            first = self._first_below(frame, _NEAR_CLEARANCES * self.clearance)
-            if first is not None and self._keeps_height(frame, first):
+            # The answer is known if the motion command was completed (free_walk.py).
+            swept = frame.walked[1] if frame.pose is frame.target else None
+            first = self.first_below(frame, self.near_reach, swept)
+            if first is not None and self.keeps_height(frame, first):
                 return
             near = (first,)
         stood, seconds = frame.body.on_ground, min(frame.seconds, LONGEST_FRAME)
@@ -181,13 +188,13 @@ class GroundRunner:
         normal = None if below.normal is None else tuple(below.normal.tolist())
         frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
 
-    def _keeps_height(self, frame: Frame, hit: Hit) -> bool:
+    def keeps_height(self, frame: Frame, hit: Hit) -> bool:
         """Finish the frame of an avatar that stands on its last ground at its height, as most do.
 
         hit: the first contact straight down from frame.pose, within the near reach. Return False if
         the avatar has to move, or stands on other ground.
         """
-        lower = hit.fraction * (_NEAR_CLEARANCES * self.clearance) - self.clearance
+        lower = hit.fraction * self.near_reach - self.clearance
         if hit.verdict == Verdict.UNKNOWN or abs(lower) > max(DEAD_BAND, HEIGHT_BAND * self.clearance):
             return False
         normal = last_normal(frame, hit)
@@ -216,12 +223,12 @@ class GroundRunner:
             if beside or first is not None:
                 frame.pose = translated(begin, aside)
             # Ground is nearly always near, and a short sweep takes half the time.
-            far = min(reach, _NEAR_CLEARANCES * self.clearance)
-            hit = self._first_below(frame, far) if near is None else near[0]
+            far = min(reach, self.near_reach)
+            hit = self.first_below(frame, far) if near is None else near[0]
             near = None
             if hit is None and far < reach:
                 far = reach
-                hit = self._first_below(frame, far)
+                hit = self.first_below(frame, far)
             frame.pose = begin
             found = GroundSearch(hit, far, far, None, beside or first is not None)
             if hit is None:
@@ -240,9 +247,10 @@ class GroundRunner:
         assert first is not None
         return first
 
-    def _first_below(self, frame: Frame, reach: float) -> Hit | None:
+    def first_below(self, frame: Frame, reach: float, swept: SweepResult | None = None) -> Hit | None:
+        """Return the first hit straight down from frame.pose within `reach` [m]. swept: the scan's, if known."""
         to = translated(frame.pose, -reach * frame.world.up)
-        return find_first_hit(frame, to, self._tolerance, below=True)
+        return find_first_hit(frame, to, self._tolerance, below=True, swept=swept)
 
     def _away(self, frame: Frame, hit: Hit) -> Vec | None:
         """Return the horizontal unit vector (3,) away from a steep surface; None if unknown."""

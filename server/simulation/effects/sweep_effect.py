@@ -44,7 +44,9 @@ class SweepRunner:
         for _ in range(_MAX_PUSHES):
             if frame.pose.tobytes() == to.tobytes():
                 return None
-            hit = find_first_hit(frame, to, self.tolerance, self.skin)
+            first = to is frame.target and frame.pose is frame.body.pose
+            swept = frame.walked[0] if first else None
+            hit = find_first_hit(frame, to, self.tolerance, self.skin, swept=swept)
             if hit is None:
                 frame.pose = to
                 return None

@@ -6,7 +6,6 @@ directly.
 """
 
 import threading
-from collections import OrderedDict
 from typing import Any
 
 import msgspec
@@ -25,19 +24,16 @@ from ...kernels.core.array_references import Held
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import with_stop
-from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
+from ...queries.resident_fast_path import SweepResult, distance_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
+from .avatar_probes import AvatarProbes
 from .frame import Hit, Pose, Vec
 from .held_archive import HeldArchive, normals_of, swept_in_world, to_archive, to_world, touched_in_archive
 from .least_answer import comes_first, merge_distances, merge_swept
 from .vectors import min_height, unit_vector
 
-# Limit on the avatars (of users and objects) for which a thread keeps a `ResidentQueries`.
-_MAX_PROBES = 256
-# Limit on the points of these avatars, some 100 MB a thread: those of dropped avatars also count.
-_MAX_PROBED_POINTS = 1 << 20
 _NO_ORIGIN = np.zeros(3)
 # If the points near a touched one form no surface, because the scan is sparse, the reach of its
 # normal is multiplied by this factor.
@@ -54,8 +50,7 @@ class _Held(threading.local):
 
     def __init__(self) -> None:
         self.seen: list[HeldArchive] = []
-        self.probes: OrderedDict[int, ResidentQueries] = OrderedDict()
-        self.points = 0
+        self.probes = AvatarProbes()
 
 
 class World:
@@ -149,23 +144,9 @@ class World:
         for each in self._held.seen:
             each.opened.record_user(user, avatar, to_archive(each, pose), around)
 
-    def _probe(self, avatar: AvatarModel) -> ResidentQueries:
-        """Return this thread's `ResidentQueries` of an avatar."""
-        probes, key = self._held.probes, id(avatar.points)
-        probe = probes.get(key)
-        if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
-            if probe is not None:
-                self._held.points -= len(probes.pop(key).avatar.points)
-            probe = probes[key] = ResidentQueries(avatar)
-            self._held.points += len(avatar.points)
-            while len(probes) > 1 and (len(probes) > _MAX_PROBES or self._held.points > _MAX_PROBED_POINTS):
-                _, oldest = probes.popitem(last=False)
-                self._held.points -= len(oldest.avatar.points)
-        return probe
-
     def collide(self, avatar: AvatarModel, pose: Pose, budget: QueryBudget = EXACT) -> Verdict:
         """Return the verdict at a pose (4, 4) over all archives; see server/queries/collide.py."""
-        found, probe = Verdict.CLEAR, self._probe(avatar)
+        found, probe = Verdict.CLEAR, self._held.probes.of(avatar)
         with self as seen:
             for each in seen:
                 verdict, visits = probe.collide(each.data, to_archive(each, pose), budget)
@@ -191,7 +172,8 @@ class World:
         are those of the earliest contact, of simultaneous ones that with the least witness.
         skin: see `ResidentQueries.sweep`; `end` is known only for a single archive.
         """
-        probe, held = self._probe(avatar), self._held
+        held = self._held
+        probe = held.probes.of(avatar)
         if self._alone and held.depth:
             swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, budget, skin)
             self.count(swept.visits, swept.unknown)
@@ -209,18 +191,44 @@ class World:
         assert found is not None
         return found
 
+    def walk(
+        self,
+        avatar: AvatarModel,
+        pose_from: Pose,
+        pose_to: Pose,
+        down: Vec,
+        tolerance: float,
+        budget: QueryBudget,
+        skin: float,
+    ) -> tuple[SweepResult | None, SweepResult | None]:
+        """Return the answers of `sweep` for a motion and for the translation `down` (3,) [m] from its end.
+
+        One kernel call gives both. None: not known; that of the translation is only known if the
+        motion is clear. skin: of the motion; the translation has none. Call it inside a `with`.
+        """
+        held = self._held
+        if not self._alone or not held.depth:
+            return None, None
+        found = held.probes.of(avatar).walk(
+            held.seen[0].data, pose_from, pose_to, down, tolerance, budget, skin
+        )
+        for swept in found:
+            if swept is not None:
+                self.count(swept.visits, swept.unknown)
+        return found
+
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
     ) -> tuple[Pose, bool]:
         """Return the pose at a fraction of a motion, and whether the proof of `sweep` covers it."""
         with self as seen:
             origin = seen[0].data.arrays.origin if self._alone else _NO_ORIGIN
-            pose, same = self._probe(avatar).between(origin, pose_from, pose_to, fraction)
+            pose, same = self._held.probes.of(avatar).between(origin, pose_from, pose_to, fraction)
         return pose, same and self._alone
 
     def body(self, avatar: AvatarModel) -> Held:
         """Return the reference to an avatar's arrays, for kernels that take one."""
-        return self._probe(avatar).body
+        return self._held.probes.of(avatar).body
 
     def lowest_height(self) -> float:
         """Return the height of the lowest corner of the archives' boxes, spheres included [m]."""
@@ -289,7 +297,7 @@ class World:
 
         See server/queries/distance.py, and `comes_first` for several at the same distance.
         """
-        found, body = None, self._probe(avatar).body.reference
+        found, body = None, self._held.probes.of(avatar).body.reference
         with self as seen:
             for each in seen:
                 answers = distance_fast(each.data, avatar, to_archive(each, pose), reach, budget, body)

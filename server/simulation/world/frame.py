@@ -12,6 +12,7 @@ from ...avatars.avatar_model import AvatarModel
 from ...kernels.motion.motion_end import MAX_SKIN_FACTOR
 from ...kernels.motion.motion_end import MIN_MOTION as MIN_MOTION
 from ...queries.context.query_budget import EXACT, QueryBudget
+from ...queries.resident_fast_path import SweepResult
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
 Vec = NDArray[np.float64]  # (3,) [m]
@@ -129,6 +130,8 @@ class Frame:
     fall_speed, on_ground: new values of `Body`.
     simulated, skipped: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
+    walked: what is known from free_walk.py: the answers of the sweep of the motion command, and of
+    the near search for ground from its end.
     """
 
     body: Body
@@ -152,6 +155,7 @@ class Frame:
     skipped: list[str] = field(default_factory=list)
     reports: dict[str, Any] = field(default_factory=dict)
     effect_state: dict[str, Any] = field(default_factory=dict)
+    walked: tuple[SweepResult | None, SweepResult | None] = (None, None)
 
     @property
     def lacked(self) -> int:
@@ -193,15 +197,23 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
 
 
 def find_first_hit(
-    frame: Frame, to: Pose, tolerance: float, skin: float = -1.0, *, below: bool = False
+    frame: Frame,
+    to: Pose,
+    tolerance: float,
+    skin: float = -1.0,
+    *,
+    below: bool = False,
+    swept: SweepResult | None = None,
 ) -> Hit | None:
     """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
 
     skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
     below: for a search for ground, leave out bodies beside the avatar.
+    swept: the scene's answer, if it is known already.
     """
     avatar, found, lacked = frame.body.avatar, None, frame.lacked
-    swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget, skin)
+    if swept is None:
+        swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget, skin)
     if swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT
         if sure and not swept.exact:

@@ -123,7 +123,7 @@ def test_of_two_archives_at_the_same_distance_the_least_witness_is_named(
 @pytest.mark.interpreted
 def test_avatars_that_were_dropped_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    monkeypatch.setattr("solidcloud.server.simulation.world.collision_world._MAX_PROBED_POINTS", 100)
+    monkeypatch.setattr("solidcloud.server.simulation.world.avatar_probes._MAX_PROBED_POINTS", 100)
     with Scene.open(case.archive) as scene:
         world, points = world_of((scene, None)), []
         for count in (1, 40, 40, 40, 200, 200, 3, 1):

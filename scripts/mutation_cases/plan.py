@@ -227,6 +227,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/nearest/pair_heap.py": work("bounded deep", "collide bounded", "distance bounded"),
     "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
+    "server/kernels/motion/walk_resident.py": (SERVER + "simulation/effects/test_free_walk.py",),
     "server/kernels/motion/motion_end.py": (SERVER + "simulation/world/test_motion_end.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/rays/level_rays.py": ("tests/property/test_ray_tolerances_naive.py",),

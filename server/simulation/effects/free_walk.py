@@ -14,6 +14,8 @@ import time
 import numpy as np
 
 from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_model import make_avatar
+from ...queries.context.query_budget import EXACT
 from ..world.collision_world import World
 from ..world.frame import Frame, Runner, find_first_hit
 from .ground_effect import GroundRunner
@@ -63,6 +65,13 @@ class FreeWalk:
         times["ground"] = seconds - times["sweep"]
         return times
 
+    def warm(self, world: World) -> None:
+        """Compile the kernel before the first frame needs it."""
+        model, poses = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05), np.tile(np.eye(4), (2, 1, 1))
+        poses[1, 0, 3] = 0.1
+        with world:
+            world.walk(model, *poses, self._down, self._sweep.tolerance, EXACT, self._sweep.skin)
+
 
 def make_free_walk(runners: list[Runner], world: World) -> FreeWalk | None:
     """Return the walk of a scene; None if it lacks `sweep` or `ground`."""
@@ -70,4 +79,6 @@ def make_free_walk(runners: list[Runner], world: World) -> FreeWalk | None:
     sweep, ground = known.get("sweep"), known.get("ground")
     if not isinstance(sweep, SweepRunner) or not isinstance(ground, GroundRunner):
         return None
-    return FreeWalk(sweep, ground, [name for name in WALKING if name in known], world)
+    walk = FreeWalk(sweep, ground, [name for name in WALKING if name in known], world)
+    walk.warm(world)
+    return walk

@@ -10,6 +10,7 @@ from effect_rooms import INTERPRETED, Play
 from solidcloud.schemas.scene.effect_table import AnyEffect, Contacts, Crowd, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.encoding import encode
+from solidcloud.server.queries.resident_fast_path import ResidentQueries
 from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
 from solidcloud.server.simulation.world.frame import Body
 
@@ -95,3 +96,17 @@ def test_time_is_divided_between_sweep_and_ground(case: archive_cases.Case) -> N
         stats = {each.effect: each for each in play.pipeline.times.stats()}
     assert [each.frames for each in stats.values()] == [40] * 5
     assert stats["sweep"].seconds > 0.0 and stats["ground"].seconds > 0.0
+
+
+def test_the_kernel_is_called_when_a_scene_opens(
+    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = []
+    walk = ResidentQueries.walk
+    monkeypatch.setattr(
+        ResidentQueries, "walk", lambda *arguments: answers.append(walk(*arguments)) or answers[-1]
+    )
+    with effect_rooms.play(case.archive, Stop(), Sweep(), Ground()):
+        assert len(answers) == 1
+    with effect_rooms.play(case.archive, Stop(), Sweep(), Slide()):
+        assert len(answers) == 1

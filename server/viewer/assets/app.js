@@ -19,6 +19,7 @@ import { Tiles } from "./tiles.js";
 
 // Numbers of the verdicts in the server's answers.
 const NAMES = ["clear", "contact", "unknown"];
+const KEPT_INTERVALS = 600;
 const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 // Radius around the camera of what is not drawn between it and the user [m].
 const CUT = 0.9;
@@ -38,7 +39,7 @@ export class App {
     this.boxes = new Boxes(view.lines);
     this.contacts = new Contacts(view.lines);
     this.clash = new ClashCheck(this);
-    this.quality = new Quality(view.software);
+    this.quality = new Quality(view.software, view.drawing !== null);
     this.scene = null;
     this.state = null;
     this.verdict = "none";
@@ -52,6 +53,8 @@ export class App {
     this.frames = 0;
     this.pictures = 0;
     this.fps = 0;
+    // Of pictures that moved [ms].
+    this.intervals = [];
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
     // For panels: called with each state of the user, and with each refusal of the server; what else
@@ -272,7 +275,8 @@ export class App {
 
   /** Draw, if the picture differs from the one before. */
   draw(now) {
-    const { camera } = this.view;
+    if (this.quality.early(now - this.times.drawn)) return;
+    const { camera, drawing } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
       this.contacts.signature, this.users.signature, this.verdict, ...[...this.movers].map((mover) => mover.signature),
@@ -291,11 +295,22 @@ export class App {
     if (this.quality.still && this.scene) this.choose(now, this.users.own);
     for (const each of this.drawings) each.prepare(!this.quality.software || this.quality.still);
     this.view.shading = this.quality.shading(settings.get("shading"));
-    if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown + this.overview.shown);
+    if (this.drawnBefore && !this.quality.still) {
+      const interval = now - this.times.drawn;
+      this.quality.measure(interval, this.tiles.shown + this.overview.shown, drawing?.times.points ?? 0);
+      this.intervals.push(interval);
+      if (this.intervals.length > 2 * KEPT_INTERVALS) this.intervals = this.intervals.slice(-KEPT_INTERVALS);
+    }
     this.times.drawn = now;
     this.drawnBefore = true;
     this.view.draw();
     this.pictured ||= this.tiles.shown + this.overview.shown > 0;
+  }
+
+  /** Return what pictures take: intervals of those that moved [ms]; parts of our own drawing of the last one [ms], and its points. */
+  drawingFigures() {
+    const { drawing } = this.view;
+    return { intervals: this.intervals.slice(), most: this.quality.most, ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
   }
 
   /** Send the intent when it changes, and again while it lasts. */

@@ -1,0 +1,135 @@
+// The scan into a picture: tiles and overview, nearest first.
+
+import { Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
+import { shared } from "../points_material.js";
+import { PointColours, world } from "./colours.js";
+import { screenRows } from "./shapes.js";
+import { fogTables, splat } from "./splats.js";
+
+export class Scan {
+  constructor() {
+    this.colours = new PointColours();
+    this.packed = new WeakMap();
+    this.kept = { places: new Uint16Array(0), colours: new Uint32Array(0) };
+    this.fog = fogTables(shared.uGround.value.toArray());
+  }
+
+  /** Draw scan points. objects: of three.js, with the material of points_material.js.
+   *
+   * Returns how many were given and how many of them were inside of the picture.
+   */
+  draw(picture, objects, camera, frustum) {
+    const ordered = [];
+    for (const object of objects) {
+      const count = object.geometry.drawRange.count;
+      if (count <= 0 || (object.frustumCulled && !frustum.intersectsObject(object))) continue;
+      const tile = object.geometry.index ? this.pack(object.geometry) : {
+        places: object.geometry.attributes.position.array, attributes: arrays(object.geometry), matrix: object.matrixWorld, source: object.geometry,
+        sphere: object.geometry.boundingSphere.clone().applyMatrix4(object.matrixWorld),
+      };
+      tile.count = Math.min(count, tile.places.length / 3);
+      tile.size = object.material.uniforms.uSize.value * shared.uScale.value;
+      // The overview is behind the tiles, mostly.
+      tile.away = object.geometry.index ? Infinity : tile.sphere.center.distanceTo(camera.position) - tile.sphere.radius;
+      ordered.push(tile);
+    }
+    ordered.sort((one, other) => one.away - other.away);
+    let given = 0, inside = 0;
+    for (const tile of ordered) {
+      given += tile.count;
+      inside += this.tile(picture, tile, camera);
+    }
+    return { given, inside };
+  }
+
+  tile(picture, tile, camera) {
+    const { matrix, sphere, attributes, source } = tile;
+    const { elements } = matrix;
+    let { places, count } = tile;
+    let colours = this.colours.of(source, attributes, places, elements);
+    colours = this.colours.around(colours, places, count, elements, sphere);
+    const way = cutReaches(sphere, camera.position);
+    if (way) [places, colours, count] = this.cut(places, colours, count, elements, camera.position, way);
+    const { x: least, y: most } = shared.uPixels.value;
+    const own = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
+    const step = Math.hypot(elements[0], elements[1], elements[2]) / shared.uFog.value;
+    return splat(picture, places, colours, count, screenRows(picture, camera, matrix), tile.size, least, most,
+      camera.near, [own.x, own.y, own.z, step * step], this.fog);
+  }
+
+  /** Return the points that are not between the camera and the user, as the shader leaves them out. */
+  cut(places, colours, count, matrix, camera, { line, whole }) {
+    if (this.kept.colours.length < count) {
+      this.kept = { places: new Uint16Array(6 * count), colours: new Uint32Array(2 * count) };
+    }
+    const { kept } = this;
+    const radius = shared.uCut.value.w;
+    let left = 0;
+    for (let row = 0; row < count; row += 1) {
+      const [x, y, z] = world(places, row, matrix);
+      const wayX = x - camera.x, wayY = y - camera.y, wayZ = z - camera.z;
+      const along = wayX * line.x + wayY * line.y + wayZ * line.z;
+      const beside = Math.sqrt(Math.max(0, wayX * wayX + wayY * wayY + wayZ * wayZ - along * along));
+      if (along < whole - 0.55 && beside < radius * (0.35 + 0.65 * (1 - along / whole))) continue;
+      for (let axis = 0; axis < 3; axis += 1) kept.places[3 * left + axis] = places[3 * row + axis];
+      kept.colours[left] = colours[row];
+      left += 1;
+    }
+    return [kept.places, kept.colours, left];
+  }
+
+  /** Return the points of an index in its order, in a frame of their box in 65,535 steps. */
+  pack(geometry) {
+    const { index, attributes, drawRange } = geometry;
+    const found = this.packed.get(geometry);
+    // The index changes as a whole, and its beginning is drawn.
+    if (found && found.version === index.version && found.rows >= drawRange.count) return found;
+    const { array } = attributes.position;
+    const rows = found && found.version === index.version ? index.count : Math.min(index.count, drawRange.count);
+    const frame = found ?? boxFrame(array);
+    const columns = Object.entries(attributes).filter(([name]) => name !== "position");
+    const packed = Object.fromEntries(columns.map(([name, each]) => [name, new each.array.constructor(rows * each.itemSize)]));
+    const places = new Uint16Array(3 * rows);
+    for (let row = 0; row < rows; row += 1) {
+      const from = index.array[row];
+      for (let axis = 0; axis < 3; axis += 1) places[3 * row + axis] = (array[3 * from + axis] - frame.low[axis]) / frame.step + 0.5;
+      for (const [name, { array: values, itemSize }] of columns) {
+        for (let part = 0; part < itemSize; part += 1) packed[name][itemSize * row + part] = values[itemSize * from + part];
+      }
+    }
+    const made = { ...frame, version: index.version, rows, places, attributes: packed, source: places };
+    this.packed.set(geometry, made);
+    return made;
+  }
+}
+
+const inverse = new Matrix4();
+const arrays = ({ attributes }) => Object.fromEntries(Object.entries(attributes).map(([name, { array }]) => [name, array]));
+
+/** Return a frame of the box of places, (n, 3) as one array. */
+function boxFrame(places) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let at = 0; at < places.length; at += 3) {
+    for (let axis = 0; axis < 3; axis += 1) {
+      low[axis] = Math.min(low[axis], places[at + axis]);
+      high[axis] = Math.max(high[axis], places[at + axis]);
+    }
+  }
+  const step = Math.max(1e-6, ...high.map((value, axis) => (value - low[axis]) / 65534));
+  const sphere = new Sphere(new Vector3(...low).add(new Vector3(...high)).multiplyScalar(0.5));
+  sphere.radius = sphere.center.distanceTo(new Vector3(...high));
+  return { low, step, matrix: new Matrix4().makeTranslation(...low).scale(new Vector3(step, step, step)), sphere };
+}
+
+/** Return the line from the camera to the user's shoulders, if what is left out on it may be in a sphere. */
+function cutReaches(sphere, camera) {
+  const { x, y, z, w: radius } = shared.uCut.value;
+  if (radius <= 0) return null;
+  const line = new Vector3(x, y, z).sub(camera), whole = line.length();
+  line.divideScalar(whole);
+  const way = sphere.center.clone().sub(camera), along = way.dot(line);
+  const beside = Math.sqrt(Math.max(0, way.lengthSq() - along * along));
+  // Behind the camera nothing is seen.
+  if (along < -sphere.radius || along > whole + sphere.radius || beside > radius + sphere.radius) return null;
+  return { line, whole };
+}

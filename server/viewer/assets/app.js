@@ -307,10 +307,10 @@ export class App {
     this.pictured ||= this.tiles.shown + this.overview.shown > 0;
   }
 
-  /** Return what pictures take: intervals of those that moved [ms]; parts of our own drawing of the last one [ms], and its points. */
+  /** Return what pictures take: intervals of those that moved since the last call [ms]; parts of our own drawing of the last one [ms], and its points. */
   drawingFigures() {
     const { drawing } = this.view;
-    return { intervals: this.intervals.slice(), most: this.quality.most, ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
+    return { intervals: this.intervals.splice(0), most: this.quality.most, ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
   }
 
   /** Send the intent when it changes, and again while it lasts. */

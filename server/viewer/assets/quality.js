@@ -6,8 +6,9 @@
 const SMOOTH_MS = 42, EASY_MS = 24;
 const LEAST_POINTS = 25e3, FIRST_SOFTWARE = 60e3;
 // Our own drawing begins with this many points. They are fewer if pictures take longer than `SMOOTH_MS`
-// and their points more than `OWN_MS` of it, and more again below half of that.
-const FIRST_OWN = 200e3, LEAST_OWN = 50e3, OWN_MS = 14;
+// and their points more than `OWN_MS` of it, and more again below half of that. Other work on the machine
+// makes pictures late, too, against which fewer points are no help: the least disturbed pictures count.
+const FIRST_OWN = 200e3, LEAST_OWN = 50e3, OWN_MS = 18;
 // Least time between two of our own pictures [ms]: a server has 30 states a second, and the processor
 // serves it, too.
 const OWN_INTERVAL_MS = 28;
@@ -94,7 +95,8 @@ export class Quality {
     this.works.push(work);
     const far = this.intervals.length >= 3 && this.intervals.every((each) => each > 2 * SMOOTH_MS);
     if (this.intervals.length < 12 && !far) return;
-    const [slow, long] = [this.intervals, this.works].map((all) => all.sort((one, other) => one - other)[Math.floor(0.75 * all.length)]);
+    const ordered = [this.intervals, this.works].map((all) => all.sort((one, other) => one - other));
+    const slow = ordered[0][Math.floor(0.75 * this.intervals.length)], long = ordered[1][Math.floor(0.25 * this.works.length)];
     this.intervals = [];
     this.works = [];
     if (this.own) this.regulate(slow, long, points);

@@ -1,7 +1,8 @@
 // The inner loop: points of a tile into a picture.
 
-// Up to this diameter a point is a square of a disc's area; above, a disc [pixels].
-const SQUARE = 4.5;
+// Up to the first diameter a point is four pixels, up to the second a square of a disc's area; above, a
+// disc [pixels].
+const FOUR = 2.6, SQUARE = 4.5;
 // Side of such a square, as a share of the diameter, and half of it.
 const HALF_SIDE = Math.sqrt(Math.PI) / 4;
 
@@ -23,6 +24,7 @@ export function splat(picture, places, colours, count, screen, size, least, most
   const [eyeX, eyeY, eyeZ, foggy] = eye;
   const { shares, redBlue, green } = fog;
   const scale = FOG_STEPS / FOG_END;
+  const lastColumn = width - 1, lastRow = height - 1;
   let inside = 0;
   for (let row = 0, at = 0; row < count; row += 1, at += 3) {
     const x = places[at], y = places[at + 1], z = places[at + 2];
@@ -43,7 +45,28 @@ export function splat(picture, places, colours, count, screen, size, least, most
     const outer = (Math.imul(own & 0xff00ff, rest) + redBlue[fogged]) >>> 8;
     const inner = (Math.imul((own >>> 8) & 0xff, rest) + green[fogged]) >>> 8;
     const shown = 0xff000000 | (outer & 0xff00ff) | (inner << 8);
-    if (diameter <= SQUARE) {
+    if (diameter <= FOUR) {
+      const left = (u - 0.5) | 0, top = (v - 0.5) | 0;
+      if (left < lastColumn && top < lastRow) {
+        const upper = top * width + left, lower = upper + width;
+        if (inverse > depth[upper]) {
+          depth[upper] = inverse;
+          colour[upper] = shown;
+        }
+        if (inverse > depth[upper + 1]) {
+          depth[upper + 1] = inverse;
+          colour[upper + 1] = shown;
+        }
+        if (inverse > depth[lower]) {
+          depth[lower] = inverse;
+          colour[lower] = shown;
+        }
+        if (inverse > depth[lower + 1]) {
+          depth[lower + 1] = inverse;
+          colour[lower + 1] = shown;
+        }
+      }
+    } else if (diameter <= SQUARE) {
       const half = HALF_SIDE * diameter;
       let left = (u - half + 0.5) | 0, right = (u + half + 0.5) | 0;
       let top = (v - half + 0.5) | 0, bottom = (v + half + 0.5) | 0;

@@ -57,6 +57,7 @@ export class App {
     this.intervals = [];
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
+    this.asked = false;
     // For panels: called with each state of the user, and with each refusal of the server; what else
     // is drawn, each with a `signature` that changes with it and a method `prepare`; what moves by
     // itself, each with `update` and a `signature`; functions by name that tests may call.
@@ -240,6 +241,7 @@ export class App {
     if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
     const { watched } = this.rig;
     const firstPerson = settings.get("firstPerson") && !watched;
+    this.asked = intent.forward !== 0 || intent.right !== 0 || intent.up !== 0;
     this.command(watched ? { ...intent, face: false } : intent, now);
     if (this.state && !watched && !firstPerson && now - this.times.boom > BOOM_MS) {
       this.times.boom = now;
@@ -288,7 +290,7 @@ export class App {
     ].join();
     const content = `${this.tiles.changes},${this.overview.count}`;
     this.pictures += 1;
-    if (!this.quality.look(seen, chosen, content, now)) {
+    if (!this.quality.look(seen, chosen, content, now, this.asked)) {
       this.drawnBefore = false;
       return;
     }
@@ -310,7 +312,7 @@ export class App {
   /** Return what pictures take: intervals of those that moved since the last call [ms]; parts of our own drawing of the last one [ms], and its points. */
   drawingFigures() {
     const { drawing } = this.view;
-    return { intervals: this.intervals.splice(0), most: this.quality.most, ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
+    return { intervals: this.intervals.splice(0), most: this.quality.most, still: this.quality.still, ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
   }
 
   /** Send the intent when it changes, and again while it lasts. */

@@ -8,7 +8,7 @@ const LEAST_POINTS = 25e3, FIRST_SOFTWARE = 60e3;
 // Our own drawing begins with this many points. They are fewer if pictures take longer than `SMOOTH_MS`
 // and their points more than `OWN_MS` of it, and more again below half of that. Other work on the machine
 // makes pictures late, too, against which fewer points are no help: the least disturbed pictures count.
-const FIRST_OWN = 200e3, LEAST_OWN = 50e3, OWN_MS = 18;
+const FIRST_OWN = 200e3, LEAST_OWN = 100e3, OWN_MS = 18;
 // Least time between two of our own pictures [ms]: a server has 30 states a second, and the processor
 // serves it, too.
 const OWN_INTERVAL_MS = 28;
@@ -43,10 +43,12 @@ export class Quality {
   /** Note what a picture depends on. Returns whether the picture must be drawn.
    *
    * seen: text of the camera and all that moves.  chosen: text of settings.  content: text of the
-   * scan that has arrived.  now: [ms].
+   * scan that has arrived.  now: [ms].  asked: whether the user is asking to move: a full picture would
+   * delay the next one.
    */
-  look(seen, chosen, content, now) {
+  look(seen, chosen, content, now, asked) {
     this.latest = content;
+    if (asked) this.changed = now;
     if (seen !== this.seen) {
       Object.assign(this, { seen, chosen, content, changed: now, full: false });
       return true;
@@ -60,7 +62,7 @@ export class Quality {
       Object.assign(this, { content, drawn: now });
       return true;
     }
-    if (this.full || now - this.changed < STILL_MS) return false;
+    if (this.full || asked || now - this.changed < STILL_MS) return false;
     Object.assign(this, { full: true, drawn: now });
     return true;
   }

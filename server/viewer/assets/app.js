@@ -20,6 +20,8 @@ import { Tiles } from "./tiles.js";
 // Numbers of the verdicts in the server's answers.
 const NAMES = ["clear", "contact", "unknown"];
 const KEPT_INTERVALS = 600;
+// Without a user for this long, the scan as a whole is looked at in detail [ms].
+const USER_MS = 4000;
 const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 // Radius around the camera of what is not drawn between it and the user [m].
 const CUT = 0.9;
@@ -159,6 +161,7 @@ export class App {
   welcome({ scene, frame, number }) {
     const another = this.scene?.name !== scene.name || this.scene?.generation !== scene.generation;
     this.scene = scene;
+    this.welcomed = performance.now();
     this.number = number;
     this.origin = frame.origin;
     this.axes = frame.axes;
@@ -270,7 +273,8 @@ export class App {
     const focus = this.rig.watched ? this.rig.watched.target : own ? own.position : this.rig.focus;
     const budget = 1e6 * settings.get("budget");
     const drawn = this.quality.budget(budget);
-    this.tiles.choose(this.view.camera, focus, budget, drawn, now);
+    // Tiles that are seen from afar are of no use beside the user, who stands there soon.
+    if (own || this.rig.watched || now - this.welcomed > USER_MS) this.tiles.choose(this.view.camera, focus, budget, drawn, now);
     this.boxes.update(this.tiles, focus, settings.get("boxes"));
     this.overview.update(settings.get("pointSize"), drawn - this.tiles.shown, now);
   }
@@ -312,7 +316,7 @@ export class App {
   /** Return what pictures take: intervals of those that moved since the last call [ms]; parts of our own drawing of the last one [ms], and its points. */
   drawingFigures() {
     const { drawing } = this.view;
-    return { intervals: this.intervals.splice(0), most: this.quality.most, still: this.quality.still, ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
+    return { intervals: this.intervals.splice(0), most: this.quality.most, still: this.quality.still, canvas: this.view.shownCanvas === this.view.canvas ? "webgl" : "own", ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
   }
 
   /** Send the intent when it changes, and again while it lasts. */

@@ -52,9 +52,9 @@ export class PointColours {
 
   /** Return colours with the verdict's around the user, for the first points of a tile, until the next call.
    *
-   * sphere: that contains the tile, in the page's frame.
+   * m: as `matrix` of `of`.  sphere: that contains the tile, in the page's frame.
    */
-  around(colours, places, count, matrix, sphere) {
+  around(colours, places, count, m, sphere) {
     if (shared.uMode.value !== 5) return colours;
     const { x: userX, y: userY, z: userZ } = shared.uUser.value;
     const { x: red, y: green, z: blue, w: tall } = shared.uVerdict.value;
@@ -64,23 +64,17 @@ export class PointColours {
     if (this.near.length < count) this.near = new Uint32Array(2 * count);
     const { near } = this;
     for (let row = 0; row < count; row += 1) {
-      const [x, y, z] = world(places, row, matrix);
+      const px = places[3 * row], py = places[3 * row + 1], pz = places[3 * row + 2];
+      const x = m[0] * px + m[4] * py + m[8] * pz + m[12], y = m[1] * px + m[5] * py + m[9] * pz + m[13];
+      const z = m[2] * px + m[6] * py + m[10] * pz + m[14];
       const part = Math.max(0, Math.min(tall, z - userZ));
-      const t = Math.max(0, Math.min(1, (Math.hypot(x - userX, y - userY, z - userZ - part) - 0.35) / (REACH - 0.35)));
+      const t = Math.max(0, Math.min(1, (Math.sqrt((x - userX) ** 2 + (y - userY) ** 2 + (z - userZ - part) ** 2) - 0.35) / (REACH - 0.35)));
       const share = t * t * (3 - 2 * t);
       const level = ((colours[row] & 0xff) / 255) * share, rest = 1 - share;
       near[row] = packed(red * rest + level, green * rest + level, blue * rest + level);
     }
     return near;
   }
-}
-
-/** Return a point's place in the page's frame. */
-export function world(places, row, m) {
-  const x = places[3 * row], y = places[3 * row + 1], z = places[3 * row + 2];
-  return [
-    m[0] * x + m[4] * y + m[8] * z + m[12], m[1] * x + m[5] * y + m[9] * z + m[13], m[2] * x + m[6] * y + m[10] * z + m[14],
-  ];
 }
 
 function paint(colours, mode, { rgb, intensity, classification, scan }, places, m) {

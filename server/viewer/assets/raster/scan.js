@@ -2,7 +2,7 @@
 
 import { Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
 import { shared } from "../points_material.js";
-import { PointColours, world } from "./colours.js";
+import { PointColours } from "./colours.js";
 import { screenRows } from "./shapes.js";
 import { fogTables, splat } from "./splats.js";
 
@@ -48,30 +48,36 @@ export class Scan {
     let { places, count } = tile;
     let colours = this.colours.of(source, attributes, places, elements);
     colours = this.colours.around(colours, places, count, elements, sphere);
-    const way = cutReaches(sphere, camera.position);
-    if (way) [places, colours, count] = this.cut(places, colours, count, elements, camera.position, way);
-    const { x: least, y: most } = shared.uPixels.value;
     const own = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
+    const way = cutReaches(sphere, camera.position);
+    if (way) [places, colours, count] = this.cut(places, colours, count, elements, own, way);
+    const { x: least, y: most } = shared.uPixels.value;
     const step = Math.hypot(elements[0], elements[1], elements[2]) / shared.uFog.value;
     return splat(picture, places, colours, count, screenRows(picture, camera, matrix), tile.size, least, most,
       camera.near, [own.x, own.y, own.z, step * step], this.fog);
   }
 
-  /** Return the points that are not between the camera and the user, as the shader leaves them out. */
-  cut(places, colours, count, matrix, camera, { line, whole }) {
+  /** Return the points that are not between the camera and the user, as the shader leaves them out. eye: camera in the tile's frame. */
+  cut(places, colours, count, matrix, eye, { line, whole }) {
     if (this.kept.colours.length < count) {
       this.kept = { places: new Uint16Array(6 * count), colours: new Uint32Array(2 * count) };
     }
     const { kept } = this;
     const radius = shared.uCut.value.w;
     let left = 0;
-    for (let row = 0; row < count; row += 1) {
-      const [x, y, z] = world(places, row, matrix);
-      const wayX = x - camera.x, wayY = y - camera.y, wayZ = z - camera.z;
-      const along = wayX * line.x + wayY * line.y + wayZ * line.z;
-      const beside = Math.sqrt(Math.max(0, wayX * wayX + wayY * wayY + wayZ * wayZ - along * along));
-      if (along < whole - 0.55 && beside < radius * (0.35 + 0.65 * (1 - along / whole))) continue;
-      for (let axis = 0; axis < 3; axis += 1) kept.places[3 * left + axis] = places[3 * row + axis];
+    // Along the line, as a function of a place in the tile's frame, whose axes are at right angles.
+    const [a, b, c] = [0, 4, 8].map((at) => line.x * matrix[at] + line.y * matrix[at + 1] + line.z * matrix[at + 2]);
+    const step = Math.hypot(matrix[0], matrix[1], matrix[2]);
+    for (let row = 0, at = 0; row < count; row += 1, at += 3) {
+      const x = places[at] - eye.x, y = places[at + 1] - eye.y, z = places[at + 2] - eye.z;
+      const along = a * x + b * y + c * z;
+      if (along < whole - 0.55) {
+        const wide = radius * (0.35 + 0.65 * (1 - along / whole));
+        if (step * step * (x * x + y * y + z * z) - along * along < wide * wide) continue;
+      }
+      kept.places[3 * left] = places[at];
+      kept.places[3 * left + 1] = places[at + 1];
+      kept.places[3 * left + 2] = places[at + 2];
       kept.colours[left] = colours[row];
       left += 1;
     }

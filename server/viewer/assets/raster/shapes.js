@@ -40,7 +40,7 @@ export function screenRows(picture, camera, matrixWorld) {
 export function figure(picture, places, rows, size, tint) {
   const { depth, colour, width, height } = picture;
   const [a, b, c, d, e, f, g, h, p, q, r, s] = rows;
-  const shades = Uint32Array.from({ length: 256 }, (_, k) => packed(...tint.map((part) => (part * k * BRIGHTEST) / 255)));
+  const shades = shadesOf(tint);
   for (let at = 0; at < places.length; at += 3) {
     const x = places[at], y = places[at + 1], z = places[at + 2];
     const w = p * x + q * y + r * z + s;
@@ -50,18 +50,28 @@ export function figure(picture, places, rows, size, tint) {
     if (!(u >= 0 && u < width && v >= 0 && v < height)) continue;
     const diameter = Math.min(Math.max(2, size * inverse), 256), half = 0.5 * diameter;
     const lift = 0.82 + 0.09 * Math.max(0, Math.min(2, z)), scale = SIDE / diameter;
-    const left = Math.max(0, Math.floor(u - half + 0.5)), right = Math.min(width, Math.floor(u + half + 0.5));
-    const bottom = Math.min(height, Math.floor(v + half + 0.5));
-    for (let line = Math.max(0, Math.floor(v - half + 0.5)); line < bottom; line += 1) {
+    const left = Math.max(0, (u - half + 0.5) | 0), right = Math.min(width, (u + half + 0.5) | 0);
+    const bottom = Math.min(height, (v + half + 0.5) | 0);
+    for (let line = Math.max(0, (v - half + 0.5) | 0); line < bottom; line += 1) {
       const lit = (((line + 0.5 - v + half) * scale) | 0) * SIDE;
       for (let column = left, pixel = line * width + left; column < right; column += 1, pixel += 1) {
+        if (inverse <= depth[pixel]) continue;
         const light = LIGHT[lit + (((column + 0.5 - u + half) * scale) | 0)];
-        if (light === 0 || inverse <= depth[pixel]) continue;
+        if (light === 0) continue;
         depth[pixel] = inverse;
         colour[pixel] = shades[(light * lift) | 0];
       }
     }
   }
+}
+
+const kept = new Map();
+function shadesOf(tint) {
+  const name = tint.join();
+  if (!kept.has(name)) {
+    kept.set(name, Uint32Array.from({ length: 256 }, (_, k) => packed(...tint.map((part) => (part * k * BRIGHTEST) / 255))));
+  }
+  return kept.get(name);
 }
 
 /** Return places as x, y [pixels] and 1 / w, (n, 3) as one array; 1 / w is 0 where a place is not before the camera. */

@@ -272,7 +272,7 @@ export class App {
     this.times.choose = now;
     const focus = this.rig.watched ? this.rig.watched.target : own ? own.position : this.rig.focus;
     const budget = 1e6 * settings.get("budget");
-    const drawn = this.quality.budget(budget);
+    const drawn = this.quality.budget(budget, this.view.drawing?.spread ?? 1);
     // Tiles that are seen from afar are of no use beside the user, who stands there soon.
     if (own || this.rig.watched || now - this.welcomed > USER_MS) this.tiles.choose(this.view.camera, focus, budget, drawn, now);
     this.boxes.update(this.tiles, focus, settings.get("boxes"));
@@ -303,7 +303,7 @@ export class App {
     this.view.shading = this.quality.shading(settings.get("shading"));
     if (this.drawnBefore && !this.quality.still) {
       const interval = now - this.times.drawn;
-      this.quality.measure(interval, this.tiles.shown + this.overview.shown, drawing?.times.points ?? 0);
+      this.quality.measure(interval, drawing?.shown.given ?? this.tiles.shown + this.overview.shown, drawing?.times.points ?? 0);
       this.intervals.push(interval);
       if (this.intervals.length > 2 * KEPT_INTERVALS) this.intervals = this.intervals.slice(-KEPT_INTERVALS);
     }

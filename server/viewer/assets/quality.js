@@ -77,9 +77,9 @@ export class Quality {
     return this.full && this.content === this.latest;
   }
 
-  /** Return how many points may be drawn. wanted: as the settings say. */
-  budget(wanted) {
-    return this.full ? wanted : Math.min(wanted, this.most);
+  /** Return how many points may be drawn. wanted: as the settings say.  spread: points of tiles for each one that takes time. */
+  budget(wanted, spread = 1) {
+    return this.full ? wanted : Math.min(wanted, spread * this.most);
   }
 
   /** Return whether edges are shaded. wanted: as the settings say. */

@@ -15,6 +15,7 @@ import { shared } from "../points_material.js";
 
 // Names of materials that this draws: of scan points, and of figures.
 const SCAN = "scan", FIGURE = "figure";
+const MOST_SPREAD = 6;
 
 const RECTANGLE = /* glsl */ `
 precision highp float;
@@ -41,7 +42,9 @@ export class Drawing {
     this.picture = new Picture(canvas, packed((ground >> 16) / 255, ((ground >> 8) & 255) / 255, (ground & 255) / 255));
     this.scan = new Scan();
     this.times = {};
-    this.shown = { given: 0, inside: 0 };
+    this.shown = { chosen: 0, given: 0, inside: 0 };
+    // Points of the chosen tiles for each one in reach of the picture, at most `MOST_SPREAD`.
+    this.spread = 1;
     this.rectangle = null;
   }
 
@@ -61,6 +64,7 @@ export class Drawing {
     times.push(performance.now());
     const frustum = new Frustum().setFromProjectionMatrix(new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
     this.shown = this.scan.draw(picture, found.scan, camera, frustum);
+    if (this.shown.given) this.spread += 0.3 * (Math.min(MOST_SPREAD, this.shown.chosen / this.shown.given) - this.spread);
     times.push(performance.now());
     for (const each of found.figures) {
       const { uSize, uColour } = each.material.uniforms;

@@ -3,6 +3,7 @@
 import { Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
 import { shared } from "../points_material.js";
 import { PointColours } from "./colours.js";
+import { boxesOf, seenRuns } from "./runs.js";
 import { screenRows } from "./shapes.js";
 import { fogTables, splat } from "./splats.js";
 
@@ -10,13 +11,15 @@ export class Scan {
   constructor() {
     this.colours = new PointColours();
     this.packed = new WeakMap();
+    this.boxes = new WeakMap();
     this.kept = { places: new Uint16Array(0), colours: new Uint32Array(0) };
     this.fog = fogTables(shared.uGround.value.toArray());
   }
 
   /** Draw scan points. objects: of three.js, with the material of points_material.js.
    *
-   * Returns how many were given and how many of them were inside of the picture.
+   * Returns how many points they have, how many of them were given to the inner loop, and how many were
+   * inside of the picture.
    */
   draw(picture, objects, camera, frustum) {
     const ordered = [];
@@ -34,33 +37,48 @@ export class Scan {
       ordered.push(tile);
     }
     ordered.sort((one, other) => one.away - other.away);
-    let given = 0, inside = 0;
-    for (const tile of ordered) {
-      given += tile.count;
-      inside += this.tile(picture, tile, camera);
-    }
-    return { given, inside };
+    const found = { chosen: 0, given: 0, inside: 0 };
+    for (const tile of ordered) this.tile(picture, tile, camera, found);
+    return found;
   }
 
-  tile(picture, tile, camera) {
-    const { matrix, sphere, attributes, source } = tile;
+  tile(picture, tile, camera, found) {
+    const { matrix, sphere, attributes, source, places, count } = tile;
     const { elements } = matrix;
-    let { places, count } = tile;
-    let colours = this.colours.of(source, attributes, places, elements);
-    colours = this.colours.around(colours, places, count, elements, sphere);
-    const own = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
+    const screen = screenRows(picture, camera, matrix);
+    const runs = seenRuns(this.boxesOf(places), count, screen, picture.width, picture.height, camera.near);
+    found.chosen += count;
+    if (!runs.length) return;
+    const last = runs.at(-1);
+    const eye = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
     const way = cutReaches(sphere, camera.position);
-    if (way) [places, colours, count] = this.cut(places, colours, count, elements, own, way);
     const { x: least, y: most } = shared.uPixels.value;
     const step = Math.hypot(elements[0], elements[1], elements[2]) / shared.uFog.value;
-    return splat(picture, places, colours, count, screenRows(picture, camera, matrix), tile.size, least, most,
-      camera.near, [own.x, own.y, own.z, step * step], this.fog);
+    const colours = this.colours.around(this.colours.of(source, attributes, places, elements), places, last, elements, sphere);
+    const draw = (ofPlaces, ofColours, from, to) => splat(picture, ofPlaces, ofColours, from, to, screen, tile.size, least, most,
+      camera.near, [eye.x, eye.y, eye.z, step * step], this.fog);
+    for (let k = 0; k < runs.length; k += 2) {
+      const [from, to] = [runs[k], runs[k + 1]];
+      found.given += to - from;
+      if (way) {
+        const left = this.cut(places, colours, from, to, elements, eye, way);
+        found.inside += draw(this.kept.places, this.kept.colours, 0, left);
+      } else found.inside += draw(places, colours, from, to);
+    }
   }
 
-  /** Return the points that are not between the camera and the user, as the shader leaves them out. eye: camera in the tile's frame. */
-  cut(places, colours, count, matrix, eye, { line, whole }) {
-    if (this.kept.colours.length < count) {
-      this.kept = { places: new Uint16Array(6 * count), colours: new Uint32Array(2 * count) };
+  boxesOf(places) {
+    if (!this.boxes.has(places)) this.boxes.set(places, boxesOf(places));
+    return this.boxes.get(places);
+  }
+
+  /** Keep the points that are not between the camera and the user, as the shader leaves them out; return how many.
+   *
+   * eye: camera in the tile's frame.
+   */
+  cut(places, colours, from, to, matrix, eye, { line, whole }) {
+    if (this.kept.colours.length < to - from) {
+      this.kept = { places: new Uint16Array(6 * (to - from)), colours: new Uint32Array(2 * (to - from)) };
     }
     const { kept } = this;
     const radius = shared.uCut.value.w;
@@ -68,7 +86,7 @@ export class Scan {
     // Along the line, as a function of a place in the tile's frame, whose axes are at right angles.
     const [a, b, c] = [0, 4, 8].map((at) => line.x * matrix[at] + line.y * matrix[at + 1] + line.z * matrix[at + 2]);
     const step = Math.hypot(matrix[0], matrix[1], matrix[2]);
-    for (let row = 0, at = 0; row < count; row += 1, at += 3) {
+    for (let row = from, at = 3 * from; row < to; row += 1, at += 3) {
       const x = places[at] - eye.x, y = places[at + 1] - eye.y, z = places[at + 2] - eye.z;
       const along = a * x + b * y + c * z;
       if (along < whole - 0.55) {
@@ -81,7 +99,7 @@ export class Scan {
       kept.colours[left] = colours[row];
       left += 1;
     }
-    return [kept.places, kept.colours, left];
+    return left;
   }
 
   /** Return the points of an index in its order, in a frame of their box in 65,535 steps. */

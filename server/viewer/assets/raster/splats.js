@@ -11,22 +11,23 @@ export const FOG_STEPS = 1024, FOG_END = 8;
 
 /** Draw points; return how many were inside of the picture.
  *
- * picture: see picture.js.  places: (n, 3) as one array of uint16.  colours: of points.  count: of
- * points to draw.  screen: 12 numbers, rows for x, y (times w, pixels) and w of a place.  size:
+ * picture: see picture.js.  places: (n, 3) as one array of uint16.  colours: of points.  from, to: first
+ * point, and the one after the last.  screen: 12 numbers, rows for x, y (times w, pixels) and w of a place.  size:
  * diameter at w = 1 [pixels].  least, most: of diameters [pixels].  near: least w.  eye: place of the
  * camera in the tile's frame, and the square of the frame's step over that of the fog's distance.
  * fog: `shares` of the ground's colour, by square of the distance; `red_blue` and `green`: those
  * shares of it.
  */
-export function splat(picture, places, colours, count, screen, size, least, most, near, eye, fog) {
+export function splat(picture, places, colours, from, to, screen, size, least, most, near, eye, fog) {
   const { depth, colour, width, height } = picture;
-  const [a, b, c, d, e, f, g, h, p, q, r, s] = screen;
+  const a = screen[0], b = screen[1], c = screen[2], d = screen[3], e = screen[4], f = screen[5];
+  const g = screen[6], h = screen[7], p = screen[8], q = screen[9], r = screen[10], s = screen[11];
   const [eyeX, eyeY, eyeZ, foggy] = eye;
   const { shares, redBlue, green } = fog;
   const scale = FOG_STEPS / FOG_END;
   const lastColumn = width - 1, lastRow = height - 1;
   let inside = 0;
-  for (let row = 0, at = 0; row < count; row += 1, at += 3) {
+  for (let row = from, at = 3 * from; row < to; row += 1, at += 3) {
     const x = places[at], y = places[at + 1], z = places[at + 2];
     const w = p * x + q * y + r * z + s;
     if (w < near) continue;

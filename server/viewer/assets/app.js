@@ -336,7 +336,7 @@ export class App {
     this.times.figures = now;
     const place = this.place();
     showFigures({
-      points: this.tiles.shown + this.overview.shown,
+      points: this.view.drawing?.shown.inside ?? this.tiles.shown + this.overview.shown,
       fps: this.fps,
       roundTrip: this.state?.roundTrip ?? null,
       frameSeconds: this.state?.seconds ?? null,

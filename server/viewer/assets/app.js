@@ -19,6 +19,9 @@ import { Tiles } from "./tiles.js";
 
 // Numbers of the verdicts in the server's answers.
 const NAMES = ["clear", "contact", "unknown"];
+const KEPT_INTERVALS = 600;
+// Without a user for this long, the scan as a whole is looked at in detail [ms].
+const USER_MS = 4000;
 const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 // Radius around the camera of what is not drawn between it and the user [m].
 const CUT = 0.9;
@@ -38,7 +41,7 @@ export class App {
     this.boxes = new Boxes(view.lines);
     this.contacts = new Contacts(view.lines);
     this.clash = new ClashCheck(this);
-    this.quality = new Quality(view.software);
+    this.quality = new Quality(view.software, view.drawing !== null);
     this.scene = null;
     this.state = null;
     this.verdict = "none";
@@ -52,8 +55,11 @@ export class App {
     this.frames = 0;
     this.pictures = 0;
     this.fps = 0;
+    // Of pictures that moved [ms].
+    this.intervals = [];
     this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
     this.lastIntent = "";
+    this.asked = false;
     // For panels: called with each state of the user, and with each refusal of the server; what else
     // is drawn, each with a `signature` that changes with it and a method `prepare`; what moves by
     // itself, each with `update` and a `signature`; functions by name that tests may call.
@@ -155,6 +161,7 @@ export class App {
   welcome({ scene, frame, number }) {
     const another = this.scene?.name !== scene.name || this.scene?.generation !== scene.generation;
     this.scene = scene;
+    this.welcomed = performance.now();
     this.number = number;
     this.origin = frame.origin;
     this.axes = frame.axes;
@@ -237,6 +244,7 @@ export class App {
     if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
     const { watched } = this.rig;
     const firstPerson = settings.get("firstPerson") && !watched;
+    this.asked = intent.forward !== 0 || intent.right !== 0 || intent.up !== 0;
     this.command(watched ? { ...intent, face: false } : intent, now);
     if (this.state && !watched && !firstPerson && now - this.times.boom > BOOM_MS) {
       this.times.boom = now;
@@ -264,15 +272,17 @@ export class App {
     this.times.choose = now;
     const focus = this.rig.watched ? this.rig.watched.target : own ? own.position : this.rig.focus;
     const budget = 1e6 * settings.get("budget");
-    const drawn = this.quality.budget(budget);
-    this.tiles.choose(this.view.camera, focus, budget, drawn, now);
+    const drawn = this.quality.budget(budget, this.view.drawing?.spread ?? 1);
+    // Tiles that are seen from afar are of no use beside the user, who stands there soon.
+    if (own || this.rig.watched || now - this.welcomed > USER_MS) this.tiles.choose(this.view.camera, focus, budget, drawn, now);
     this.boxes.update(this.tiles, focus, settings.get("boxes"));
     this.overview.update(settings.get("pointSize"), drawn - this.tiles.shown, now);
   }
 
   /** Draw, if the picture differs from the one before. */
   draw(now) {
-    const { camera } = this.view;
+    if (this.quality.early(now - this.times.drawn)) return;
+    const { camera, drawing } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
       this.contacts.signature, this.users.signature, this.verdict, ...[...this.movers].map((mover) => mover.signature),
@@ -284,18 +294,29 @@ export class App {
     ].join();
     const content = `${this.tiles.changes},${this.overview.count}`;
     this.pictures += 1;
-    if (!this.quality.look(seen, chosen, content, now)) {
+    if (!this.quality.look(seen, chosen, content, now, this.asked)) {
       this.drawnBefore = false;
       return;
     }
     if (this.quality.still && this.scene) this.choose(now, this.users.own);
     for (const each of this.drawings) each.prepare(!this.quality.software || this.quality.still);
     this.view.shading = this.quality.shading(settings.get("shading"));
-    if (this.drawnBefore && !this.quality.still) this.quality.measure(now - this.times.drawn, this.tiles.shown + this.overview.shown);
+    if (this.drawnBefore && !this.quality.still) {
+      const interval = now - this.times.drawn;
+      this.quality.measure(interval, drawing?.shown.given ?? this.tiles.shown + this.overview.shown, drawing?.times.points ?? 0);
+      this.intervals.push(interval);
+      if (this.intervals.length > 2 * KEPT_INTERVALS) this.intervals = this.intervals.slice(-KEPT_INTERVALS);
+    }
     this.times.drawn = now;
     this.drawnBefore = true;
     this.view.draw();
     this.pictured ||= this.tiles.shown + this.overview.shown > 0;
+  }
+
+  /** Return what pictures take: intervals of those that moved since the last call [ms]; parts of our own drawing of the last one [ms], and its points. */
+  drawingFigures() {
+    const { drawing } = this.view;
+    return { intervals: this.intervals.splice(0), most: this.quality.most, still: this.quality.still, canvas: this.view.shownCanvas === this.view.canvas ? "webgl" : "own", ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
   }
 
   /** Send the intent when it changes, and again while it lasts. */
@@ -315,7 +336,7 @@ export class App {
     this.times.figures = now;
     const place = this.place();
     showFigures({
-      points: this.tiles.shown + this.overview.shown,
+      points: this.view.drawing?.shown.inside ?? this.tiles.shown + this.overview.shown,
       fps: this.fps,
       roundTrip: this.state?.roundTrip ?? null,
       frameSeconds: this.state?.seconds ?? null,

@@ -37,7 +37,7 @@ export class Avatar {
   constructor(geometry, radius, group) {
     this.group = group;
     this.material = new ShaderMaterial({
-      vertexShader: VERTEX, fragmentShader: FRAGMENT,
+      name: "figure", vertexShader: VERTEX, fragmentShader: FRAGMENT,
       uniforms: { uSize: { value: 2 * radius }, uScale: shared.uScale, uColour: { value: new Color() } },
     });
     this.object = new Group();

@@ -52,6 +52,7 @@ function expose(app) {
     yaw: () => app.rig.yaw,
     notices: () => subjects(),
     software: () => app.view.software,
+    drawing: () => app.drawingFigures(),
     ...app.readable,
     camera: () => app.view.camera.position.toArray(),
     watching: () => app.rig.watched !== null,
@@ -68,7 +69,7 @@ function expose(app) {
 function start() {
   let view;
   try {
-    view = new View(document.getElementById("view"));
+    view = new View(document.getElementById("view"), new URLSearchParams(location.search).get("drawing") === "webgl");
   } catch (error) {
     console.info(error);
     fatal("This browser offers no WebGL 2, which the picture needs. Use a current browser, with graphics acceleration on.");

@@ -93,6 +93,7 @@ export const shared = {
 /** Return a material of points with a diameter [m]. */
 export function pointsMaterial(size) {
   return new ShaderMaterial({
+    name: "scan",
     vertexShader: VERTEX,
     fragmentShader: FRAGMENT,
     uniforms: { ...shared, uSize: { value: size } },

@@ -1,20 +1,31 @@
 // How much is drawn: as the settings say when nothing moves, and as much as stays smooth when it does.
 //
-// A picture that did not change is not drawn again. Where graphics are computed in software, a point
-// takes about a microsecond, and a moving picture has fewer points than a still one.
+// A picture that did not change is not drawn again. Where graphics are computed in software, a moving
+// picture has fewer points than a still one.
 
 const SMOOTH_MS = 42, EASY_MS = 24;
 const LEAST_POINTS = 25e3, FIRST_SOFTWARE = 60e3;
+// Our own drawing begins with this many points. They are fewer if pictures take longer than `SMOOTH_MS`
+// and their points more than `OWN_MS` of it, and more again below half of that. Other work on the machine
+// makes pictures late, too, against which fewer points are no help: the least disturbed pictures count.
+const FIRST_OWN = 200e3, LEAST_OWN = 100e3, OWN_MS = 18;
+// Least time between two of our own pictures [ms]: a server has 30 states a second, and the processor
+// serves it, too.
+const OWN_INTERVAL_MS = 28;
 // A view that has not changed for this long is drawn in full [ms].
 const STILL_MS = 240;
-const GATHERED_MS = 1500;
+// A full picture takes a second in WebGL, and a tenth of a second in our own drawing [ms].
+const GATHERED_MS = 1500, GATHERED_OWN_MS = 400;
 
 export class Quality {
-  /** software: whether there is no graphics processor. */
-  constructor(software) {
+  /** software: whether there is no graphics processor.  own: whether raster/ draws. */
+  constructor(software, own) {
     this.software = software;
-    this.most = software ? FIRST_SOFTWARE : Infinity;
+    this.own = own;
+    this.most = own ? FIRST_OWN : software ? FIRST_SOFTWARE : Infinity;
+    this.gathered = own ? GATHERED_OWN_MS : GATHERED_MS;
     this.intervals = [];
+    this.works = [];
     this.seen = "";
     this.chosen = "";
     this.content = "";
@@ -24,13 +35,20 @@ export class Quality {
     this.full = false;
   }
 
+  /** Return whether it is too early for another picture. since: the last one [ms]. */
+  early(since) {
+    return this.own && since < OWN_INTERVAL_MS;
+  }
+
   /** Note what a picture depends on. Returns whether the picture must be drawn.
    *
    * seen: text of the camera and all that moves.  chosen: text of settings.  content: text of the
-   * scan that has arrived.  now: [ms].
+   * scan that has arrived.  now: [ms].  asked: whether the user is asking to move: a full picture would
+   * delay the next one.
    */
-  look(seen, chosen, content, now) {
+  look(seen, chosen, content, now, asked) {
     this.latest = content;
+    if (asked) this.changed = now;
     if (seen !== this.seen) {
       Object.assign(this, { seen, chosen, content, changed: now, full: false });
       return true;
@@ -39,12 +57,12 @@ export class Quality {
       Object.assign(this, { chosen, content, drawn: now });
       return true;
     }
-    // In software a full picture takes a second: new tiles are gathered.
-    if (content !== this.content && (!this.software || !this.full || now - this.drawn > GATHERED_MS)) {
+    // In software a full picture takes long: new tiles are gathered.
+    if (content !== this.content && (!this.software || !this.full || now - this.drawn > this.gathered)) {
       Object.assign(this, { content, drawn: now });
       return true;
     }
-    if (this.full || now - this.changed < STILL_MS) return false;
+    if (this.full || asked || now - this.changed < STILL_MS) return false;
     Object.assign(this, { full: true, drawn: now });
     return true;
   }
@@ -59,9 +77,9 @@ export class Quality {
     return this.full && this.content === this.latest;
   }
 
-  /** Return how many points may be drawn. wanted: as the settings say. */
-  budget(wanted) {
-    return this.full ? wanted : Math.min(wanted, this.most);
+  /** Return how many points may be drawn. wanted: as the settings say.  spread: points of tiles for each one that takes time. */
+  budget(wanted, spread = 1) {
+    return this.full ? wanted : Math.min(wanted, spread * this.most);
   }
 
   /** Return whether edges are shaded. wanted: as the settings say. */
@@ -71,18 +89,29 @@ export class Quality {
 
   /** Take the time between two drawn pictures that moved [ms], and that many points of the last one.
    *
-   * Pictures that take several times too long are answered after three of them: twelve take seconds.
+   * work: time that points took in our own drawing [ms].  Pictures that take several times too long are
+   * answered after three of them: twelve take seconds.
    */
-  measure(interval, points) {
+  measure(interval, points, work) {
     this.intervals.push(interval);
+    this.works.push(work);
     const far = this.intervals.length >= 3 && this.intervals.every((each) => each > 2 * SMOOTH_MS);
     if (this.intervals.length < 12 && !far) return;
-    const sorted = this.intervals.sort((one, other) => one - other);
-    const slow = sorted[Math.floor(0.75 * sorted.length)];
+    const ordered = [this.intervals, this.works].map((all) => all.sort((one, other) => one - other));
+    const slow = ordered[0][Math.floor(0.75 * this.intervals.length)], long = ordered[1][Math.floor(0.25 * this.works.length)];
     this.intervals = [];
-    if (slow > SMOOTH_MS) {
+    this.works = [];
+    if (this.own) this.regulate(slow, long, points);
+    else if (slow > SMOOTH_MS) {
       const share = Math.max(0.25, (0.9 * SMOOTH_MS) / slow);
       this.most = Math.max(LEAST_POINTS, Math.min(this.most, points) * share);
     } else if (slow < EASY_MS && this.most < Infinity) this.most *= 1.15;
+  }
+
+  /** Change the number of points of our own drawing. long: time that they took [ms]. */
+  regulate(slow, long, points) {
+    if (slow > SMOOTH_MS && long > OWN_MS) {
+      this.most = Math.max(LEAST_OWN, Math.min(this.most, points) * Math.max(0.5, OWN_MS / long));
+    } else if (long < 0.5 * OWN_MS) this.most = Math.min(1.15 * this.most, 2 * FIRST_OWN);
   }
 }

@@ -165,14 +165,15 @@ export class Tiles {
       voxel.away = Math.max(0.5, Math.sqrt(distanceTo(voxel.box, camera.position)));
       voxel.factor = frustum.intersectsSphere(voxel.sphere) ? 1 : BEHIND;
     }
-    const fit = (most) => {
+    const fit = (voxels, most) => {
       let pixels = FINE;
       const cost = (sum, each) => sum + each.points / 4 ** detailOf(each, pixels, spacing);
-      while (pixels < 4096 && ordered.reduce(cost, 0) > most) pixels *= 1.25;
+      while (pixels < 4096 && voxels.reduce(cost, 0) > most) pixels *= 1.25;
       return pixels;
     };
-    const pixels = fit(budget);
-    const drawnPixels = drawn < budget ? fit(drawn) : pixels;
+    const pixels = fit(ordered, budget);
+    // What is behind the camera takes no time.
+    const drawnPixels = drawn < budget ? Math.max(pixels, fit(ordered.filter((each) => each.factor === 1), drawn)) : pixels;
     this.shown = 0;
     const missing = [];
     let kept = 0;
@@ -183,7 +184,7 @@ export class Tiles {
       if (lacks > 0 && !this.failed.has(voxel.name)) missing.push({ voxel, urgency: (2 ** lacks * voxel.points ** 0.5) / (voxel.away * voxel.factor) });
       if (voxel.object) {
         this.show(voxel, detailOf(voxel, drawnPixels, spacing));
-        this.shown += voxel.drawn;
+        if (voxel.factor === 1) this.shown += voxel.drawn;
         kept += voxel.loaded;
       }
     }

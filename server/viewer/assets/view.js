@@ -5,8 +5,9 @@ import {
   RawShaderMaterial, Scene, UnsignedIntType, Vector2, WebGLRenderTarget, WebGLRenderer,
 } from "./vendor/three.module.min.js";
 import { shared } from "./points_material.js";
+import { Drawing } from "./raster/drawing.js";
 
-const FIELD_OF_VIEW = 62;
+const FIELD_OF_VIEW = 62, GROUND = 0x0a0e15;
 // Colours are written as they are shown.
 ColorManagement.enabled = false;
 
@@ -43,8 +44,11 @@ void main() {
 }`;
 
 export class View {
-  /** Make the view on a canvas. Throws where the browser has no WebGL 2. */
-  constructor(canvas) {
+  /** Make the view on a canvas. Throws where the browser has no WebGL 2.
+   *
+   * graphics: whether WebGL draws the scan even if it computes in software.
+   */
+  constructor(canvas, graphics = false) {
     this.canvas = canvas;
     const context = canvas.getContext("webgl2", {
       antialias: false, alpha: false, powerPreference: "high-performance",
@@ -53,7 +57,7 @@ export class View {
     this.renderer = new WebGLRenderer({ canvas, context });
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.renderer.autoClear = false;
-    this.renderer.setClearColor(0x0a0e15);
+    this.renderer.setClearColor(GROUND);
     this.camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.05, 2000);
     this.camera.up.set(0, 0, 1);
     this.points = new Scene();
@@ -62,6 +66,8 @@ export class View {
     this.software = isSoftware(context);
     // Beyond one pixel of the picture per pixel of the style, shading costs more than it shows.
     this.ratio = this.software ? 1 : Math.min(devicePixelRatio, 1.5);
+    // Where WebGL computes in software, our own code is faster: raster/.
+    this.drawing = this.software && !graphics ? new Drawing(canvas, GROUND) : null;
     this.target = new WebGLRenderTarget(1, 1, { minFilter: NearestFilter, magFilter: NearestFilter });
     this.target.depthTexture = new DepthTexture(1, 1, UnsignedIntType);
     this.material = new RawShaderMaterial({
@@ -87,7 +93,8 @@ export class View {
     this.renderer.setPixelRatio(this.ratio);
     this.renderer.setSize(width, height, false);
     const size = this.renderer.getDrawingBufferSize(new Vector2());
-    this.target.setSize(size.x, size.y);
+    if (this.drawing) this.drawing.resize(size.x, size.y);
+    else this.target.setSize(size.x, size.y);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.material.uniforms.uPixel.value.set(1 / size.x, 1 / size.y);
@@ -99,9 +106,18 @@ export class View {
     return shared.uScale.value;
   }
 
+  /** Return the canvas with the last picture. */
+  get shownCanvas() {
+    return this.drawing && this.drawing.canvas.style.display === "" ? this.drawing.canvas : this.canvas;
+  }
+
   draw() {
     const { renderer, camera, material } = this;
     camera.updateMatrixWorld();
+    if (this.drawing) {
+      this.drawing.draw(this);
+      return;
+    }
     if (this.shading) {
       renderer.setRenderTarget(this.target);
       renderer.clear();

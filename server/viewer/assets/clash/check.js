@@ -149,7 +149,7 @@ export class ClashCheck {
     const { view } = this.app;
     // The canvas keeps its pixels only until the browser has shown them.
     view.draw();
-    view.canvas.toBlob((blob) => { if (blob) download(blob, `${this.app.scene?.name ?? "solidcloud"}.png`); }, "image/png");
+    view.shownCanvas.toBlob((blob) => { if (blob) download(blob, `${this.app.scene?.name ?? "solidcloud"}.png`); }, "image/png");
   }
 
   /** Return a text that changes with what is drawn. */

@@ -1,0 +1,93 @@
+// A picture in memory: a colour and a depth for each pixel, and its canvas.
+//
+// Depths are 1 / w, with w the distance along the view [m]: linear in the picture, larger when nearer,
+// 0 where nothing is. Colours are bytes red, green, blue, alpha, as one integer.
+
+// Strength of the shading by depth, and the sum of steps from which on its table is black.
+const STRENGTH = 7, DARKEST = 1, SHADES = 1024;
+
+export class Picture {
+  /** canvas: shows the picture.  ground: colour where nothing is. */
+  constructor(canvas, ground) {
+    this.canvas = canvas;
+    this.ground = ground;
+    // Without waiting for the page's other parts, the browser needs 12 instead of 22 ms for a picture where
+    // SwiftShader puts the page together (1280 x 720).
+    this.context = canvas.getContext("2d", { alpha: false, desynchronized: true });
+    this.shadeTable = Uint16Array.from({ length: SHADES + 1 },
+      (_, k) => Math.round(256 * Math.exp((-STRENGTH * DARKEST * k) / SHADES)));
+    this.resize(1, 1);
+  }
+
+  resize(width, height) {
+    if (this.width === width && this.height === height) return;
+    Object.assign(this, { width, height });
+    this.canvas.width = width;
+    this.canvas.height = height;
+    this.image = new ImageData(width, height);
+    this.colour = new Uint32Array(this.image.data.buffer);
+    this.depth = new Float32Array(width * height);
+    this.logarithms = null;
+  }
+
+  clear() {
+    this.colour.fill(this.ground);
+    this.depth.fill(0);
+  }
+
+  show() {
+    this.context.putImageData(this.image, 0, 0);
+  }
+
+  /** Darken pixels that lie behind their neighbours: as the shader in view.js. */
+  shade() {
+    const { width, height, colour, shadeTable } = this;
+    this.logarithms ??= new Float32Array(width * height);
+    const away = this.logarithms;
+    logarithms(new Int32Array(this.depth.buffer), away);
+    const scale = SHADES / DARKEST;
+    for (let row = 0; row < height; row += 1) {
+      const above = row > 0 ? -width : 0, below = row < height - 1 ? width : 0;
+      for (let column = 0; column < width; column += 1) {
+        const at = row * width + column;
+        const here = away[at];
+        if (here > 100) continue;
+        const right = here - away[column < width - 1 ? at + 1 : at], left = here - away[column > 0 ? at - 1 : at];
+        const up = here - away[at + above], down = here - away[at + below];
+        let sum = 0;
+        if (right > 0) sum += right;
+        if (left > 0) sum += left;
+        if (up > 0) sum += up;
+        if (down > 0) sum += down;
+        if (sum < 1e-3) continue;
+        colour[at] = mixed(colour[at], 0xff000000, sum >= DARKEST ? 256 - shadeTable[SHADES] : 256 - shadeTable[(sum * scale) | 0]);
+      }
+    }
+  }
+}
+
+/** Write binary logarithms of distances w; 127 where there is none. bits: of depths 1 / w.
+ *
+ * The logarithm of the mantissa is a parabola through its ends, with an error below 0.01.
+ */
+function logarithms(bits, away) {
+  for (let k = 0; k < bits.length; k += 1) {
+    const each = bits[k];
+    const part = 1 + (each & 0x7fffff) * 2 ** -23;
+    away[k] = 128 - (each >> 23) - (2 - part / 3) * part + 2 / 3;
+  }
+}
+
+/** Return a colour mixed with another one. share: of the other one, 0 to 256. */
+export function mixed(colour, other, share) {
+  const rest = 256 - share;
+  const outer = (Math.imul(colour & 0xff00ff, rest) + Math.imul(other & 0xff00ff, share)) >>> 8;
+  const inner = (Math.imul((colour >>> 8) & 0xff, rest) + Math.imul((other >>> 8) & 0xff, share)) >>> 8;
+  return (0xff000000 | (outer & 0xff00ff) | (inner << 8)) >>> 0;
+}
+
+/** Return red, green and blue, 0 to 1, as a colour. */
+export function packed(red, green, blue) {
+  const byte = (value) => Math.max(0, Math.min(255, Math.round(255 * value)));
+  return (0xff000000 | (byte(blue) << 16) | (byte(green) << 8) | byte(red)) >>> 0;
+}

@@ -1,0 +1,159 @@
+// The scan into a picture: tiles and overview, nearest first.
+
+import { Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
+import { shared } from "../points_material.js";
+import { PointColours } from "./colours.js";
+import { boxesOf, seenRuns } from "./runs.js";
+import { screenRows } from "./shapes.js";
+import { fogTables, splat } from "./splats.js";
+
+export class Scan {
+  constructor() {
+    this.colours = new PointColours();
+    this.packed = new WeakMap();
+    this.boxes = new WeakMap();
+    this.kept = { places: new Uint16Array(0), colours: new Uint32Array(0) };
+    this.fog = fogTables(shared.uGround.value.toArray());
+  }
+
+  /** Draw scan points. objects: of three.js, with the material of points_material.js.
+   *
+   * Returns how many points they have, how many of them were given to the inner loop, and how many were
+   * inside of the picture.
+   */
+  draw(picture, objects, camera, frustum) {
+    const ordered = [];
+    for (const object of objects) {
+      const count = object.geometry.drawRange.count;
+      if (count <= 0 || (object.frustumCulled && !frustum.intersectsObject(object))) continue;
+      const tile = object.geometry.index ? this.pack(object.geometry) : {
+        places: object.geometry.attributes.position.array, attributes: arrays(object.geometry), matrix: object.matrixWorld, source: object.geometry,
+        sphere: object.geometry.boundingSphere.clone().applyMatrix4(object.matrixWorld),
+      };
+      tile.count = Math.min(count, tile.places.length / 3);
+      tile.size = object.material.uniforms.uSize.value * shared.uScale.value;
+      // The overview is behind the tiles, mostly.
+      tile.away = object.geometry.index ? Infinity : tile.sphere.center.distanceTo(camera.position) - tile.sphere.radius;
+      ordered.push(tile);
+    }
+    ordered.sort((one, other) => one.away - other.away);
+    const found = { chosen: 0, given: 0, inside: 0 };
+    for (const tile of ordered) this.tile(picture, tile, camera, found);
+    return found;
+  }
+
+  tile(picture, tile, camera, found) {
+    const { matrix, sphere, attributes, source, places, count } = tile;
+    const { elements } = matrix;
+    const screen = screenRows(picture, camera, matrix);
+    const runs = seenRuns(this.boxesOf(places), count, screen, picture.width, picture.height, camera.near);
+    found.chosen += count;
+    if (!runs.length) return;
+    const last = runs.at(-1);
+    const eye = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
+    const way = cutReaches(sphere, camera.position);
+    const { x: least, y: most } = shared.uPixels.value;
+    const step = Math.hypot(elements[0], elements[1], elements[2]) / shared.uFog.value;
+    const colours = this.colours.around(this.colours.of(source, attributes, places, elements), places, last, elements, sphere);
+    const draw = (ofPlaces, ofColours, from, to) => splat(picture, ofPlaces, ofColours, from, to, screen, tile.size, least, most,
+      camera.near, [eye.x, eye.y, eye.z, step * step], this.fog);
+    for (let k = 0; k < runs.length; k += 2) {
+      const [from, to] = [runs[k], runs[k + 1]];
+      found.given += to - from;
+      if (way) {
+        const left = this.cut(places, colours, from, to, elements, eye, way);
+        found.inside += draw(this.kept.places, this.kept.colours, 0, left);
+      } else found.inside += draw(places, colours, from, to);
+    }
+  }
+
+  boxesOf(places) {
+    if (!this.boxes.has(places)) this.boxes.set(places, boxesOf(places));
+    return this.boxes.get(places);
+  }
+
+  /** Keep the points that are not between the camera and the user, as the shader leaves them out; return how many.
+   *
+   * eye: camera in the tile's frame.
+   */
+  cut(places, colours, from, to, matrix, eye, { line, whole }) {
+    if (this.kept.colours.length < to - from) {
+      this.kept = { places: new Uint16Array(6 * (to - from)), colours: new Uint32Array(2 * (to - from)) };
+    }
+    const { kept } = this;
+    const radius = shared.uCut.value.w;
+    let left = 0;
+    // Along the line, as a function of a place in the tile's frame, whose axes are at right angles.
+    const [a, b, c] = [0, 4, 8].map((at) => line.x * matrix[at] + line.y * matrix[at + 1] + line.z * matrix[at + 2]);
+    const step = Math.hypot(matrix[0], matrix[1], matrix[2]);
+    for (let row = from, at = 3 * from; row < to; row += 1, at += 3) {
+      const x = places[at] - eye.x, y = places[at + 1] - eye.y, z = places[at + 2] - eye.z;
+      const along = a * x + b * y + c * z;
+      if (along < whole - 0.55) {
+        const wide = radius * (0.35 + 0.65 * (1 - along / whole));
+        if (step * step * (x * x + y * y + z * z) - along * along < wide * wide) continue;
+      }
+      kept.places[3 * left] = places[at];
+      kept.places[3 * left + 1] = places[at + 1];
+      kept.places[3 * left + 2] = places[at + 2];
+      kept.colours[left] = colours[row];
+      left += 1;
+    }
+    return left;
+  }
+
+  /** Return the points of an index in its order, in a frame of their box in 65,535 steps. */
+  pack(geometry) {
+    const { index, attributes, drawRange } = geometry;
+    const found = this.packed.get(geometry);
+    // The index changes as a whole, and its beginning is drawn.
+    if (found && found.version === index.version && found.rows >= drawRange.count) return found;
+    const { array } = attributes.position;
+    const rows = found && found.version === index.version ? index.count : Math.min(index.count, drawRange.count);
+    const frame = found ?? boxFrame(array);
+    const columns = Object.entries(attributes).filter(([name]) => name !== "position");
+    const packed = Object.fromEntries(columns.map(([name, each]) => [name, new each.array.constructor(rows * each.itemSize)]));
+    const places = new Uint16Array(3 * rows);
+    for (let row = 0; row < rows; row += 1) {
+      const from = index.array[row];
+      for (let axis = 0; axis < 3; axis += 1) places[3 * row + axis] = (array[3 * from + axis] - frame.low[axis]) / frame.step + 0.5;
+      for (const [name, { array: values, itemSize }] of columns) {
+        for (let part = 0; part < itemSize; part += 1) packed[name][itemSize * row + part] = values[itemSize * from + part];
+      }
+    }
+    const made = { ...frame, version: index.version, rows, places, attributes: packed, source: places };
+    this.packed.set(geometry, made);
+    return made;
+  }
+}
+
+const inverse = new Matrix4();
+const arrays = ({ attributes }) => Object.fromEntries(Object.entries(attributes).map(([name, { array }]) => [name, array]));
+
+/** Return a frame of the box of places, (n, 3) as one array. */
+function boxFrame(places) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let at = 0; at < places.length; at += 3) {
+    for (let axis = 0; axis < 3; axis += 1) {
+      low[axis] = Math.min(low[axis], places[at + axis]);
+      high[axis] = Math.max(high[axis], places[at + axis]);
+    }
+  }
+  const step = Math.max(1e-6, ...high.map((value, axis) => (value - low[axis]) / 65534));
+  const sphere = new Sphere(new Vector3(...low).add(new Vector3(...high)).multiplyScalar(0.5));
+  sphere.radius = sphere.center.distanceTo(new Vector3(...high));
+  return { low, step, matrix: new Matrix4().makeTranslation(...low).scale(new Vector3(step, step, step)), sphere };
+}
+
+/** Return the line from the camera to the user's shoulders, if what is left out on it may be in a sphere. */
+function cutReaches(sphere, camera) {
+  const { x, y, z, w: radius } = shared.uCut.value;
+  if (radius <= 0) return null;
+  const line = new Vector3(x, y, z).sub(camera), whole = line.length();
+  line.divideScalar(whole);
+  const way = sphere.center.clone().sub(camera), along = way.dot(line);
+  const beside = Math.sqrt(Math.max(0, way.lengthSq() - along * along));
+  // Behind the camera nothing is seen.
+  if (along < -sphere.radius || along > whole + sphere.radius || beside > radius + sphere.radius) return null;
+  return { line, whole };
+}

@@ -22,6 +22,8 @@ const NAMES = ["clear", "contact", "unknown"];
 const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 // Radius around the camera of what is not drawn between it and the user [m].
 const CUT = 0.9;
+// A user who begins farther than this from the link's place is told so [m].
+const NOT_THERE = 0.3;
 
 /** Return a number without the noise of interpolation. */
 const digits = (value) => value.toFixed(5);
@@ -189,12 +191,22 @@ export class App {
     for (const listener of this.frameListeners) listener(state);
     showVerdict(this.verdict);
     showState(state);
+    if (this.entered) this.checkStart();
     if (first || this.entered) {
       this.entered = false;
       // The avatar faces along its y axis.
       this.rig.yaw = Math.atan2(state.pose[1][1], state.pose[0][1]);
       this.rig.started = false;
     }
+  }
+
+  /** Say why the user is not at the link's place: the server begins all users at the scene's spawn. */
+  checkStart() {
+    const { at } = this.link, place = this.place();
+    if (!at || !place || !this.scene.spawn) return;
+    const away = Math.hypot(...place.slice(0, 3).map((value, k) => value - at[k]));
+    if (away < NOT_THERE) return;
+    notify("place", "You are not at the link's place", `All users of this scene begin at its spawn, and something stops the way from there. The place is ${away.toFixed(1)} m from here: walk to it.`, "warn", 15);
   }
 
   forgetUser() {
@@ -206,6 +218,7 @@ export class App {
 
   /** Put the user back to the start, or to a place. */
   restart(at) {
+    this.link.at = at;
     this.link.send({ type: "restart", at });
   }
 

@@ -4,7 +4,7 @@ const KEY = "solidcloud.settings";
 
 const DEFAULTS = {
   colour: "auto", pointSize: 1, budget: 1.2, shading: true, firstPerson: false,
-  contacts: true, clearance: true, boxes: false, near: 0.25, panel: true,
+  contacts: true, clearance: true, boxes: false, near: 0.02, panel: true,
   instruments: false, openPlots: true, openEffects: false, openAccuracy: false, openHierarchy: false,
   tolerance: 3, spheres: true, level: 4,
 };

@@ -24,6 +24,9 @@ const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 const CUT = 0.9;
 // A user who begins farther than this from the link's place is told so [m].
 const NOT_THERE = 0.3;
+// Shown until the first step, once for a browser.
+const HINT = ["Walk with W A S D or the arrow keys", "Look by dragging; Shift runs. All keys are at the end of the settings."];
+const HINT_TOUCH = ["Walk with the round stick", "Look by dragging; two fingers go nearer and farther."];
 
 /** Return a number without the noise of interpolation. */
 const digits = (value) => value.toFixed(5);
@@ -191,7 +194,10 @@ export class App {
     for (const listener of this.frameListeners) listener(state);
     showVerdict(this.verdict);
     showState(state);
-    if (this.entered) this.checkStart();
+    if (this.entered) {
+      this.checkStart();
+      if (!settings.get("walked")) notify("hint", ...(matchMedia("(pointer: coarse)").matches ? HINT_TOUCH : HINT));
+    }
     if (first || this.entered) {
       this.entered = false;
       // The avatar faces along its y axis.
@@ -248,6 +254,10 @@ export class App {
     if (this.scene?.effects.includes("ground")) intent.up = 0;
     // Who walks looks at the user again.
     if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
+    if (this.state && (intent.forward || intent.right) && !settings.get("walked")) {
+      settings.set("walked", true);
+      clear("hint");
+    }
     const { watched } = this.rig;
     const firstPerson = settings.get("firstPerson") && !watched;
     this.command(watched ? { ...intent, face: false } : intent, now);

@@ -113,7 +113,8 @@ export class CameraRig {
       if (Math.abs(wanted - this.used) < 0.01) this.used = wanted;
       this.camera.position.addScaledVector(ahead, -this.used);
       // Over the shoulder: the user does not hide where it goes.
-      const right = Math.max(BESIDE, 0.07 * this.used);
+      // A high picture, as on a phone, has less room beside the user.
+      const right = Math.max(BESIDE, 0.07 * this.used) * Math.min(1, this.camera.aspect);
       this.camera.position.x += Math.sin(this.yaw) * right;
       this.camera.position.y -= Math.cos(this.yaw) * right;
       const floor = place.z + 0.12;

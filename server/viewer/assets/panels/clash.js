@@ -37,7 +37,7 @@ export function addClashPanel(app) {
   const found = make("div");
   section.append(found);
   // The effect `ground` keeps the feet 3 cm above the floor: a larger default calls every step near.
-  slider(found, "near", "Near", { min: 0.01, max: 0.5, step: 0.01 }, (value) => `${value.toFixed(2)} m`);
+  slider(found, "near", "Near", { min: 0.01, max: 1, step: 0.01 }, (value) => `${value.toFixed(2)} m`);
   const legend = make("ul", { className: "legend" });
   const list = make("ol", { id: "clash-list" });
   list.setAttribute("aria-label", "Clashes, deepest first");

@@ -7,7 +7,7 @@ const NEAR = 1.2, FAR = 40;
 // Least distance to which the scan behind the user brings the camera, and of the camera from that scan
 // [m]. From nearer than this the user hides half of the picture; the camera then goes into the wall
 // instead, and what is between it and the user is not drawn.
-const CLOSEST = 2.2, CLEAR = 0.5;
+const CLOSEST = 1.6, CLEAR = 0.5;
 // Least distance to the right of the user: from near, it does not hide where it goes [m].
 const BESIDE = 0.3;
 

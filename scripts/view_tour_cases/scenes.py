@@ -85,7 +85,8 @@ def pace(page: TourPage) -> None:
     """Walk to and fro before the portal, until the plots have something to show."""
     page.hold("w", "s.place && s.place[1] > -7.5")
     page.hold("s", "s.place && s.place[1] < -10")
-    page.hold("w", "s.place && s.place[1] > -9 && s.samples.length > 12")
+    page.hold("w", "s.place && s.place[1] > -9")
+    page.wait("s.samples.length > 12")
 
 
 def clash(browser: Any, url: str) -> Image.Image:

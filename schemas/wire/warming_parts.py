@@ -16,7 +16,9 @@ BUDGETS = "budgets"
 # All parts in the order of warming: a server answers `collide` first.
 PARTS = (COLLIDE.name, MOTION, *(name for name in QUESTIONS if name != COLLIDE.name), BUDGETS)
 
-# Line that `solidcloud serve` prints once all parts are ready.
+# Lines that `solidcloud serve` prints: the first words of the one with which it begins to answer, and
+# the one once all parts are ready.
+SERVING_WORDS = "serving "
 READY_LINE = "all questions are ready"
 
 

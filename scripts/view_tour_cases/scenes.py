@@ -21,6 +21,10 @@ _STEP = 0.05
 _STAIRS, _FLOORS, _ABOVE = (-2.9, -2.15), (0.0, 0.45), 0.08
 
 
+# Panels without the scan behind them.
+_PLAIN = "aside, footer { background: #0f151f !important; } .more { display: none; }"
+
+
 class Scene(NamedTuple):
     """Scene of the tour. name: of its picture.  caption: under it.  take: returns its picture."""
 
@@ -81,7 +85,8 @@ def pace(page: TourPage) -> None:
     """Walk to and fro before the portal, until the plots have something to show."""
     page.hold("w", "s.place && s.place[1] > -7.5")
     page.hold("s", "s.place && s.place[1] < -10")
-    page.hold("w", "s.place && s.place[1] > -9 && s.samples.length > 12")
+    page.hold("w", "s.place && s.place[1] > -9")
+    page.wait("s.samples.length > 12")
 
 
 def clash(browser: Any, url: str) -> Image.Image:
@@ -104,7 +109,7 @@ def meet(browser: Any, url: str) -> Image.Image:
 
 def check(page: TourPage, path: str) -> None:
     """Check a path, and go to its deepest clash."""
-    page.page.locator("#panel input[type=file]").set_input_files(
+    page.page.get_by_label("Load a path").set_input_files(
         {"name": "cart.csv", "mimeType": "text/csv", "buffer": path.encode()}
     )
     page.wait("s.clash.state === 'done'")
@@ -146,11 +151,12 @@ def panel_pictures(browser: Any, url: str, folder: Path) -> list[Path]:
         image.quantize(128, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(path, optimize=True)
         written.append(path)
 
-    # A high page: no panel scrolls.
-    light = {"size": (700, 1500), "budget": 0.1, "shading": False}
+    # A high page, on which no panel scrolls, and which is not a small screen with one column.
+    light = {"size": (1000, 1700), "budget": 0.1, "shading": False}
     with tour_page(
         browser, url, "1.2,-11,0.1,97", **light, **{**_INSTRUMENTS, "openPlots": True}, panel=True
     ) as page:
+        page.page.add_style_tag(content=_PLAIN)
         pace(page)
         write("plots", page.panel("#instruments section:nth-of-type(1)"))
         write("settings", page.panel("#panel section:nth-of-type(2)"))
@@ -165,5 +171,5 @@ def panel_pictures(browser: Any, url: str, folder: Path) -> list[Path]:
             write(name.lower(), page.panel(f"#instruments section:nth-of-type({number})"))
         check(page, clash_path())
         page.page.wait_for_timeout(500)
-        write("clash", page.panel("#panel section:nth-of-type(5)"))
+        write("clash", page.panel("#panel section:has(#clash-list)"))
     return written

@@ -17,7 +17,7 @@ PATIENCE = 240.0
 # Radians of a pixel by which the pointer drags the view (assets/input.js).
 _PER_PIXEL = 0.0042
 # All of a new user's settings that a scene changes; the pictures have many points.
-_SETTINGS = {"budget": 2.0, "panel": False, "instruments": False, "openPlots": False}
+_SETTINGS = {"budget": 2.0, "panel": False, "instruments": False, "openPlots": False, "walked": True}
 _BARE = "aside, header, footer, button, #notices { display: none !important; } #view { outline: none !important; }"
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
 from ...schemas.wire.scene_messages import SceneInfo
+from ...schemas.wire.warming_parts import MOTION
 from .browser_user import BrowserUser, state_fields
 from .clash_session import ClashSession
 from .effect_switch import effects_message
@@ -45,6 +46,8 @@ log = logging.getLogger(__name__)
 _RETRY_SECONDS = 1.0
 # An intent without a following message ends after this time: the page may be hidden or frozen [s].
 _INTENT_SECONDS = 1.0
+# Parts of a server that a user needs from the first frame: a direction to look to, and motion.
+_ENTERING = frozenset({"raycast", MOTION})
 # Distance of the outer rays between user and camera from the middle one [m].
 _BOOM_RADIUS = 0.12
 # Changes of residency that wait for a page that takes none: a page that misses some asks again for
@@ -177,7 +180,12 @@ class Browser:
                 self._user.end()
                 self._begun, tried = False, 0.0
             now = time.monotonic()
-            if not self._begun and scene is not None and scene.info.points and now - tried > _RETRY_SECONDS:
+            if (
+                not self._begun
+                and scene is not None
+                and may_enter(scene.info)
+                and now - tried > _RETRY_SECONDS
+            ):
                 self._enter(scene)
                 tried = now
             if self._begun:
@@ -291,6 +299,11 @@ class Browser:
         """Send a message, unless the page is closed."""
         if message is not None and self._connection.is_open():
             self._connection.send(message)
+
+
+def may_enter(info: SceneInfo) -> bool:
+    """Return whether a user can enter a scene: it has points, and the server has compiled what that needs."""
+    return bool(info.points) and not _ENTERING.intersection(info.compiling)
 
 
 def same_picture(one: SceneInfo, other: SceneInfo) -> bool:

@@ -247,6 +247,7 @@ def clashes_message(last: CheckedScene) -> str:
         faults=list(checked.faults),
         counts={verdict.name.lower(): checked.count(verdict) for verdict in Verdict},
         total=len(checked.clashes),
+        topics=MOST_TOPICS,
         clashes=listed,
     )
 

@@ -10,6 +10,7 @@ from typing import NamedTuple, Self
 
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire.scene_messages import SceneInfo
+from ...schemas.wire.warming_parts import PARTS
 from ..client import Client
 from ..zenoh_client.server_connection import scenes_at
 from .view_frame import ViewFrame
@@ -18,6 +19,8 @@ log = logging.getLogger(__name__)
 
 # Interval of the questions whether the server still answers, and how long an answer may take [s].
 _CHECK_SECONDS, _ANSWER_SECONDS = 0.7, 5.0
+# Questions in a row that may remain without an answer while the server compiles.
+_MOST_SILENT = 24
 # How long an answer to long work may take [s].
 _LONG_SECONDS = 30.0
 # Interval of the attempts to find a server [s].
@@ -146,8 +149,10 @@ class SceneLink:
         except SolidcloudError as error:
             log.debug("scene %s: %s", opened.info.scene, error)
             self._failures += 1
-            # A single answer may be late because a large one is on the way.
-            if self._failures > 1:
+            # A single answer may be late because a large one is on the way. A server that compiles may
+            # be silent for a minute; a question to one that is gone ends at once.
+            silent = time.monotonic() - begin > 0.9 * _ANSWER_SECONDS
+            if self._failures > (_MOST_SILENT if silent and opened.info.compiling else 1):
                 self._set("lost", str(error))
             return
         self._failures = 0
@@ -162,8 +167,11 @@ class SceneLink:
         message = ""
         if not info.points:
             message = f"The scene {info.scene} holds no points."
-        elif "motion" in info.compiling:
-            message = "The server is still compiling its motion kernels: walking begins when it is done."
+        elif info.compiling:
+            message = (
+                f"The server compiles its kernels, once on this machine, for some minutes: {len(info.compiling)} "
+                f"of {len(PARTS)} parts are left. Then you can walk."
+            )
         self._set("connected", message)
 
     def _set(self, state: str, message: str) -> None:

@@ -3,12 +3,15 @@
 import logging
 import threading
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.wire.answers import Verdict
+from ...schemas.wire.answers import CollideAnswers, Verdict
+from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..cli.scene_files.spawn_search import Body, add_body, find_spawn
 from .scene_link import OpenScene
 from .user_avatar import UserAvatar
@@ -24,6 +27,28 @@ _EYES, _SIGHT, _DIRECTIONS = 0.9, 60.0, 32
 # Room that a camera behind the user takes [m].
 _BEHIND = 4.0
 _PROBE = "viewer-start"
+
+
+class _UprightScene:
+    """Scene in the page's frame, whose z is up, for the search of a place."""
+
+    def __init__(self, scene: OpenScene) -> None:
+        self._scene = scene
+
+    def info(self) -> SceneInfo:
+        """Return the scene, with bounds in the page's frame."""
+        info = self._scene.info
+        low, high = np.array(info.bounds)
+        low, high = self._scene.frame.boxes(np.eye(4)[None], low[None], high[None])
+        return structs.replace(info, bounds=[low[0].tolist(), high[0].tolist()])
+
+    def add_avatar(self, name: str, points: Any, radius: float | None = None) -> AvatarInfo:
+        """Add an avatar."""
+        return self._scene.client.add_avatar(name, points, radius)
+
+    def collide(self, name: str, poses: Any) -> CollideAnswers:
+        """Return the verdicts of poses (k, 4, 4), avatar to the page's frame."""
+        return self._scene.client.collide(name, self._scene.frame.poses_to_world(poses))
 
 
 class StartingPlaces:
@@ -59,8 +84,8 @@ class StartingPlaces:
         if self._found is not None and self._found[0] == scene.info.generation:
             return self._found[1]
         body = add_body(scene.client, {_PROBE: (self._avatar.points, self._avatar.radius)})
-        found = find_spawn(scene.client, body) if scene.info.up == (0.0, 0.0, 1.0) else None
-        place = np.array(found) if found is not None else _above(scene, body)
+        found = find_spawn(_UprightScene(scene), body)
+        place = scene.frame.to_world(found) if found is not None else _above(scene, body)
         self._found = (scene.info.generation, place)
         return place
 

@@ -57,6 +57,13 @@ class ViewFrame:
         made[:3, 3] = self.points(pose[:3, 3])
         return made
 
+    def poses_to_world(self, poses: ArrayLike) -> Floats:
+        """Return poses (k, 4, 4), anything to this frame, as ones to the world."""
+        made: Floats = np.array(poses, np.float64)
+        made[:, :3, 3] = self.to_world(made[:, :3, 3])
+        made[:, :3, :3] = self.axes.T @ made[:, :3, :3]
+        return made
+
     def standing(self, place: ArrayLike, yaw: float) -> Floats:
         """Return the pose (4, 4), avatar to world, of an avatar upright at a place of the world.
 

@@ -24,6 +24,9 @@ from .browser import PageConnection
 from .static_files import StaticFile, static_files
 
 log = logging.getLogger(__name__)
+# Of the library. A page that is frozen or asleep is regular: its end is worth no traceback.
+connection_log = logging.getLogger(f"{__name__}.connections")
+connection_log.addFilter(lambda record: record.msg != "keepalive ping failed")
 
 HOST = "127.0.0.1"
 SOCKET_PATH = "/socket"
@@ -80,6 +83,7 @@ class WebServer:
                 server_header=None,
                 ping_timeout=_STALLED_SECONDS,
                 close_timeout=1.0,
+                logger=connection_log,
             )
         except OSError as error:
             raise SolidcloudError(

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from ...schemas.wire.warming_parts import READY_LINE
+from ...schemas.wire.warming_parts import READY_LINE, SERVING_WORDS
 from ..runtime.process_heap import exempt_present_objects, give_back_large_blocks
 from ..runtime.threads import start_thread
 from ..scene_interface import ServedScene
@@ -84,7 +84,8 @@ def serve(
                 print(READY_LINE, flush=True)
 
         with _listening(scenes, dispatcher, config), _reloader(dispatcher) as wanted:
-            print(f"serving {', '.join(scene.name for scene in scenes)} at {config.listen}", flush=True)
+            names = ", ".join(scene.name for scene in scenes)
+            print(f"{SERVING_WORDS}{names} at {config.listen}", flush=True)
             rest = start_thread("warm", warm_rest)
             while signals.next() == signal.SIGHUP:
                 wanted.set()

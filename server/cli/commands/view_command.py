@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import KeyFile, needs_extra
+from .command_options import KeyFile, among, needs_extra, parse_bytes
 
 
 def view(
@@ -33,6 +33,17 @@ def view(
             help="Path whose clashes are shown: CSV file t,x,y,z,qw,qx,qy,qz, or TUM trajectory (.tum, .txt)."
         ),
     ] = None,
+    cache: Annotated[
+        str | None,
+        typer.Option(help="Memory bound of decoded voxels of the server that is started; default: 512MB."),
+    ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option(
+            help="Axis of an archive that points up: x, y or z; default: z.",
+            autocompletion=among("x", "y", "z"),
+        ),
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     key_file: KeyFile = None,
 ) -> None:
@@ -43,25 +54,44 @@ def view(
     switch the effects of a server that this command has started.
     """
     import signal
+    import sys
     import threading
     import webbrowser
     from contextlib import ExitStack
 
     with needs_extra("view"):
         from ...viewer.viewer import viewing
+    from ....schemas.errors import BadRequestError
     from ..scene_files.viewed_scene import viewed_scene
     from .viewed_server import ViewedServer
+
+    options: list[str] = []
+    if cache is not None:
+        parse_bytes(cache, "--cache")
+        options = ["--cache", cache]
+    if what is None and (cache is not None or up is not None):
+        raise BadRequestError(
+            "--cache and --up belong to a server that this command starts: name an archive or a scene file"
+        )
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     server: ViewedServer | None = None
     with ExitStack() as stack:
         if what is not None:
-            server = stack.enter_context(ViewedServer(stack.enter_context(viewed_scene(what))))
+            file = stack.enter_context(viewed_scene(what, up))
+            # Without a word until the libraries are loaded, the command seems to hang.
+            print(f"starting a server of {what}", file=sys.stderr, flush=True)
+            server = stack.enter_context(ViewedServer(file, *options))
             connect = server.endpoint
         url = stack.enter_context(
             viewing(connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server, poses=poses)
         )
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
+        if server is not None:
+            print(
+                "walk with W A S D, look by dragging; all keys are at the foot of the settings",
+                file=sys.stderr,
+            )
         if browser:
             # Some browsers return only when they are closed.
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()

@@ -12,6 +12,7 @@ from typing import Any, Self
 from ....schemas.errors import BadRequestError, SolidcloudError
 from ....schemas.scene.effect_table import effect_name
 from ....schemas.scene.scene_file import parse_scene, read_scene, scene_name
+from ....schemas.wire.warming_parts import SERVING_WORDS
 from ...report.walk.server_process import free_port, served
 from ..scene_files.scene_text import toml_value
 
@@ -23,9 +24,9 @@ class ViewedServer:
     The viewer's clients connect again by themselves, and their users continue where they were.
     """
 
-    def __init__(self, file: Path) -> None:
-        """Make a server. Raise BadRequestError for an invalid scene file."""
-        self._file, self._scene = file, read_scene(file)
+    def __init__(self, file: Path, *options: str) -> None:
+        """Make a server. options: of `solidcloud serve`. Raise BadRequestError for an invalid scene file."""
+        self._file, self._scene, self._options = file, read_scene(file), options
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.declared: Sequence[str] = [effect_name(effect) for effect in self._scene.effects]
         self._running = ExitStack()
@@ -68,7 +69,10 @@ class ViewedServer:
         """Start the server of a scene file. Raise SolidcloudError."""
         # A temporary file may have another name than the scene that clients know.
         name = scene_name(self._scene, self._file)
-        self._running.enter_context(served(file, name, endpoint=self.endpoint))
+        # The page shows the scan while kernels are compiled, which can take minutes.
+        self._running.enter_context(
+            served(file, name, *self._options, endpoint=self.endpoint, until=SERVING_WORDS)
+        )
 
 
 def scene_with_effects(file: Path, names: Collection[str]) -> str:

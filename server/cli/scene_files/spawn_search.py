@@ -19,8 +19,9 @@ _Floats = NDArray[np.float64]
 # Height of the feet above the floor [m]: the default clearance of the effect `ground`.
 CLEARANCE = 0.03
 # Columns near the middle: their number along an axis and their distance [m]. If an avatar can stand
-# in none of them, columns of the whole scene are tried.
-_NEAR_COLUMNS, _NEAR_DISTANCE = 9, 0.5
+# on one level in less than this share of them, columns of the whole scene are tried too: the few may be
+# the top of an arch or of a wall.
+_NEAR_COLUMNS, _NEAR_DISTANCE, _NEAR_SHARE = 9, 0.5, 0.2
 _ALL_COLUMNS = 15
 # Heights tried in a column are this share of the avatars' height apart, and limited in number.
 _STEP, _MAX_HEIGHTS = 0.3, 1000
@@ -86,13 +87,15 @@ def find_spawn(scene: SearchedScene, body: Body) -> tuple[float, float, float] |
         (_NEAR_COLUMNS, np.full(2, near)),
         (_ALL_COLUMNS, (high - low)[:2] / _ALL_COLUMNS),
     )
+    places: _Floats = np.empty((0, 3))
     for count, spacing in spacings:
         offsets = np.arange(count) - count // 2
         columns = np.stack(np.meshgrid(offsets * spacing[0], offsets * spacing[1]), axis=-1).reshape(-1, 2)
-        places = _standing_places(scene, body, np.round(middle + columns, 3), low[2], high[2])
-        if len(places):
-            return _choose(places, middle)
-    return None
+        found = _standing_places(scene, body, np.round(middle + columns, 3), low[2], high[2])
+        places = np.concatenate([places, found])
+        if len(places) and len(_floor(places)) >= _NEAR_SHARE * _NEAR_COLUMNS**2:
+            break
+    return _nearest(_floor(places), middle) if len(places) else None
 
 
 def _standing_places(scene: SearchedScene, body: Body, columns: _Floats, low: float, high: float) -> _Floats:
@@ -148,11 +151,15 @@ def _verdicts(
     return clear, touching
 
 
-def _choose(places: _Floats, middle: _Floats) -> tuple[float, float, float]:
-    """Return the place nearest to the middle of those on the lowest level that has many."""
+def _floor(places: _Floats) -> _Floats:
+    """Return the places on the lowest level that has many."""
     levels = np.round(places[:, 2] / _LEVEL)
     found, counts = np.unique(levels, return_counts=True)
     level = found[np.argmax(counts >= _SHARE * counts.max())]
-    on_level = places[levels == level]
-    x, y, z = on_level[np.argmin(np.hypot(*(on_level[:, :2] - middle).T))].tolist()
+    return places[levels == level]
+
+
+def _nearest(places: _Floats, middle: _Floats) -> tuple[float, float, float]:
+    """Return the place nearest to the middle."""
+    x, y, z = places[np.argmin(np.hypot(*(places[:, :2] - middle).T))].tolist()
     return round(x, 3), round(y, 3), round(z, 3)

@@ -25,6 +25,11 @@ const USER_MS = 4000;
 const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 // Radius around the camera of what is not drawn between it and the user [m].
 const CUT = 0.9;
+// A user who begins farther than this from the link's place is told so [m].
+const NOT_THERE = 0.3;
+// Shown until the first step, once for a browser.
+const HINT = ["Walk with W A S D or the arrow keys", "Look by dragging; Shift runs. All keys are at the end of the settings."];
+const HINT_TOUCH = ["Walk with the round stick", "Look by dragging; two fingers go nearer and farther."];
 
 /** Return a number without the noise of interpolation. */
 const digits = (value) => value.toFixed(5);
@@ -196,12 +201,25 @@ export class App {
     for (const listener of this.frameListeners) listener(state);
     showVerdict(this.verdict);
     showState(state);
+    if (this.entered) {
+      this.checkStart();
+      if (!settings.get("walked")) notify("hint", ...(matchMedia("(pointer: coarse)").matches ? HINT_TOUCH : HINT));
+    }
     if (first || this.entered) {
       this.entered = false;
       // The avatar faces along its y axis.
       this.rig.yaw = Math.atan2(state.pose[1][1], state.pose[0][1]);
       this.rig.started = false;
     }
+  }
+
+  /** Say why the user is not at the link's place: the server begins all users at the scene's spawn. */
+  checkStart() {
+    const { at } = this.link, place = this.place();
+    if (!at || !place || !this.scene.spawn) return;
+    const away = Math.hypot(...place.slice(0, 3).map((value, k) => value - at[k]));
+    if (away < NOT_THERE) return;
+    notify("place", "You are not at the link's place", `All users of this scene begin at its spawn, and something stops the way from there. The place is ${away.toFixed(1)} m from here: walk to it.`, "warn", 15);
   }
 
   forgetUser() {
@@ -213,6 +231,7 @@ export class App {
 
   /** Put the user back to the start, or to a place. */
   restart(at) {
+    this.link.at = at;
     this.link.send({ type: "restart", at });
   }
 
@@ -242,6 +261,10 @@ export class App {
     if (this.scene?.effects.includes("ground")) intent.up = 0;
     // Who walks looks at the user again.
     if (this.rig.watched && (intent.forward || intent.right || intent.up)) this.clash.leave();
+    if (this.state && (intent.forward || intent.right) && !settings.get("walked")) {
+      settings.set("walked", true);
+      clear("hint");
+    }
     const { watched } = this.rig;
     const firstPerson = settings.get("firstPerson") && !watched;
     this.asked = intent.forward !== 0 || intent.right !== 0 || intent.up !== 0;

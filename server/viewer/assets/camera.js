@@ -4,8 +4,10 @@ import { MathUtils, Vector3 } from "./vendor/three.module.min.js";
 
 const EYES = 0.93, SHOULDERS = 0.86;
 const NEAR = 1.2, FAR = 40;
-// Least distance of the camera from the user, and from the scan behind it [m].
-const CLOSEST = 0.7, CLEAR = 0.5;
+// Least distance to which the scan behind the user brings the camera, and of the camera from that scan
+// [m]. From nearer than this the user hides half of the picture; the camera then goes into the wall
+// instead, and what is between it and the user is not drawn.
+const CLOSEST = 1.6, CLEAR = 0.5;
 // Least distance to the right of the user: from near, it does not hide where it goes [m].
 const BESIDE = 0.3;
 
@@ -111,7 +113,8 @@ export class CameraRig {
       if (Math.abs(wanted - this.used) < 0.01) this.used = wanted;
       this.camera.position.addScaledVector(ahead, -this.used);
       // Over the shoulder: the user does not hide where it goes.
-      const right = Math.max(BESIDE, 0.07 * this.used);
+      // A high picture, as on a phone, has less room beside the user.
+      const right = Math.max(BESIDE, 0.07 * this.used) * Math.min(1, this.camera.aspect);
       this.camera.position.x += Math.sin(this.yaw) * right;
       this.camera.position.y -= Math.cos(this.yaw) * right;
       const floor = place.z + 0.12;

@@ -47,7 +47,7 @@ export class PathLine {
     this.group = group;
     this.meshes = [];
     this.version = 0;
-    this.near = 0.25;
+    this.near = 0.02;
     this.clear();
   }
 

@@ -36,7 +36,8 @@ export function addClashPanel(app) {
 
   const found = make("div");
   section.append(found);
-  slider(found, "near", "Near", { min: 0.05, max: 1, step: 0.05 }, (value) => `${value.toFixed(2)} m`);
+  // The effect `ground` keeps the feet 3 cm above the floor: a larger default calls every step near.
+  slider(found, "near", "Near", { min: 0.01, max: 1, step: 0.01 }, (value) => `${value.toFixed(2)} m`);
   const legend = make("ul", { className: "legend" });
   const list = make("ol", { id: "clash-list" });
   list.setAttribute("aria-label", "Clashes, deepest first");
@@ -49,6 +50,8 @@ export function addClashPanel(app) {
   found.append(save);
   buttons(found, ["CSV", () => clash.save("csv")], ["JSON", () => clash.save("json")], ["BCF 2.1", () => clash.save("bcf")]);
   found.lastChild.classList.add("three");
+  const cut = make("p", { id: "clash-cut" });
+  found.append(cut);
   buttons(section, ["Save the view as PNG", () => clash.savePicture()]);
   section.lastChild.classList.add("one");
 
@@ -80,6 +83,8 @@ export function addClashPanel(app) {
       item.lastChild.hidden = !own;
       if (own) item.scrollIntoView({ block: "nearest" });
     }
+    cut.hidden = !result || result.total <= result.topics;
+    if (!cut.hidden) cut.textContent = `BCF has the ${result.topics} deepest of the ${result.total.toLocaleString("en")} clashes, because each has a picture; CSV and JSON have all.`;
     back.hidden = !app.rig.watched;
     for (const button of found.querySelectorAll(".buttons button")) button.disabled = !result || state === "saving";
   });

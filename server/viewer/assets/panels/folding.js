@@ -35,7 +35,12 @@ export function instrumentsToggle(app) {
   button.addEventListener("click", () => settings.toggle("instruments"));
   app.input.actions.KeyG = () => settings.toggle("instruments");
   // On a small screen they would cover the scan.
-  if (matchMedia("(max-width: 760px)").matches) settings.set("instruments", false);
+  const small = matchMedia("(max-width: 760px)");
+  if (small.matches) settings.set("instruments", false);
+  // And there is room for one column.
+  for (const [name, other] of [["instruments", "panel"], ["panel", "instruments"]]) {
+    settings.follow(name, (open) => { if (open && small.matches) settings.set(other, false); });
+  }
   settings.follow("instruments", (open) => {
     area.hidden = !open;
     button.setAttribute("aria-expanded", String(open));

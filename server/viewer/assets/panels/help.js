@@ -16,11 +16,18 @@ const KEYS = [
   [["R", "F"], "up and down, where nothing holds you to the ground"],
 ];
 
+const TOUCH = [
+  [["stick"], "walk"],
+  [["drag"], "look"],
+  [["pinch"], "nearer, farther"],
+];
+
 export function addHelpPanel() {
   const section = panel("Keys");
   const list = document.createElement("dl");
   list.className = "keys";
-  for (const [keys, text] of KEYS) {
+  const touched = matchMedia("(pointer: coarse)").matches;
+  for (const [keys, text] of touched ? [...TOUCH, ...KEYS] : KEYS) {
     const term = document.createElement("dt");
     for (const key of keys) {
       const shown = document.createElement("kbd");

@@ -9,6 +9,7 @@ import { addHelpPanel } from "./help.js";
 import { addHierarchyPanel } from "./hierarchy.js";
 import { addPlacePanel } from "./place.js";
 import { addPlotsPanel } from "./plots.js";
+import { hintAtMore } from "./scrolling.js";
 import { addQualityPanel, addShowPanel } from "./show.js";
 import { addWalkPanel } from "./walk.js";
 
@@ -20,4 +21,5 @@ export function addPanels(app) {
   // What is going on, beside the settings.
   instrumentsToggle(app);
   for (const add of [addPlotsPanel, addEffectsPanel, addAccuracyPanel, addHierarchyPanel]) add(app);
+  for (const name of ["panel", "instruments"]) hintAtMore(document.getElementById(name));
 }

@@ -52,3 +52,11 @@ def test_box_encloses_the_corners_of_a_posed_one(rng: np.random.Generator) -> No
     corners = np.where(picks, high, low) @ turn.T + pose[:3, 3]
     assert np.allclose(frame.points(corners).min(axis=0), box_low[0])
     assert np.allclose(frame.points(corners).max(axis=0), box_high[0])
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0.2, -0.3, 0.9)])
+def test_poses_go_to_the_frame_and_back(up: tuple[float, ...]) -> None:
+    frame = ViewFrame(MAP, up)
+    poses = np.stack([frame.standing(place, yaw) for place, yaw in zip(MAP, (0.3, -2.0), strict=True)])
+    here = np.stack([frame.pose(pose) for pose in poses])
+    assert np.allclose(frame.poses_to_world(here), poses, rtol=0, atol=1e-8)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_table import effect_name
 from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.server.cli.scene_files.viewed_scene import VIEWER_EFFECTS, archive_scene, viewed_scene
@@ -26,3 +27,12 @@ def test_file_is_temporary_and_a_given_one_is_used_as_it_is(tmp_path: Path) -> N
     given = tmp_path / "scene.toml"
     with viewed_scene(given) as file:
         assert file == given
+
+
+def test_archive_that_stands_on_another_axis_is_served_with_it_up(tmp_path: Path) -> None:
+    with viewed_scene(tmp_path / "hall", "y") as file:
+        assert parse_scene(file.read_bytes(), "viewer.toml").up == (0.0, 1.0, 0.0)
+    with pytest.raises(BadRequestError, match=r"--up 'north': expected one of x, y, z"):
+        viewed_scene(tmp_path / "hall", "north").__enter__()
+    with pytest.raises(BadRequestError, match=r"write `up = \[0.0, 1.0, 0.0\]` in scene.toml"):
+        viewed_scene(tmp_path / "scene.toml", "y").__enter__()

@@ -1,6 +1,7 @@
 """One browser: reads its messages, moves its user, and sends it what it draws."""
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -50,6 +51,9 @@ _INTENT_SECONDS = 1.0
 _ENTERING = frozenset({"raycast", MOTION})
 # Distance of the outer rays between user and camera from the middle one [m].
 _BOOM_RADIUS = 0.12
+# A page that takes tiles slowly asks again for those that are on their way: a tile that was sent is sent
+# again only after this time [s].
+_AGAIN_SECONDS = 3.0
 # Changes of residency that wait for a page that takes none: a page that misses some asks again for
 # the voxels near it every few seconds.
 _MOST_CHANGES = 64
@@ -85,6 +89,7 @@ class Browser:
         self._restart = threading.Event()
         self._closed = threading.Event()
         self._wanted: list[TileKey] = []
+        self._sent: dict[TileKey, float] = {}  # when a tile was sent last [s]
         self._around: Around | None = None
         self._overview: OpenScene | None = None  # whose overview the page lacks
         self._changes: deque[bytes] = deque(maxlen=_MOST_CHANGES)
@@ -174,6 +179,7 @@ class Browser:
                     self._clash.begin()
                     with self._work:
                         self._overview = scene
+                        self._sent.clear()
                         self._work.notify_all()
             if self._restart.is_set():
                 self._restart.clear()
@@ -245,7 +251,9 @@ class Browser:
                 overview, self._overview = self._overview, None
                 around, self._around = self._around, None
                 changes = [self._changes.popleft() for _ in range(len(self._changes))]
-                key = self._wanted.pop(0) if self._wanted and around is None else None
+                key = self._next_tile() if around is None else None
+                if overview is None and around is None and key is None and not changes:
+                    self._work.wait(0.1)  # all that is wanted is on its way
             for message in changes:
                 self._send(message)
             if overview is not None:
@@ -254,6 +262,15 @@ class Browser:
                 self._attempt(partial(self._send_voxels, around), again=True)
             elif key is not None:
                 self._send_tile(key)
+
+    def _next_tile(self) -> TileKey | None:
+        """Take the most urgent tile that is not on its way to the page. The caller holds `_work`."""
+        begin = time.monotonic() - _AGAIN_SECONDS
+        for place, key in enumerate(self._wanted):
+            if self._sent.get(key, -math.inf) < begin:
+                self._sent = {each: when for each, when in self._sent.items() if when >= begin}
+                return self._wanted.pop(place)
+        return None
 
     def _send_overview(self, scene: OpenScene) -> None:
         """Send the overview of a scene."""
@@ -288,6 +305,8 @@ class Browser:
             )
         else:
             self._send(message)
+            with self._work:
+                self._sent[key] = time.monotonic()
 
     # --- messages --------------------------------------------------------------------------------
 

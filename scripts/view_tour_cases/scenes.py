@@ -22,7 +22,7 @@ _STAIRS, _FLOORS, _ABOVE = (-2.9, -2.15), (0.0, 0.45), 0.08
 
 
 # Panels without the scan behind them.
-_PLAIN = "aside, footer { background: #0f151f !important; } .more { display: none; }"
+_PLAIN = "aside, footer { background: #0f151f !important; } .more, #title { display: none; } #view { visibility: hidden; }"
 
 
 class Scene(NamedTuple):
@@ -75,7 +75,7 @@ def hierarchy(browser: Any, url: str) -> Image.Image:
 
 def plots(browser: Any, url: str) -> Image.Image:
     """Return the page with the live plots after walks before the portal."""
-    options = {**_INSTRUMENTS, "openPlots": True, "size": _LARGE, "budget": 0.8}
+    options = {**_INSTRUMENTS, "openPlots": True, "size": _LARGE, "budget": 0.5}
     with tour_page(browser, url, "1.2,-11,0.1,97", **options) as page:
         pace(page)
         return page.picture(bare=False)
@@ -148,7 +148,7 @@ def panel_pictures(browser: Any, url: str, folder: Path) -> list[Path]:
 
     def write(name: str, image: Image.Image) -> None:
         path = folder / f"{name}.png"
-        image.quantize(128, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(path, optimize=True)
+        image.quantize(200, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
         written.append(path)
 
     # A high page, on which no panel scrolls, and which is not a small screen with one column.

@@ -13,7 +13,10 @@ from PIL import Image
 SIZE = (1280, 720)
 # A graphics card is not needed: SwiftShader draws.
 OPTIONS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
-PATIENCE = 240.0
+# A server may compile its kernels first [s].
+PATIENCE = 600.0
+# Around the picture of a part of the page [pixels].
+_MARGIN = 12
 # Radians of a pixel by which the pointer drags the view (assets/input.js).
 _PER_PIXEL = 0.0042
 # All of a new user's settings that a scene changes; the pictures have many points.
@@ -32,7 +35,10 @@ class TourPage:
         end = time.monotonic() + PATIENCE
         while not self.read(f"Boolean({expression})"):
             if time.monotonic() > end:
-                raise TimeoutError(f"{self.page.url}: {expression} does not hold after {PATIENCE:g} s")
+                state = self.read("[s.place, s.verdict, s.missing, s.shown, s.fps, s.notices]")
+                raise TimeoutError(
+                    f"{self.page.url}: {expression} does not hold after {PATIENCE:g} s; the page has {state}"
+                )
             self.page.wait_for_timeout(50)
 
     def read(self, expression: str) -> Any:
@@ -82,8 +88,13 @@ class TourPage:
         return image
 
     def panel(self, selector: str) -> Image.Image:
-        """Return the picture of one part of the page."""
-        return _image(self.page.locator(selector).first.screenshot())
+        """Return the picture of one part of the page, with a margin."""
+        part = self.page.locator(selector).first
+        part.scroll_into_view_if_needed()
+        box = part.bounding_box()
+        clip = {name: box[name] - _MARGIN for name in ("x", "y")}
+        clip |= {name: box[name] + 2 * _MARGIN for name in ("width", "height")}
+        return _image(self.page.screenshot(clip=clip))
 
 
 @contextmanager

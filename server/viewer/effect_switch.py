@@ -1,4 +1,4 @@
-"""Which effects a scene runs, and whether the viewer may switch them.
+"""Effects that a scene runs, and the viewer's switch for them.
 
 A session cannot skip effects, and a server reads a scene's effects when it opens it. Effects of a
 server that the viewer has not started are therefore shown only.

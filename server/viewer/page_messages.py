@@ -43,7 +43,7 @@ class Hello(msgspec.Struct, frozen=True, tag="hello"):
 
 
 class Intent(msgspec.Struct, frozen=True, tag="intent"):
-    """What the user wants to do, until the next message.
+    """Motion that the user wants, until the next message.
 
     forward, right, up: shares of the speed, relative to the view.  yaw: direction of the view about
     the up axis [rad].  face: turn towards the view, also while standing.

@@ -1,4 +1,4 @@
-"""What the panels of one browser ask for: statistics, measurements of the user's pose, spheres near it."""
+"""Work for the panels of one browser: statistics, measurements of the user's pose, spheres near it."""
 
 import threading
 from collections import deque

@@ -25,7 +25,7 @@ _SEARCH_SECONDS = 0.5
 
 
 class LinkStatus(NamedTuple):
-    """What is known of the server.
+    """State of the connection to the server.
 
     number: grows with every change.  state: "searching" before a server was found, "connected", or
     "lost".  message: a sentence for the user, "" if all is well.
@@ -80,7 +80,7 @@ class SceneLink:
 
     @property
     def status(self) -> LinkStatus:
-        """Return what is known of the server."""
+        """Return the state of the connection to the server."""
         return self._status
 
     @property

@@ -1,4 +1,4 @@
-"""Where a user begins: the scene's spawn, or a place where the avatar stands free on a floor."""
+"""Starting place of a user: the scene's spawn, or a place where the avatar stands free on a floor."""
 
 import logging
 import threading

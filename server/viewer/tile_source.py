@@ -1,4 +1,4 @@
-"""What the page draws, as messages: overview, tiles, voxels. Tiles are kept for all browsers, within a budget."""
+"""Messages with what the page draws: overview, tiles, voxels. Tiles are kept for all browsers, within a budget."""
 
 import threading
 from collections import OrderedDict

@@ -1,4 +1,4 @@
-"""What the browsers of one viewer share: the scene, the avatar, tiles, and where the users are."""
+"""Parts that the browsers of one viewer share: the scene, the avatar, tiles, and the users' places."""
 
 import threading
 from itertools import count
@@ -19,7 +19,7 @@ from .voxel_spheres import SphereSource
 
 
 class UserPlace(NamedTuple):
-    """Where a user is.
+    """Place of a user.
 
     place: world [m].  pose: rows of a 4 x 4 matrix, avatar to the page's frame.  verdict: of it.
     """
@@ -80,7 +80,7 @@ class Users:
 
 
 class ViewerParts(NamedTuple):
-    """What the browsers of one viewer share.
+    """Parts that the browsers of one viewer share.
 
     path: whose clashes each page shows from the beginning, or None.
     """

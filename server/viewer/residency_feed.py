@@ -1,15 +1,13 @@
 """Changes of which voxels are in the server's memory, from one stream for all browsers."""
 
 import logging
-import threading
 from collections.abc import Callable
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
 from ...schemas.errors import SolidcloudError
 from ...schemas.wire.residency_messages import ResidencyChanges
+from .browser_feed import BrowserFeed
 from .page_messages import binary_message
 from .scene_link import OpenScene
 
@@ -20,36 +18,13 @@ log = logging.getLogger(__name__)
 _SILENT_SECONDS, _RETRY_SECONDS = 1.0, 0.5
 
 
-class ResidencyFeed:
+class ResidencyFeed(BrowserFeed[bytes]):
     """Stream of changes that browsers follow; a context manager, thread-safe."""
 
     def __init__(self, scene: Callable[[], OpenScene | None]) -> None:
         """Make a feed. scene: returns the scene that is shown."""
+        super().__init__("viewer-residency")
         self._scene = scene
-        self._listeners: dict[int, Callable[[bytes], None]] = {}
-        self._lock = threading.Lock()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="viewer-residency", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def follow(self, number: int, listener: Callable[[bytes], None]) -> None:
-        """Call a function with the message of each change, from the feed's thread; it must not wait."""
-        with self._lock:
-            self._listeners[number] = listener
-
-    def leave(self, number: int) -> None:
-        """Forget the function of a browser."""
-        with self._lock:
-            self._listeners.pop(number, None)
 
     def _run(self) -> None:
         """Read the stream for as long as browsers follow. Runs in a thread."""
@@ -66,13 +41,6 @@ class ResidencyFeed:
                                 break
             except SolidcloudError as error:
                 log.debug("no changes of residency: %s", error)
-
-    def _tell(self, message: bytes) -> None:
-        """Give a message to all browsers."""
-        with self._lock:
-            listeners = list(self._listeners.values())
-        for listener in listeners:
-            listener(message)
 
 
 def residency_message(changes: ResidencyChanges) -> bytes:

@@ -5,13 +5,13 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire.scene_messages import SceneInfo
 from ..client import Client
 from ..zenoh_client.server_connection import scenes_at
+from .browser_feed import BackgroundThread
 from .view_frame import ViewFrame
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class OpenScene(NamedTuple):
     reader: Client
 
 
-class SceneLink:
+class SceneLink(BackgroundThread):
     """Connection to the scene that the viewer shows; a context manager, thread-safe.
 
     It is kept when the server is lost: the clients connect again by themselves.
@@ -59,24 +59,13 @@ class SceneLink:
 
     def __init__(self, endpoint: str, scene: str | None = None, key_file: Path | None = None) -> None:
         """Make a link. scene: None: the only one at the endpoint."""
+        super().__init__("viewer-link")
         self.endpoint = endpoint
         self._scene, self._key_file = scene, key_file
         self._changed = threading.Condition()
-        self._stop = threading.Event()
         self._status = LinkStatus(0, "searching", f"Looking for a server at {endpoint}.")
         self._failures = 0  # questions without an answer since the last answer
         self._open: OpenScene | None = None
-        self._thread = threading.Thread(target=self._run, name="viewer-link", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
 
     @property
     def status(self) -> LinkStatus:

@@ -1,15 +1,14 @@
 """Statistics of the scene over the last minute, asked once a second for all browsers."""
 
 import logging
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from ...schemas.errors import SolidcloudError
 from ...schemas.wire.stats import StatsAnswer
+from .browser_feed import BrowserFeed
 from .page_messages import text_message
 from .scene_link import OpenScene
 
@@ -29,41 +28,20 @@ class Reading(NamedTuple):
     stats: StatsAnswer
 
 
-class StatisticsFeed:
+class StatisticsFeed(BrowserFeed[str]):
     """Samples that browsers follow; a context manager, thread-safe."""
 
     def __init__(self, scene: Callable[[], OpenScene | None], interval: float = _INTERVAL) -> None:
         """Make a feed. scene: returns the scene that is shown.  interval: of the samples [s]."""
+        super().__init__("viewer-statistics")
         self._scene, self._interval = scene, interval
         self._samples: deque[dict[str, Any]] = deque(maxlen=_KEPT)
-        self._listeners: dict[int, Callable[[str], None]] = {}
-        self._lock = threading.Lock()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="viewer-statistics", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
 
     def follow(self, number: int, listener: Callable[[str], None]) -> None:
-        """Call a function with the samples so far, and with each later one; it must not wait.
-
-        number: of the browser.
-        """
+        """Call a function with the samples so far, and with each later one."""
         with self._lock:
-            self._listeners[number] = listener
+            super().follow(number, listener)
             listener(text_message("statistics", all=True, samples=list(self._samples)))
-
-    def leave(self, number: int) -> None:
-        """Forget the function of a browser."""
-        with self._lock:
-            self._listeners.pop(number, None)
 
     def _run(self) -> None:
         """Ask once in each interval, while browsers follow. Runs in a thread."""
@@ -74,7 +52,7 @@ class StatisticsFeed:
                 continue
             now = self._read()
             if now is not None and before is not None:
-                self._tell(sample(before, now))
+                self._keep(sample(before, now))
             before = now
 
     def _read(self) -> Reading | None:
@@ -91,15 +69,13 @@ class StatisticsFeed:
         end = time.monotonic()
         return Reading(end, end - begin, stats)
 
-    def _tell(self, made: dict[str, Any] | None) -> None:
+    def _keep(self, made: dict[str, Any] | None) -> None:
         """Keep a sample, and give it to all browsers."""
         if made is None:
             return
         with self._lock:
             self._samples.append(made)
-            message = text_message("statistics", all=False, samples=[made])
-            for listener in self._listeners.values():
-                listener(message)
+            self._tell(text_message("statistics", all=False, samples=[made]))
 
 
 def sample(before: Reading, now: Reading) -> dict[str, Any] | None:

@@ -5,6 +5,7 @@ import stat
 from pathlib import Path
 
 import pytest
+from forged_archives import forge
 from sealed_archives import key_file
 from solidcloud.schemas.archive.seal import read_archive_key, write_new_key
 from solidcloud.schemas.errors import BadRequestError
@@ -51,3 +52,11 @@ def test_the_commands_seal_and_validate(
     for wrong in ([str(copy)], ["--key", keys[0]], [str(copy), "--new-key", str(tmp_path / "c.key")], []):
         assert run(["seal", *wrong]) != 0
     assert not (tmp_path / "c.key").exists()
+
+
+def test_validate_compares_digests_without_a_key(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from solidcloud.server.cli.main import run
+
+    forge(copy, lambda columns: columns["record_digest"].__setitem__((0, 1), 0))
+    assert run(["validate", str(copy)]) == 3
+    assert "points that are not those sealed" in capsys.readouterr().err

@@ -86,11 +86,12 @@ ALLOWED = {
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (
-        "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency "
-        "cli/output archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
+        "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars "
+        "cli/output simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
         "report/accuracy report/common report/load/runs report/load report/walk viewer"
     ),
-    "server/cli": "cli/commands cli/output",
+    "server/cli/commands/archives": "archives cli/commands cli/input cli/output client.py residency",
+    "server/cli": "cli/commands cli/commands/archives cli/output",
     "server/api": "client.py scene.py",
 }
 

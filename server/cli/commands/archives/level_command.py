@@ -1,7 +1,7 @@
 """`solidcloud level`: write the level of detail of an existing archive."""
 
+from ..command_options import ArchivePath, interruptible, parse_bytes
 from .add_remove_command import Jobs, Memory
-from .command_options import ArchivePath, interruptible, parse_bytes
 
 
 def level(archive: ArchivePath, jobs: Jobs = 0, memory: Memory = "2GB") -> None:
@@ -9,9 +9,9 @@ def level(archive: ArchivePath, jobs: Jobs = 0, memory: Memory = "2GB") -> None:
 
     Builds write one, unless --no-level is given; archives of earlier versions have none.
     """
-    from ....builder.edit.renew_level import renew_level
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+    from .....builder.edit.renew_level import renew_level
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     with (
         interruptible(lambda: f"{archive} is what it was"),

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, interruptible, print_error, print_json, print_warning
+from ..command_options import AsJson, interruptible, print_error, print_json, print_warning
 
 if TYPE_CHECKING:
-    from ....builder.plan.stray_points import StrayPoints
-    from ....builder.sources.scan_list import ScanEntry
+    from .....builder.plan.stray_points import StrayPoints
+    from .....builder.sources.scan_list import ScanEntry
 
 DEFAULT_LIST = Path("scans.toml")
 
@@ -48,11 +48,11 @@ def inspect(
     """
     from dataclasses import replace
 
-    from ....builder.sources.scan_files import inspect_scans
-    from ....builder.sources.scan_list import write_scan_list
-    from ....schemas.errors import BadRequestError
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+    from .....builder.sources.scan_files import inspect_scans
+    from .....builder.sources.scan_list import write_scan_list
+    from .....schemas.errors import BadRequestError
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     if output and output.exists() and not overwrite:
         raise BadRequestError(f"{output}: exists, expected no such file: give another -o, or --overwrite")
@@ -60,7 +60,7 @@ def inspect(
     with progress_listener() as bars:
         entries = inspect_scans(scans, with_sha256=with_sha256, progress=bars)
         if stray:
-            from ....builder.plan.stray_points import find_stray_points
+            from .....builder.plan.stray_points import find_stray_points
 
             with interruptible():
                 found = find_stray_points(entries, bars)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, print_error, print_json
+from ..command_options import ArchivePath, AsJson, print_error, print_json
 
 
 def info(archive: ArchivePath, as_json: AsJson = False) -> None:
@@ -16,12 +16,12 @@ def info(archive: ArchivePath, as_json: AsJson = False) -> None:
     """
     import msgspec
 
-    from ....builder.passes.archive_summary import summarize_archive
-    from ....schemas.archive.radius_model import radius_distribution
-    from ...archives.archive_info import describe
-    from ...residency.voxel_store import VoxelStore
-    from ..output.archive_facts import archive_details, detail_facts, print_summary
-    from ..output.console import print_info
+    from .....builder.passes.archive_summary import summarize_archive
+    from .....schemas.archive.radius_model import radius_distribution
+    from ....archives.archive_info import describe
+    from ....residency.voxel_store import VoxelStore
+    from ...output.archive_facts import archive_details, detail_facts, print_summary
+    from ...output.console import print_info
 
     store = VoxelStore(archive)
     found = describe(store, archive.resolve().name)
@@ -57,10 +57,10 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Check every record of an archive. Exit code 3 if one is broken."""
-    from ....builder.passes.verify import verify_archive, verify_jobs
-    from ....builder.run.executor import ProcessExecutor
-    from ....schemas.archive.seal import read_archive_key
-    from ..output.progress_display import progress_listener
+    from .....builder.passes.verify import verify_archive, verify_jobs
+    from .....builder.run.executor import ProcessExecutor
+    from .....schemas.archive.seal import read_archive_key
+    from ...output.progress_display import progress_listener
 
     key = None if archive_key is None else read_archive_key(archive_key)
     jobs = verify_jobs(archive, jobs, deep=deep, exact=exact)

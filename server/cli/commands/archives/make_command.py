@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from ....schemas.errors import BadRequestError
-from .command_options import interruptible, needs_extra
+from .....schemas.errors import BadRequestError
+from ..command_options import interruptible, needs_extra
 
 ScanOutput = Annotated[
     Path,
@@ -33,9 +33,9 @@ def make_facade(
     """
     _check_new(output, overwrite)
     with needs_extra("made"):
-        from ....builder.synthetic.scenes import make_facade as make_it
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+        from .....builder.synthetic.scenes import make_facade as make_it
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     with interruptible(), naming_write_errors(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, door=door, progress=bars.made)
@@ -57,9 +57,9 @@ def make_town(
     """
     _check_new(output, overwrite)
     with needs_extra("made"):
-        from ....builder.synthetic.scenes import make_town as make_it
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+        from .....builder.synthetic.scenes import make_town as make_it
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     with interruptible(), naming_write_errors(output), progress_listener() as bars:
         made = make_it(output, points=points, seed=seed, progress=bars.made)
@@ -81,9 +81,9 @@ def make_office(
     """
     _check_new(output, overwrite)
     with needs_extra("made"):
-        from ....builder.synthetic.office import make_office as make_it
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+        from .....builder.synthetic.office import make_office as make_it
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     with interruptible(), naming_write_errors(output), progress_listener() as bars:
         made = make_it(output, seed=seed, progress=bars.made)
@@ -99,8 +99,8 @@ def make_figure(
 ) -> None:
     """Make an avatar: a human figure in mid-stride."""
     _check_new(output, overwrite)
-    from ....builder.synthetic.figure import figure_points, write_figure
-    from ....schemas.process.os_errors import naming_write_errors
+    from .....builder.synthetic.figure import figure_points, write_figure
+    from .....schemas.process.os_errors import naming_write_errors
 
     with interruptible(), naming_write_errors(output):
         write_figure(output, figure_points(points, seed, height))
@@ -119,10 +119,10 @@ def make_walk(
     reads them.
     """
     _check_new(output, overwrite)
-    from ....builder.synthetic.truth import read_truth
-    from ....builder.synthetic.walk import walk_poses
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..input.pose_file import write_poses
+    from .....builder.synthetic.truth import read_truth
+    from .....builder.synthetic.walk import walk_poses
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...input.pose_file import write_poses
 
     with interruptible(), naming_write_errors(output):
         write_poses(output, *walk_poses(read_truth(truth).facades[0], frames))

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .command_options import AsJson, interruptible, parse_bytes, print_json, print_warning
+from ..command_options import AsJson, interruptible, parse_bytes, print_json, print_warning
 
 if TYPE_CHECKING:
-    from ....builder.plan.build_plan import BuildPlan, Limit
+    from .....builder.plan.build_plan import BuildPlan, Limit
 
 
 def plan(
@@ -64,11 +64,11 @@ def plan(
 
     Prints bytes, memory, time by stage, and the limits that would stop the build.
     """
-    from ....builder.config import BuildConfig
-    from ....builder.plan.build_plan import estimate, hypothetical_scene
-    from ....builder.plan.rates import load_rates
-    from ....schemas.errors import BadRequestError
-    from ..output.progress_display import progress_listener
+    from .....builder.config import BuildConfig
+    from .....builder.plan.build_plan import estimate, hypothetical_scene
+    from .....builder.plan.rates import load_rates
+    from .....schemas.errors import BadRequestError
+    from ...output.progress_display import progress_listener
 
     if bool(scans) == (points is not None):
         raise BadRequestError("expected either scans or --points with a number")
@@ -86,7 +86,7 @@ def plan(
     )
     rates = load_rates()
     if measure:
-        from ....builder.plan.measure_rates import measure_rates
+        from .....builder.plan.measure_rates import measure_rates
 
         with interruptible(), progress_listener() as bars:
             rates = measure_rates(rates, bars)
@@ -95,7 +95,7 @@ def plan(
             hypothetical_scene(_number(points), rates, density, number_of_scans), config, rates, output
         )
     else:
-        from ....builder.plan.scan_sample import plan_build
+        from .....builder.plan.scan_sample import plan_build
 
         found = plan_build(scans or [], config, output, rates, quick=quick)
     print_plan(found, as_json)
@@ -103,7 +103,7 @@ def plan(
 
 def print_plan(plan: "BuildPlan", as_json: bool) -> None:
     """Print a plan, and its warnings on standard error."""
-    from ..output.console import print_facts
+    from ...output.console import print_facts
 
     if as_json:
         print_json(plan.as_json())
@@ -115,7 +115,7 @@ def print_plan(plan: "BuildPlan", as_json: bool) -> None:
 
 def _number(text: str) -> int:
     """Parse a number of points, such as 1e9 or 1_000_000. Raises BadRequestError if invalid."""
-    from ....schemas.errors import BadRequestError
+    from .....schemas.errors import BadRequestError
 
     try:
         value = int(float(text))
@@ -128,7 +128,7 @@ def _number(text: str) -> int:
 
 def plan_facts(plan: "BuildPlan") -> Iterator[tuple[str, str]]:
     """Yield the names and values that describe a plan."""
-    from ..output.console import bytes_text
+    from ...output.console import bytes_text
 
     yield "points", f"{plan.points:,} of {plan.scans:,} scans, {plan.density:,.0f} per square metre"
     yield (
@@ -161,7 +161,7 @@ def plan_facts(plan: "BuildPlan") -> Iterator[tuple[str, str]]:
 
 def _limit_text(limit: "Limit") -> str:
     """Format a limit, with advice if it binds."""
-    from ..output.console import bytes_text
+    from ...output.console import bytes_text
 
     found, most = (
         bytes_text(value) if limit.unit == "bytes" else f"{value:,.0f}" for value in (limit.found, limit.most)

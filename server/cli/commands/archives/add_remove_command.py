@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .command_options import (
+from ..command_options import (
     ArchivePath,
     AsJson,
     KeyFile,
@@ -16,7 +16,7 @@ from .command_options import (
 )
 
 if TYPE_CHECKING:
-    from ....builder.edit.rebuild_voxels import ChangeSummary
+    from .....builder.edit.rebuild_voxels import ChangeSummary
 
 Jobs = Annotated[int, typer.Option(help="Worker processes; 0: one per core, fewer for little work.")]
 Memory = Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")]
@@ -45,9 +45,9 @@ def add(
 
     The result is a new generation, which a running server serves after solidcloud reload.
     """
-    from ....builder.edit.edit_archive import add_scans
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+    from .....builder.edit.edit_archive import add_scans
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     with (
         interruptible(lambda: _archive_state(archive)),
@@ -82,9 +82,9 @@ def remove(
     built again. The result is a new generation, which a running server serves after solidcloud
     reload.
     """
-    from ....builder.edit.edit_archive import remove_scans
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.progress_display import progress_listener
+    from .....builder.edit.edit_archive import remove_scans
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.progress_display import progress_listener
 
     with (
         interruptible(lambda: _archive_state(archive)),
@@ -99,8 +99,8 @@ def remove(
 
 def _archive_state(archive: Path) -> str:
     """Return a sentence about the state of an archive after a change to it was interrupted."""
-    from ....schemas.archive.archive import Archive
-    from ....schemas.errors import FormatError
+    from .....schemas.archive.archive import Archive
+    from .....schemas.errors import FormatError
 
     try:
         with Archive(archive) as held:
@@ -124,7 +124,7 @@ def _print(summary: "ChangeSummary", what: str, as_json: bool) -> None:
             }
         )
         return
-    from ..output.console import bytes_text, length_text, print_facts
+    from ...output.console import bytes_text, length_text, print_facts
 
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in summary.stages.items())
     dead = f", {bytes_text(summary.dead_bytes)} unused in older shards" if summary.dead_bytes else ""
@@ -158,7 +158,7 @@ def reload(
     """
     import msgspec
 
-    from ...client import Client
+    from ....client import Client
 
     with Client(connect, scene=scene, key_file=key_file) as client:
         answer = client.reload()

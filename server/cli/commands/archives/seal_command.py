@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import interruptible
+from ..command_options import interruptible
 
 
 def seal(
@@ -26,11 +26,11 @@ def seal(
     Readers with the key find every change. Adding or removing scans removes the seal, and writing
     another level of detail removes that of the level: seal the archive again.
     """
-    from ....schemas.archive.seal import MIN_KEY_BYTES, read_archive_key, write_new_key
-    from ....schemas.errors import BadRequestError
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.console import bytes_text
-    from ..output.progress_display import progress_listener
+    from .....schemas.archive.seal import MIN_KEY_BYTES, read_archive_key, write_new_key
+    from .....schemas.errors import BadRequestError
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.console import bytes_text
+    from ...output.progress_display import progress_listener
 
     if (new_key is None) == (key is None) or (archive is None) != (key is None):
         raise BadRequestError("expected ARCHIVE and --key FILE, to seal it, or --new-key FILE alone")
@@ -39,7 +39,7 @@ def seal(
             write_new_key(new_key)
         print(f"{new_key}: a key of {MIN_KEY_BYTES} random bytes, which only you can read")
         return
-    from ....builder.edit.seal_archive import seal_archive
+    from .....builder.edit.seal_archive import seal_archive
 
     assert archive is not None and key is not None
     secret = read_archive_key(key)

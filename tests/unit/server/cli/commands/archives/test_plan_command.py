@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solidcloud.server.cli.commands.plan_command import time_text
+from solidcloud.server.cli.commands.archives.plan_command import time_text
 from solidcloud.server.cli.main import run
 from synthetic_scans import write_las
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ....builder.sources.format_table import FORMATS
-from ....schemas.process.own_command import own_command
-from .command_options import AsJson, among, interruptible, parse_bytes, print_json, print_warning
+from .....builder.sources.format_table import FORMATS
+from .....schemas.process.own_command import own_command
+from ..command_options import AsJson, among, interruptible, parse_bytes, print_json, print_warning
 
 if TYPE_CHECKING:
-    from ....builder.config import BuildConfig
-    from ....builder.pipeline import BuildSummary
+    from .....builder.config import BuildConfig
+    from .....builder.pipeline import BuildSummary
 
 Scans = Annotated[
     list[Path],
@@ -121,12 +121,12 @@ def build(
     as_json: AsJson = False,
 ) -> None:
     """Build one archive from scans. The same command resumes an interrupted build."""
-    from ....builder.resume.lock import check_free
+    from .....builder.resume.lock import check_free
 
     if not dry_run:
         check_free(output)  # before loading numba, which takes a second
-    from ....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_radius, parse_rule
-    from ....schemas.errors import BadRequestError
+    from .....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_radius, parse_rule
+    from .....schemas.errors import BadRequestError
 
     if cell_points is not None and leaf_cells is not None:
         raise BadRequestError(
@@ -168,13 +168,13 @@ def build(
 
 def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: bool, as_json: bool) -> None:
     """Build the archive and print its summary."""
-    from ....builder.passes.archive_summary import summarize_archive
-    from ....builder.pipeline import build_archive
-    from ....schemas.archive.archive import Archive
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.archive_facts import print_summary
-    from ..output.console import print_build
-    from ..output.progress_display import progress_listener
+    from .....builder.passes.archive_summary import summarize_archive
+    from .....builder.pipeline import build_archive
+    from .....schemas.archive.archive import Archive
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.archive_facts import print_summary
+    from ...output.console import print_build
+    from ...output.progress_display import progress_listener
 
     built: list[BuildSummary] = []
     said: set[str] = set()
@@ -219,7 +219,7 @@ def _build(scans: list[Path], output: Path, config: "BuildConfig", log_json: boo
 
 def _kept_work(output: Path) -> str:
     """Return a sentence about the files that an interrupted build leaves."""
-    from ....builder.resume.kept_work import building_folder
+    from .....builder.resume.kept_work import building_folder
 
     folder = building_folder(output)
     if folder.exists():
@@ -229,10 +229,10 @@ def _kept_work(output: Path) -> str:
 
 def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_json: bool) -> None:
     """Print the estimated cost of a build."""
-    from ....builder.plan.build_plan import estimate
-    from ....builder.plan.rates import load_rates
-    from ....builder.plan.scan_sample import sample_scene
-    from ....builder.sources.scan_files import open_input_files
+    from .....builder.plan.build_plan import estimate
+    from .....builder.plan.rates import load_rates
+    from .....builder.plan.scan_sample import sample_scene
+    from .....builder.sources.scan_files import open_input_files
     from .plan_command import print_plan
 
     with interruptible():

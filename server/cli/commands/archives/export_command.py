@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, AsJson, among, interruptible, needs_extra, print_json
+from ..command_options import ArchivePath, AsJson, among, interruptible, needs_extra, print_json
 
 
 def export(
@@ -36,10 +36,10 @@ def export(
     Coordinates equal those in the archive, bit for bit. Intensity and scan number are written if
     stored.
     """
-    from ....builder.export.export_archive import export_archive
-    from ....schemas.process.os_errors import naming_write_errors
-    from ..output.archive_facts import print_export
-    from ..output.progress_display import progress_listener
+    from .....builder.export.export_archive import export_archive
+    from .....schemas.process.os_errors import naming_write_errors
+    from ...output.archive_facts import print_export
+    from ...output.progress_display import progress_listener
 
     with interruptible(), needs_extra("readers"), naming_write_errors(output), progress_listener() as bars:
         done = export_archive(archive, output, box=box, form=form, overwrite=overwrite, progress=bars)

@@ -82,7 +82,10 @@ ALLOWED = {
     "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/clash": "scene_interface.py",
-    "server/viewer": "avatars clash client.py cli/input cli/scene_files zenoh_client",
+    "server/viewer/feeds": "client.py viewer/page zenoh_client",
+    "server/viewer/users": "avatars cli/scene_files viewer/feeds viewer/page zenoh_client",
+    "server/viewer/panels": "cli/input viewer/feeds viewer/page",
+    "server/viewer": "clash client.py viewer/feeds viewer/page viewer/panels viewer/users",
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (
@@ -100,7 +103,7 @@ ALLOWED = {
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
-    "server/viewer": ("builder/synthetic/figure",),
+    "server/viewer/users": ("builder/synthetic/figure",),
     "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
@@ -144,7 +147,7 @@ DOORS = {
     "PIL": ("server/report/",),
     "scipy": ("server/report/accuracy/measurement/",),
     "typer": ("server/cli/main.py", "server/cli/commands/"),
-    "websockets": ("server/viewer/web_server.py",),
+    "websockets": ("server/viewer/page/web_server.py",),
     "rich": ("server/cli/output/", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.

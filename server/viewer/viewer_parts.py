@@ -7,15 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .effect_switch import EffectSwitch
-from .path_source import GivenPath
-from .residency_feed import ResidencyFeed
-from .scene_link import SceneLink
-from .starting_place import StartingPlaces
-from .statistics_feed import StatisticsFeed
-from .tile_source import TileSource
-from .user_avatar import UserAvatar
-from .voxel_spheres import SphereSource
+from .feeds.residency_feed import ResidencyFeed
+from .feeds.scene_link import SceneLink
+from .feeds.statistics_feed import StatisticsFeed
+from .feeds.tile_source import TileSource
+from .panels.effect_switch import EffectSwitch
+from .panels.path_source import GivenPath
+from .panels.voxel_spheres import SphereSource
+from .users.starting_place import StartingPlaces
+from .users.user_avatar import UserAvatar
 
 
 class UserPlace(NamedTuple):

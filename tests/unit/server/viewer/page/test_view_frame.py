@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.server.viewer.view_frame import ViewFrame
+from solidcloud.server.viewer.page.view_frame import ViewFrame
 
 MAP = [[4_465_000.25, 5_330_000.5, 510.0], [4_465_040.0, 5_330_060.0, 530.0]]
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.wire.overview_messages import OverviewAnswer
-from ...schemas.wire.tile_messages import MAX_DETAIL, TileAnswer, VoxelsAnswer
-from .page_messages import Place, TileKey, binary_message
+from ....schemas.wire.overview_messages import OverviewAnswer
+from ....schemas.wire.tile_messages import MAX_DETAIL, TileAnswer, VoxelsAnswer
+from ..page.page_messages import Place, TileKey, binary_message
+from ..page.view_frame import ViewFrame
 from .scene_link import OpenScene
-from .view_frame import ViewFrame
 
 # Memory for tiles that a browser may ask for again [bytes].
 TILE_BYTES = 192 << 20

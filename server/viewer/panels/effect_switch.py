@@ -8,9 +8,9 @@ import inspect
 from collections.abc import Sequence
 from typing import Protocol, get_args
 
-from ...schemas.errors import BadRequestError
-from ...schemas.scene.effect_table import AnyEffect
-from .page_messages import text_message
+from ....schemas.errors import BadRequestError
+from ....schemas.scene.effect_table import AnyEffect
+from ..page.page_messages import text_message
 
 _KINDS = {str(kind.__struct_config__.tag): kind for kind in get_args(AnyEffect)}
 

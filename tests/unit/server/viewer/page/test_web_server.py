@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError, SolidcloudError
-from solidcloud.server.viewer.browser import PageConnection
-from solidcloud.server.viewer.web_server import MAX_BROWSERS, MAX_MESSAGE_BYTES, WebServer
+from solidcloud.server.viewer.page.page_messages import PageConnection
+from solidcloud.server.viewer.page.web_server import MAX_BROWSERS, MAX_MESSAGE_BYTES, WebServer
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

@@ -6,9 +6,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.wire.motion_messages import State
-from .page_messages import Intent
-from .view_frame import ViewFrame
+from ....schemas.wire.motion_messages import State
+from ..page.page_messages import Intent
+from ..page.view_frame import ViewFrame
 
 # Speeds of a person who walks and runs [m/s].
 WALK_SPEED, RUN_SPEED = 1.6, 4.0

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers
-from solidcloud.server.viewer.pose_measurement import MEASURED_REACH, measured_message
+from solidcloud.server.viewer.panels.pose_measurement import MEASURED_REACH, measured_message
 
 
 def cost(tolerance: float, seconds: float) -> dict[str, Any]:

@@ -7,12 +7,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
-from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.wire.scene_messages import SceneInfo
-from ..client import Client
-from ..zenoh_client.server_connection import scenes_at
+from ....schemas.errors import BadRequestError, SolidcloudError
+from ....schemas.wire.scene_messages import SceneInfo
+from ...client import Client
+from ...zenoh_client.server_connection import scenes_at
+from ..page.view_frame import ViewFrame
 from .browser_feed import BackgroundThread
-from .view_frame import ViewFrame
 
 log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from page_arrays import decoded
 from solidcloud.schemas.wire.tile_messages import MAX_SPHERE_LEVEL, TileAnswer, VoxelsAnswer
-from solidcloud.server.viewer.view_frame import ViewFrame
-from solidcloud.server.viewer.voxel_spheres import SphereSource, nearest
+from solidcloud.server.viewer.page.view_frame import ViewFrame
+from solidcloud.server.viewer.panels.voxel_spheres import SphereSource, nearest
 
 DEPTH = 3
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from page_arrays import decoded
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.viewer.page_messages import (
+from solidcloud.server.viewer.page.page_messages import (
     Hello,
     Intent,
     Want,

@@ -2,9 +2,9 @@
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError
-from solidcloud.server.viewer import path_source
-from solidcloud.server.viewer.page_messages import PathText
-from solidcloud.server.viewer.path_source import PathParts
+from solidcloud.server.viewer.page.page_messages import PathText
+from solidcloud.server.viewer.panels import path_source
+from solidcloud.server.viewer.panels.path_source import PathParts
 
 TEXT = "t,x,y,z,qw,qx,qy,qz\n0.5,1,2,3,1,0,0,0\n1.5,4,5,6,1,0,0,0\n"
 

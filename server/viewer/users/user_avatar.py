@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...builder.synthetic.figure import figure_points
-from ..avatars.avatar_shape import avatar_shape
+from ....builder.synthetic.figure import figure_points
+from ...avatars.avatar_shape import avatar_shape
 
 # Points of the generated figure: enough for a round body, and found in a moment.
 FIGURE_POINTS = 1500

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.viewer.effect_switch import NoSwitch, effects_message
+from solidcloud.server.viewer.panels.effect_switch import NoSwitch, effects_message
 
 
 def test_effects_that_run_and_that_can_be_switched_on() -> None:

@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from ...schemas.errors import SolidcloudError
-from ...schemas.wire.stats import StatsAnswer
+from ....schemas.errors import SolidcloudError
+from ....schemas.wire.stats import StatsAnswer
+from ..page.page_messages import text_message
 from .browser_feed import BrowserFeed
-from .page_messages import text_message
 from .scene_link import OpenScene
 
 log = logging.getLogger(__name__)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import BusyError, SolidcloudError
-from ...schemas.wire.motion_messages import State
-from ..zenoh_client.client_session import ClientSession
-from .page_messages import Intent
-from .scene_link import OpenScene
+from ....schemas.errors import BusyError, SolidcloudError
+from ....schemas.wire.motion_messages import State
+from ...zenoh_client.client_session import ClientSession
+from ..feeds.scene_link import OpenScene
+from ..page.page_messages import Intent
+from ..page.view_frame import ViewFrame
 from .user_avatar import UserAvatar
 from .user_motion import Easing, turn, velocity
-from .view_frame import ViewFrame
 
 log = logging.getLogger(__name__)
 

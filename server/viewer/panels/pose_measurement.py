@@ -6,8 +6,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.wire.answers import CollideAnswers, DistanceAnswers
-from .page_messages import text_message
+from ....schemas.wire.answers import CollideAnswers, DistanceAnswers
+from ..page.page_messages import text_message
 
 # Repetitions of each question: the least time is that of the engine with the voxels in memory, the
 # others include what else the machine did meanwhile.

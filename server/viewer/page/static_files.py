@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from ...schemas.errors import InternalError
+from ....schemas.errors import InternalError
 
-_ASSETS = Path(__file__).resolve().parent / "assets"
+_ASSETS = Path(__file__).resolve().parents[1] / "assets"
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",

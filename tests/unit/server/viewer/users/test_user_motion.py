@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 from solidcloud.schemas.wire.motion_messages import State, Touched
-from solidcloud.server.viewer.page_messages import Intent
-from solidcloud.server.viewer.user_motion import RUN_SPEED, WALK_SPEED, Easing, turn, velocity
-from solidcloud.server.viewer.view_frame import ViewFrame
+from solidcloud.server.viewer.page.page_messages import Intent
+from solidcloud.server.viewer.page.view_frame import ViewFrame
+from solidcloud.server.viewer.users.user_motion import RUN_SPEED, WALK_SPEED, Easing, turn, velocity
 
 FRAME = ViewFrame([[0, 0, 0], [1, 1, 1]])
 Y_UP = ViewFrame([[0, 0, 0], [1, 1, 1]], (0, 1, 0))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from page_arrays import decoded
 from solidcloud.schemas.wire.tile_messages import MAX_DETAIL, TileAnswer
-from solidcloud.server.viewer.tile_source import TileSource, coarse_first
-from solidcloud.server.viewer.view_frame import ViewFrame
+from solidcloud.server.viewer.feeds.tile_source import TileSource, coarse_first
+from solidcloud.server.viewer.page.view_frame import ViewFrame
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 1000, 4**8 + 1])

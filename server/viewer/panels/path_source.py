@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import TooLargeError
-from ..cli.input.pose_file import parse_path, read_path
-from .page_messages import PathText
+from ....schemas.errors import TooLargeError
+from ...cli.input.pose_file import parse_path, read_path
+from ..page.page_messages import PathText
 
 # Longest file of poses that a page may send [characters]: 100,000 poses in full precision.
 MAX_PATH_TEXT = 32 << 20

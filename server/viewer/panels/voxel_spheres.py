@@ -7,10 +7,10 @@ a query descends it level by level.
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.wire.tile_messages import MAX_SPHERE_LEVEL, TileAnswer, VoxelsAnswer
-from .page_messages import Place, binary_message
-from .scene_link import OpenScene
-from .view_frame import ViewFrame
+from ....schemas.wire.tile_messages import MAX_SPHERE_LEVEL, TileAnswer, VoxelsAnswer
+from ..feeds.scene_link import OpenScene
+from ..page.page_messages import Place, binary_message
+from ..page.view_frame import ViewFrame
 
 # Voxels whose boxes are within this distance of the user's middle belong to where it stands [m], at
 # most this many, nearest first.

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import SolidcloudError
-from ...schemas.wire.answers import Verdict
-from ..cli.scene_files.spawn_search import Body, add_body, find_spawn
-from .scene_link import OpenScene
+from ....schemas.errors import SolidcloudError
+from ....schemas.wire.answers import Verdict
+from ...cli.scene_files.spawn_search import Body, add_body, find_spawn
+from ..feeds.scene_link import OpenScene
 from .user_avatar import UserAvatar
 
 log = logging.getLogger(__name__)

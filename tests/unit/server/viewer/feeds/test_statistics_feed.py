@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from solidcloud.schemas.errors import BusyError
 from solidcloud.schemas.wire.stats import EffectStats, StatsAnswer
-from solidcloud.server.viewer.statistics_feed import Reading, StatisticsFeed, sample
+from solidcloud.server.viewer.feeds.statistics_feed import Reading, StatisticsFeed, sample
 
 
 def reading(time: float, hits: int = 0, frames: int = 0, **fields: Any) -> Reading:

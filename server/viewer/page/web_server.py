@@ -19,8 +19,8 @@ from websockets.http11 import Request, Response
 from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection, serve
 
-from ...schemas.errors import BadRequestError, SolidcloudError
-from .browser import PageConnection
+from ....schemas.errors import BadRequestError, SolidcloudError
+from .page_messages import PageConnection
 from .static_files import StaticFile, static_files
 
 log = logging.getLogger(__name__)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...schemas.errors import SolidcloudError
-from ...schemas.wire.residency_messages import ResidencyChanges
+from ....schemas.errors import SolidcloudError
+from ....schemas.wire.residency_messages import ResidencyChanges
+from ..page.page_messages import binary_message
 from .browser_feed import BrowserFeed
-from .page_messages import binary_message
 from .scene_link import OpenScene
 
 log = logging.getLogger(__name__)

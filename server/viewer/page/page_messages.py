@@ -6,14 +6,14 @@ copying them.
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.errors import BadRequestError
-from ...schemas.wire.tile_messages import MAX_SPHERE_LEVEL
+from ....schemas.errors import BadRequestError
+from ....schemas.wire.tile_messages import MAX_SPHERE_LEVEL
 
 # Version of these messages; a page of another version asks its user to reload it.
 PAGE_VERSION = 1
@@ -177,3 +177,11 @@ def binary_message(kind: str, arrays: Mapping[str, NDArray], **fields: Any) -> b
     header = json.dumps({"type": kind, **fields, "arrays": listed}, separators=(",", ":")).encode()
     header += b" " * (-(len(header) + 4) % _ALIGNMENT)
     return b"".join([len(header).to_bytes(4, "little"), header, *parts])
+
+
+class PageConnection(Protocol):
+    """Connection to a page: iterating yields its messages until it is closed."""
+
+    def __iter__(self) -> Any: ...
+    def send(self, message: str | bytes) -> None: ...
+    def is_open(self) -> bool: ...

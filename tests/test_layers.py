@@ -4,19 +4,13 @@ A room is a folder of schemas/, builder/ or server/; a module at the top of one 
 """
 
 import ast
-import functools
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
-
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("schemas", "builder", "server")
-API = "server/api/"
+from source_imports import API, PACKAGES, ROOT, Import, all_imports, cycles, imports_of, sources
 
 # Rooms of the same package that each room may import, lower rooms first; every entry is in use. "kernels" stands for
 # all its sub-rooms, except between these. Every room may import schemas.
@@ -88,15 +82,19 @@ ALLOWED = {
     "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/clash": "scene_interface.py",
-    "server/viewer": "avatars clash client.py cli/input cli/scene_files zenoh_client",
+    "server/viewer/feeds": "client.py viewer/page zenoh_client",
+    "server/viewer/users": "avatars cli/scene_files viewer/feeds viewer/page zenoh_client",
+    "server/viewer/panels": "cli/input viewer/feeds viewer/page",
+    "server/viewer": "clash client.py viewer/feeds viewer/page viewer/panels viewer/users",
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (
-        "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars residency "
-        "cli/output archives simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
+        "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars "
+        "cli/output simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
         "report/accuracy report/common report/load/runs report/load report/walk viewer"
     ),
-    "server/cli": "cli/commands cli/output",
+    "server/cli/commands/archives": "archives cli/commands cli/input cli/output client.py residency",
+    "server/cli": "cli/commands cli/commands/archives cli/output",
     "server/api": "client.py scene.py",
 }
 
@@ -105,7 +103,7 @@ ALLOWED = {
 CROSSING = {
     "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
-    "server/viewer": ("builder/synthetic/figure",),
+    "server/viewer/users": ("builder/synthetic/figure",),
     "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
         "builder/voxel/point_hierarchy",
@@ -149,7 +147,7 @@ DOORS = {
     "PIL": ("server/report/",),
     "scipy": ("server/report/accuracy/measurement/",),
     "typer": ("server/cli/main.py", "server/cli/commands/"),
-    "websockets": ("server/viewer/web_server.py",),
+    "websockets": ("server/viewer/page/web_server.py",),
     "rich": ("server/cli/output/", "server/report/"),
 }
 # Needed everywhere; numpy and msgspec are the language that arrays and messages are written in.
@@ -158,69 +156,6 @@ FREE = frozenset({"numpy", "msgspec"}) | sys.stdlib_module_names
 MOST_LINES = 400
 # Longer files, with their lines: a file here may only become shorter, and none may be added.
 LONG: dict[str, int] = {}
-
-
-class Import(NamedTuple):
-    """One import: its file, what it names as a path below the root or a library, its line."""
-
-    file: str
-    target: str
-    line: int
-    typing_only: bool
-
-
-def imports_of(file: str, source: str) -> Iterator[Import]:
-    """Yield the imports of one file. Relative ones become paths such as "schemas/errors"."""
-    tree = ast.parse(source)
-    for_types = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        for inner in ast.walk(node)
-    }
-    # server/api is installed as the package itself, which its imports are relative to.
-    folder = () if file.startswith(API) else Path(file).parent.parts
-    for node in ast.walk(tree):
-        typing_only = id(node) in for_types
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield Import(file, alias.name.split(".")[0], node.lineno, typing_only)
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            yield Import(file, (node.module or "").split(".")[0], node.lineno, typing_only)
-        elif isinstance(node, ast.ImportFrom):
-            base = (*folder[: len(folder) - node.level + 1], *filter(None, (node.module or "").split(".")))
-            for alias in node.names:
-                module = (*base, alias.name)
-                found = module if is_module(module) else base
-                yield Import(file, "/".join(found), node.lineno, typing_only)
-        elif isinstance(node, ast.Call) and is_late_import(node):
-            # builder/sources/formats imports a library by name, on first use.
-            argument = node.args[0]
-            if isinstance(argument, ast.Constant):
-                yield Import(file, str(argument.value).split(".")[0], node.lineno, False)
-
-
-def is_module(parts: tuple[str, ...]) -> bool:
-    path = ROOT.joinpath(*parts)
-    return path.is_dir() or path.with_suffix(".py").is_file()
-
-
-def is_late_import(call: ast.Call) -> bool:
-    name = call.func.id if isinstance(call.func, ast.Name) else getattr(call.func, "attr", "")
-    return bool(call.args) and name in ("reader_library", "import_module", "__import__")
-
-
-def sources() -> list[Path]:
-    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-
-
-@functools.cache
-def all_imports() -> list[Import]:
-    return [
-        found
-        for path in sources()
-        for found in imports_of(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
-    ]
 
 
 def room_of(module: str) -> str:
@@ -275,24 +210,6 @@ def stray_inside(where: str, file: str, top: str, target: str) -> str | None:
     if aim == top and room != aimed and entry_for(room, aimed) not in allowed_from(room):
         return f"{where}: {room} imports {aimed}; it may import {ALLOWED.get(room, 'no other room')}"
     return None
-
-
-def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
-    """Return a cycle for each edge that closes one, found depth first."""
-    found: list[list[str]] = []
-    done: set[str] = set()
-
-    def visit(node: str, path: list[str]) -> None:
-        if node in path:
-            found.append([*path[path.index(node) :], node])
-        elif node not in done:
-            for after in sorted(graph.get(node, ())):
-                visit(after, [*path, node])
-            done.add(node)
-
-    for node in sorted(graph):
-        visit(node, [])
-    return found
 
 
 def test_imports_follow_the_table_and_each_library_has_one_door() -> None:

@@ -99,7 +99,8 @@ def verify_archive(
     sample: verify only this many of them, spread over the archive; None: all.
     executor: runs the work; None: this process.
     places: the `position_hash` that all points must have (run_files.py); None: not known.
-    key: of the seal that the archive must have (schemas/archive/seal.py).
+    key: of the seal that the archive must have (schemas/archive/seal.py). The records of a sealed
+    archive are compared with their digests without a key too.
 
     A job holds one voxel: 12 bytes per point of it, 16 with intensities, and 40 if bounds are
     verified. Raise FormatError or CorruptError only if the index itself cannot be used,
@@ -206,7 +207,7 @@ def _verify_rows(unit: _Unit) -> _Found:
     points = proved = places = 0
     damaged: set[Path] = set()
     classes = np.zeros(RADIUS_CLASSES, np.int64)
-    with Archive(unit.folder, unit.key) as archive:
+    with Archive(unit.folder, unit.key, digests=True) as archive:
         for i, row in enumerate(unit.rows):
             known = len(faults)
             check_interrupt()

@@ -58,15 +58,18 @@ class Archive:
 
     is_as_stored = True
 
-    def __init__(self, folder: str | os.PathLike[str], key: bytes | None = None) -> None:
+    def __init__(
+        self, folder: str | os.PathLike[str], key: bytes | None = None, *, digests: bool = False
+    ) -> None:
         """Open the archive in `folder`.
 
         key: refuse an archive that is not sealed with this key, and records that are not those
         sealed (seal.py); None: do not look at seals.
+        digests: compare records with the digests of a seal without a key too.
         Raises FormatError or CorruptError naming the file and the fault.
         """
         self.folder, self.key = Path(folder), key
-        self._digests: NDArray[np.uint8] | None = None
+        self._compares_digests = digests or key is not None
         self._descriptors: list[int] = []
         while True:
             index = self._index_identity()
@@ -97,9 +100,9 @@ class Archive:
             found = read_index(path)
             columns = found.columns
             if self.key is not None:
-                has_digests = RECORD_DIGEST in columns
-                check_seal(self.folder, self.key, found.version, found.digest, has_digests=has_digests)
-                self._digests = columns[RECORD_DIGEST]
+                has = RECORD_DIGEST in columns
+                check_seal(self.folder, self.key, found.version, found.digest, has_digests=has)
+            self._digests = columns.get(RECORD_DIGEST) if self._compares_digests else None
             self.header = read_header(found.archive_id, columns)
             self.voxels = columns["voxels"]
             self._shape_dtype = self.header.point_dtype

@@ -1,4 +1,4 @@
-"""What one panel shows: simulated walks over scan points, and what its caption claims of them."""
+"""Content of one panel: simulated walks over scan points, and what its caption claims of them."""
 
 from typing import Literal, NamedTuple
 

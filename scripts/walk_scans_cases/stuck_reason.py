@@ -1,4 +1,4 @@
-"""Why a walk ended before its goal: what the person touches, and how wide the way is."""
+"""Reason why a walk ended before its goal: what the person touches, and how wide the way is."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -75,7 +75,7 @@ class CheckedPath(NamedTuple):
 
 
 class Watcher(NamedTuple):
-    """What a check tells while it runs, and asks.
+    """Callbacks of a running check.
 
     clearances: takes those of poses as they arrive.  progress: takes what is done (0 to 1).
     stopped: returns whether the check is to end.

@@ -1,4 +1,4 @@
-"""What surrounds a clash, for its picture: points of the scan, the avatar, and the contacts."""
+"""Surroundings of a clash, for its picture: points of the scan, the avatar, and the contacts."""
 
 from typing import Any, Protocol
 

@@ -1,4 +1,4 @@
-"""Where a camera sees a clash: candidates around it, tested with rays."""
+"""Viewpoint of a clash: candidates around it, tested with rays."""
 
 from typing import Any, NamedTuple
 

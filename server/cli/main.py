@@ -18,23 +18,23 @@ from ...schemas.process.interrupts import deferring_interrupts
 from ...schemas.process.os_errors import os_error_line
 from ...schemas.process.own_command import NAME, path_advice
 from .commands import accuracy_command as accuracy
-from .commands import add_remove_command as add_remove
-from .commands import build_command as build
 from .commands import doctor_command as doctor
-from .commands import export_command as export
-from .commands import info_validate_command as info_validate
-from .commands import inspect_command as inspect
-from .commands import level_command as level
 from .commands import loadtest_command as loadtest
-from .commands import make_command as make
-from .commands import plan_command as plan
 from .commands import query_command as query
 from .commands import replay_command as replay
 from .commands import scene_command as scene
-from .commands import seal_command as seal
 from .commands import serve_command as serve
 from .commands import top_command as top
 from .commands import view_command as view
+from .commands.archives import add_remove_command as add_remove
+from .commands.archives import build_command as build
+from .commands.archives import export_command as export
+from .commands.archives import info_validate_command as info_validate
+from .commands.archives import inspect_command as inspect
+from .commands.archives import level_command as level
+from .commands.archives import make_command as make
+from .commands.archives import plan_command as plan
+from .commands.archives import seal_command as seal
 from .commands.command_options import print_error
 from .output.compile_notice import compile_notices
 

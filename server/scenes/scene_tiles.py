@@ -1,4 +1,4 @@
-"""What a scene looks like: the methods of `Scene` that viewers draw with."""
+"""Tiles of a scene: the methods of `Scene` that viewers draw with."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,10 +14,9 @@ from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
 from ...schemas.wire.scene_messages import SceneInfo
 from ...schemas.wire.warming_parts import MOTION
-from .browser_user import BrowserUser, state_fields
 from .clash_session import ClashSession
-from .effect_switch import effects_message
-from .page_messages import (
+from .feeds.scene_link import LinkStatus, OpenScene
+from .page.page_messages import (
     PAGE_VERSION,
     Around,
     Boom,
@@ -27,6 +25,7 @@ from .page_messages import (
     Hello,
     Intent,
     Measure,
+    PageConnection,
     Restart,
     Spheres,
     SwitchEffects,
@@ -36,9 +35,10 @@ from .page_messages import (
     read_message,
     text_message,
 )
+from .page.view_frame import ViewFrame
 from .panel_work import PanelWork
-from .scene_link import LinkStatus, OpenScene
-from .view_frame import ViewFrame
+from .panels.effect_switch import effects_message
+from .users.browser_user import BrowserUser, state_fields
 from .viewer_parts import ViewerParts
 
 log = logging.getLogger(__name__)
@@ -57,14 +57,6 @@ _AGAIN_SECONDS = 3.0
 # Changes of residency that wait for a page that takes none: a page that misses some asks again for
 # the voxels near it every few seconds.
 _MOST_CHANGES = 64
-
-
-class PageConnection(Protocol):
-    """Connection to a page: iterating yields its messages until it is closed."""
-
-    def __iter__(self) -> Any: ...
-    def send(self, message: str | bytes) -> None: ...
-    def is_open(self) -> bool: ...
 
 
 class Browser:

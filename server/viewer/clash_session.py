@@ -23,11 +23,11 @@ from ..clash.clash_surroundings import surroundings
 from ..clash.clash_tables import clash_values, clashes_csv, clashes_json
 from ..clash.clash_viewpoint import Viewpoint, find_viewpoint
 from ..client import Client
-from .browser_user import rounded
-from .page_messages import ClashMessage, PathText, SaveClashes, ShowClash, binary_message, text_message
-from .path_source import GivenPath, PathParts
-from .scene_link import OpenScene
-from .view_frame import ViewFrame
+from .feeds.scene_link import OpenScene
+from .page.page_messages import ClashMessage, PathText, SaveClashes, ShowClash, binary_message, text_message
+from .page.view_frame import ViewFrame
+from .panels.path_source import GivenPath, PathParts
+from .users.browser_user import rounded
 from .viewer_parts import ViewerParts
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""What the panels of one browser ask for: statistics, measurements of the user's pose, spheres near it."""
+"""Work for the panels of one browser: statistics, measurements of the user's pose, spheres near it."""
 
 import threading
 from collections import deque
@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .page_messages import Measure, Spheres, SwitchEffects
-from .pose_measurement import measured_message
+from .page.page_messages import Measure, Spheres, SwitchEffects
+from .panels.pose_measurement import measured_message
 from .viewer_parts import ViewerParts
 
 # Samples of statistics that wait for a page that takes none: the charts then have a gap.

@@ -9,17 +9,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from .browser import Browser
-from .effect_switch import EffectSwitch, NoSwitch
-from .path_source import read_given_path
-from .residency_feed import ResidencyFeed
-from .scene_link import SceneLink
-from .starting_place import StartingPlaces
-from .statistics_feed import StatisticsFeed
-from .tile_source import TileSource
-from .user_avatar import load_avatar
+from .feeds.residency_feed import ResidencyFeed
+from .feeds.scene_link import SceneLink
+from .feeds.statistics_feed import StatisticsFeed
+from .feeds.tile_source import TileSource
+from .page.web_server import WebServer
+from .panels.effect_switch import EffectSwitch, NoSwitch
+from .panels.path_source import read_given_path
+from .panels.voxel_spheres import SphereSource
+from .users.starting_place import StartingPlaces
+from .users.user_avatar import load_avatar
 from .viewer_parts import Users, ViewerParts
-from .voxel_spheres import SphereSource
-from .web_server import WebServer
 
 log = logging.getLogger(__name__)
 

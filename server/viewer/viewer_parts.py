@@ -1,4 +1,4 @@
-"""What the browsers of one viewer share: the scene, the avatar, tiles, and where the users are."""
+"""Parts that the browsers of one viewer share: the scene, the avatar, tiles, and the users' places."""
 
 import threading
 from itertools import count
@@ -7,19 +7,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .effect_switch import EffectSwitch
-from .path_source import GivenPath
-from .residency_feed import ResidencyFeed
-from .scene_link import SceneLink
-from .starting_place import StartingPlaces
-from .statistics_feed import StatisticsFeed
-from .tile_source import TileSource
-from .user_avatar import UserAvatar
-from .voxel_spheres import SphereSource
+from .feeds.residency_feed import ResidencyFeed
+from .feeds.scene_link import SceneLink
+from .feeds.statistics_feed import StatisticsFeed
+from .feeds.tile_source import TileSource
+from .panels.effect_switch import EffectSwitch
+from .panels.path_source import GivenPath
+from .panels.voxel_spheres import SphereSource
+from .users.starting_place import StartingPlaces
+from .users.user_avatar import UserAvatar
 
 
 class UserPlace(NamedTuple):
-    """Where a user is.
+    """Place of a user.
 
     place: world [m].  pose: rows of a 4 x 4 matrix, avatar to the page's frame.  verdict: of it.
     """
@@ -80,7 +80,7 @@ class Users:
 
 
 class ViewerParts(NamedTuple):
-    """What the browsers of one viewer share.
+    """Parts that the browsers of one viewer share.
 
     path: whose clashes each page shows from the beginning, or None.
     """

@@ -16,23 +16,15 @@ from typing import Any, Self
 
 import zenoh
 
-from ...schemas.errors import (
-    BadRequestError,
-    BusyError,
-    SolidcloudError,
-    UnknownAvatarError,
-    error_from_code,
-)
+from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, UnknownAvatarError
 from ...schemas.wire import key_expressions
-from ...schemas.wire.encoding import MSGPACK, decode_answer, encode
+from ...schemas.wire.encoding import MSGPACK, encode
 from ...schemas.wire.motion_messages import Late, State, Wish, motion_fields, object_poses
-from ...schemas.wire.scene_messages import ErrorReply
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
-from ..zenoh_common.sealed_replies import OtherAvatarError
 from ..zenoh_common.zenoh_settings import FRAME_QOS
 from .server_connection import ServerConnection
-from .state_query import StateQuery
+from .state_query import StateQuery, decode_reply
 
 log = logging.getLogger(__name__)
 
@@ -313,7 +305,7 @@ class ClientSession:
         while (replies := self._states.take(lambda: self._published)) is not None:
             unknown: UnknownAvatarError | None = None
             for reply in replies:
-                found = _decoded(reply)
+                found = decode_reply(State, reply)
                 if isinstance(found, UnknownAvatarError):
                     unknown = found
                 else:
@@ -375,17 +367,3 @@ class ClientSession:
 def _is_same(one: State, other: State) -> bool:
     """Return whether two states are of the same frame of the same motion command."""
     return (one.seq, one.time, one.frame) == (other.seq, other.time, other.frame)
-
-
-def _decoded(reply: tuple[bool, bytes] | OtherAvatarError) -> State | SolidcloudError:
-    """Return the state or error of a reply; an InternalError if it cannot be decoded."""
-    if isinstance(reply, OtherAvatarError):
-        return reply
-    ok, payload = reply
-    try:
-        if ok:
-            return decode_answer(State, payload)
-        refusal = decode_answer(ErrorReply, payload)
-        return error_from_code(refusal.code, refusal.message)
-    except SolidcloudError as error:
-        return error

@@ -10,15 +10,13 @@ from typing import Self
 import zenoh
 from msgspec import structs
 
-from ...schemas.errors import BadRequestError, SolidcloudError, error_from_code
+from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire import key_expressions
-from ...schemas.wire.encoding import decode_answer, encode
+from ...schemas.wire.encoding import encode
 from ...schemas.wire.residency_messages import ResidencyChanges, ResidencyRequest
-from ...schemas.wire.scene_messages import ErrorReply
 from ..zenoh_common.endpoints import zenoh_words
-from ..zenoh_common.sealed_replies import OtherAvatarError
 from .server_connection import ServerConnection
-from .state_query import StateQuery
+from .state_query import StateQuery, decode_reply
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +98,7 @@ class ResidencyStream:
         # The server sends without being asked again: silence alone is a reason to query again.
         while (replies := self._query.take(lambda: math.inf)) is not None:
             for reply in replies:
-                self._keep(_decoded(reply))
+                self._keep(decode_reply(ResidencyChanges, reply))
             self._follow_client()
 
     def _follow_client(self) -> None:
@@ -126,17 +124,3 @@ class ResidencyStream:
                 self._lost = True
             self._kept.append(found)
             self._changed.notify_all()
-
-
-def _decoded(reply: tuple[bool, bytes] | OtherAvatarError) -> ResidencyChanges | SolidcloudError:
-    """Return the message or error of a reply; an InternalError if it cannot be decoded."""
-    if isinstance(reply, OtherAvatarError):
-        return reply
-    ok, payload = reply
-    try:
-        if ok:
-            return decode_answer(ResidencyChanges, payload)
-        refusal = decode_answer(ErrorReply, payload)
-        return error_from_code(refusal.code, refusal.message)
-    except SolidcloudError as error:
-        return error

@@ -4,14 +4,20 @@ import logging
 import queue
 from collections.abc import Callable
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import zenoh
 
-from ...schemas.wire.encoding import MSGPACK
+from ...schemas.errors import SolidcloudError, error_from_code
+from ...schemas.wire.encoding import MSGPACK, decode_answer
+from ...schemas.wire.scene_messages import ErrorReply
 from ..zenoh_common.sealed_replies import OtherAvatarError, SealedQuery, TrustAnchor
 
 log = logging.getLogger(__name__)
+
+# Content of a reply: (True, payload) of a state, (False, payload) of an error.
+Reply = tuple[bool, bytes] | OtherAvatarError
+Answer = TypeVar("Answer")
 
 # If motion commands are sent and no reply arrives for this long, the query is sent again [s].
 _SILENCE = 1.0
@@ -84,12 +90,11 @@ class StateQuery:
         except zenoh.ZError as error:  # the zenoh session was closed before
             log.debug("telling %s: %s", self._key, error)
 
-    def take(self, published: Callable[[], float]) -> list[tuple[bool, bytes] | OtherAvatarError] | None:
+    def take(self, published: Callable[[], float]) -> list[Reply] | None:
         """Wait a while for replies and return them; return None after the end.
 
-        A state is (True, payload), an error (False, payload), a state of another avatar an
-        OtherAvatarError. published: returns the time of the last motion command, on the monotonic
-        clock [s].
+        A state of another avatar is an OtherAvatarError.
+        published: returns the time of the last motion command, on the monotonic clock [s].
         """
         if self._over:
             return None
@@ -102,7 +107,7 @@ class StateQuery:
             return []
         while not self._arrived.empty():
             arrived.append(self._arrived.get())
-        found: list[tuple[bool, bytes] | OtherAvatarError] = []
+        found: list[Reply] = []
         for item in arrived:
             if item is None:
                 self._over = True
@@ -144,9 +149,23 @@ class StateQuery:
             log.debug("querying %s: %s", self._key, error)
 
 
-def _read(query: SealedQuery, reply: Any) -> tuple[bool, bytes] | OtherAvatarError | None:
+def _read(query: SealedQuery, reply: Any) -> Reply | None:
     """Return the content of a reply; None if the server did not send it."""
     try:
         return query.read(reply)
     except OtherAvatarError as error:
+        return error
+
+
+def decode_reply(answer: type[Answer], reply: Reply) -> Answer | SolidcloudError:
+    """Return the answer or error of a reply; an InternalError if it cannot be decoded."""
+    if isinstance(reply, OtherAvatarError):
+        return reply
+    ok, payload = reply
+    try:
+        if ok:
+            return decode_answer(answer, payload)
+        refusal = decode_answer(ErrorReply, payload)
+        return error_from_code(refusal.code, refusal.message)
+    except SolidcloudError as error:
         return error

@@ -18,9 +18,10 @@ from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import decode_request, encode, wire_encoding
 from ...schemas.wire.residency_messages import CHANGES_SECONDS, ResidencyChanges, ResidencyRequest
 from ..scene_interface import EncodedReply, LimitReached, ServedWatch
-from ..zenoh_common.sealed_replies import encoding_of, sealer_of, send_reply
+from ..zenoh_common.sealed_replies import encoding_of
 from .request_dispatcher import RequestDispatcher
 from .state_streams import StateStreams
+from .stream_queries import content_and_sealer, refuse, take_queries
 
 log = logging.getLogger(__name__)
 
@@ -67,31 +68,18 @@ class ResidencyStreams:
     def _take_queries(self, queries: Any) -> None:
         """Open streams until queries end, then end the streams. Runs in a thread."""
         try:
-            for query in queries:
-                try:
-                    self._open(query)
-                except Exception:  # affects this query only
-                    log.exception("a query for changes failed")
+            take_queries(queries, "changes", key_expressions.parse_residency_key, self._open)
         finally:
             self._closed.set()
             self._wake.set()
             self._streams.close()
 
-    def _open(self, query: zenoh.Query) -> None:
-        """Open a stream or answer with an error; end a query of no client without a reply."""
-        key = str(query.key_expr)
-        try:
-            client = key_expressions.parse_residency_key(key)
-        except BadRequestError as error:
-            log.debug("a query for the changes of no client: %s", error)
+    def _open(self, client: str, query: zenoh.Query) -> None:
+        """Open a stream or answer with an error."""
+        if query.payload is not None and len(query.payload) > _MAX_REQUEST_BYTES:
             query.drop()
             return
-        payload = query.payload
-        if payload is not None and len(payload) > _MAX_REQUEST_BYTES:
-            query.drop()
-            return
-        content = b"" if payload is None else payload.to_bytes()
-        sealer = sealer_of(query, self._server_key, key, content)
+        content, sealer = content_and_sealer(query, self._server_key)
         encoding, refusal, request = encoding_of(query), None, ResidencyRequest()
         try:
             stated = wire_encoding(encoding)
@@ -107,8 +95,7 @@ class ResidencyStreams:
         if refusal is None and not self._streams.open(user, query, sealer):
             refusal = self._dispatcher.busy(encoding, LimitReached.STATES)
         if refusal is not None:
-            with query:
-                send_reply(query, query.key_expr, refusal, sealer)
+            refuse(query, refusal, sealer)
             return
         with self._lock:
             self._new[user] = stated

@@ -15,12 +15,13 @@ import zenoh
 from ...schemas.errors import BadRequestError
 from ...schemas.wire import key_expressions
 from ..scene_interface import EncodedReply, LimitReached
-from ..zenoh_common.sealed_replies import encoding_of, sealer_of, send_reply
+from ..zenoh_common.sealed_replies import encoding_of
 from .command_mailboxes import FrameLoop, WaitingCommands
 from .fair_queues import LivelinessTokens
 from .request_dispatcher import RequestDispatcher
 from .request_lanes import take_waiting
 from .state_streams import StateStreams
+from .stream_queries import content_and_sealer, refuse, take_queries
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +66,8 @@ class SceneSessions:
             key_expressions.all_commands_key(scene), zenoh.handlers.FifoChannel(_CHANNEL)
         )
         self.declared += [queryable, wishes]
-        start(f"{scene}-states", self._open_streams, queryable.handler)
+        parse = key_expressions.parse_state_key
+        start(f"{scene}-states", take_queries, queryable.handler, "states", parse, self._open_stream)
         start(f"{scene}-wishes", self._take_wishes, wishes.handler, frames)
         start(f"{scene}-frames", self._run_frames, frames)
 
@@ -88,29 +90,11 @@ class SceneSessions:
         finally:
             self._streams.close()
 
-    def _open_streams(self, queries: Any) -> None:
-        """Take the queries for states. Runs in a thread."""
-        for query in queries:
-            try:
-                self._open_stream(query)
-            except Exception:  # affects this query only
-                log.exception("a query for states failed")
-
-    def _open_stream(self, query: zenoh.Query) -> None:
-        """Open a stream or answer `busy`; end a query for several users without a reply."""
-        try:
-            key = str(query.key_expr)
-            user = key_expressions.parse_state_key(key)
-        except BadRequestError as error:
-            log.debug("a query for the states of no user: %s", error)
-            query.drop()
-            return
-        payload = query.payload
-        sealer = sealer_of(query, self._server_key, key, b"" if payload is None else payload.to_bytes())
+    def _open_stream(self, user: key_expressions.User, query: zenoh.Query) -> None:
+        """Open a stream or answer `busy`."""
+        _, sealer = content_and_sealer(query, self._server_key)
         if not self._streams.open(user, query, sealer):
-            with query:
-                busy = self._dispatcher.busy(encoding_of(query), LimitReached.STATES)
-                send_reply(query, query.key_expr, busy, sealer)
+            refuse(query, self._dispatcher.busy(encoding_of(query), LimitReached.STATES), sealer)
 
     def _take_wishes(self, samples: Any, frames: FrameLoop) -> None:
         """Take motion commands until they end, then end the frames. Runs in a thread.

@@ -3,7 +3,7 @@
 import socket
 
 import pytest
-from fake_server import FloorScene
+from fake_server import FloorScene, floor_simulation
 from solidcloud.server.client import Client
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
@@ -36,3 +36,14 @@ def scene():
 def client(scene, endpoint):
     with serving([scene], ServerConfig(listen=endpoint)), Client(endpoint, scene="floor") as client:
         yield client
+
+
+@pytest.fixture
+def floor():
+    return floor_simulation()
+
+
+@pytest.fixture
+def served(floor, endpoint):
+    with serving([floor.scene], ServerConfig(listen=endpoint)):
+        yield floor

@@ -8,7 +8,6 @@ import threading
 from contextlib import contextmanager
 
 import numpy as np
-import pytest
 from fake_server import floor_simulation
 from floor import DEADLINE, POINTS, eventually, server_process
 from frozen_processes import freeze
@@ -18,21 +17,7 @@ from solidcloud.schemas.wire.motion_messages import Wish
 from solidcloud.server.client import Client
 from solidcloud.server.simulation.replay import replay
 from solidcloud.server.simulation.replay_log import FrameRecord, read_log
-from solidcloud.server.zenoh_server.serve_loop import serving
-from solidcloud.server.zenoh_server.server_config import ServerConfig
 from walkers import pose_at, walking
-
-
-@pytest.fixture
-def floor():
-    return floor_simulation()
-
-
-@pytest.fixture
-def served(floor, endpoint):
-    with serving([floor.scene], ServerConfig(listen=endpoint)):
-        yield floor
-
 
 CLIENT = """
 import sys, threading, numpy as np

@@ -25,7 +25,7 @@ from solidcloud.schemas.wire.warming_parts import READY_LINE
 from solidcloud.server.cli.input.pose_file import read_path
 from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
 from solidcloud.server.client import Client
-from solidcloud.server.viewer.user_avatar import load_avatar
+from solidcloud.server.viewer.users.user_avatar import load_avatar
 from solidcloud.server.viewer.viewer import viewing
 from viewed_page import CHROMIUM, DEADLINE, ViewedPage, browsing, viewed_page
 

@@ -10,6 +10,7 @@ import zstandard
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.codec import CELL_DTYPE, NODE_DTYPE, point_dtype
 from solidcloud.schemas.archive.index import index_digest
+from solidcloud.schemas.archive.seal import frames_digest
 from solidcloud.schemas.archive.zstd_frame import pack
 
 Columns = dict[str, NDArray]
@@ -66,17 +67,21 @@ def row_types(columns: Columns) -> tuple[np.dtype, np.dtype, np.dtype]:
 
 def read_rows(folder: Path, columns: Columns, voxel: int, i: int) -> NDArray:
     """Return the rows of dataset i of a voxel."""
-    entry = columns["voxels"][voxel]
-    data = (folder / "shards" / columns["shards"]["name"][entry["shard"]].decode()).read_bytes()
-    begin = int(entry["frame_offset"][i])
-    plain = zstandard.decompress(data[begin : begin + int(entry["frame_bytes"][i])])
+    plain = zstandard.decompress(_frame(folder, columns, voxel, i))
     dtype = row_types(columns)[i]
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
     return planes.T.copy().view(dtype)[:, 0]
 
 
+def _frame(folder: Path, columns: Columns, voxel: int, i: int) -> bytes:
+    entry = columns["voxels"][voxel]
+    data = (folder / "shards" / columns["shards"]["name"][entry["shard"]].decode()).read_bytes()
+    begin = int(entry["frame_offset"][i])
+    return data[begin : begin + int(entry["frame_bytes"][i])]
+
+
 def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) -> None:
-    """Append another frame to its shard, and let the index refer to it."""
+    """Append another frame to its shard, and let the index refer to it, with its digest if it has any."""
     entry, shards = columns["voxels"][voxel], columns["shards"]
     number = int(entry["shard"])
     with open(folder / "shards" / shards["name"][number].decode(), "ab") as file:
@@ -85,6 +90,10 @@ def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) 
         shards["bytes"][number] = file.tell()
     entry["frame_bytes"][i] = len(frame)
     entry["frame_checksum"][i] = int.from_bytes(frame[-4:], "little")
+    if "record_digest" in columns:
+        part = (2,) if i == 2 else (0, 1)
+        frames = [_frame(folder, columns, voxel, each) for each in part]
+        columns["record_digest"][voxel, int(i == 2)] = frames_digest(frames)
 
 
 def put_rows(folder: Path, columns: Columns, voxel: int, i: int, rows: NDArray) -> None:

@@ -45,6 +45,13 @@ def build_sealed(folder: Path) -> Path:
     return target
 
 
+def key_file(folder: Path, key: bytes = KEY) -> Path:
+    """Write a key."""
+    path = folder / "archives.key"
+    path.write_bytes(key)
+    return path
+
+
 def reseal(folder: Path, key: bytes = KEY) -> None:
     """Seal an index as it is, whatever it says, as only one with the key can."""
     from solidcloud.schemas.archive.index import index_digest

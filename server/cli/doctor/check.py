@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 
 class Status(StrEnum):
-    """What a check found: FAULT prevents use, WARNING may prevent some, NOTE is for information."""
+    """Outcome of a check: FAULT prevents use, WARNING may prevent some, NOTE is for information."""
 
     OK = "ok"
     NOTE = "note"

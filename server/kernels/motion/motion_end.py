@@ -1,4 +1,4 @@
-"""Where a motion that touches ends: the touching point, and the pose `skin` before the contact.
+"""End of a motion that touches: the touching point, and the pose `skin` before the contact.
 
 The operations and their order are those of server/simulation/world/frame.py, which computes the same
 for obstacles that are not of the scan. In one call with the sweep they take a tenth of the time.

@@ -1,34 +1,10 @@
 // Users as the server last reported them: little spheres in the colour of their verdict.
 
 import {
-  BufferAttribute, BufferGeometry, Color, DoubleSide, Group, Matrix4, Mesh, MeshBasicMaterial, Points, Quaternion,
-  RingGeometry, ShaderMaterial, Vector3,
+  BufferAttribute, BufferGeometry, DoubleSide, Group, Matrix4, Mesh, MeshBasicMaterial, Quaternion, RingGeometry, Vector3,
 } from "./vendor/three.module.min.js";
-import { shared } from "./points_material.js";
+import { figure, figureMaterial } from "./figure.js";
 import { VERDICTS } from "./colours.js";
-
-const VERTEX = /* glsl */ `
-uniform float uSize;
-uniform float uScale;
-varying float vLight;
-void main() {
-  vec4 seen = modelViewMatrix * vec4(position, 1.0);
-  gl_Position = projectionMatrix * seen;
-  gl_PointSize = max(2.0, uSize * uScale / max(-seen.z, 1e-3));
-  vLight = 0.82 + 0.18 * clamp(position.z, 0.0, 2.0) * 0.5;
-}`;
-
-const FRAGMENT = /* glsl */ `
-uniform vec3 uColour;
-varying float vLight;
-void main() {
-  vec2 at = 2.0 * gl_PointCoord - 1.0;
-  float square = dot(at, at);
-  if (square > 1.0) discard;
-  vec3 normal = vec3(at.x, -at.y, sqrt(1.0 - square));
-  float light = 0.42 + 0.62 * max(0.0, dot(normal, normalize(vec3(-0.35, 0.75, 0.6))));
-  gl_FragColor = vec4(uColour * light * vLight, 1.0);
-}`;
 
 /** Interval between two states of the server [ms]: the picture is one behind, and moves evenly. */
 const FRAME_MS = 1000 / 30;
@@ -36,13 +12,9 @@ const FRAME_MS = 1000 / 30;
 export class Avatar {
   constructor(geometry, radius, group) {
     this.group = group;
-    this.material = new ShaderMaterial({
-      name: "figure", vertexShader: VERTEX, fragmentShader: FRAGMENT,
-      uniforms: { uSize: { value: 2 * radius }, uScale: shared.uScale, uColour: { value: new Color() } },
-    });
+    this.material = figureMaterial({ name: "figure", radius, light: [0.42, 0.62, 0.18] });
     this.object = new Group();
-    this.body = new Points(geometry, this.material);
-    this.body.frustumCulled = false;
+    this.body = figure(geometry, this.material);
     this.ring = new Mesh(
       new RingGeometry(0.34, 0.4, 48), new MeshBasicMaterial({ side: DoubleSide, transparent: true, opacity: 0.85 }));
     this.ring.position.z = 0.012;
@@ -51,7 +23,6 @@ export class Avatar {
     this.poses = [];
     this.position = new Vector3();
     this.turn = new Quaternion();
-    this.colour = new Color();
     this.verdict = "";
   }
 
@@ -66,10 +37,14 @@ export class Avatar {
     if (verdict !== this.verdict) {
       this.verdict = verdict;
       const [r, g, b] = VERDICTS[verdict] ?? VERDICTS.unknown;
-      this.colour.setRGB(r / 255, g / 255, b / 255);
-      this.material.uniforms.uColour.value.copy(this.colour);
-      this.ring.material.color.copy(this.colour);
+      this.paint([r / 255, g / 255, b / 255]);
     }
+  }
+
+  /** Draw in a colour, (3,) from 0 to 1. */
+  paint(colour) {
+    this.material.uniforms.uColour.value.setRGB(...colour);
+    this.ring.material.color.setRGB(...colour);
   }
 
   /** Place the body between its last two poses. */

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.builder.build_limits import MAX_SHARDS, SHARD_POINTS, shard_points
-from solidcloud.builder.config import BuildConfig, parse_rule
+from solidcloud.builder.config import BuildConfig, parse_radius, parse_rule
 from solidcloud.builder.passes.build_shards import plan_shards
 from solidcloud.schemas.errors import BadRequestError
 
@@ -60,3 +60,38 @@ def test_no_more_shards_than_may_be_open_whatever_the_voxels_hold(voxel: int) ->
     plans = plan_shards(np.arange(3000, dtype=np.uint64), counts)
     assert len(plans) <= MAX_SHARDS + 1
     assert sum(points for _, points in plans) == counts.sum()
+
+
+@pytest.mark.parametrize(
+    ("text", "radius", "models"),
+    [
+        ("mean", None, {"mean"}),
+        ("mean,local,border", None, {"mean", "local", "border"}),
+        ("local", None, {"mean", "local"}),
+        ("0.01", 0.01, {"mean"}),
+        ("fixed:0.01", 0.01, {"mean"}),
+        ("border, fixed:0", 0.0, {"mean", "border"}),
+    ],
+)
+def test_radius_texts(text: str, radius: float | None, models: set[str]) -> None:
+    assert parse_radius(text) == (radius, models)
+    BuildConfig(radius=radius, models=frozenset(models))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "median", "mean,0.01", "0.01,fixed:0.02", "fixed:", "fixed:x", "local:2", "mean,"]
+)
+def test_other_radius_texts_are_refused(text: str) -> None:
+    with pytest.raises(
+        BadRequestError, match=r"--radius .*expected mean, local, border, separated by commas"
+    ):
+        parse_radius(text)
+
+
+def test_a_config_always_holds_the_mean() -> None:
+    with pytest.raises(
+        BadRequestError, match="--radius local: expected mean, optionally with local and border"
+    ):
+        BuildConfig(models=frozenset({"local"}))
+    with pytest.raises(BadRequestError, match="--radius colour,mean"):
+        BuildConfig(models=frozenset({"mean", "colour"}))

@@ -7,7 +7,7 @@ from ...common.paper_case import PAPER_POINTS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasurementPlan:
-    """What is measured, and how often.
+    """Sizes and repetitions of the measurements.
 
     points: of the generated façade.
     frames: poses of the walk. Answers are compared at these, and at as many poses with random

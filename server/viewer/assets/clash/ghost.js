@@ -1,44 +1,21 @@
 // The avatar at a clash as a ghost, with its contact points and contact normals.
 
 import {
-  Color, ConeGeometry, CylinderGeometry, Group, InstancedMesh, Matrix4, Mesh, MeshBasicMaterial, Points, ShaderMaterial,
-  SphereGeometry, Vector3,
+  ConeGeometry, CylinderGeometry, Group, InstancedMesh, Matrix4, Mesh, MeshBasicMaterial, SphereGeometry, Vector3,
 } from "../vendor/three.module.min.js";
-import { shared } from "../points_material.js";
+import { figure, figureMaterial } from "../figure.js";
 
 const MOST_PLACES = 64, MOST_ARROWS = 8, LENGTH = 0.3;
 const COLOURS = { body: 0xdfe6f2, contact: 0xff5448, arrow: 0xffc2bc };
-
-const VERTEX = /* glsl */ `
-uniform float uSize;
-uniform float uScale;
-void main() {
-  vec4 seen = modelViewMatrix * vec4(position, 1.0);
-  gl_Position = projectionMatrix * seen;
-  gl_PointSize = max(2.0, uSize * uScale / max(-seen.z, 1e-3));
-}`;
-
-const FRAGMENT = /* glsl */ `
-uniform vec3 uColour;
-uniform float uOpacity;
-void main() {
-  vec2 at = 2.0 * gl_PointCoord - 1.0;
-  float square = dot(at, at);
-  if (square > 1.0) discard;
-  vec3 normal = vec3(at.x, -at.y, sqrt(1.0 - square));
-  gl_FragColor = vec4(uColour * (0.5 + 0.55 * max(0.0, dot(normal, normalize(vec3(-0.35, 0.75, 0.6))))), uOpacity);
-}`;
 
 export class Ghost {
   /** group: object for what is drawn over the scan. */
   constructor(group) {
     this.group = group;
     this.body = [];
-    const uniforms = { uSize: { value: 0.05 }, uScale: shared.uScale, uColour: { value: new Color(COLOURS.body) }, uOpacity: { value: 0.62 } };
+    const look = { radius: 0.025, colour: COLOURS.body, light: [0.5, 0.55, 0], opacity: 0.62, transparent: true };
     // First the depths alone: of a translucent body, only its near side is seen.
-    this.bodyMaterials = [false, true].map((colorWrite) => new ShaderMaterial({
-      vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms, colorWrite, depthWrite: !colorWrite, transparent: true,
-    }));
+    this.bodyMaterials = [false, true].map((colorWrite) => figureMaterial({ ...look, colorWrite, depthWrite: !colorWrite }));
     const over = { depthTest: false, transparent: true };
     this.places = new InstancedMesh(
       new SphereGeometry(0.016, 10, 8), new MeshBasicMaterial({ ...over, color: COLOURS.contact, opacity: 0.9 }), MOST_PLACES);
@@ -63,10 +40,9 @@ export class Ghost {
   show({ pose, places, clusters }, geometry, radius) {
     this.hide();
     if (geometry) {
-      this.bodyMaterials[0].uniforms.uSize.value = 2 * radius;
       this.body = this.bodyMaterials.map((material, k) => {
-        const body = new Points(geometry, material);
-        body.frustumCulled = false;
+        material.uniforms.uSize.value = 2 * radius;
+        const body = figure(geometry, material);
         body.matrixAutoUpdate = false;
         body.matrix.set(...pose.flat());
         body.renderOrder = -2 + k;

@@ -82,8 +82,7 @@ export class Ghost {
     const [x, y, z] = axes;
     this.turn = new Quaternion().setFromRotationMatrix(new Matrix4().set(...x, 0, ...y, 0, ...z, 0, 0, 0, 0, 1));
     this.avatar = new Avatar(users.geometry, users.radius, view.points);
-    this.avatar.material.uniforms.uColour.value.setRGB(...COLOUR);
-    this.avatar.ring.material.color.setRGB(...COLOUR);
+    this.avatar.paint(COLOUR);
     const places = [];
     for (const { place } of this.walk) {
       const next = this.toFrame(place);

@@ -11,7 +11,7 @@ import pytest
 import solidcloud.builder.build_limits as build_limits
 from dense_voxels import KEY, rows_of, spooled
 from numpy.typing import NDArray
-from solidcloud.builder.config import BuildConfig, parse_radius
+from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.neighbours.nearest_neighbours import bound_boxes, box_starts
 from solidcloud.builder.kernels.neighbours.point_classes import TOO_FEW_NEIGHBOURS, point_classes
 from solidcloud.builder.kernels.points.octree_cells import voxel_codes
@@ -27,7 +27,6 @@ from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import Header
 from solidcloud.schemas.archive.radius_model import LOCAL_CLASSES, RIM_BIT, local_radii, radius_distribution
-from solidcloud.schemas.errors import BadRequestError
 from synthetic_scans import make_scan, write_xyz
 from written_runs import write_run
 
@@ -291,41 +290,6 @@ def _ring(held: int, radius: int, side: int) -> NDArray[np.int32]:
     lengths = np.where(np.arange(held) % 2, radius, radius * 0.9)
     around = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(held)]) * lengths[:, None]
     return np.unique(np.concatenate([[[0, 0, 0]], np.trunc(around)]), axis=0).astype(np.int32)
-
-
-@pytest.mark.parametrize(
-    ("text", "radius", "models"),
-    [
-        ("mean", None, {"mean"}),
-        ("mean,local,border", None, {"mean", "local", "border"}),
-        ("local", None, {"mean", "local"}),
-        ("0.01", 0.01, {"mean"}),
-        ("fixed:0.01", 0.01, {"mean"}),
-        ("border, fixed:0", 0.0, {"mean", "border"}),
-    ],
-)
-def test_radius_texts(text: str, radius: float | None, models: set[str]) -> None:
-    assert parse_radius(text) == (radius, models)
-    BuildConfig(radius=radius, models=frozenset(models))
-
-
-@pytest.mark.parametrize(
-    "text", ["", "median", "mean,0.01", "0.01,fixed:0.02", "fixed:", "fixed:x", "local:2", "mean,"]
-)
-def test_other_radius_texts_are_refused(text: str) -> None:
-    with pytest.raises(
-        BadRequestError, match=r"--radius .*expected mean, local, border, separated by commas"
-    ):
-        parse_radius(text)
-
-
-def test_a_config_always_holds_the_mean() -> None:
-    with pytest.raises(
-        BadRequestError, match="--radius local: expected mean, optionally with local and border"
-    ):
-        BuildConfig(models=frozenset({"local"}))
-    with pytest.raises(BadRequestError, match="--radius colour,mean"):
-        BuildConfig(models=frozenset({"mean", "colour"}))
 
 
 @pytest.mark.parametrize("kind", ["corner", "duplicates"])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from solidcloud.schemas.errors import BadRequestError, SolidcloudError
-from solidcloud.server.viewer.page_messages import Measure, Spheres, SwitchEffects
+from solidcloud.server.viewer.page.page_messages import Measure, Spheres, SwitchEffects
 from solidcloud.server.viewer.panel_work import PanelWork
 
 DEADLINE = 60.0

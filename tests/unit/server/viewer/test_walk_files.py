@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from solidcloud.server import viewer
 from solidcloud.server.cli.input.pose_file import read_poses, read_tum_poses, write_poses
-from solidcloud.server.viewer.view_frame import ViewFrame
+from solidcloud.server.viewer.page.view_frame import ViewFrame
 
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node in PATH: apt-get install nodejs")

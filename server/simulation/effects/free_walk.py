@@ -70,7 +70,7 @@ class FreeWalk:
         model, poses = make_avatar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], 0.05), np.tile(np.eye(4), (2, 1, 1))
         poses[1, 0, 3] = 0.1
         with world:
-            world.walk(model, *poses, self._down, self._sweep.tolerance, EXACT, self._sweep.skin)
+            world.walk(model, poses[0], poses[1], self._down, self._sweep.tolerance, EXACT, self._sweep.skin)
 
 
 def make_free_walk(runners: list[Runner], world: World) -> FreeWalk | None:

@@ -8,7 +8,8 @@ const LEAST_POINTS = 25e3, FIRST_SOFTWARE = 60e3;
 // Our own drawing begins with this many points. They are fewer if pictures take longer than `SMOOTH_MS`
 // and their points more than `OWN_MS` of it, and more again below half of that. Other work on the machine
 // makes pictures late, too, against which fewer points are no help: the least disturbed pictures count.
-const FIRST_OWN = 200e3, LEAST_OWN = 100e3, OWN_MS = 18;
+// Fewer points are larger and cover as much: a fifth of them takes two thirds of the time.
+const FIRST_OWN = 200e3, LEAST_OWN = 120e3, OWN_MS = 18;
 // Least time between two of our own pictures [ms]: a server has 30 states a second, and the processor
 // serves it, too.
 const OWN_INTERVAL_MS = 28;

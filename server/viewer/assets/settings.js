@@ -3,7 +3,7 @@
 const KEY = "solidcloud.settings";
 
 const DEFAULTS = {
-  colour: "auto", pointSize: 1, budget: 0.8, shading: true, firstPerson: false,
+  colour: "auto", pointSize: 1, budget: 0.7, shading: true, firstPerson: false,
   contacts: true, clearance: true, boxes: false, near: 0.02, panel: true,
   instruments: false, openPlots: true, openEffects: false, openAccuracy: false, openHierarchy: false,
   tolerance: 3, spheres: true, level: 4, walked: false,

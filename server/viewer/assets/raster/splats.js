@@ -88,6 +88,13 @@ export function splat(picture, places, colours, from, to, screen, size, least, m
       let top = (v - half + 0.5) | 0, bottom = (v + half + 0.5) | 0;
       if (top < 0) top = 0;
       if (bottom > height) bottom = height;
+      // A disc that is hidden in its middle and at its four ends is left out: of all pixels that would be
+      // looked at, half are hidden.
+      const middle = (v | 0) * width, column = u | 0, arm = (0.9 * half) | 0;
+      if (inverse <= depth[middle + column]
+        && inverse <= depth[top * width + column] && inverse <= depth[(bottom - 1) * width + column]
+        && inverse <= depth[middle + (column > arm ? column - arm : 0)]
+        && inverse <= depth[middle + (column + arm < width ? column + arm : lastColumn)]) continue;
       for (let line = top * width; top < bottom; top += 1, line += width) {
         const away = top + 0.5 - v;
         const reach = square - away * away;

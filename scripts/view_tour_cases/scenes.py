@@ -22,7 +22,11 @@ _STAIRS, _FLOORS, _ABOVE = (-2.9, -2.15), (0.0, 0.45), 0.08
 
 
 # Panels without the scan behind them.
-_PLAIN = "aside, footer { background: #0f151f !important; } .more, #title { display: none; } #view { visibility: hidden; }"
+_PLAIN = """
+aside, footer { background: #0f151f !important; }
+.more, #title { display: none; }
+#view { visibility: hidden; }
+"""
 
 
 class Scene(NamedTuple):

@@ -106,6 +106,7 @@ def tour_page(
     at: x, y, z [m] and direction [degrees] in the world, as in a link.  settings: of the page.
     """
     context = browser.new_context(viewport={"width": size[0], "height": size[1]})
+    context.set_default_timeout(1000 * PATIENCE)
     chosen = json.dumps(json.dumps({**_SETTINGS, **settings}))
     context.add_init_script(f"localStorage.setItem('solidcloud.settings', {chosen})")
     try:

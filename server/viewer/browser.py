@@ -219,6 +219,9 @@ class Browser:
                 self._problem(str(error))
         except SolidcloudError as error:
             self._problem(str(error))
+        except Exception:  # the browser's thread must go on: its user would never enter, or never move
+            log.exception("browser %d", self.number)
+            self._problem("The viewer failed at something: its log says at what.")
 
     def _deliver(self, state: State, frame: ViewFrame) -> None:
         """Send a state to the page, with the other users."""

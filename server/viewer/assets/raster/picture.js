@@ -11,9 +11,7 @@ export class Picture {
   constructor(canvas, ground) {
     this.canvas = canvas;
     this.ground = ground;
-    // Without waiting for the page's other parts, the browser needs 12 instead of 22 ms for a picture where
-    // SwiftShader puts the page together (1280 x 720).
-    this.context = canvas.getContext("2d", { alpha: false, desynchronized: true });
+    this.context = canvas.getContext("2d", { alpha: false });
     this.shadeTable = Uint16Array.from({ length: SHADES + 1 },
       (_, k) => Math.round(256 * Math.exp((-STRENGTH * DARKEST * k) / SHADES)));
     this.resize(1, 1);

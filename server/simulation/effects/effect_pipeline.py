@@ -144,6 +144,7 @@ class Pipeline:
             ran: list[tuple[str, float]] = []
             now = time.perf_counter()
             walked: dict[str, float] = {}
+            ahead = 0.0  # time of answers that `FreeWalk` got for effects that then ran
             for runner in self.runners:
                 if budget.stop:
                     raise StoppedError
@@ -151,7 +152,8 @@ class Pipeline:
                     walked = self._walk.run(frame) or {}
                     ran.extend(walked.items())
                     frame.simulated.extend(walked)
-                    now = time.perf_counter()
+                    before, now = now, time.perf_counter()
+                    ahead = 0.0 if walked else now - before
                 if runner.name in walked:
                     continue
                 if self._free and not skip:
@@ -161,7 +163,7 @@ class Pipeline:
                     self._run_one(runner, frame, begin, since, skip)
                 before, now = now, time.perf_counter()
                 if frame.simulated and frame.simulated[-1] == runner.name:
-                    ran.append((runner.name, now - before))
+                    ran.append((runner.name, now - before + (ahead if runner.name == "sweep" else 0.0)))
             self.times.add(ran, frame.skipped)
             if not self._stops:
                 frame.verdict = world.collide(body.avatar, frame.pose, budget)

@@ -35,9 +35,10 @@ class FreeWalk:
     def run(self, frame: Frame) -> dict[str, float] | None:
         """Finish the effects of a frame if nothing obstructs the avatar; otherwise change no pose.
 
-        Return the time that each effect took [s], or None if the effects must run. The time of the
-        kernel is divided by the node visits of its two parts.
+        Return the time that each effect took [s], or None if the effects must run. `stop` is the test
+        that the avatar begins clear; the rest is divided between `sweep` and `ground` by node visits.
         """
+        start = time.perf_counter()
         body, world, sweep, ground = frame.body, frame.world, self._sweep, self._ground
         if not (body.on_ground and body.clear and body.generations == frame.generations):
             return None
@@ -61,6 +62,7 @@ class FreeWalk:
         frame.clear = True
         seconds = time.perf_counter() - since
         times = dict.fromkeys(self.names, 0.0)
+        times["stop"] = since - start
         times["sweep"] = seconds * moved.visits / max(world.visits - visits, 1)
         times["ground"] = seconds - times["sweep"]
         return times

@@ -95,7 +95,7 @@ def test_time_is_divided_between_sweep_and_ground(case: archive_cases.Case) -> N
             assert answer.simulated == ["stop", "sweep", "slide", "step", "ground"]
         stats = {each.effect: each for each in play.pipeline.times.stats()}
     assert [each.frames for each in stats.values()] == [40] * 5
-    assert stats["sweep"].seconds > 0.0 and stats["ground"].seconds > 0.0
+    assert min(stats[name].seconds for name in ("stop", "sweep", "ground")) > 0.0
 
 
 def test_the_kernel_is_called_when_a_scene_opens(

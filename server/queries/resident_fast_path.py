@@ -22,16 +22,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
-from ..avatars.avatar_model import AvatarModel
+from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..kernels.collide.collide_poses import collide_resident
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN
 from ..kernels.core.array_references import Held, refer_to_avatar
 from ..kernels.motion import sweep_resident as _swept
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
-from ..kernels.motion.walk_resident import walk_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
+from ..kernels.walk.walk_state import make_walk_avatar
 from ..residency.voxel_cache import VoxelCache
 from .collide import collide
 from .context.query_budget import EXACT, QueryBudget
@@ -172,8 +172,6 @@ class SweepResult(NamedTuple):
     end: Pose | None = None
 
 
-_STILL = SweepResult(Verdict.CLEAR, 1.0, np.inf)
-
 
 class ResidentQueries:
     """Queries of one avatar, frame after frame. Not thread-safe: it reuses its arrays.
@@ -183,7 +181,6 @@ class ResidentQueries:
 
     __slots__ = (
         "_again",
-        "_below",
         "_box",
         "_counts",
         "_first",
@@ -191,13 +188,12 @@ class ResidentQueries:
         "_outside",
         "_poses",
         "_result",
-        "_result_below",
         "_rows",
-        "_rows_below",
         "_scratch",
         "_small",
         "_used",
         "_verdict",
+        "_walking",
         "avatar",
         "body",
     )
@@ -210,8 +206,7 @@ class ResidentQueries:
         self._scratch = make_scratch(avatar.arrays) if self._small else None
         self._poses, self._first, self._last = np.empty((1, 4, 4)), np.empty((4, 4)), np.empty((4, 4))
         self._rows, self._result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_swept.COLUMNS)
-        self._rows_below, self._result_below = self._rows.copy(), self._result.copy()
-        self._below = np.empty((4, 4))
+        self._walking: Any = None
         self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
         self._counts = np.zeros((3, 1), np.uint32)
         self._used: list[int] = []
@@ -241,7 +236,7 @@ class ResidentQueries:
                     max(tolerance, budget.tolerance), skin, rows, result,
                 )  # fmt: skip
                 if needed > 0:
-                    self._use(residency, rows[:needed].tolist())
+                    self.use(residency, rows[:needed].tolist())
             if needed >= 0:
                 return self._swept(
                     data, pose_from, verdict, visits, max(tolerance, budget.tolerance), skin, result
@@ -264,48 +259,33 @@ class ResidentQueries:
             missing > 0 or verdict == Verdict.UNKNOWN or (not exact and partial),
         )
 
-    def walk(
-        self,
-        data: SceneData,
-        pose_from: Pose,
-        pose_to: Pose,
-        down: Vec,
-        tolerance: float,
-        budget: QueryBudget,
-        skin: float,
-    ) -> tuple[SweepResult | None, SweepResult | None]:
-        """Sweep a motion and, if it is clear, the translation `down` (3,) [m] from its end, in one call.
+    @property
+    def is_small(self) -> bool:
+        """Return whether queries of the avatar take the fast path: it has points, and not too many."""
+        return self._small
 
-        The results equal those of two calls of `sweep`, the second without a skin. None: not known,
-        call `sweep`. A motion between equal poses is clear.
+    @property
+    def walking(self) -> Any:
+        """Return the avatar's arrays for the kernel `walk_frame`."""
+        if self._walking is None:
+            scratch = self._scratch
+            if scratch is None:  # not used, but of this type
+                scratch = make_scratch(make_avatar([[0.0, 0.0, 0.0]], 0.1).arrays)
+            points = np.ascontiguousarray(self.avatar.points)
+            self._walking = make_walk_avatar(
+                self.body.reference, scratch, self._box, points, float(self.avatar.radius)
+            )
+        return self._walking
+
+    def use(self, residency: VoxelCache, rows: list[int]) -> None:
+        """Record a use of voxels, once for _QUERIES_PER_USE consecutive uses of the same voxels.
+
+        Recording takes as long as a tenth of a query.
         """
-        if not self._small or budget.limited:
-            return None, None
-        residency, first, last = data.residency, self._first, self._last
-        first[:], last[:] = pose_from, pose_to
-        moves, tolerance = first.tobytes() != last.tobytes(), max(tolerance, budget.tolerance)
-        held = data.references.to(data.arrays, data.broad)
-        with residency.frozen():
-            needed, verdict, visits, needed_below, verdict_below, visits_below = held.call(
-                walk_resident, first, last, moves, down, self._below, self.body.reference, self._scratch,
-                self.avatar.radius, data.radius_units, self._box, held.reference, data.arrays.stop, data.unknown,
-                data.nothing_clear, tolerance, skin, self._rows, self._result, self._rows_below, self._result_below,
-            )  # fmt: skip
-            used = self._rows[:needed].tolist() if needed > 0 else []
-            if needed_below > 0:
-                used += [row for row in self._rows_below[:needed_below].tolist() if row not in used]
-            if used:
-                self._use(residency, used)
-        if needed < 0:
-            return None, None
-        moved = (
-            self._swept(data, pose_from, verdict, visits, tolerance, skin, self._result) if moves else _STILL
-        )
-        if needed_below < 0:
-            return moved, None
-        return moved, self._swept(
-            data, pose_to, verdict_below, visits_below, tolerance, -1.0, self._result_below
-        )
+        if rows != self._used or not self._again:
+            residency.use(rows)
+            self._used, self._again = rows, _QUERIES_PER_USE
+        self._again -= 1
 
     @staticmethod
     def _swept(
@@ -335,16 +315,6 @@ class ResidentQueries:
             Verdict.CONTACT, lower, upper, own, cloud, 0, exact, visits, 0, unknown, point, end
         )
 
-    def _use(self, residency: VoxelCache, rows: list[int]) -> None:
-        """Record a use of voxels, once for _QUERIES_PER_USE consecutive queries in the same voxels.
-
-        Recording takes as long as a tenth of a query.
-        """
-        if rows != self._used or not self._again:
-            residency.use(rows)
-            self._used, self._again = rows, _QUERIES_PER_USE
-        self._again -= 1
-
     def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
         """Return verdict and node visits of `collide` for a pose (4, 4)."""
         if self._small and not budget.limited and not _has_unknown(data):
@@ -360,7 +330,7 @@ class ResidentQueries:
                     budget.tolerance_units, held.reference, data.arrays.stop, rows, self._outside, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:
-                    self._use(residency, rows[:needed].tolist())
+                    self.use(residency, rows[:needed].tolist())
             refuse(fault, at, found)
             if needed >= 0:
                 return _VERDICTS[int(verdict[0])], int(counts[1, 0])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.normal_reach import squared_reach
-from ...schemas.errors import CorruptError
+from ...schemas.errors import BadRequestError, CorruptError
 from ...schemas.kernels.normal_codes import NO_NORMAL, decode_normal
 from ..kernels.core.array_references import refer_to_scene
 from ..kernels.core.scene_arrays import LANES
@@ -67,6 +67,7 @@ class Normals:
         self._codes: OrderedDict[tuple[int, int], NDArray[np.uint16]] = OrderedDict()
         self._evictions = 0
         self._squares: dict[float, int] = {}
+        self._all_squares: dict[tuple[float, ...], NDArray[np.int64]] = {}
         self._stored = -1
         if store.with_normals:
             self._stored = squared_reach(
@@ -136,6 +137,23 @@ class Normals:
 
         self.visits += self._at_point(cloud, look, 0, stop, waits=waits)
         return heights * self._data.arrays.step
+
+    def squares(self, reaches: tuple[float, ...]) -> NDArray[np.int64]:
+        """Return the squares of reaches [steps^2], 0 for an invalid one, that of the stored normals, or -1.
+
+        The last element says whether scan numbers are in memory.
+        """
+        found = self._all_squares.get(reaches)
+        if found is None:
+            squares = []
+            for reach in reaches:
+                try:
+                    squares.append(self._square(reach))
+                except BadRequestError:
+                    squares.append(0)
+            found = np.array([*squares, self._stored, self._data.keeps_scan], np.int64)
+            self._all_squares[reaches] = found
+        return found
 
     def _square(self, reach: float) -> int:
         """Return the square of a reach [steps^2]. Raise BadRequestError."""

@@ -89,7 +89,7 @@ class Pipeline:
         self._seconds = None if limits.frame_ms is None else limits.frame_ms / 1e3
         self._visits = limits.frame_visits
         self._free = self._seconds is None and self._visits is None  # no budget, no measurement
-        self._walk = self._make_walk() if self._free else None
+        self._groups = _groups_of(runners, together=self._free)
 
     def run(
         self,
@@ -143,27 +143,23 @@ class Pipeline:
             since = world.visits
             ran: list[tuple[str, float]] = []
             now = time.perf_counter()
-            walked: dict[str, float] = {}
-            ahead = 0.0  # time of answers that `FreeWalk` got for effects that then ran
-            for runner in self.runners:
+            for group in self._groups if not skip else _groups_of(self.runners, together=False):
                 if budget.stop:
                     raise StoppedError
-                if runner.name == "stop" and self._walk is not None and not skip:
-                    walked = self._walk.run(frame) or {}
-                    ran.extend(walked.items())
-                    frame.simulated.extend(walked)
-                    before, now = now, time.perf_counter()
-                    ahead = 0.0 if walked else now - before
-                if runner.name in walked:
-                    continue
-                if self._free and not skip:
+                runner = group[0]
+                if len(group) > 1:
+                    world.walker.run(frame, sum([each.part for each in group]))  # type: ignore[attr-defined]
+                    frame.simulated.extend([each.name for each in group])
+                elif self._free and not skip:
                     runner.run(frame)
                     frame.simulated.append(runner.name)
                 else:
                     self._run_one(runner, frame, begin, since, skip)
                 before, now = now, time.perf_counter()
-                if frame.simulated and frame.simulated[-1] == runner.name:
-                    ran.append((runner.name, now - before + (ahead if runner.name == "sweep" else 0.0)))
+                if len(group) > 1:
+                    ran.extend(_shared_time(group, now - before, frame.visits))
+                elif frame.simulated and frame.simulated[-1] == runner.name:
+                    ran.append((runner.name, now - before))
             self.times.add(ran, frame.skipped)
             if not self._stops:
                 frame.verdict = world.collide(body.avatar, frame.pose, budget)
@@ -174,15 +170,6 @@ class Pipeline:
             if budget.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError
             world.saw(body.user, body.avatar, frame.pose)
-
-    def _make_walk(self) -> Any:
-        """Return the `FreeWalk` of the scene; None if it lacks an effect for it."""
-        if not {runner.name for runner in self.runners} >= {"stop", "sweep", "ground"}:
-            return None
-        # Imported here, so that scenes without these effects do not import them.
-        from .free_walk import make_free_walk
-
-        return make_free_walk(self.runners, self.world)
 
     def _poses_to_restore(self, body: Body, budget: QueryBudget) -> Any:
         """Return the poses of pushed objects that a stopped frame must restore; None if there are none.
@@ -214,6 +201,26 @@ class Pipeline:
         if self._seconds is not None and seconds + cost.seconds > self._seconds:
             return True
         return self._visits is not None and visits + cost.visits > self._visits
+
+
+def _groups_of(runners: list[Runner], *, together: bool) -> list[list[Runner]]:
+    """Return the effects in groups that one call runs. together: whether effects may share a call."""
+    groups: list[list[Runner]] = []
+    for runner in runners:
+        if together and hasattr(runner, "part") and groups and hasattr(groups[-1][-1], "part"):
+            groups[-1].append(runner)
+        else:
+            groups.append([runner])
+    return groups
+
+
+def _shared_time(group: list[Runner], seconds: float, visits: list[int]) -> list[tuple[str, float]]:
+    """Return the time of each effect of a call [s], divided by node visits. visits: of each part."""
+    counts = [visits[runner.part.bit_length() - 1] for runner in group]  # type: ignore[attr-defined]
+    total = sum(counts)
+    if not total:
+        return [(runner.name, seconds / len(group)) for runner in group]
+    return [(runner.name, seconds * count / total) for runner, count in zip(group, counts, strict=True)]
 
 
 def _vector(place: Vec) -> tuple[float, float, float]:

@@ -14,20 +14,9 @@ because voxels are not in memory yet, for a frame that does not wait for them.
 
 from ....schemas.scene.effect_table import Stop, Sweep
 from ....schemas.wire.answers import Verdict
+from ...kernels.walk.walk_state import FOLLOW
 from ..world.collision_world import World
-from ..world.frame import (
-    Frame,
-    Hit,
-    Pose,
-    Vec,
-    find_touched,
-    follow_command,
-    is_clear,
-    pushes_on,
-    record_hit,
-    translated,
-    with_point,
-)
+from ..world.frame import Frame, Hit, Vec, find_touched, is_clear, record_hit, translated
 from ..world.vectors import dot, norm
 
 # Longest displacement of an escape from contact [m], and the distances that are tried.
@@ -46,29 +35,11 @@ class StopRunner:
 
     def run(self, frame: Frame) -> None:
         """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
-        frame.advance = move_if_clear
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             escape_contact(frame)
         if not self._continuous:
-            follow_command(frame)
-
-
-def move_if_clear(frame: Frame, to: Pose) -> Hit | None:
-    """Move to a pose if nothing is touched there; otherwise return the hit."""
-    if frame.pose.tobytes() == to.tobytes():
-        return None
-    hit = find_touched(frame, to)
-    if hit is not None and pushes_on(frame, hit, to):
-        hit = find_touched(frame, to)
-    if hit is None:
-        frame.pose, frame.clear = to, True
-        if frame.verdict == Verdict.CONTACT:
-            frame.verdict = Verdict.CLEAR
-        return None
-    hit = with_point(frame, to, hit._replace(fraction=1.0))._replace(fraction=0.0)
-    record_hit(frame, hit, to)
-    return hit
+            frame.world.walker.run(frame, FOLLOW)
 
 
 def escape_contact(frame: Frame) -> None:
@@ -110,4 +81,5 @@ def _escape_displacements(frame: Frame, hit: Hit) -> list[Vec]:
 
 def make(effect: Stop, world: World) -> StopRunner:
     """Create the effect of a scene."""
+    world.walker.warm()
     return StopRunner(any(isinstance(each, Sweep) for each in world.file.effects))

@@ -6,6 +6,7 @@ directly.
 """
 
 import threading
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -20,11 +21,10 @@ from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, 
 from ...archives.placed_archive import PlacedArchive
 from ...archives.rigid_transform import rotate_vectors, transform_points
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.core.array_references import Held
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import with_stop
-from ...queries.resident_fast_path import SweepResult, distance_fast
+from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
@@ -191,32 +191,6 @@ class World:
         assert found is not None
         return found
 
-    def walk(
-        self,
-        avatar: AvatarModel,
-        pose_from: Pose,
-        pose_to: Pose,
-        down: Vec,
-        tolerance: float,
-        budget: QueryBudget,
-        skin: float,
-    ) -> tuple[SweepResult | None, SweepResult | None]:
-        """Return the answers of `sweep` for a motion and for the translation `down` (3,) [m] from its end.
-
-        One kernel call gives both. None: not known; that of the translation is only known if the
-        motion is clear. skin: of the motion; the translation has none. Call it inside a `with`.
-        """
-        held = self._held
-        if not self._alone or not held.depth:
-            return None, None
-        found = held.probes.of(avatar).walk(
-            held.seen[0].data, pose_from, pose_to, down, tolerance, budget, skin
-        )
-        for swept in found:
-            if swept is not None:
-                self.count(swept.visits, swept.unknown)
-        return found
-
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
     ) -> tuple[Pose, bool]:
@@ -226,9 +200,22 @@ class World:
             pose, same = self._held.probes.of(avatar).between(origin, pose_from, pose_to, fraction)
         return pose, same and self._alone
 
-    def body(self, avatar: AvatarModel) -> Held:
-        """Return the reference to an avatar's arrays, for kernels that take one."""
-        return self._held.probes.of(avatar).body
+    @property
+    def is_alone(self) -> bool:
+        """Return whether the world is a single archive at the identity."""
+        return self._alone
+
+    def probe(self, avatar: AvatarModel) -> ResidentQueries:
+        """Return this thread's `ResidentQueries` of an avatar."""
+        return self._held.probes.of(avatar)
+
+    @cached_property
+    def walker(self) -> Any:
+        """Return the `Walker` of the scene."""
+        # Imported here: only effects that move an avatar need it.
+        from .frame_walk import Walker
+
+        return Walker(self)
 
     def lowest_height(self) -> float:
         """Return the height of the lowest corner of the archives' boxes, spheres included [m]."""
@@ -347,11 +334,17 @@ class World:
         """
         if hit.cloud is None or hit.avatar is None or hit.archive < 0:
             return hit.normal  # hit of a body, whose normal is known
+        return self.normal_at(hit.archive, hit.cloud, hit.avatar - hit.cloud, reach, budget)
+
+    def normal_at(
+        self, archive: int, cloud: Vec, toward: Vec, reach: float, budget: QueryBudget = EXACT
+    ) -> Vec | None:
+        """Return `normal` at a scan point (3,) of an archive, on the side of a direction (3,)."""
         held = self._held
         with self as seen:
-            each = seen[hit.archive]
+            each = seen[archive]
             normals, pose = normals_of(each), each.placed.pose
-            place, way = touched_in_archive(each, hit.cloud, (hit.avatar - hit.cloud)[None])
+            place, way = touched_in_archive(each, cloud, toward[None])
             waits = budget.late is None
             try:
                 found: Vec | None = normals.at(place, way[0], reach, held.stop, waits=waits)

@@ -1,6 +1,6 @@
 """One frame of one user: its state, the hits that end motions, and the motions of effects."""
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -9,20 +9,12 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.motion.motion_end import MAX_SKIN_FACTOR
-from ...kernels.motion.motion_end import MIN_MOTION as MIN_MOTION
+from ...kernels.walk.walk_queries import MAX_UNDECIDED
 from ...queries.context.query_budget import EXACT, QueryBudget
-from ...queries.resident_fast_path import SweepResult
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
 Vec = NDArray[np.float64]  # (3,) [m]
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
-
-# If a motion is undecided for more than this distance before its contact, it ends where the
-# undecided part begins [m].
-MAX_UNDECIDED = 1e-4
-# First step back from a pose that turns out not to be clear [m], and its growth factor.
-_FIRST_STEP_BACK, _STEP_GROWTH = 1e-7, 4.0
 
 
 class Hit(NamedTuple):
@@ -120,18 +112,15 @@ class Frame:
     seconds: time since the previous frame.
     world: answers the queries (collision_world.py).  budget: of the queries.
     pose, verdict: reached so far.  generations: of the archives in use.
-    clear: whether nothing is touched at `pose`; queried once, then maintained by `advance`.
+    clear: whether nothing is touched at `pose`.
     remaining: (3,), part of the commanded translation that is not completed yet [m].
     hits: hits that ended motions, in order.
-    blocked, blocked_pose: hit that ended the commanded motion first, and the pose there; None if
-    nothing ended it.
     obstacles: obstacles besides the scan.
-    advance: function that moves as far as nothing is touched; set by `stop` or `sweep`.
     fall_speed, on_ground: new values of `Body`.
     simulated, skipped: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
-    walked: what is known from free_walk.py: the answers of the sweep of the motion command, and of
-    the near search for ground from its end.
+    walks, walk_hits: for frame_walk.py: whether a part has run, and the hits that Python answered with, by
+    their row.  visits: node visits of each part in its last call.
     """
 
     body: Body
@@ -145,17 +134,16 @@ class Frame:
     clear: bool = False
     remaining: Vec = field(default_factory=lambda: np.zeros(3))
     hits: list[Hit] = field(default_factory=list)
-    blocked: Hit | None = None
-    blocked_pose: Pose | None = None
     obstacles: list[Obstacle] = field(default_factory=list)
-    advance: "Advance | None" = None
     fall_speed: float = 0.0
     on_ground: bool = False
     simulated: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     reports: dict[str, Any] = field(default_factory=dict)
     effect_state: dict[str, Any] = field(default_factory=dict)
-    walked: tuple[SweepResult | None, SweepResult | None] = (None, None)
+    walks: bool = False
+    walk_hits: dict[int, Hit] | None = None
+    visits: list[int] = field(default_factory=list)
 
     @property
     def lacked(self) -> int:
@@ -163,16 +151,12 @@ class Frame:
         return 0 if self.budget.late is None else self.budget.late.count
 
 
-# Function that moves from `frame.pose` towards a pose as far as nothing is touched, sets frame.pose
-# and returns the hit that ended the motion, or None.
-Advance = Callable[[Frame, Pose], Hit | None]
-
-
 class Runner(Protocol):
     """One effect of one scene. It stores the state of a user only in `Body`.
 
     Each effect's module creates one: `make(effect, world)`. If a runner also has a method
-    `begin(frame)`, it is called before any effect runs and may change the motion command.
+    `begin(frame)`, it is called before any effect runs and may change the motion command. Effects that
+    move the avatar have an attribute `part`, their bit in `walk_frame`: several run in one call.
     """
 
     name: str
@@ -197,23 +181,15 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
 
 
 def find_first_hit(
-    frame: Frame,
-    to: Pose,
-    tolerance: float,
-    skin: float = -1.0,
-    *,
-    below: bool = False,
-    swept: SweepResult | None = None,
+    frame: Frame, to: Pose, tolerance: float, skin: float = -1.0, *, below: bool = False
 ) -> Hit | None:
     """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
 
     skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
     below: for a search for ground, leave out bodies beside the avatar.
-    swept: the scene's answer, if it is known already.
     """
-    avatar, found, lacked = frame.body.avatar, None, frame.lacked
-    if swept is None:
-        swept = frame.world.sweep(avatar, frame.pose, to, tolerance, frame.budget, skin)
+    found, lacked = None, frame.lacked
+    swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
     if swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT
         if sure and not swept.exact:
@@ -225,10 +201,20 @@ def find_first_hit(
             )  # fmt: skip
         else:
             found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
+    until = math.inf if found is None else found.fraction
+    return first_body_hit(frame, to, tolerance, until, below=below) or found
+
+
+def first_body_hit(frame: Frame, to: Pose, tolerance: float, until: float, *, below: bool) -> Hit | None:
+    """Return the first hit of the motion from frame.pose to a pose with obstacles, before `until`.
+
+    until: fraction of the motion.  below: as for `find_first_hit`.
+    """
+    found = None
     for obstacle in frame.obstacles:
-        hit = obstacle.sweep(avatar, frame.pose, to, tolerance, below=below)
-        if hit is not None and (found is None or hit.fraction < found.fraction):
-            found = hit
+        hit = obstacle.sweep(frame.body.avatar, frame.pose, to, tolerance, below=below)
+        if hit is not None and hit.fraction < until:
+            found, until = hit, hit.fraction
     return found
 
 
@@ -251,7 +237,12 @@ def is_clear(frame: Frame, pose: Pose, *, proved: bool = False) -> bool:
     avatar = frame.body.avatar
     if not proved and frame.world.collide(avatar, pose, frame.budget) != Verdict.CLEAR:
         return False
-    return not any(each.touches(avatar, pose) for each in frame.obstacles)
+    return not touches_bodies(frame, pose)
+
+
+def touches_bodies(frame: Frame, pose: Pose) -> bool:
+    """Return whether an obstacle is touched at a pose."""
+    return any(each.touches(frame.body.avatar, pose) for each in frame.obstacles)
 
 
 def max_displacement(frame: Frame, to: Pose) -> float:
@@ -270,73 +261,8 @@ def max_displacement(frame: Frame, to: Pose) -> float:
     return norm(center) + frobenius_norm(turn) * float(avatar.arrays.radius[0])
 
 
-def with_point(frame: Frame, to: Pose, hit: Hit) -> Hit:
-    """Return the hit that ended a motion from frame.pose to a pose; one of the scan with its `point`."""
-    if hit.archive < 0 or hit.avatar is None or hit.point is not None:
-        return hit
-    return hit._replace(point=_touching_point(frame, to, hit, hit.avatar))
-
-
-def _touching_point(frame: Frame, to: Pose, hit: Hit, place: Vec) -> Vec:
-    """Return a place (3,) [m] at the time of a hit, in the avatar's frame."""
-    there, _ = frame.world.between(frame.body.avatar, frame.pose, to, min(hit.fraction, 1.0))
-    return rotate_back(there, place - there[:3, 3])
-
-
-def skin_fraction(frame: Frame, to: Pose, hit: Hit, skin: float) -> float:
-    """Return the share of the motion by which to stop before `hit`.
-
-    The avatar is then `skin` [m] away from the tangent plane of the two spheres.
-    """
-    way = max_displacement(frame, to)
-    if way <= 0.0 or skin <= 0.0:
-        return 0.0
-    if hit.avatar is None or hit.cloud is None:
-        return skin / way
-    out = hit.avatar - hit.cloud
-    point = hit.point if hit.point is not None else _touching_point(frame, to, hit, hit.avatar)
-    # The displacement of the point that touches.
-    goes = (to[:3, 3] - frame.pose[:3, 3]) + rotate(to[:3, :3] - frame.pose[:3, :3], point)
-    length, speed = norm(out), norm(goes)
-    if speed <= 1e-9 * way:
-        return min(1.0, skin / way)
-    into = speed if length == 0.0 else -dot(goes, out) / length
-    return skin / max(into, speed / MAX_SKIN_FACTOR)
-
-
-def settle_before(frame: Frame, to: Pose, fraction: float, proved: float) -> None:
-    """Set frame.pose to the pose at `fraction` of the way to a pose, or to a clear one before it.
-
-    proved: fraction before which nothing touches. The pose stays unchanged if the way is shorter
-    than MIN_MOTION.
-    """
-    begin, way = frame.pose, max_displacement(frame, to)
-    back = 0.0
-    while (fraction - back) * way >= MIN_MOTION:
-        pose, same = frame.world.between(frame.body.avatar, begin, to, fraction - back)
-        if is_clear(frame, pose, proved=same and fraction - back < proved):
-            frame.pose = pose
-            return
-        back = max(_STEP_GROWTH * back, _FIRST_STEP_BACK / way)
-
-
-def pushes_on(frame: Frame, hit: Hit, to: Pose) -> bool:
-    """Let the touched obstacle give way; return whether the motion should be tried again."""
-    return bool(hit.what) and any(obstacle.give_way(frame, hit, to) for obstacle in frame.obstacles)
-
-
-def record_hit(frame: Frame, hit: Hit, to: Pose | None = None) -> None:
-    """Record the hit that ended a motion. to: pose that the motion led to, by the motion command."""
-    if hit.unloaded and to is not None:
-        hit = hit._replace(rest=norm(to[:3, 3] - frame.pose[:3, 3]))
+def record_hit(frame: Frame, hit: Hit) -> None:
+    """Record a hit where the frame begins."""
     frame.hits.append(hit)
     if hit.verdict == Verdict.UNKNOWN and frame.verdict == Verdict.CLEAR:
         frame.verdict = Verdict.UNKNOWN
-
-
-def follow_command(frame: Frame) -> None:
-    """Move towards the commanded pose."""
-    assert frame.advance is not None
-    frame.blocked = frame.advance(frame, frame.target)
-    frame.blocked_pose = None if frame.blocked is None else frame.pose
-    frame.remaining = frame.target[:3, 3] - frame.pose[:3, 3]

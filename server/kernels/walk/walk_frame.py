@@ -1,0 +1,58 @@
+"""Parts of a user's frame in one call: the motion command, `slide`, `step` and `ground`."""
+
+from ....schemas.kernels import compiling as nb
+from .slide_along import slide_command
+from .stand_on_ground import stand_on_ground
+from .step_up import step_up
+from .walk_motions import follow_command
+from .walk_state import FOLLOW, GROUND, PART, POSE, POSES, REPEATS, SLIDE, STEP, Walk
+from .walk_vectors import copy_pose
+
+
+@nb.njit(nogil=True, cache=True)
+def walk_frame(
+    parts, settings, avatar, memory, held, stop, unknown, unknown_everywhere, native, bodies, other_units,
+    least_tolerance, tolerance_units, squares,
+):  # fmt: skip
+    """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
+
+    parts: bits of FOLLOW to GROUND.  settings, avatar, memory: references, see walk_state.py.
+    held: reference to the scene's arrays.  stop, unknown, unknown_everywhere, other_units: as for
+    `sweep_resident`.  native: whether queries may be answered here: the scene is one archive at the
+    identity, and the avatar is small and not empty.  bodies: whether other bodies are obstacles.
+    least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
+    squares: (5,) int64, the normal reach, thrice and nine times that, squared [steps^2], or 0 if it is
+    invalid; that of stored normals, and whether scan numbers are in memory.
+    """
+    walk = Walk(
+        settings, avatar, memory, held, stop, unknown, unknown_everywhere, native, bodies, other_units, least_tolerance,
+        tolerance_units, squares,
+    )  # fmt: skip
+    if memory.log[REPEATS] != 0:
+        _copy_state(memory, memory.saved_numbers, memory.numbers, memory.saved_values, memory.values, False)
+    else:
+        _copy_state(memory, memory.numbers, memory.saved_numbers, memory.values, memory.saved_values, True)
+    if parts & FOLLOW:
+        memory.numbers[PART] = 0
+        follow_command(walk)
+    if parts & SLIDE:
+        memory.numbers[PART] = 1
+        slide_command(walk)
+    if parts & STEP:
+        memory.numbers[PART] = 2
+        step_up(walk)
+    if parts & GROUND:
+        memory.numbers[PART] = 3
+        stand_on_ground(walk)
+
+
+@nb.njit(nogil=True, cache=True)
+def _copy_state(memory, numbers, to_numbers, values, to_values, saves):
+    """Save what a part changes, or restore it. Hits are restored by their number."""
+    to_numbers[:] = numbers
+    to_values[:] = values
+    for n in range(POSE, POSES):
+        if saves:
+            copy_pose(memory.poses[n], memory.saved_poses[n])
+        else:
+            copy_pose(memory.saved_poses[n], memory.poses[n])

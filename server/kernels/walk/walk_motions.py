@@ -1,0 +1,180 @@
+"""Motions of a walking avatar: as far as nothing is touched.
+
+With the effect `sweep`, a motion stops the skin before the first contact, at a pose that is clear by
+`collide`. The sweep proves the pose clear if the pose is one of the sweep's bit for bit; otherwise
+`collide` is queried. Without `sweep`, a motion leads to its end or nowhere.
+"""
+
+import numpy as np
+
+from ....schemas.kernels import compiling as nb
+from ..motion.motion_end import MIN_MOTION, skin_fraction
+from ..motion.sweep_resident import END, LOWER, POINT
+from .walk_queries import (
+    farthest_motion,
+    first_hit,
+    gives_way,
+    hit_at,
+    is_clear,
+    keep_point,
+    motion_left,
+    pair_of,
+    pose_on_way,
+    touching_point,
+)
+from .walk_state import (
+    BLOCKED,
+    BLOCKED_POSE,
+    CLEAR,
+    CONTACT,
+    FRAME_VERDICT,
+    HAS_END,
+    HAS_PAIR,
+    HAS_POINT,
+    HITS,
+    IS_CLEAR,
+    LEFT,
+    POSE,
+    REST,
+    TARGET,
+    UNKNOWN,
+    UNLOADED,
+    VERDICT,
+    pose_now,
+)
+from .walk_vectors import copy_pose
+
+# First step back from a pose that turns out not to be clear [m], and its growth factor.
+FIRST_STEP_BACK, STEP_GROWTH = 1e-7, 4.0
+# Limit of pushes of bodies in one motion.
+MAX_PUSHES = 4
+
+
+@nb.njit(nogil=True, cache=True)
+def same_pose(one, other):
+    """Return whether two poses (4, 4) have the same bits."""
+    for r in range(4):
+        for c in range(4):
+            a, b = one[r, c], other[r, c]
+            if a != b or np.signbit(a) != np.signbit(b):
+                return False
+    return True
+
+
+@nb.njit(nogil=True, cache=True)
+def move_to(walk, pose):
+    """Set the frame's pose (4, 4)."""
+    copy_pose(pose, walk.memory.poses[POSE])
+
+
+@nb.njit(nogil=True, cache=True)
+def record_hit(walk, hit, to):
+    """Record the hit that ended a motion to a pose (4, 4)."""
+    memory = walk.memory
+    result, numbers = memory.tape[hit], memory.numbers
+    if result[UNLOADED] != 0.0:
+        result[REST] = motion_left(walk, to)
+    memory.hits[numbers[HITS]] = hit
+    memory.normals[numbers[HITS], 0] = 0.0
+    numbers[HITS] += 1
+    if result[VERDICT] == UNKNOWN and numbers[FRAME_VERDICT] == CLEAR:
+        numbers[FRAME_VERDICT] = UNKNOWN
+
+
+@nb.njit(nogil=True, cache=True)
+def settle_before(walk, to, fraction, proved):
+    """Move to the pose at `fraction` of the way to a pose (4, 4), or to a clear one before it.
+
+    proved: fraction before which nothing touches. The avatar stays if the way is shorter than
+    MIN_MOTION.
+    """
+    begin, pose = pose_now(walk), np.empty((4, 4))
+    way, back = farthest_motion(walk, begin, to), 0.0
+    while (fraction - back) * way >= MIN_MOTION:
+        same = pose_on_way(walk, begin, to, fraction - back, pose)
+        if is_clear(walk, pose, same and fraction - back < proved):
+            move_to(walk, pose)
+            return
+        back = max(STEP_GROWTH * back, FIRST_STEP_BACK / way)
+
+
+@nb.njit(nogil=True, cache=True)
+def _skin_share(walk, to, hit):
+    """Return the share of the motion to a pose (4, 4) by which to stop before a hit, to keep the skin."""
+    skin, begin, result = walk.settings.skin, pose_now(walk), walk.memory.tape[hit]
+    way = farthest_motion(walk, begin, to)
+    if way <= 0.0 or skin <= 0.0:
+        return 0.0
+    if result[HAS_PAIR] == 0.0:
+        return skin / way
+    point = result[POINT : POINT + 3] if result[HAS_POINT] != 0.0 else touching_point(walk, to, hit)
+    own, cloud = pair_of(walk, hit)
+    return skin_fraction(begin, to, own, cloud, point, way, skin)
+
+
+@nb.njit(nogil=True, cache=True)
+def advance(walk, to):
+    """Move towards a pose (4, 4) as far as nothing is touched; return the hit that ended the motion."""
+    if not walk.settings.continuous:
+        return _move_if_clear(walk, to)
+    memory, hit = walk.memory, -1
+    for _ in range(MAX_PUSHES):
+        if same_pose(pose_now(walk), to):
+            return -1
+        hit = first_hit(walk, to, walk.settings.tolerance, walk.settings.skin, False)
+        if hit < 0:
+            move_to(walk, to)
+            return -1
+        result = memory.tape[hit]
+        if result[HAS_END] != 0.0 and not walk.bodies:
+            move_to(walk, result[END:VERDICT].reshape(4, 4))
+        else:
+            keep_point(walk, to, hit)
+            fraction = result[LOWER]
+            settle_before(walk, to, fraction - _skin_share(walk, to, hit), fraction)
+        if not gives_way(walk, hit, to):
+            break
+    record_hit(walk, hit, to)
+    return hit
+
+
+@nb.njit(nogil=True, cache=True)
+def _move_if_clear(walk, to):
+    """Move to a pose (4, 4) if nothing is touched there; otherwise return the hit."""
+    if same_pose(pose_now(walk), to):
+        return -1
+    memory = walk.memory
+    hit = hit_at(walk, to)
+    if hit >= 0 and gives_way(walk, hit, to):
+        hit = hit_at(walk, to)
+    if hit < 0:
+        move_to(walk, to)
+        memory.numbers[IS_CLEAR] = 1
+        if memory.numbers[FRAME_VERDICT] == CONTACT:
+            memory.numbers[FRAME_VERDICT] = CLEAR
+        return -1
+    memory.tape[hit, LOWER] = 1.0
+    keep_point(walk, to, hit)
+    memory.tape[hit, LOWER] = 0.0
+    record_hit(walk, hit, to)
+    return hit
+
+
+@nb.njit(nogil=True, cache=True)
+def follow_command(walk):
+    """Move towards the commanded pose."""
+    memory = walk.memory
+    hit = advance(walk, memory.poses[TARGET])
+    memory.numbers[BLOCKED] = hit
+    if hit >= 0:
+        copy_pose(pose_now(walk), memory.poses[BLOCKED_POSE])
+    keep_rest(walk, 0.0)
+
+
+@nb.njit(nogil=True, cache=True)
+def keep_rest(walk, rose):
+    """Record what is left of the motion command, after a climb by `rose` [m]."""
+    memory = walk.memory
+    target, pose = memory.poses[TARGET], pose_now(walk)
+    for r in range(3):
+        memory.values[LEFT + r] = target[r, 3] + rose * walk.settings.up[r] - pose[r, 3]

@@ -1,0 +1,397 @@
+"""Queries of a walking avatar, answered from what is in memory or by Python; see walk_state.py.
+
+A hit is the number of its row of the tape; -1 stands for none.
+"""
+
+import numpy as np
+
+from ....schemas.kernels import compiling as nb
+from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal
+from ..collide.collide_poses import collide_resident
+from ..core.voxels_in_reach import VALID
+from ..motion.motion_end import longest_way
+from ..motion.sweep_resident import (
+    AVATAR,
+    CLOUD,
+    END,
+    ENDED,
+    LOWER,
+    OPEN,
+    POINT,
+    PROVED,
+    SPEED,
+    UPPER,
+    pose_between,
+    sweep_resident,
+)
+from ..rays.stored_normals import code_at, find_voxel, highest_near, stored_code_at
+from .walk_state import (
+    ANSWER,
+    ARCHIVE,
+    BODIES_AT,
+    BODIES_SWEPT,
+    CLEAR,
+    CLEAR_AT,
+    CONTACT,
+    GIVES_WAY,
+    HAS_END,
+    HAS_NORMAL,
+    HAS_PAIR,
+    HAS_POINT,
+    HEIGHTS,
+    HIGHEST,
+    KNOWN,
+    LANDS,
+    MISSED,
+    NAMED,
+    NEAREST,
+    NORMAL,
+    NORMAL_AT,
+    PART,
+    REST,
+    SWEPT,
+    TOUCHED,
+    UNKNOWN,
+    UNLOADED,
+    VERDICT,
+    VISITS,
+    ask,
+    next_row,
+    pose_now,
+    use_voxels,
+)
+from .walk_vectors import copy_pose, dot, minus, norm, times, vector
+
+# If a motion is undecided for more than this distance before its contact, it ends where the
+# undecided part begins [m].
+MAX_UNDECIDED = 1e-4
+
+
+@nb.njit(nogil=True, cache=True)
+def pair_of(walk, hit):
+    """Return the centres of the two touching spheres of a hit: the avatar's and the other, world [m]."""
+    row = walk.memory.tape[hit]
+    return vector(row[AVATAR:CLOUD]), vector(row[CLOUD:ENDED])
+
+
+@nb.njit(nogil=True, cache=True)
+def farthest_motion(walk, pose_from, pose_to):
+    """Return an approximate bound of the distance that any avatar point moves [m]."""
+    if walk.avatar.points.shape[0] == 0:
+        return 0.0
+    return longest_way(pose_from, pose_to, walk.avatar.body.avatar)
+
+
+@nb.njit(nogil=True, cache=True)
+def pose_on_way(walk, pose_from, pose_to, fraction, pose):
+    """Write the pose at a fraction of a motion (4, 4); return whether the proof of its sweep covers it."""
+    origin = walk.held.scene.origin if walk.native else np.zeros(3)
+    return pose_between(pose_from, pose_to, fraction, walk.avatar.box, origin, pose) and walk.native
+
+
+@nb.njit(nogil=True, cache=True)
+def _count(walk, visits, missed):
+    log = walk.memory.log
+    log[VISITS + walk.memory.numbers[PART]] += visits
+    if missed:
+        log[MISSED] = 1
+
+
+@nb.njit(nogil=True, cache=True)
+def _ask_at(walk, query, place):
+    """Ask about a place; see `_answer` in frame_walk.py for the numbers that each query gives."""
+    for r in range(3):
+        walk.memory.asked[r] = place[r]
+    ask(walk.memory, query)
+
+
+@nb.njit(nogil=True, cache=True)
+def _ask_motion(walk, query, to, tolerance, skin, below):
+    """Ask about the motion to a pose (4, 4)."""
+    memory = walk.memory
+    copy_pose(pose_now(walk), memory.asked_poses[0])
+    copy_pose(to, memory.asked_poses[1])
+    memory.asked[0], memory.asked[1], memory.asked[2] = tolerance, skin, 1.0 if below else 0.0
+    ask(memory, query)
+
+
+@nb.njit(nogil=True, cache=True)
+def first_hit(walk, to, tolerance, skin, below):
+    """Return the first hit of the motion from the frame's pose to a pose (4, 4).
+
+    skin: distance to keep from the hit [m], for its end; negative: not requested.
+    below: for a search for ground, leave out bodies beside the avatar.
+    """
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        if not (walk.native and _sweep(walk, to, tolerance, skin, row)):
+            _ask_motion(walk, SWEPT, to, tolerance, skin, below)
+        if walk.bodies:
+            _ask_motion(walk, BODIES_SWEPT, to, tolerance, skin, below)
+        memory.log[KNOWN] = row + 1
+    return -1 if memory.tape[row, VERDICT] == CLEAR else row
+
+
+@nb.njit(nogil=True, cache=True)
+def _sweep(walk, to, tolerance, skin, row):
+    """Write the scene's answer about a motion to a row; return whether it is known."""
+    memory, avatar = walk.memory, walk.avatar
+    result, pose = memory.tape[row], pose_now(walk)
+    within = max(tolerance, walk.least_tolerance)
+    needed, verdict, visits, _, _ = sweep_resident(
+        pose, to, avatar.body, avatar.scratch, avatar.radius, walk.other_units, avatar.box, walk.held, walk.stop,
+        walk.unknown, walk.unknown_everywhere, within, skin, memory.rows, result[:VERDICT],
+    )  # fmt: skip
+    if needed < 0:
+        return False
+    use_voxels(memory, needed)
+    exact = True
+    if verdict == CONTACT:
+        apart = result[UPPER] - result[LOWER]
+        exact = apart == 0.0 or result[SPEED] * apart <= within
+        if not exact and not farthest_motion(walk, pose, to) * apart <= MAX_UNDECIDED:
+            verdict = UNKNOWN
+    part_unknown = walk.unknown_everywhere or walk.unknown.shape[0] > 0
+    _count(walk, visits, verdict == UNKNOWN and exact or not exact and part_unknown)
+    pair, ends = verdict == CONTACT, verdict == CONTACT and skin >= 0.0
+    result[VERDICT], result[ARCHIVE] = verdict, 0.0 if pair else -1.0
+    result[HAS_PAIR], result[HAS_POINT] = 1.0 if pair else 0.0, 1.0 if ends else 0.0
+    result[HAS_END] = 1.0 if ends and result[ENDED] != OPEN else 0.0
+    if ends and result[ENDED] != OPEN and result[ENDED] != PROVED:
+        copy_pose(pose, result[END:VERDICT].reshape(4, 4))
+    result[HAS_NORMAL], result[NAMED], result[UNLOADED], result[REST] = 0.0, 0.0, 0.0, 0.0
+    return True
+
+
+@nb.njit(nogil=True, cache=True)
+def _collide(walk, pose):
+    """Return the verdict of the scene at a pose (4, 4); -1 if it is not known."""
+    memory, avatar = walk.memory, walk.avatar
+    if walk.unknown_everywhere or walk.unknown.shape[0] > 0:
+        return -1
+    copy_pose(pose, memory.one[0])
+    memory.verdict[0] = CLEAR
+    memory.counts[:] = 0
+    fault, _, _, needed = collide_resident(
+        memory.one, avatar.body, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop, memory.rows, memory.outside,
+        memory.verdict, memory.counts,
+    )  # fmt: skip
+    if fault != VALID or needed < 0:
+        return -1
+    use_voxels(memory, needed)
+    verdict = np.int64(memory.verdict[0])
+    if verdict != CLEAR and verdict != UNKNOWN:
+        verdict = CONTACT
+    _count(walk, np.int64(memory.counts[1, 0]), verdict == UNKNOWN)
+    return verdict
+
+
+@nb.njit(nogil=True, cache=True)
+def is_clear(walk, pose, proved):
+    """Return whether it is known that nothing is touched at a pose (4, 4).
+
+    proved: whether this is already proved for the scene; then only bodies are tested.
+    """
+    if proved and not walk.bodies:
+        return True
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        copy_pose(pose, memory.asked_poses[0])
+        memory.asked[0] = 1.0 if proved else 0.0
+        verdict = CLEAR if proved else _collide(walk, pose) if walk.native else -1
+        if verdict < 0:
+            ask(memory, CLEAR_AT)
+        if verdict == CLEAR and walk.bodies:
+            ask(memory, BODIES_AT)
+        memory.tape[row, ANSWER] = 1.0 if verdict == CLEAR else 0.0
+        memory.log[KNOWN] = row + 1
+    return memory.tape[row, ANSWER] != 0.0
+
+
+@nb.njit(nogil=True, cache=True)
+def hit_at(walk, pose):
+    """Return a hit with fraction 0 if a pose (4, 4) touches something or is unknown."""
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        if walk.bodies or not walk.native or _collide(walk, pose) != CLEAR:
+            copy_pose(pose, memory.asked_poses[0])
+            ask(memory, TOUCHED)
+        memory.tape[row, VERDICT] = CLEAR
+        memory.log[KNOWN] = row + 1
+    return -1 if memory.tape[row, VERDICT] == CLEAR else row
+
+
+@nb.njit(nogil=True, cache=True)
+def gives_way(walk, hit, to):
+    """Let the touched body give way; return whether the motion to a pose (4, 4) should be tried again."""
+    memory = walk.memory
+    if memory.tape[hit, NAMED] == 0.0:
+        return False
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        _ask_motion(walk, GIVES_WAY, to, np.float64(hit), 0.0, False)
+    return memory.tape[row, ANSWER] != 0.0
+
+
+@nb.njit(nogil=True, cache=True)
+def _voxel_at(walk, place):
+    """Return the lattice point of a place (3,) [m], and the row of its voxel.
+
+    -1: there is no voxel; -2: it is not in memory. Rounds half to even, as `Lattice.to_lattice`.
+    """
+    scene = walk.held.scene
+    x = np.int64(np.rint((place[0] - scene.origin[0]) / scene.step))
+    y = np.int64(np.rint((place[1] - scene.origin[1]) / scene.step))
+    z = np.int64(np.rint((place[2] - scene.origin[2]) / scene.step))
+    row = find_voxel(walk.held.index.keys, scene.voxel_steps, x, y, z)
+    if row >= 0:
+        if scene.where[row, 0] < 0:
+            return x, y, z, -2
+        walk.memory.rows[0] = row
+        use_voxels(walk.memory, 1)
+    return x, y, z, row
+
+
+@nb.njit(nogil=True, cache=True)
+def _code(walk, x, y, z, row, level):
+    """Return the code of the normal at a lattice point of a voxel in memory. level: as for `scan_normal`."""
+    if row < 0:
+        return NO_NORMAL
+    square = walk.squares[level]
+    if square == walk.squares[3]:
+        code, _ = stored_code_at(walk.held, row, x, y, z, walk.squares[4] != 0)
+        return code
+    code, _, _ = code_at(walk.held, row, x, y, z, square, np.empty(0, np.uint16))
+    return code
+
+
+@nb.njit(nogil=True, cache=True)
+def scan_normal(walk, archive, cloud, toward, level):
+    """Return whether the normal at a scan point is known, and it: a unit vector on the side of `toward`.
+
+    archive: number of the scan's archive.  cloud: the point, world [m].  level: 0: points within the
+    normal reach form the surface; 1: those within three times that. If they form none, the next level
+    is taken.
+    """
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        x, y, z, voxel = np.int64(0), np.int64(0), np.int64(0), np.int64(-2)
+        if walk.native and walk.squares[0] > 0:
+            x, y, z, voxel = _voxel_at(walk, cloud)
+        if voxel == -2:
+            for r in range(3):
+                memory.asked[3 + r] = toward[r]
+            memory.asked[6], memory.asked[7] = np.float64(archive), np.float64(level)
+            _ask_at(walk, NORMAL_AT, cloud)
+        code = _code(walk, x, y, z, voxel, level)
+        if code == NO_NORMAL:
+            code = _code(walk, x, y, z, voxel, level + 1)
+        memory.tape[row, HAS_NORMAL] = 0.0 if code == NO_NORMAL else 1.0
+        if code != NO_NORMAL:
+            found = decode_normal(code)
+            found = times(-1.0 if dot(found, toward) < 0.0 else 1.0, found)
+            for r in range(3):
+                memory.tape[row, NORMAL + r] = found[r]
+        memory.log[KNOWN] = row + 1
+    result = memory.tape[row]
+    return result[HAS_NORMAL] != 0.0, vector(result[NORMAL : NORMAL + 3])
+
+
+@nb.njit(nogil=True, cache=True)
+def hit_normal(walk, hit, level):
+    """Return whether the normal at a hit is known, and it; of a body, as its hit has it."""
+    result = walk.memory.tape[hit]
+    if result[HAS_PAIR] == 0.0 or result[ARCHIVE] < 0.0:
+        return result[HAS_NORMAL] != 0.0, vector(result[NORMAL : NORMAL + 3])
+    own, cloud = pair_of(walk, hit)
+    return scan_normal(walk, result[ARCHIVE], cloud, minus(own, cloud), level)
+
+
+@nb.njit(nogil=True, cache=True)
+def scan_heights(walk, hit, directions, level):
+    """Return how high the scan points around a touched one lie along up to three directions [m].
+
+    directions: (k, 3) unit.  level: as for `scan_normal`. Of further directions, the heights are zero.
+    """
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        archive, (_, cloud) = memory.tape[hit, ARCHIVE], pair_of(walk, hit)
+        count = directions.shape[0]
+        x, y, z, voxel = np.int64(0), np.int64(0), np.int64(0), np.int64(-2)
+        if walk.native and walk.squares[0] > 0:
+            x, y, z, voxel = _voxel_at(walk, cloud)
+        if voxel == -2:
+            memory.asked[3], memory.asked[4], memory.asked[5] = archive, np.float64(level), np.float64(count)
+            for n in range(count):
+                for r in range(3):
+                    memory.asked[6 + 3 * n + r] = directions[n, r]
+            _ask_at(walk, HIGHEST, cloud)
+        heights = memory.tape[row, HEIGHTS : HEIGHTS + 3]
+        heights[:] = 0.0
+        if voxel >= 0:
+            highest_near(walk.held, voxel, x, y, z, walk.squares[level], directions, heights[:count])
+            for n in range(count):
+                heights[n] *= walk.held.scene.step
+        memory.log[KNOWN] = row + 1
+    return vector(memory.tape[row, HEIGHTS : HEIGHTS + 3])
+
+
+@nb.njit(nogil=True, cache=True)
+def nearest_point(walk, place, reach):
+    """Return the row with the scan point nearest to a place within `reach` [m]; -1 if there is none."""
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        memory.asked[3] = reach
+        _ask_at(walk, NEAREST, place)
+    return row if memory.tape[row, HAS_PAIR] != 0.0 else -1
+
+
+@nb.njit(nogil=True, cache=True)
+def lands(walk, reach, stood):
+    """Return the row that says whether the avatar would land if it fell, see `_would_land` in frame_walk.py.
+
+    reach: distance below that is free [m].  stood: whether it stood in the last frame.
+    """
+    memory = walk.memory
+    row = next_row(memory)
+    if row >= memory.log[KNOWN]:
+        copy_pose(pose_now(walk), memory.asked_poses[0])
+        memory.asked[0], memory.asked[1] = reach, 1.0 if stood else 0.0
+        ask(memory, LANDS)
+    return row
+
+
+@nb.njit(nogil=True, cache=True)
+def motion_left(walk, to):
+    """Return the length of the translation from the frame's pose to a pose (4, 4) [m]."""
+    pose = pose_now(walk)
+    return norm((to[0, 3] - pose[0, 3], to[1, 3] - pose[1, 3], to[2, 3] - pose[2, 3]))
+
+
+@nb.njit(nogil=True, cache=True)
+def touching_point(walk, to, hit):
+    """Write the centre of the avatar's touching sphere at a hit (3,), avatar frame, to a new array.
+
+    The hit ended the motion from the frame's pose to a pose (4, 4).
+    """
+    result, there, point = walk.memory.tape[hit], np.empty((4, 4)), np.empty(3)
+    pose_on_way(walk, pose_now(walk), to, min(result[LOWER], 1.0), there)
+    x, y, z = result[AVATAR] - there[0, 3], result[AVATAR + 1] - there[1, 3], result[AVATAR + 2] - there[2, 3]
+    for k in range(3):
+        point[k] = there[0, k] * x + there[1, k] * y + there[2, k] * z
+    return point
+
+
+@nb.njit(nogil=True, cache=True)
+def keep_point(walk, to, hit):
+    """Complete a hit of the scan that ended the motion to a pose (4, 4) with its touching point."""
+    result = walk.memory.tape[hit]
+    if result[ARCHIVE] >= 0.0 and result[HAS_PAIR] != 0.0 and result[HAS_POINT] == 0.0:
+        result[POINT : POINT + 3] = touching_point(walk, to, hit)
+        result[HAS_POINT] = 1.0

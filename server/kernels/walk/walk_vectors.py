@@ -1,0 +1,121 @@
+"""Vectors and rotations in compiled code: tuples of three float64.
+
+The operations and their order are those of server/simulation/world/vectors.py, so that both give the
+same bits.
+"""
+
+import math
+
+import numpy as np
+
+from ....schemas.kernels import compiling as nb
+from ..core.kernel_decorators import njit_no_refcount
+
+
+@njit_no_refcount
+def vector(row):
+    """Return the vector in an array (3,)."""
+    return row[0], row[1], row[2]
+
+
+@njit_no_refcount
+def place_of(pose):
+    """Return the translation of a pose (4, 4)."""
+    return pose[0, 3], pose[1, 3], pose[2, 3]
+
+
+@njit_no_refcount
+def dot(one, other):
+    """Return the dot product."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+@njit_no_refcount
+def norm(one):
+    """Return the length."""
+    return math.sqrt(one[0] * one[0] + one[1] * one[1] + one[2] * one[2])
+
+
+@njit_no_refcount
+def plus(one, other):
+    """Return the sum."""
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+
+
+@njit_no_refcount
+def minus(one, other):
+    """Return the difference."""
+    return one[0] - other[0], one[1] - other[1], one[2] - other[2]
+
+
+@njit_no_refcount
+def times(factor, one):
+    """Return a multiple."""
+    return factor * one[0], factor * one[1], factor * one[2]
+
+
+@njit_no_refcount
+def divided(one, by):
+    """Return the quotient of a vector and a number."""
+    return one[0] / by, one[1] / by, one[2] / by
+
+
+@njit_no_refcount
+def cross(one, other):
+    """Return the cross product."""
+    return (
+        one[1] * other[2] - one[2] * other[1],
+        one[2] * other[0] - one[0] * other[2],
+        one[0] * other[1] - one[1] * other[0],
+    )
+
+
+@njit_no_refcount
+def rotate(pose, one):
+    """Return a vector of the frame of a pose (4, 4) in the world."""
+    return (
+        pose[0, 0] * one[0] + pose[0, 1] * one[1] + pose[0, 2] * one[2],
+        pose[1, 0] * one[0] + pose[1, 1] * one[1] + pose[1, 2] * one[2],
+        pose[2, 0] * one[0] + pose[2, 1] * one[1] + pose[2, 2] * one[2],
+    )
+
+
+@njit_no_refcount
+def rotate_back(pose, one):
+    """Return a vector of the world in the frame of a pose (4, 4)."""
+    return (
+        pose[0, 0] * one[0] + pose[1, 0] * one[1] + pose[2, 0] * one[2],
+        pose[0, 1] * one[0] + pose[1, 1] * one[1] + pose[2, 1] * one[2],
+        pose[0, 2] * one[0] + pose[1, 2] * one[1] + pose[2, 2] * one[2],
+    )
+
+
+@njit_no_refcount
+def copy_pose(source, target):
+    """Copy a pose (4, 4) to another array."""
+    for r in range(4):
+        for c in range(4):
+            target[r, c] = source[r, c]
+
+
+@nb.njit(nogil=True, cache=True)
+def translated(pose, way):
+    """Return a new pose (4, 4), translated by a vector."""
+    there = np.empty((4, 4))
+    copy_pose(pose, there)
+    for r in range(3):
+        there[r, 3] += way[r]
+    return there
+
+
+@njit_no_refcount
+def lowest_height(points, radius, pose, up):
+    """Return the lowest height of spheres under a pose, along `up` [m].
+
+    points: (n, 3) float64, their centres in the pose's frame; n > 0.  radius: [m].
+    """
+    down = rotate_back(pose, up)
+    least = np.inf
+    for n in range(points.shape[0]):
+        least = min(least, points[n, 0] * down[0] + points[n, 1] * down[1] + points[n, 2] * down[2])
+    return dot(place_of(pose), up) + least - radius

@@ -1,0 +1,357 @@
+"""Parts of a frame that move an avatar, by the kernel `walk_frame`, and its queries for Python.
+
+The kernel asks Python if voxels have to be loaded, bodies are in the way, a scene is not a single
+archive at the identity, or an avatar is too large (kernels/walk/walk_state.py).
+"""
+
+import math
+import threading
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
+from ....schemas.scene.effect_table import Ground, Slide, Step, Stop, Sweep
+from ....schemas.scene.scene_file import SceneFile, sweep_tolerance
+from ....schemas.wire.answers import Verdict
+from ....schemas.wire.motion_messages import GroundReport
+from ...kernels.motion.sweep_resident import AVATAR, CLOUD, END, ENDED, LOWER, POINT
+from ...kernels.walk import walk_state as state
+from ...kernels.walk.slide_along import FLAT, FLAT_REACH_FACTOR
+from ...kernels.walk.walk_frame import walk_frame
+from ...queries.context.query_budget import EXACT, QueryBudget
+from ...queries.resident_fast_path import MAX_FAST_VOXELS
+from .collision_world import SPARSE_FACTOR, World
+from .frame import (
+    Frame,
+    Hit,
+    Pose,
+    Vec,
+    find_first_hit,
+    find_touched,
+    first_body_hit,
+    is_clear,
+    lowest_height,
+    touches_bodies,
+    translated,
+)
+from .held_archive import normals_of
+from .vectors import dot
+
+# Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
+# on, and the place where it was raised last.
+GROUND_PLANE, RAISED = "ground", "ground raised"
+# Rows of the tape at first; frames that need more double it.
+_ROWS = 64
+# Points within this distance of the touched point determine the ground's normal [m]. With `slide`, its
+# distance is used instead, because an archive stores normals for one distance.
+_NORMAL_REACH = 0.08
+# The first search for ground extends this many clearances down.
+_NEAR_CLEARANCES = 2.0
+# Least distance to move off a bump [m].
+_MIN_LIFT = 5e-4
+# Error of a cosine that results from storing normals to a third of a degree.
+_ROUNDING = 0.005
+# A search for any landing place extends to this distance below the scene's lowest sphere [m]; the
+# tolerance of that sweep [m].
+_FALL_MARGIN, _FALL_TOLERANCE = 0.1, 1e-2
+
+
+def _settings(file: SceneFile, up: Vec) -> tuple[Any, float]:
+    """Return the options of a scene's effects for the kernel, and the normal reach [m]."""
+    declared: dict[type, Any] = {type(effect): effect for effect in file.effects}
+    stop, slide = declared.get(Stop, Stop()), declared.get(Slide)
+    ground, step = declared.get(Ground), declared.get(Step)
+    reach, height = _NORMAL_REACH if slide is None else slide.normal_reach, 0.0 if step is None else step.height
+    walkable_slide, standing = -2.0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if ground is not None:
+        walkable_slide = math.cos(math.radians(ground.slope))
+        snap = height if ground.snap is None else ground.snap
+        clearance = ground.clearance
+        standing = (
+            clearance, _NEAR_CLEARANCES * clearance, clearance + max(snap, clearance), ground.gravity,
+            ground.fall_speed, walkable_slide - _ROUNDING,
+        )  # fmt: skip
+    made = state.make_settings(
+        up, Sweep in declared, float(stop.skin), float(sweep_tolerance(file)), slide is not None,
+        4 if slide is None else slide.surfaces, float(reach), max(stop.skin, _MIN_LIFT), walkable_slide,
+        float(height), *(float(each) for each in standing),
+    )  # fmt: skip
+    return made, reach
+
+
+class _Thread(threading.local):
+    """State of a frame of each thread."""
+
+    def __init__(self) -> None:
+        self.use(state.make_arrays(_ROWS, MAX_FAST_VOXELS))
+
+    def use(self, memory: state.WalkArrays) -> None:
+        """Take other arrays."""
+        self.memory, self.reference = memory, state.refer_to_memory(memory)
+
+    def grow(self) -> None:
+        """Double the rows of the tape."""
+        old, rows = self.memory, len(self.memory.tape)
+        larger = state.make_arrays(2 * rows, MAX_FAST_VOXELS)
+        for old_array, array in zip(old, larger, strict=True):
+            array[: len(old_array)] = old_array
+        self.use(larger)
+
+
+class Walker:
+    """Moves the avatars of one scene. Thread-safe.
+
+    native: whether the kernel answers queries itself; tests compare both.
+    """
+
+    def __init__(self, world: World) -> None:
+        """Prepare the effects of the world's scene file, and compile the kernel."""
+        self.native = True
+        self._world = world
+        self._settings, reach = _settings(world.file, world.up)
+        farther = min(FLAT_REACH_FACTOR * reach, MAX_NORMAL_REACH)
+        # By the level of `scan_normal`.
+        self._reaches = (reach, farther, min(SPARSE_FACTOR * farther, MAX_NORMAL_REACH))
+        self._thread = _Thread()
+
+    def run(self, frame: Frame, parts: int) -> None:
+        """Run parts of a frame (bits of FOLLOW to GROUND), each once and in their order.
+
+        Raise the errors of queries and StoppedError; the frame is then undefined.
+        """
+        call = _Call(self._thread, self._reaches, frame)
+        if not frame.walks:
+            call.begin()
+            frame.walks = True
+        world, body = frame.world, frame.body
+        with world as seen:
+            each, probe, budget = seen[0], world.probe(body.avatar), frame.budget
+            data = each.data
+            native = self.native and world.is_alone and probe.is_small and not budget.limited
+            squares = normals_of(each).squares(self._reaches)
+            held, log = data.references.to(data.arrays, data.broad), self._thread.memory.log
+            log[state.VISITS :] = 0
+            log[state.USED] = log[state.MISSED] = log[state.REPEATS] = 0
+            while True:
+                try:
+                    with data.residency.frozen():
+                        held.call(
+                            walk_frame, parts, self._settings, probe.walking, self._thread.reference, held.reference,
+                            data.arrays.stop, data.unknown, data.nothing_clear, native, bool(frame.obstacles),
+                            data.radius_units, float(budget.tolerance), budget.tolerance_units, squares,
+                        )  # fmt: skip
+                    break
+                except state.AskedError:
+                    call.answer()
+                    self._thread.memory.log[state.REPEATS] = 1
+            memory, log = self._thread.memory, self._thread.memory.log
+            if log[state.USED]:
+                with data.residency.frozen():
+                    probe.use(data.residency, memory.used[: log[state.USED]].tolist())
+            frame.visits = log[state.VISITS :].tolist()
+            world.count(sum(frame.visits), int(log[state.MISSED]))
+        call.finish()
+
+    def warm(self) -> None:
+        """Compile the kernel before the first frame needs it."""
+        from ...avatars.avatar_model import make_avatar
+        from .frame import Body
+
+        body = Body("", make_avatar([[0.0, 0.0, 0.0]], 0.1), np.eye(4))
+        frame = Frame(body, np.eye(4), 0.0, self._world, EXACT, body.pose)
+        with self._world:
+            self.run(frame, 0)
+
+
+class _Call:
+    """One call of the kernel for a frame: its state to and from arrays, and the answers to its queries."""
+
+    def __init__(self, thread: _Thread, reaches: tuple[float, ...], frame: Frame) -> None:
+        self._thread, self._reaches, self._frame = thread, reaches, frame
+        if frame.walk_hits is None:
+            frame.walk_hits = {}
+        self._hits: dict[int, Hit] = frame.walk_hits
+
+    def begin(self) -> None:
+        """Write the state of a frame at its beginning."""
+        frame, body, memory = self._frame, self._frame.body, self._thread.memory
+        poses, inputs, numbers = memory.poses, memory.inputs, memory.numbers
+        poses[state.BEGIN], poses[state.TARGET], poses[state.POSE] = body.pose, frame.target, frame.pose
+        inputs[: state.OLD_PLANE] = frame.seconds, body.fall_speed, body.on_ground, 0.0, 0.0
+        plane, raised = body.effect_state.get(GROUND_PLANE), body.effect_state.get(RAISED)
+        if plane is not None:
+            inputs[state.HAD_PLANE] = 1.0
+            inputs[state.OLD_PLANE : state.OLD_PLANE + 3], inputs[state.OLD_PLANE + 3 : state.OLD_RAISED] = plane
+        if raised is not None:
+            inputs[state.WAS_RAISED] = 1.0
+            inputs[state.OLD_RAISED :] = raised
+        numbers[:] = 0
+        numbers[state.BLOCKED], numbers[state.FRAME_VERDICT] = -1, int(frame.verdict)
+        numbers[state.IS_CLEAR] = frame.clear
+        memory.values[state.STEPPED] = math.nan
+        memory.log[state.KNOWN] = 0
+        for hit in frame.hits:
+            row = int(numbers[state.AT])
+            self._write_hit(row, hit)
+            memory.hits[row], memory.normals[row, 0] = row, 0.0
+            numbers[state.AT] = numbers[state.HITS] = memory.log[state.KNOWN] = row + 1
+
+    def finish(self) -> None:
+        """Read the state that a frame has reached."""
+        frame, memory = self._frame, self._thread.memory
+        numbers, values = memory.numbers.tolist(), memory.values.tolist()
+        frame.pose = memory.poses[state.POSE].copy()
+        frame.verdict = _VERDICTS[numbers[state.FRAME_VERDICT]]
+        frame.clear = bool(numbers[state.IS_CLEAR])
+        frame.remaining = memory.values[state.LEFT : state.LEFT + 3].copy()
+        frame.hits = [self._read_hit(n) for n in range(numbers[state.HITS])]
+        if not math.isnan(values[state.STEPPED]):
+            frame.reports["stepped"] = values[state.STEPPED]
+        if not numbers[state.GROUNDED]:
+            return
+        frame.on_ground, frame.fall_speed = bool(numbers[state.STANDS]), values[state.FALL_SPEED]
+        normal = None
+        if numbers[state.HAS_STOOD_ON]:
+            x, y, z = values[state.STOOD_ON : state.STOOD_ON + 3]
+            normal = x, y, z
+        frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
+        if numbers[state.HAS_PLANE]:
+            plane = memory.values[state.PLANE : state.RAISED_AT].copy()
+            frame.effect_state[GROUND_PLANE] = plane[:3], plane[3:]
+        if numbers[state.RAISED]:
+            frame.effect_state[RAISED] = memory.values[state.RAISED_AT :].copy()
+
+    def answer(self) -> None:
+        """Answer the query that the kernel asked."""
+        memory, frame = self._thread.memory, self._frame
+        query, row = int(memory.log[state.ASKED]), int(memory.log[state.KNOWN])
+        if query == state.FULL:
+            self._thread.grow()
+            return
+        asked = memory.asked.tolist()
+        before, frame.pose = frame.pose, memory.asked_poses[0].copy()
+        try:
+            self._answer(query, row, asked, memory.asked_poses[1].copy())
+        finally:
+            frame.pose = before
+        memory.log[state.KNOWN] = row + 1
+
+    def _answer(self, query: int, row: int, asked: list[float], to: Pose) -> None:
+        """Write the answer of a query to its row. asked, to: of the query, see walk_queries.py."""
+        memory, frame = self._thread.memory, self._frame
+        result, world, pose = memory.tape[row], frame.world, frame.pose
+        if query == state.SWEPT:
+            tolerance, skin, below = asked[:3]
+            self._write_hit(row, find_first_hit(frame, to, tolerance, skin, below=below != 0.0))
+        elif query == state.BODIES_SWEPT:
+            until = math.inf if result[state.VERDICT] == int(Verdict.CLEAR) else float(result[LOWER])
+            hit = first_body_hit(frame, to, asked[0], until, below=asked[2] != 0.0)
+            if hit is not None:
+                self._write_hit(row, hit)
+        elif query == state.CLEAR_AT:
+            result[state.ANSWER] = is_clear(frame, pose, proved=asked[0] != 0.0)
+        elif query == state.BODIES_AT:
+            result[state.ANSWER] = not touches_bodies(frame, pose)
+        elif query == state.TOUCHED:
+            self._write_hit(row, find_touched(frame, pose))
+        elif query == state.GIVES_WAY:
+            hit = self._hits[int(asked[0])]
+            result[state.ANSWER] = any(each.give_way(frame, hit, to) for each in frame.obstacles)
+        elif query == state.NORMAL_AT:
+            reach = self._reaches[int(asked[7])]
+            cloud, toward = np.array(asked[:3]), np.array(asked[3:6])
+            normal = world.normal_at(int(asked[6]), cloud, toward, reach, frame.budget)
+            result[state.HAS_NORMAL] = normal is not None
+            if normal is not None:
+                result[state.NORMAL : state.NORMAL + 3] = normal
+        elif query == state.HIGHEST:
+            directions = np.array(asked[6 : 6 + 3 * int(asked[5])]).reshape(-1, 3)
+            touched = Hit(0.0, Verdict.CONTACT, None, np.array(asked[:3]), archive=int(asked[3]))
+            heights = world.highest(touched, directions, self._reaches[int(asked[4])], frame.budget)
+            result[state.HEIGHTS : state.HEIGHTS + 3] = 0.0
+            result[state.HEIGHTS : state.HEIGHTS + len(heights)] = heights
+        elif query == state.NEAREST:
+            found = world.nearest(np.array(asked[:3]), asked[3], frame.budget)
+            result[state.HAS_PAIR] = found is not None
+            if found is not None:
+                result[CLOUD:ENDED], result[state.ARCHIVE] = found.cloud, found.archive
+        else:
+            assert query == state.LANDS
+            self._write_landing(row, asked[0], stood=asked[1] != 0.0)
+
+    def _write_landing(self, row: int, reach: float, *, stood: bool) -> None:
+        """Write whether an avatar without ground within `reach` [m] of its feet may land.
+
+        stood: whether it stood in the last frame.
+        """
+        frame, result = self._frame, self._thread.memory.tape[row]
+        world, avatar, up = frame.world, frame.body.avatar, frame.world.up
+        result[state.ANSWER] = result[state.UNLOADED] = result[state.REST] = 0.0
+        if not len(avatar.points):
+            return
+        feet = lowest_height(avatar, frame.pose, up)
+        deep = feet - world.lowest_height() + _FALL_MARGIN
+        if deep <= reach:
+            return
+        lacked = frame.lacked
+        swept = world.sweep(
+            avatar, frame.pose, translated(frame.pose, -deep * up), _FALL_TOLERANCE, frame.budget
+        )
+        if frame.lacked > lacked and not (swept.verdict == Verdict.CONTACT and swept.exact):
+            result[state.UNLOADED] = 1.0
+        elif swept.verdict != Verdict.CONTACT:
+            result[state.ANSWER] = swept.verdict == Verdict.UNKNOWN
+        else:
+            # The rim of a hole, or the ledge behind, stops the parts above the feet, which are wider.
+            result[state.ANSWER] = not stood or dot(swept.cloud, up) < feet - reach
+
+    def _write_hit(self, row: int, hit: Hit | None) -> None:
+        """Write a hit, or None, to a row."""
+        result = self._thread.memory.tape[row]
+        result[:] = 0.0
+        if hit is None:
+            result[state.VERDICT] = int(Verdict.CLEAR)
+            return
+        self._hits[row] = hit
+        result[LOWER], result[state.VERDICT], result[state.ARCHIVE] = hit.fraction, int(hit.verdict), hit.archive
+        result[state.UNLOADED], result[state.REST], result[state.NAMED] = hit.unloaded, hit.rest, bool(hit.what)
+        parts: tuple[tuple[int, int, NDArray[np.float64] | None], ...] = (
+            (state.HAS_NORMAL, state.NORMAL, hit.normal),
+            (state.HAS_POINT, POINT, hit.point),
+            (state.HAS_END, END, None if hit.end is None else hit.end.ravel()),
+        )
+        for has, at, part in parts:
+            if part is not None:
+                result[has], result[at : at + len(part)] = 1.0, part
+        if hit.avatar is not None and hit.cloud is not None:
+            result[state.HAS_PAIR] = 1.0
+            result[AVATAR:CLOUD], result[CLOUD:ENDED] = hit.avatar, hit.cloud
+
+    def _read_hit(self, number: int) -> Hit:
+        """Return a recorded hit."""
+        memory = self._thread.memory
+        row = int(memory.hits[number])
+        result = memory.tape[row]
+        has_pair, normal = result[state.HAS_PAIR] != 0.0, None
+        if memory.normals[number, 0] != 0.0:
+            normal = memory.normals[number, 1:].copy()
+        elif result[state.HAS_NORMAL] != 0.0:
+            normal = result[state.NORMAL : state.NORMAL + 3].copy()
+        known = self._hits.get(row)
+        return Hit(
+            float(result[LOWER]),
+            _VERDICTS[int(result[state.VERDICT])],
+            result[AVATAR:CLOUD].copy() if has_pair else None,
+            result[CLOUD:ENDED].copy() if has_pair else None,
+            "" if known is None else known.what,
+            int(result[state.ARCHIVE]),
+            normal,
+            result[POINT:END].copy() if result[state.HAS_POINT] != 0.0 else None,
+            bool(result[state.UNLOADED]),
+            float(result[state.REST]),
+        )
+
+
+_VERDICTS = {int(verdict): verdict for verdict in Verdict}

@@ -17,6 +17,7 @@ import numba.core.compiler
 import numba.core.dispatcher
 from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import CPUDispatcher
+from numba.core.types import unliteral
 
 # numba creates their attributes on import, invisible to type checkers.
 compiler: Any = numba.core.compiler
@@ -62,6 +63,15 @@ class InnerKernel(_Dispatcher):  # type: ignore[misc]
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options)
         self._compiler = _InnerCompiler(self)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Return the type of a call. A constant is a value like any other.
+
+        numba compiles a function once more for each constant that it is called with.
+        """
+        return super().get_call_template(
+            tuple(map(unliteral, args)), {name: unliteral(value) for name, value in kws.items()}
+        )
 
     def add_overload(self, cres: Any) -> None:
         """Store the code for a signature."""

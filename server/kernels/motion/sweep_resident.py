@@ -174,7 +174,9 @@ def pose_between(pose_from, pose_to, fraction, box, origin, pose):
     the sweep's pose bit for bit, so that a proof of the sweep holds for this pose.
     """
     poses = np.empty((2, 4, 4))
-    poses[0], poses[1] = pose_from, pose_to
+    for r in range(4):
+        for c in range(4):
+            poses[0, r, c], poses[1, r, c] = pose_from[r, c], pose_to[r, c]
     for r in range(3):
         poses[0, r, 3] -= origin[r]
         poses[1, r, 3] -= origin[r]

@@ -11,21 +11,21 @@ from .walk_vectors import copy_pose
 
 @nb.njit(nogil=True, cache=True)
 def walk_frame(
-    parts, settings, avatar, memory, held, stop, unknown, unknown_everywhere, native, bodies, other_units,
+    parts, settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units,
     least_tolerance, tolerance_units, squares,
 ):  # fmt: skip
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
 
     parts: bits of FOLLOW to GROUND.  settings, avatar, memory: references, see walk_state.py.
     held: reference to the scene's arrays.  stop, unknown, unknown_everywhere, other_units: as for
-    `sweep_resident`.  native: whether queries may be answered here: the scene is one archive at the
-    identity, and the avatar is small and not empty.  bodies: whether other bodies are obstacles.
+    `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
+    may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies are obstacles.
     least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
     squares: (5,) int64, the normal reach, thrice and nine times that, squared [steps^2], or 0 if it is
     invalid; that of stored normals, and whether scan numbers are in memory.
     """
     walk = Walk(
-        settings, avatar, memory, held, stop, unknown, unknown_everywhere, native, bodies, other_units, least_tolerance,
+        settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units, least_tolerance,
         tolerance_units, squares,
     )  # fmt: skip
     if memory.log[REPEATS] != 0:
@@ -49,8 +49,10 @@ def walk_frame(
 @nb.njit(nogil=True, cache=True)
 def _copy_state(memory, numbers, to_numbers, values, to_values, saves):
     """Save what a part changes, or restore it. Hits are restored by their number."""
-    to_numbers[:] = numbers
-    to_values[:] = values
+    for n in range(numbers.shape[0]):
+        to_numbers[n] = numbers[n]
+    for n in range(values.shape[0]):
+        to_values[n] = values[n]
     for n in range(POSE, POSES):
         if saves:
             copy_pose(memory.poses[n], memory.saved_poses[n])

@@ -85,8 +85,8 @@ def farthest_motion(walk, pose_from, pose_to):
 @nb.njit(nogil=True, cache=True)
 def pose_on_way(walk, pose_from, pose_to, fraction, pose):
     """Write the pose at a fraction of a motion (4, 4); return whether the proof of its sweep covers it."""
-    origin = walk.held.scene.origin if walk.native else np.zeros(3)
-    return pose_between(pose_from, pose_to, fraction, walk.avatar.box, origin, pose) and walk.native
+    origin = walk.held.scene.origin if walk.alone else np.zeros(3)
+    return pose_between(pose_from, pose_to, fraction, walk.avatar.box, origin, pose) and walk.alone
 
 
 @nb.njit(nogil=True, cache=True)
@@ -172,7 +172,8 @@ def _collide(walk, pose):
         return -1
     copy_pose(pose, memory.one[0])
     memory.verdict[0] = CLEAR
-    memory.counts[:] = 0
+    for n in range(3):
+        memory.counts[n, 0] = np.uint32(0)
     fault, _, _, needed = collide_resident(
         memory.one, avatar.body, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop, memory.rows, memory.outside,
         memory.verdict, memory.counts,
@@ -332,7 +333,8 @@ def scan_heights(walk, hit, directions, level):
                     memory.asked[6 + 3 * n + r] = directions[n, r]
             _ask_at(walk, HIGHEST, cloud)
         heights = memory.tape[row, HEIGHTS : HEIGHTS + 3]
-        heights[:] = 0.0
+        for n in range(3):
+            heights[n] = 0.0
         if voxel >= 0:
             highest_near(walk.held, voxel, x, y, z, walk.squares[level], directions, heights[:count])
             for n in range(count):
@@ -393,5 +395,7 @@ def keep_point(walk, to, hit):
     """Complete a hit of the scan that ended the motion to a pose (4, 4) with its touching point."""
     result = walk.memory.tape[hit]
     if result[ARCHIVE] >= 0.0 and result[HAS_PAIR] != 0.0 and result[HAS_POINT] == 0.0:
-        result[POINT : POINT + 3] = touching_point(walk, to, hit)
+        point = touching_point(walk, to, hit)
+        for r in range(3):
+            result[POINT + r] = point[r]
         result[HAS_POINT] = 1.0

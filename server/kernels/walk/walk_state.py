@@ -64,7 +64,7 @@ _SETTINGS = [
 ]  # fmt: skip
 _AVATAR = ["body", "scratch", "box", "points", "radius"]
 _WALK = [
-    "settings", "avatar", "memory", "held", "stop", "unknown", "unknown_everywhere", "native", "bodies",
+    "settings", "avatar", "memory", "held", "stop", "unknown", "unknown_everywhere", "alone", "native", "bodies",
     "other_units", "least_tolerance", "tolerance_units", "squares",
 ]  # fmt: skip
 
@@ -140,6 +140,7 @@ if nb.config.DISABLE_JIT:
         stop: NDArray[np.int64]
         unknown: NDArray[np.int64]
         unknown_everywhere: bool
+        alone: bool
         native: bool
         bodies: bool
         other_units: int

@@ -139,7 +139,7 @@ class Walker:
                     with data.residency.frozen():
                         held.call(
                             walk_frame, parts, self._settings, probe.walking, self._thread.reference, held.reference,
-                            data.arrays.stop, data.unknown, data.nothing_clear, native, bool(frame.obstacles),
+                            data.arrays.stop, data.unknown, data.nothing_clear, world.is_alone, native, bool(frame.obstacles),
                             data.radius_units, float(budget.tolerance), budget.tolerance_units, squares,
                         )  # fmt: skip
                     break

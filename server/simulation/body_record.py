@@ -64,7 +64,7 @@ def record_of(body: Body, bodies: "Bodies | None") -> BodyRecord:
         body.fall_speed,
         body.on_ground,
         body.clear,
-        b"" if stood is None else np.concatenate(stood).astype("<f8").tobytes(),
+        b"" if stood is None else stood.astype("<f8").tobytes(),
         pushed,
         b"" if raised is None else raised.astype("<f8").tobytes(),
     )
@@ -80,8 +80,7 @@ def take_record(record: BodyRecord, body: Body, world: Any, bodies: "Bodies | No
     body.fall_speed, body.on_ground, body.clear = record.fall_speed, record.on_ground, record.clear
     body.effect_state.pop(_GROUND, None)
     if record.ground:
-        plane = np.frombuffer(record.ground, "<f8").astype(np.float64)
-        body.effect_state[_GROUND] = plane[:3], plane[3:]
+        body.effect_state[_GROUND] = np.frombuffer(record.ground, "<f8").astype(np.float64)
     body.effect_state.pop(_RAISED, None)
     if record.raised:
         body.effect_state[_RAISED] = np.frombuffer(record.raised, "<f8").astype(np.float64)

@@ -7,7 +7,6 @@ from .walk_state import (
     HAD_PLANE,
     HAS_PAIR,
     HAS_PLANE,
-    OLD_PLANE,
     PLANE,
     pose_now,
 )
@@ -22,8 +21,8 @@ SAME_FLOOR, SAME_FLOOR_REACH = 5e-3, 0.75
 @nb.njit(nogil=True, cache=True)
 def old_plane(walk):
     """Return the point and the normal of the plane that the avatar stood on."""
-    inputs = walk.memory.inputs
-    return vector(inputs[OLD_PLANE : OLD_PLANE + 3]), vector(inputs[OLD_PLANE + 3 : OLD_PLANE + 6])
+    plane = walk.memory.old_plane
+    return vector(plane), (plane[3], plane[4], plane[5])
 
 
 @nb.njit(nogil=True, cache=True)

@@ -16,7 +16,6 @@ from .walk_state import (
     HAS_PAIR,
     HAS_STOOD_ON,
     HITS,
-    OLD_RAISED,
     RAISED,
     RAISED_AT,
     SECONDS,
@@ -162,5 +161,5 @@ def _was_raised_here(walk):
     memory = walk.memory
     if memory.inputs[WAS_RAISED] == 0.0 or memory.numbers[BLOCKED] < 0 or memory.inputs[STOOD] == 0.0:
         return False
-    place = vector(memory.inputs[OLD_RAISED : OLD_RAISED + 3])
+    place = vector(memory.old_raised)
     return norm(minus(place_of(pose_now(walk)), place)) <= SAME_PLACE

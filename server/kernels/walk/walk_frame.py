@@ -1,36 +1,70 @@
 """Parts of a user's frame in one call: the motion command, `slide`, `step` and `ground`."""
 
+import numpy as np
+
 from ....schemas.kernels import compiling as nb
 from .slide_along import slide_command
 from .stand_on_ground import stand_on_ground
 from .step_up import step_up
 from .walk_motions import follow_command
-from .walk_state import FOLLOW, GROUND, PART, POSE, POSES, REPEATS, SLIDE, STEP, Walk
+from .walk_state import (
+    AT,
+    BEGIN,
+    BLOCKED,
+    FELL,
+    FOLLOW,
+    FRAME_VERDICT,
+    GROUND,
+    HITS,
+    IS_CLEAR,
+    KNOWN,
+    PART,
+    POSE,
+    POSES,
+    REPEATS,
+    SECONDS,
+    SLIDE,
+    STEP,
+    STEPPED,
+    STOOD,
+    TARGET,
+    USED,
+    Walk,
+)
 from .walk_vectors import copy_pose
 
 
 @nb.njit(nogil=True, cache=True)
 def walk_frame(
-    parts, settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units,
-    least_tolerance, tolerance_units, squares,
+    parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear, settings, avatar, memory, held, stop,
+    unknown, unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares,
 ):  # fmt: skip
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
 
-    parts: bits of FOLLOW to GROUND.  settings, avatar, memory: references, see walk_state.py.
+    parts: bits of FOLLOW to GROUND.  starts: whether the frame begins; if not, the arguments up to
+    `clear` are those of the first call.  begin, target, pose: (4, 4), where the frame began, the commanded
+    pose, and the pose reached.  seconds: duration of the frame.  fell: speed of falling [m/s].
+    stood: whether the avatar stood.  verdict: of the frame.  clear: whether `pose` is known to be clear.
+    settings, avatar, memory: references, see walk_state.py.
     held: reference to the scene's arrays.  stop, unknown, unknown_everywhere, other_units: as for
     `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
-    may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies are obstacles.
-    least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
+    may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies
+    are obstacles.  least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
     squares: (5,) int64, the normal reach, thrice and nine times that, squared [steps^2], or 0 if it is
     invalid; that of stored normals, and whether scan numbers are in memory.
     """
     walk = Walk(
-        settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units, least_tolerance,
-        tolerance_units, squares,
+        settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units,
+        least_tolerance, tolerance_units, squares,
     )  # fmt: skip
-    if memory.log[REPEATS] != 0:
+    log = memory.log
+    if log[REPEATS] != 0:
         _copy_state(memory, memory.saved_numbers, memory.numbers, memory.saved_values, memory.values, False)
     else:
+        for n in range(USED, log.shape[0]):
+            log[n] = 0
+        if starts:
+            _start(memory, begin, target, pose, seconds, fell, stood, verdict, clear)
         _copy_state(memory, memory.numbers, memory.saved_numbers, memory.values, memory.saved_values, True)
     if parts & FOLLOW:
         memory.numbers[PART] = 0
@@ -44,6 +78,24 @@ def walk_frame(
     if parts & GROUND:
         memory.numbers[PART] = 3
         stand_on_ground(walk)
+
+
+@nb.njit(nogil=True, cache=True)
+def _start(memory, begin, target, pose, seconds, fell, stood, verdict, clear):
+    """Write the state of a frame at its beginning, but for its hits, which are on the tape."""
+    numbers, inputs = memory.numbers, memory.inputs
+    copy_pose(begin, memory.poses[BEGIN])
+    copy_pose(target, memory.poses[TARGET])
+    copy_pose(pose, memory.poses[POSE])
+    inputs[SECONDS], inputs[FELL], inputs[STOOD] = seconds, fell, 1.0 if stood else 0.0
+    known = memory.log[KNOWN]
+    for n in range(numbers.shape[0]):
+        numbers[n] = 0
+    numbers[AT] = numbers[HITS] = known
+    for n in range(known):
+        memory.hits[n], memory.normals[n, 0] = n, 0.0
+    numbers[BLOCKED], numbers[FRAME_VERDICT], numbers[IS_CLEAR] = -1, verdict, 1 if clear else 0
+    memory.values[STEPPED] = np.nan
 
 
 @nb.njit(nogil=True, cache=True)

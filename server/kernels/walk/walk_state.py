@@ -52,8 +52,8 @@ GROUNDED, STANDS, HAS_STOOD_ON, HAS_PLANE, RAISED, NUMBERS = range(6, 12)
 # where the avatar was raised (3,).
 FALL_SPEED, STEPPED, LEFT, STOOD_ON, PLANE, RAISED_AT, VALUES = 0, 1, 2, 5, 8, 14, 17
 # Elements of `inputs`: duration of the frame [s], speed of falling [m/s]; whether the avatar stood,
-# whether its plane and the place of its last raise are known; these (6,) and (3,).
-SECONDS, FELL, STOOD, HAD_PLANE, WAS_RAISED, OLD_PLANE, OLD_RAISED, INPUTS = 0, 1, 2, 3, 4, 5, 11, 14
+# whether the plane that it stood on and the place of its last raise are known.
+SECONDS, FELL, STOOD, HAD_PLANE, WAS_RAISED, INPUTS = range(6)
 # Poses: where the frame began, the commanded one, that reached so far, and that where the motion
 # command was obstructed.
 BEGIN, TARGET, POSE, BLOCKED_POSE, POSES = range(5)
@@ -78,6 +78,8 @@ class WalkArrays(NamedTuple):
     values: NDArray[np.float64]
     inputs: NDArray[np.float64]
     poses: NDArray[np.float64]
+    old_plane: NDArray[np.float64]
+    old_raised: NDArray[np.float64]
     hits: NDArray[np.int64]
     normals: NDArray[np.float64]
     asked_poses: NDArray[np.float64]
@@ -218,6 +220,7 @@ def make_arrays(rows: int, voxels: int) -> WalkArrays:
     """Allocate the state of a frame. rows: of the tape.  voxels: limit of the voxels of a query.
 
     tape: (rows, ROW).  log, numbers, values, inputs, poses: with the elements above.
+    old_plane: point and normal of the plane that the avatar stood on.  old_raised: place of its last raise.
     hits: (rows,), row of each recorded hit.  normals: (rows, 4), whether its normal is known, and it.
     asked_poses, asked: of the query that Python answers.  rows: voxels of a query.  used: of all.
     outside, verdict, counts, one: scratch of `collide_resident`.  saved: state before a call.
@@ -229,6 +232,8 @@ def make_arrays(rows: int, voxels: int) -> WalkArrays:
         values=np.zeros(VALUES),
         inputs=np.zeros(INPUTS),
         poses=np.zeros((POSES, 4, 4)),
+        old_plane=np.zeros(6),
+        old_raised=np.zeros(3),
         hits=np.zeros(rows, np.int64),
         normals=np.zeros((rows, 4)),
         asked_poses=np.zeros((2, 4, 4)),
@@ -249,8 +254,8 @@ def make_arrays(rows: int, voxels: int) -> WalkArrays:
 def refer_to_memory(arrays):
     """Return a reference to the state of a frame."""
     return WalkMemory(
-        arrays.tape, arrays.log, arrays.numbers, arrays.values, arrays.inputs, arrays.poses, arrays.hits,
-        arrays.normals, arrays.asked_poses, arrays.asked, arrays.rows, arrays.used, arrays.outside, arrays.verdict,
+        arrays.tape, arrays.log, arrays.numbers, arrays.values, arrays.inputs, arrays.poses, arrays.old_plane,
+        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.rows, arrays.used, arrays.outside, arrays.verdict,
         arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values, arrays.saved_poses,
     )  # fmt: skip
 

@@ -40,7 +40,7 @@ from .held_archive import normals_of
 from .vectors import dot
 
 # Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
-# on, and the place where it was raised last.
+# on, (6,), and the place where it was raised last, (3,).
 GROUND_PLANE, RAISED = "ground", "ground raised"
 # Rows of the tape at first; frames that need more double it.
 _ROWS = 64
@@ -121,37 +121,38 @@ class Walker:
 
         Raise the errors of queries and StoppedError; the frame is then undefined.
         """
-        call = _Call(self._thread, self._reaches, frame)
-        if not frame.walks:
+        thread, world, body, budget = self._thread, frame.world, frame.body, frame.budget
+        call = _Call(thread, self._reaches, frame)
+        starts, frame.walks = not frame.walks, True
+        if starts:
             call.begin()
-            frame.walks = True
-        world, body = frame.world, frame.body
+        begin, target, pose, stood, fell = body.pose, frame.target, frame.pose, body.on_ground, body.fall_speed
+        verdict, clear, bodies = int(frame.verdict), frame.clear, bool(frame.obstacles)
         with world as seen:
-            each, probe, budget = seen[0], world.probe(body.avatar), frame.budget
-            data = each.data
-            native = self.native and world.is_alone and probe.is_small and not budget.limited
-            squares = normals_of(each).squares(self._reaches)
-            held, log = data.references.to(data.arrays, data.broad), self._thread.memory.log
-            log[state.VISITS :] = 0
-            log[state.USED] = log[state.MISSED] = log[state.REPEATS] = 0
+            each, probe = seen[0], world.probe(body.avatar)
+            data, residency = each.data, each.data.residency
+            alone = world.is_alone
+            native = self.native and alone and probe.is_small and not budget.limited
+            squares, held = normals_of(each).squares(self._reaches), data.references.to(data.arrays, data.broad)
+            thread.memory.log[state.REPEATS] = 0
             while True:
                 try:
-                    with data.residency.frozen():
+                    with residency.frozen():
                         held.call(
-                            walk_frame, parts, self._settings, probe.walking, self._thread.reference, held.reference,
-                            data.arrays.stop, data.unknown, data.nothing_clear, world.is_alone, native, bool(frame.obstacles),
-                            data.radius_units, float(budget.tolerance), budget.tolerance_units, squares,
+                            walk_frame, parts, starts, begin, target, pose, frame.seconds, fell, stood, verdict, clear,
+                            self._settings, probe.walking, thread.reference, held.reference, data.arrays.stop,
+                            data.unknown, data.nothing_clear, alone, native, bodies, data.radius_units,
+                            budget.tolerance, budget.tolerance_units, squares,
                         )  # fmt: skip
+                        log = thread.memory.log.tolist()
+                        if used := log[state.USED]:
+                            probe.use(residency, thread.memory.used[:used].tolist())
                     break
                 except state.AskedError:
                     call.answer()
-                    self._thread.memory.log[state.REPEATS] = 1
-            memory, log = self._thread.memory, self._thread.memory.log
-            if log[state.USED]:
-                with data.residency.frozen():
-                    probe.use(data.residency, memory.used[: log[state.USED]].tolist())
-            frame.visits = log[state.VISITS :].tolist()
-            world.count(sum(frame.visits), int(log[state.MISSED]))
+                    thread.memory.log[state.REPEATS] = 1
+        frame.visits = log[state.VISITS :]
+        world.count(sum(frame.visits), log[state.MISSED])
         call.finish()
 
     def warm(self) -> None:
@@ -175,28 +176,18 @@ class _Call:
         self._hits: dict[int, Hit] = frame.walk_hits
 
     def begin(self) -> None:
-        """Write the state of a frame at its beginning."""
-        frame, body, memory = self._frame, self._frame.body, self._thread.memory
-        poses, inputs, numbers = memory.poses, memory.inputs, memory.numbers
-        poses[state.BEGIN], poses[state.TARGET], poses[state.POSE] = body.pose, frame.target, frame.pose
-        inputs[: state.OLD_PLANE] = frame.seconds, body.fall_speed, body.on_ground, 0.0, 0.0
+        """Write what the body keeps between frames, and the hits before the first part."""
+        body, memory = self._frame.body, self._thread.memory
         plane, raised = body.effect_state.get(GROUND_PLANE), body.effect_state.get(RAISED)
+        memory.inputs[state.HAD_PLANE] = plane is not None
+        memory.inputs[state.WAS_RAISED] = raised is not None
         if plane is not None:
-            inputs[state.HAD_PLANE] = 1.0
-            inputs[state.OLD_PLANE : state.OLD_PLANE + 3], inputs[state.OLD_PLANE + 3 : state.OLD_RAISED] = plane
+            memory.old_plane[:] = plane
         if raised is not None:
-            inputs[state.WAS_RAISED] = 1.0
-            inputs[state.OLD_RAISED :] = raised
-        numbers[:] = 0
-        numbers[state.BLOCKED], numbers[state.FRAME_VERDICT] = -1, int(frame.verdict)
-        numbers[state.IS_CLEAR] = frame.clear
-        memory.values[state.STEPPED] = math.nan
-        memory.log[state.KNOWN] = 0
-        for hit in frame.hits:
-            row = int(numbers[state.AT])
+            memory.old_raised[:] = raised
+        for row, hit in enumerate(self._frame.hits):
             self._write_hit(row, hit)
-            memory.hits[row], memory.normals[row, 0] = row, 0.0
-            numbers[state.AT] = numbers[state.HITS] = memory.log[state.KNOWN] = row + 1
+        memory.log[state.KNOWN] = len(self._frame.hits)
 
     def finish(self) -> None:
         """Read the state that a frame has reached."""
@@ -218,8 +209,7 @@ class _Call:
             normal = x, y, z
         frame.reports["ground"] = GroundReport(frame.on_ground, frame.fall_speed, normal)
         if numbers[state.HAS_PLANE]:
-            plane = memory.values[state.PLANE : state.RAISED_AT].copy()
-            frame.effect_state[GROUND_PLANE] = plane[:3], plane[3:]
+            frame.effect_state[GROUND_PLANE] = memory.values[state.PLANE : state.RAISED_AT].copy()
         if numbers[state.RAISED]:
             frame.effect_state[RAISED] = memory.values[state.RAISED_AT :].copy()
 

@@ -131,7 +131,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @njit_no_refcount
-def _search(scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys):
+def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
     near: exact units, as in VoxelLists. A bound of a node holds for its children; no bound
@@ -227,7 +227,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share,
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                limit = _search(
+                limit = search_voxel(
                     scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys
                 )  # fmt: skip
             cursor[i] = at + 1

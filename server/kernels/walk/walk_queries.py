@@ -24,6 +24,7 @@ from ..motion.sweep_resident import (
     pose_between,
     sweep_resident,
 )
+from ..rays.nearest_in_memory import nearest_in_memory
 from ..rays.stored_normals import code_at, find_voxel, highest_near, stored_code_at
 from .walk_state import (
     ANSWER,
@@ -349,8 +350,17 @@ def nearest_point(walk, place, reach):
     memory = walk.memory
     row = next_row(memory)
     if row >= memory.log[KNOWN]:
-        memory.asked[3] = reach
-        _ask_at(walk, NEAREST, place)
+        needed, known, visits = -1, False, 0
+        if walk.native and not (walk.unknown_everywhere or walk.unknown.shape[0] > 0):
+            cloud = memory.tape[row, CLOUD:ENDED]
+            needed, known, visits = nearest_in_memory(walk.held, place, reach, walk.stop, memory.rows, cloud)
+        if needed < 0:
+            memory.asked[3] = reach
+            _ask_at(walk, NEAREST, place)
+        use_voxels(memory, needed)
+        _count(walk, visits, False)
+        memory.tape[row, HAS_PAIR], memory.tape[row, ARCHIVE] = 1.0 if known else 0.0, 0.0
+        memory.log[KNOWN] = row + 1
     return row if memory.tape[row, HAS_PAIR] != 0.0 else -1
 
 

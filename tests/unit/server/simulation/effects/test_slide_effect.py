@@ -10,7 +10,7 @@ from effect_rooms import INTERPRETED, RADIUS, at, play
 from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.simulation.effects.slide_effect import clip
+from solidcloud.server.kernels.walk.slide_planes import clip_displacement
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2
@@ -112,6 +112,13 @@ def test_it_goes_over_the_bumps_of_a_wall(wall: archive_cases.Case, rng: np.rand
                 game.go(body, (0.01, 0.04, 0.003))
                 assert not game.touches(body)
             assert body.pose[1, 3] - start > 0.5 * 0.04 * FRAMES
+
+
+def clip(left: np.ndarray, planes: list[np.ndarray]) -> np.ndarray | None:
+    """Return the clipped displacement (3,); None if there is none."""
+    way = np.empty(3)
+    found = clip_displacement(left, np.array(planes, np.float64).reshape(-1, 3), way)
+    return way if found else None
 
 
 @pytest.mark.interpreted

@@ -1,4 +1,4 @@
-"""Test where swept motions end, by the kernel, against the same steps in Python."""
+"""Test where swept motions end, by the sweep's kernel, against a search of a clear pose."""
 
 from typing import Any
 
@@ -10,12 +10,12 @@ from effect_rooms import INTERPRETED
 from solidcloud.schemas.scene.effect_table import AnyEffect, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.placed_archive import PlacedArchive
+from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.sweep_effect import SweepRunner
+from solidcloud.server.kernels.walk.walk_state import FOLLOW
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame
 
-EFFECTS: list[AnyEffect] = [Stop(), Sweep()]
 MOTIONS = 6 if INTERPRETED else 300
 
 
@@ -26,17 +26,6 @@ class SweptOnly(World):
         return super().sweep(*arguments, **options)._replace(point=None, end=None)
 
 
-class Counted(World):
-    """World that counts the sweeps that say where a motion ends."""
-
-    ends = 0
-
-    def sweep(self, *arguments: Any, **options: Any) -> Any:
-        swept = super().sweep(*arguments, **options)
-        self.ends += swept.end is not None
-        return swept
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
     return effect_rooms.build(tmp_path_factory.mktemp("room"), effect_rooms.room(2.4))
@@ -44,14 +33,16 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("skin", [0.0, 0.002, 0.05])
-def test_motions_end_where_the_steps_in_python_end_them(
+def test_motions_end_where_clear_poses_are_found_step_by_step(
     room: archive_cases.Case, rng: np.random.Generator, skin: float
 ) -> None:
     placed = PlacedArchive.open(room.archive, budget_bytes=1 << 28)
-    file = SceneFile(format=1, archives=[ArchiveItem(path=str(room.archive))], effects=EFFECTS)
-    runner, person, hits = SweepRunner(skin, 1e-6), effect_rooms.person(), 0
+    effects: list[AnyEffect] = [Stop(skin=skin), Sweep(tolerance=1e-6)]
+    file = SceneFile(format=1, archives=[ArchiveItem(path=str(room.archive))], effects=effects)
+    person, hits, proved = effect_rooms.person(), 0, 0
     with Scene([placed], "room") as scene:
-        fused, apart = Counted(scene, file), SweptOnly(scene, file)
+        fused, apart = World(scene, file), SweptOnly(scene, file)
+        apart.walker.native = False
         scene.add_avatar("person", person.points, person.radius)
         scene.collide("person", effect_rooms.at(0.125, 0.0625, -0.75), margin=3.0)  # loads the voxels
         for number in range(MOTIONS):
@@ -66,9 +57,13 @@ def test_motions_end_where_the_steps_in_python_end_them(
                 frame = Frame(Body("a/b", person, begin), to, 1 / 30, world, pose=begin)
                 world.begin(frame.budget.stop)
                 with world:
-                    hit = runner.sweep_towards(frame, to)
+                    world.walker.run(frame, FOLLOW)
+                hit = frame.hits[0] if frame.hits else None
                 point = None if hit is None or hit.point is None else hit.point.tobytes()
                 results.append((frame.pose.tobytes(), None if hit is None else hit.fraction, point))
                 hits += hit is not None
+            with fused:
+                swept = fused.sweep(person, begin, to, 1e-6, EXACT, skin)
+            proved += swept.end is not None
             assert results[0] == results[1]
-    assert hits > MOTIONS / 4 and fused.ends > 0
+    assert hits > MOTIONS / 4 and proved > 0

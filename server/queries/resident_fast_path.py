@@ -172,7 +172,6 @@ class SweepResult(NamedTuple):
     end: Pose | None = None
 
 
-
 class ResidentQueries:
     """Queries of one avatar, frame after frame. Not thread-safe: it reuses its arrays.
 

@@ -53,6 +53,8 @@ ALONE: dict[str, list[str]] = {
     "objects": ["objects"],
     "crowd": ["stop", "crowd"],
 }
+# Effects whose frames the kernel of walking runs.
+MOVING = {"stop", "sweep", "slide", "ground", "step"}
 # What only some effects have a use for, and which; every effect has itself.
 HELPERS = {
     "server.simulation.world.separation_cache": {"proximity", "contacts", "uncertainty"},
@@ -63,7 +65,9 @@ HELPERS = {
     "server.simulation.world.body_obstacles": {"objects", "crowd"},
     "server.kernels.bodies.body_sweep": {"objects", "crowd"},
     "server.queries.surface_normals": {"slide", "ground", "step"},
-    "server.kernels.rays.stored_normals": {"slide", "ground", "step"},
+    "server.simulation.world.frame_walk": MOVING,
+    "server.kernels.walk.walk_frame": MOVING,
+    "server.kernels.rays.stored_normals": MOVING,
 }
 # All that needs no objects of its own.
 EVERY_EFFECT = msgspec.convert(

@@ -24,7 +24,8 @@ from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ..bodies.avatar_patch import SUMS, lowest_heights
 from ..motion.sweep_resident import POINT
-from .walk_queries import hit_normal, pair_of, scan_heights
+from .walk_normals import hit_normal, scan_heights
+from .walk_queries import pair_of
 from .walk_state import ARCHIVE, HAS_PAIR, HAS_POINT, pose_now
 from .walk_vectors import divided, dot, minus, norm, rotate, rotate_back, times, vector
 

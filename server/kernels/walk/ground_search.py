@@ -9,7 +9,8 @@ from ..motion.sweep_resident import LOWER
 from .ground_plane import is_last_ground, old_plane
 from .slide_along import slide_along
 from .walk_motions import advance, move_to, settle_before
-from .walk_queries import first_hit, hit_normal, nearest_point, pair_of, scan_normal
+from .walk_normals import hit_normal, scan_normal
+from .walk_queries import first_hit, nearest_point, pair_of
 from .walk_state import ARCHIVE, HAS_NORMAL, HAS_PAIR, HITS, NORMAL, UNKNOWN, VERDICT, pose_now
 from .walk_vectors import copy_pose, divided, dot, minus, norm, place_of, plus, times, translated, vector
 

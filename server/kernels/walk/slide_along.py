@@ -7,7 +7,8 @@ from ....schemas.kernels import compiling as nb
 from .contact_normal import contact_normal
 from .slide_planes import ROUNDING, clip, limit_displacement
 from .walk_motions import advance, keep_rest, move_to
-from .walk_queries import hit_normal, pair_of, scan_heights
+from .walk_normals import hit_normal, scan_heights
+from .walk_queries import pair_of
 from .walk_state import ARCHIVE, BEGIN, BLOCKED, HAS_PAIR, HITS, TARGET, UNKNOWN, VERDICT, pose_now
 from .walk_vectors import copy_pose, divided, dot, minus, norm, place_of, times, translated, vector
 
@@ -79,7 +80,7 @@ def slide_along(walk, hit, rest, command, upright):
     upright: treat a surface that is too steep to walk on as vertical, with `ground`.
     Return the hit that ended the motion, or -1.
     """
-    memory, surfaces = walk.memory, walk.settings.surfaces
+    surfaces = walk.settings.surfaces
     start, most = minus(place_of(pose_now(walk)), minus(command, rest)), norm(command)
     # Distinct planes touched so far. A plane that is touched again, or that the motion did not lead
     # into, is taken for a bump.
@@ -133,10 +134,10 @@ def slide_along(walk, hit, rest, command, upright):
 
 @nb.njit(nogil=True, cache=True)
 def _is_among(plane, planes, count):
+    found = False
     for n in range(count):
-        if dot(plane, vector(planes[n])) > SAME_PLANE_COSINE:
-            return True
-    return False
+        found |= dot(plane, vector(planes[n])) > SAME_PLANE_COSINE
+    return found
 
 
 @nb.njit(nogil=True, cache=True)

@@ -28,10 +28,10 @@ def limit_displacement(gone, way, most):
 
 @njit_no_refcount
 def _is_free(way, planes, count, least):
+    free = True
     for n in range(count):
-        if not dot(way, vector(planes[n])) >= least:
-            return False
-    return True
+        free &= dot(way, vector(planes[n])) >= least
+    return free
 
 
 @nb.njit(nogil=True, cache=True)

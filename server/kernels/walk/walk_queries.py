@@ -6,7 +6,6 @@ A hit is the number of its row of the tape; -1 stands for none.
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal
 from ..collide.collide_poses import collide_resident
 from ..core.voxels_in_reach import VALID
 from ..motion.motion_end import longest_way
@@ -25,7 +24,6 @@ from ..motion.sweep_resident import (
     sweep_resident,
 )
 from ..rays.nearest_in_memory import nearest_in_memory
-from ..rays.stored_normals import code_at, find_voxel, highest_near, stored_code_at
 from .walk_state import (
     ANSWER,
     ARCHIVE,
@@ -39,15 +37,12 @@ from .walk_state import (
     HAS_NORMAL,
     HAS_PAIR,
     HAS_POINT,
-    HEIGHTS,
-    HIGHEST,
     KNOWN,
     LANDS,
+    MAX_UNDECIDED,
     MISSED,
     NAMED,
     NEAREST,
-    NORMAL,
-    NORMAL_AT,
     PART,
     REST,
     SWEPT,
@@ -61,11 +56,7 @@ from .walk_state import (
     pose_now,
     use_voxels,
 )
-from .walk_vectors import copy_pose, dot, minus, norm, times, vector
-
-# If a motion is undecided for more than this distance before its contact, it ends where the
-# undecided part begins [m].
-MAX_UNDECIDED = 1e-4
+from .walk_vectors import copy_pose, norm, vector
 
 
 @nb.njit(nogil=True, cache=True)
@@ -91,7 +82,8 @@ def pose_on_way(walk, pose_from, pose_to, fraction, pose):
 
 
 @nb.njit(nogil=True, cache=True)
-def _count(walk, visits, missed):
+def count_visits(walk, visits, missed):
+    """Add the cost of a query. missed: whether something in reach was not examined."""
     log = walk.memory.log
     log[VISITS + walk.memory.numbers[PART]] += visits
     if missed:
@@ -99,8 +91,8 @@ def _count(walk, visits, missed):
 
 
 @nb.njit(nogil=True, cache=True)
-def _ask_at(walk, query, place):
-    """Ask about a place; see `_answer` in frame_walk.py for the numbers that each query gives."""
+def ask_at(walk, query, place):
+    """Ask about a place; see `_Call._answer` in frame_walk.py for the numbers that each query gives."""
     for r in range(3):
         walk.memory.asked[r] = place[r]
     ask(walk.memory, query)
@@ -154,7 +146,7 @@ def _sweep(walk, to, tolerance, skin, row):
         if not exact and not farthest_motion(walk, pose, to) * apart <= MAX_UNDECIDED:
             verdict = UNKNOWN
     part_unknown = walk.unknown_everywhere or walk.unknown.shape[0] > 0
-    _count(walk, visits, verdict == UNKNOWN and exact or not exact and part_unknown)
+    count_visits(walk, visits, (verdict == UNKNOWN and exact) or (not exact and part_unknown))
     pair, ends = verdict == CONTACT, verdict == CONTACT and skin >= 0.0
     result[VERDICT], result[ARCHIVE] = verdict, 0.0 if pair else -1.0
     result[HAS_PAIR], result[HAS_POINT] = 1.0 if pair else 0.0, 1.0 if ends else 0.0
@@ -176,16 +168,15 @@ def _collide(walk, pose):
     for n in range(3):
         memory.counts[n, 0] = np.uint32(0)
     fault, _, _, needed = collide_resident(
-        memory.one, avatar.body, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop, memory.rows, memory.outside,
-        memory.verdict, memory.counts,
+        memory.one, avatar.body, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop,
+        memory.rows, memory.outside, memory.verdict, memory.counts,
     )  # fmt: skip
     if fault != VALID or needed < 0:
         return -1
     use_voxels(memory, needed)
-    verdict = np.int64(memory.verdict[0])
-    if verdict != CLEAR and verdict != UNKNOWN:
-        verdict = CONTACT
-    _count(walk, np.int64(memory.counts[1, 0]), verdict == UNKNOWN)
+    found = memory.verdict[0]
+    verdict = CLEAR if found == CLEAR else UNKNOWN if found == UNKNOWN else CONTACT
+    count_visits(walk, np.int64(memory.counts[1, 0]), verdict == UNKNOWN)
     return verdict
 
 
@@ -239,112 +230,6 @@ def gives_way(walk, hit, to):
 
 
 @nb.njit(nogil=True, cache=True)
-def _voxel_at(walk, place):
-    """Return the lattice point of a place (3,) [m], and the row of its voxel.
-
-    -1: there is no voxel; -2: it is not in memory. Rounds half to even, as `Lattice.to_lattice`.
-    """
-    scene = walk.held.scene
-    x = np.int64(np.rint((place[0] - scene.origin[0]) / scene.step))
-    y = np.int64(np.rint((place[1] - scene.origin[1]) / scene.step))
-    z = np.int64(np.rint((place[2] - scene.origin[2]) / scene.step))
-    row = find_voxel(walk.held.index.keys, scene.voxel_steps, x, y, z)
-    if row >= 0:
-        if scene.where[row, 0] < 0:
-            return x, y, z, -2
-        walk.memory.rows[0] = row
-        use_voxels(walk.memory, 1)
-    return x, y, z, row
-
-
-@nb.njit(nogil=True, cache=True)
-def _code(walk, x, y, z, row, level):
-    """Return the code of the normal at a lattice point of a voxel in memory. level: as for `scan_normal`."""
-    if row < 0:
-        return NO_NORMAL
-    square = walk.squares[level]
-    if square == walk.squares[3]:
-        code, _ = stored_code_at(walk.held, row, x, y, z, walk.squares[4] != 0)
-        return code
-    code, _, _ = code_at(walk.held, row, x, y, z, square, np.empty(0, np.uint16))
-    return code
-
-
-@nb.njit(nogil=True, cache=True)
-def scan_normal(walk, archive, cloud, toward, level):
-    """Return whether the normal at a scan point is known, and it: a unit vector on the side of `toward`.
-
-    archive: number of the scan's archive.  cloud: the point, world [m].  level: 0: points within the
-    normal reach form the surface; 1: those within three times that. If they form none, the next level
-    is taken.
-    """
-    memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[KNOWN]:
-        x, y, z, voxel = np.int64(0), np.int64(0), np.int64(0), np.int64(-2)
-        if walk.native and walk.squares[0] > 0:
-            x, y, z, voxel = _voxel_at(walk, cloud)
-        if voxel == -2:
-            for r in range(3):
-                memory.asked[3 + r] = toward[r]
-            memory.asked[6], memory.asked[7] = np.float64(archive), np.float64(level)
-            _ask_at(walk, NORMAL_AT, cloud)
-        code = _code(walk, x, y, z, voxel, level)
-        if code == NO_NORMAL:
-            code = _code(walk, x, y, z, voxel, level + 1)
-        memory.tape[row, HAS_NORMAL] = 0.0 if code == NO_NORMAL else 1.0
-        if code != NO_NORMAL:
-            found = decode_normal(code)
-            found = times(-1.0 if dot(found, toward) < 0.0 else 1.0, found)
-            for r in range(3):
-                memory.tape[row, NORMAL + r] = found[r]
-        memory.log[KNOWN] = row + 1
-    result = memory.tape[row]
-    return result[HAS_NORMAL] != 0.0, vector(result[NORMAL : NORMAL + 3])
-
-
-@nb.njit(nogil=True, cache=True)
-def hit_normal(walk, hit, level):
-    """Return whether the normal at a hit is known, and it; of a body, as its hit has it."""
-    result = walk.memory.tape[hit]
-    if result[HAS_PAIR] == 0.0 or result[ARCHIVE] < 0.0:
-        return result[HAS_NORMAL] != 0.0, vector(result[NORMAL : NORMAL + 3])
-    own, cloud = pair_of(walk, hit)
-    return scan_normal(walk, result[ARCHIVE], cloud, minus(own, cloud), level)
-
-
-@nb.njit(nogil=True, cache=True)
-def scan_heights(walk, hit, directions, level):
-    """Return how high the scan points around a touched one lie along up to three directions [m].
-
-    directions: (k, 3) unit.  level: as for `scan_normal`. Of further directions, the heights are zero.
-    """
-    memory = walk.memory
-    row = next_row(memory)
-    if row >= memory.log[KNOWN]:
-        archive, (_, cloud) = memory.tape[hit, ARCHIVE], pair_of(walk, hit)
-        count = directions.shape[0]
-        x, y, z, voxel = np.int64(0), np.int64(0), np.int64(0), np.int64(-2)
-        if walk.native and walk.squares[0] > 0:
-            x, y, z, voxel = _voxel_at(walk, cloud)
-        if voxel == -2:
-            memory.asked[3], memory.asked[4], memory.asked[5] = archive, np.float64(level), np.float64(count)
-            for n in range(count):
-                for r in range(3):
-                    memory.asked[6 + 3 * n + r] = directions[n, r]
-            _ask_at(walk, HIGHEST, cloud)
-        heights = memory.tape[row, HEIGHTS : HEIGHTS + 3]
-        for n in range(3):
-            heights[n] = 0.0
-        if voxel >= 0:
-            highest_near(walk.held, voxel, x, y, z, walk.squares[level], directions, heights[:count])
-            for n in range(count):
-                heights[n] *= walk.held.scene.step
-        memory.log[KNOWN] = row + 1
-    return vector(memory.tape[row, HEIGHTS : HEIGHTS + 3])
-
-
-@nb.njit(nogil=True, cache=True)
 def nearest_point(walk, place, reach):
     """Return the row with the scan point nearest to a place within `reach` [m]; -1 if there is none."""
     memory = walk.memory
@@ -356,9 +241,9 @@ def nearest_point(walk, place, reach):
             needed, known, visits = nearest_in_memory(walk.held, place, reach, walk.stop, memory.rows, cloud)
         if needed < 0:
             memory.asked[3] = reach
-            _ask_at(walk, NEAREST, place)
+            ask_at(walk, NEAREST, place)
         use_voxels(memory, needed)
-        _count(walk, visits, False)
+        count_visits(walk, visits, False)
         memory.tape[row, HAS_PAIR], memory.tape[row, ARCHIVE] = 1.0 if known else 0.0, 0.0
         memory.log[KNOWN] = row + 1
     return row if memory.tape[row, HAS_PAIR] != 0.0 else -1
@@ -366,7 +251,7 @@ def nearest_point(walk, place, reach):
 
 @nb.njit(nogil=True, cache=True)
 def lands(walk, reach, stood):
-    """Return the row that says whether the avatar would land if it fell, see `_would_land` in frame_walk.py.
+    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in frame_walk.py.
 
     reach: distance below that is free [m].  stood: whether it stood in the last frame.
     """

@@ -22,6 +22,9 @@ from ..motion.sweep_resident import COLUMNS
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
+# If a motion is undecided for more than this distance before its contact, it ends where the
+# undecided part begins [m].
+MAX_UNDECIDED = 1e-4
 # Columns of a row of the tape. The first are those of `sweep_resident`. Then, for a hit: its verdict,
 # number of its archive (-1: not of the scan), whether the centres of the touching spheres, the
 # touching point, the end and the normal are known, the normal (3,), number of the body's name (0:
@@ -31,7 +34,9 @@ VERDICT = COLUMNS
 ARCHIVE, HAS_PAIR, HAS_POINT, HAS_END, HAS_NORMAL, NORMAL = (COLUMNS + n for n in range(1, 7))
 NAMED, UNLOADED, REST, ANSWER, HEIGHTS, ROW = (COLUMNS + n for n in (9, 10, 11, 12, 13, 16))
 # Queries that Python answers. FULL: the tape needs more rows.
-FULL, SWEPT, BODIES_SWEPT, CLEAR_AT, BODIES_AT, TOUCHED, GIVES_WAY, NORMAL_AT, HIGHEST, NEAREST, LANDS = range(11)
+FULL, SWEPT, BODIES_SWEPT, CLEAR_AT, BODIES_AT, TOUCHED, GIVES_WAY, NORMAL_AT, HIGHEST, NEAREST, LANDS = (
+    range(11)
+)
 
 # Elements of `log`, which repetitions keep: number of known rows, the query asked, whether the call
 # repeats a frame's part, number of voxels used, whether something in reach was not examined, and the
@@ -255,8 +260,9 @@ def refer_to_memory(arrays):
     """Return a reference to the state of a frame."""
     return WalkMemory(
         arrays.tape, arrays.log, arrays.numbers, arrays.values, arrays.inputs, arrays.poses, arrays.old_plane,
-        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.rows, arrays.used, arrays.outside, arrays.verdict,
-        arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values, arrays.saved_poses,
+        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.rows, arrays.used,
+        arrays.outside, arrays.verdict, arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values,
+        arrays.saved_poses,
     )  # fmt: skip
 
 

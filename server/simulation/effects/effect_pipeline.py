@@ -75,7 +75,7 @@ class Pipeline:
 
     def __init__(self, file: SceneFile, world: World, runners: list[Runner]) -> None:
         """Create a pipeline; callers use `make_pipeline`."""
-        self.file, self.world, self.runners = file, world, runners
+        self.file, self.world, self._runners = file, world, runners
         self.costs = {runner.name: CostEstimate() for runner in runners}
         self.times = EffectTimes(self.costs)
         self.bodies: Any = None
@@ -90,6 +90,15 @@ class Pipeline:
         self._visits = limits.frame_visits
         self._free = self._seconds is None and self._visits is None  # no budget, no measurement
         self._groups = _groups_of(runners, together=self._free)
+
+    @property
+    def runners(self) -> list[Runner]:
+        """Return the effects; set it to replace them."""
+        return self._runners
+
+    @runners.setter
+    def runners(self, runners: list[Runner]) -> None:
+        self._runners, self._groups = runners, _groups_of(runners, together=self._free)
 
     def run(
         self,
@@ -143,7 +152,7 @@ class Pipeline:
             since = world.visits
             ran: list[tuple[str, float]] = []
             now = time.perf_counter()
-            for group in self._groups if not skip else _groups_of(self.runners, together=False):
+            for group in self._groups if not skip else _groups_of(self._runners, together=False):
                 if budget.stop:
                     raise StoppedError
                 runner = group[0]

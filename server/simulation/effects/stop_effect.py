@@ -13,7 +13,6 @@ because voxels are not in memory yet, for a frame that does not wait for them.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
-from ....schemas.wire.answers import Verdict
 from ...kernels.walk.walk_state import FOLLOW
 from ..world.collision_world import World
 from ..world.frame import Frame, Hit, Vec, find_touched, is_clear, record_hit, translated

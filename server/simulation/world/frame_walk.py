@@ -18,9 +18,9 @@ from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import GroundReport
 from ...kernels.motion.sweep_resident import AVATAR, CLOUD, END, ENDED, LOWER, POINT
 from ...kernels.walk import walk_state as state
-from ...kernels.walk.slide_along import FLAT, FLAT_REACH_FACTOR
+from ...kernels.walk.slide_along import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
-from ...queries.context.query_budget import EXACT, QueryBudget
+from ...queries.context.query_budget import EXACT
 from ...queries.resident_fast_path import MAX_FAST_VOXELS
 from .collision_world import SPARSE_FACTOR, World
 from .frame import (
@@ -42,6 +42,7 @@ from .vectors import dot
 # Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
 # on, (6,), and the place where it was raised last, (3,).
 GROUND_PLANE, RAISED = "ground", "ground raised"
+_NO_SQUARES = np.zeros(5, np.int64)
 # Rows of the tape at first; frames that need more double it.
 _ROWS = 64
 # Points within this distance of the touched point determine the ground's normal [m]. With `slide`, its
@@ -63,7 +64,10 @@ def _settings(file: SceneFile, up: Vec) -> tuple[Any, float]:
     declared: dict[type, Any] = {type(effect): effect for effect in file.effects}
     stop, slide = declared.get(Stop, Stop()), declared.get(Slide)
     ground, step = declared.get(Ground), declared.get(Step)
-    reach, height = _NORMAL_REACH if slide is None else slide.normal_reach, 0.0 if step is None else step.height
+    reach, height = (
+        _NORMAL_REACH if slide is None else slide.normal_reach,
+        0.0 if step is None else step.height,
+    )
     walkable_slide, standing = -2.0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if ground is not None:
         walkable_slide = math.cos(math.radians(ground.slope))
@@ -95,8 +99,9 @@ class _Thread(threading.local):
         """Double the rows of the tape."""
         old, rows = self.memory, len(self.memory.tape)
         larger = state.make_arrays(2 * rows, MAX_FAST_VOXELS)
-        for old_array, array in zip(old, larger, strict=True):
-            array[: len(old_array)] = old_array
+        for name in state.WalkArrays._fields:
+            part: NDArray[np.float64] = getattr(old, name)
+            getattr(larger, name)[: len(part)] = part
         self.use(larger)
 
 
@@ -114,6 +119,7 @@ class Walker:
         farther = min(FLAT_REACH_FACTOR * reach, MAX_NORMAL_REACH)
         # By the level of `scan_normal`.
         self._reaches = (reach, farther, min(SPARSE_FACTOR * farther, MAX_NORMAL_REACH))
+        self._has_normals = any(isinstance(effect, (Slide, Ground)) for effect in world.file.effects)
         self._thread = _Thread()
 
     def run(self, frame: Frame, parts: int) -> None:
@@ -126,14 +132,21 @@ class Walker:
         starts, frame.walks = not frame.walks, True
         if starts:
             call.begin()
-        begin, target, pose, stood, fell = body.pose, frame.target, frame.pose, body.on_ground, body.fall_speed
+        begin, target, pose, stood, fell = (
+            body.pose,
+            frame.target,
+            frame.pose,
+            body.on_ground,
+            body.fall_speed,
+        )
         verdict, clear, bodies = int(frame.verdict), frame.clear, bool(frame.obstacles)
         with world as seen:
             each, probe = seen[0], world.probe(body.avatar)
             data, residency = each.data, each.data.residency
             alone = world.is_alone
             native = self.native and alone and probe.is_small and not budget.limited
-            squares, held = normals_of(each).squares(self._reaches), data.references.to(data.arrays, data.broad)
+            squares = normals_of(each).squares(self._reaches) if self._has_normals else _NO_SQUARES
+            held = data.references.to(data.arrays, data.broad)
             thread.memory.log[state.REPEATS] = 0
             while True:
                 try:
@@ -305,8 +318,16 @@ class _Call:
             result[state.VERDICT] = int(Verdict.CLEAR)
             return
         self._hits[row] = hit
-        result[LOWER], result[state.VERDICT], result[state.ARCHIVE] = hit.fraction, int(hit.verdict), hit.archive
-        result[state.UNLOADED], result[state.REST], result[state.NAMED] = hit.unloaded, hit.rest, bool(hit.what)
+        result[LOWER], result[state.VERDICT], result[state.ARCHIVE] = (
+            hit.fraction,
+            int(hit.verdict),
+            hit.archive,
+        )
+        result[state.UNLOADED], result[state.REST], result[state.NAMED] = (
+            hit.unloaded,
+            hit.rest,
+            bool(hit.what),
+        )
         parts: tuple[tuple[int, int, NDArray[np.float64] | None], ...] = (
             (state.HAS_NORMAL, state.NORMAL, hit.normal),
             (state.HAS_POINT, POINT, hit.point),

@@ -1,7 +1,5 @@
 """Test that a frame is the same bit for bit, whoever answers its queries and in however many calls."""
 
-from pathlib import Path
-
 import archive_cases
 import effect_rooms
 import numpy as np

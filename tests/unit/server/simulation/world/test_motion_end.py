@@ -10,9 +10,9 @@ from effect_rooms import INTERPRETED
 from solidcloud.schemas.scene.effect_table import AnyEffect, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.archives.placed_archive import PlacedArchive
+from solidcloud.server.kernels.walk.walk_state import FOLLOW
 from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.scene import Scene
-from solidcloud.server.kernels.walk.walk_state import FOLLOW
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame
 

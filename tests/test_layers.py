@@ -44,6 +44,7 @@ ALLOWED = {
     "server/kernels/motion": "kernels/core",
     "server/kernels/nearest": "kernels/core",
     "server/kernels/bodies": "kernels/core kernels/motion",
+    "server/kernels/walk": "kernels/core kernels/bodies kernels/collide kernels/motion kernels/rays",
     "server/zenoh_common": "scene_interface.py",
     "server/zenoh_client": "zenoh_common scene_interface.py",
     "server/zenoh_server": "observability runtime scene_interface.py zenoh_common",

@@ -23,9 +23,9 @@ others would otherwise fall.
 import numpy as np
 
 from ....schemas.scene.effect_table import Ground
-from ...kernels.walk.walk_state import GROUND
 from ..world.collision_world import World
 from ..world.frame import Frame, Vec
+from ..world.frame_walk import GROUND
 from ..world.vectors import dot, norm
 
 

@@ -23,8 +23,8 @@ slides at the orientation reached. Finally, the rest of the rotation is tried in
 from typing import Any
 
 from ....schemas.scene.effect_table import Slide
-from ...kernels.walk.walk_state import SLIDE
 from ..world.frame import Frame
+from ..world.frame_walk import SLIDE
 
 
 class SlideRunner:

@@ -9,8 +9,8 @@ frame is restored. The effect `ground` handles steps down: it searches for groun
 from typing import Any
 
 from ....schemas.scene.effect_table import Step
-from ...kernels.walk.walk_state import STEP
 from ..world.frame import Frame
+from ..world.frame_walk import STEP
 
 
 class StepRunner:

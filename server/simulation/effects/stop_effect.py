@@ -13,9 +13,9 @@ because voxels are not in memory yet, for a frame that does not wait for them.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
-from ...kernels.walk.walk_state import FOLLOW
 from ..world.collision_world import World
 from ..world.frame import Frame, Hit, Vec, find_touched, is_clear, record_hit, translated
+from ..world.frame_walk import FOLLOW
 from ..world.vectors import dot, norm
 
 # Longest displacement of an escape from contact [m], and the distances that are tried.

@@ -8,8 +8,8 @@ the pose clear if the pose is one of the sweep's bit for bit; otherwise `collide
 from typing import Any
 
 from ....schemas.scene.effect_table import Sweep
-from ...kernels.walk.walk_state import FOLLOW
 from ..world.frame import Frame
+from ..world.frame_walk import FOLLOW
 
 
 class SweepRunner:

@@ -30,14 +30,19 @@ from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
 from .avatar_probes import AvatarProbes
 from .frame import Hit, Pose, Vec
-from .held_archive import HeldArchive, normals_of, swept_in_world, to_archive, to_world, touched_in_archive
+from .held_archive import (
+    SPARSE_FACTOR,
+    HeldArchive,
+    normals_of,
+    swept_in_world,
+    to_archive,
+    to_world,
+    touched_in_archive,
+)
 from .least_answer import comes_first, merge_distances, merge_swept
 from .vectors import min_height, unit_vector
 
 _NO_ORIGIN = np.zeros(3)
-# If the points near a touched one form no surface, because the scan is sparse, the reach of its
-# normal is multiplied by this factor.
-SPARSE_FACTOR = 3.0
 
 
 class _Held(threading.local):

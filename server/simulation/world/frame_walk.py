@@ -22,7 +22,6 @@ from ...kernels.walk.slide_along import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
 from ...queries.context.query_budget import EXACT
 from ...queries.resident_fast_path import MAX_FAST_VOXELS
-from .collision_world import SPARSE_FACTOR, World
 from .frame import (
     Frame,
     Hit,
@@ -36,12 +35,14 @@ from .frame import (
     touches_bodies,
     translated,
 )
-from .held_archive import normals_of
+from .held_archive import SPARSE_FACTOR, normals_of
 from .vectors import dot
 
 # Names under which `Body.effect_state` keeps the point and the normal of the plane that the avatar stands
 # on, (6,), and the place where it was raised last, (3,).
 GROUND_PLANE, RAISED = "ground", "ground raised"
+# Parts of a frame that effects run.
+FOLLOW, SLIDE, STEP, GROUND = state.FOLLOW, state.SLIDE, state.STEP, state.GROUND
 _NO_SQUARES = np.zeros(5, np.int64)
 # Rows of the tape at first; frames that need more double it.
 _ROWS = 64
@@ -111,7 +112,7 @@ class Walker:
     native: whether the kernel answers queries itself; tests compare both.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: Any) -> None:
         """Prepare the effects of the world's scene file, and compile the kernel."""
         self.native = True
         self._world = world

@@ -12,6 +12,10 @@ from ...queries.context.query_context import SceneData
 from ...queries.resident_fast_path import SweepResult
 from .frame import Pose, Vec
 
+# If the points near a touched one form no surface, because the scan is sparse, the reach of its
+# normal is multiplied by this factor.
+SPARSE_FACTOR = 3.0
+
 
 class HeldArchive(NamedTuple):
     """Archive generation that a thread holds. data: with the scene's radius model."""

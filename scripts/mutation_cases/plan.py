@@ -4,6 +4,7 @@ Quick tests come first, because the first failure ends a trial.
 """
 
 SCHEMAS, BUILDER, SERVER = "tests/unit/schemas/", "tests/unit/builder/", "tests/unit/server/"
+WALK = (SERVER + "simulation/world/test_frame_walk.py",)
 
 
 def work(*questions: str) -> tuple[str, ...]:
@@ -227,7 +228,20 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "server/kernels/nearest/pair_heap.py": work("bounded deep", "collide bounded", "distance bounded"),
     "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
-    "server/kernels/motion/walk_resident.py": (SERVER + "simulation/effects/test_free_walk.py",),
+    "server/kernels/walk/walk_state.py": WALK,
+    "server/kernels/walk/walk_vectors.py": WALK,
+    "server/kernels/walk/walk_queries.py": (*WALK, SERVER + "simulation/world/test_motion_end.py"),
+    "server/kernels/walk/walk_normals.py": (*WALK, SERVER + "simulation/world/test_contact_normal.py"),
+    "server/kernels/walk/walk_motions.py": (*WALK, SERVER + "simulation/world/test_motion_end.py"),
+    "server/kernels/walk/walk_frame.py": WALK,
+    "server/kernels/walk/contact_normal.py": (SERVER + "simulation/world/test_contact_normal.py",),
+    "server/kernels/walk/slide_planes.py": (SERVER + "simulation/effects/test_slide_effect.py",),
+    "server/kernels/walk/slide_along.py": (*WALK, SERVER + "simulation/effects/test_slide_effect.py"),
+    "server/kernels/walk/ground_plane.py": (*WALK, SERVER + "simulation/effects/test_ground_effect.py"),
+    "server/kernels/walk/ground_search.py": (*WALK, SERVER + "simulation/effects/test_ground_effect.py"),
+    "server/kernels/walk/stand_on_ground.py": (*WALK, SERVER + "simulation/effects/test_ground_effect.py"),
+    "server/kernels/walk/step_up.py": (*WALK, SERVER + "simulation/effects/test_ground_effect.py"),
+    "server/kernels/rays/nearest_in_memory.py": (SERVER + "kernels/rays/test_nearest_in_memory.py",),
     "server/kernels/motion/motion_end.py": (SERVER + "simulation/world/test_motion_end.py",),
     "server/kernels/rays/rays.py": work("raycast", "raycast bounded"),
     "server/kernels/rays/level_rays.py": ("tests/property/test_ray_tolerances_naive.py",),

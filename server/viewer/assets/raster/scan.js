@@ -1,11 +1,11 @@
 // The scan into a picture: tiles and overview, nearest first.
 
-import { Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
+import { Frustum, Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
 import { shared } from "../points_material.js";
 import { PointColours } from "./colours.js";
 import { boxesOf, seenRuns } from "./runs.js";
 import { screenRows } from "./shapes.js";
-import { fogTables, splat } from "./splats.js";
+import { fogTables } from "./splats.js";
 
 export class Scan {
   constructor() {
@@ -16,12 +16,14 @@ export class Scan {
     this.fog = fogTables(shared.uGround.value.toArray());
   }
 
-  /** Draw scan points. objects: of three.js, with the material of points_material.js.
+  /** Draw scan points. objects: of three.js, with the material of points_material.js.  view: from
+   * the world to the picture, as a matrix.
    *
    * Returns how many points they have, how many of them were given to the inner loop, and how many were
    * inside of the picture.
    */
-  draw(picture, objects, camera, frustum) {
+  draw(picture, objects, camera, view) {
+    const frustum = new Frustum().setFromProjectionMatrix(view);
     const ordered = [];
     for (const object of objects) {
       const count = object.geometry.drawRange.count;
@@ -38,14 +40,14 @@ export class Scan {
     }
     ordered.sort((one, other) => one.away - other.away);
     const found = { chosen: 0, given: 0, inside: 0 };
-    for (const tile of ordered) this.tile(picture, tile, camera, found);
+    for (const tile of ordered) this.tile(picture, tile, camera, view, found);
     return found;
   }
 
-  tile(picture, tile, camera, found) {
+  tile(picture, tile, camera, view, found) {
     const { matrix, sphere, attributes, source, places, count } = tile;
     const { elements } = matrix;
-    const screen = screenRows(picture, camera, matrix);
+    const screen = screenRows(picture, view, matrix);
     const runs = seenRuns(this.boxesOf(places), count, screen, picture.width, picture.height, camera.near);
     found.chosen += count;
     if (!runs.length) return;
@@ -55,7 +57,7 @@ export class Scan {
     const { x: least, y: most } = shared.uPixels.value;
     const step = Math.hypot(elements[0], elements[1], elements[2]) / shared.uFog.value;
     const colours = this.colours.around(this.colours.of(source, attributes, places, elements), places, last, elements, sphere);
-    const draw = (ofPlaces, ofColours, from, to) => splat(picture, ofPlaces, ofColours, from, to, screen, tile.size, least, most,
+    const draw = (ofPlaces, ofColours, from, to) => picture.splat(ofPlaces, ofColours, from, to, screen, tile.size, least, most,
       camera.near, [eye.x, eye.y, eye.z, step * step], this.fog);
     for (let k = 0; k < runs.length; k += 2) {
       const [from, to] = [runs[k], runs[k + 1]];

@@ -10,7 +10,7 @@ const MOST = 16384;
 // Least width and height of a picture [pixels]: a row has a disc's largest width.
 const LEAST_SIDE = 64;
 // Addresses, and bytes of the lists: see splats.ts. The page's arrays are behind them.
-const FOG = 1024, NUMBERS = FOG + 3 * 4 * FOG_STEPS, LISTS = NUMBERS + 128, PLACES = LISTS + 4 * 8192 + 128;
+const FOG = 1024, NUMBERS = FOG + 3 * 4 * FOG_STEPS, LISTS = NUMBERS + 128, PLACES = LISTS + 4 * 4096 + 128;
 const TINTS = PLACES + 6 * MOST + 64, PICTURE = TINTS + 4 * MOST + 64;
 const PAGE = 65536;
 
@@ -45,7 +45,7 @@ export class Kernel {
     const lacking = Math.ceil((colours + 4 * pixels) / PAGE) - this.memory.buffer.byteLength / PAGE;
     if (lacking > 0) this.memory.grow(lacking);
     const { buffer } = this.memory;
-    this.numbers = new Float32Array(buffer, NUMBERS, 20);
+    this.numbers = new Float32Array(buffer, NUMBERS, 27);
     this.places = new Uint16Array(buffer, PLACES, 3 * MOST);
     this.tints = new Uint32Array(buffer, TINTS, MOST);
     this.functions.begin(PICTURE, colours, width, height);
@@ -53,7 +53,7 @@ export class Kernel {
   }
 
   /** Draw points, as `splat` of splats.js does. */
-  splat(places, colours, from, to, screen, size, least, most, near, [eyeX, eyeY, eyeZ, foggy], fog) {
+  splat(places, colours, from, to, screen, size, least, most, near, [eyeX, eyeY, eyeZ, foggy], fog, cut) {
     if (this.fog !== fog) {
       this.fog = fog;
       [fog.shares, fog.redBlue, fog.green].forEach((table, k) => new Int32Array(this.memory.buffer, FOG + 4 * FOG_STEPS * k, FOG_STEPS).set(table));
@@ -68,6 +68,7 @@ export class Kernel {
     numbers[17] = eyeY;
     numbers[18] = eyeZ;
     numbers[19] = (foggy * FOG_STEPS) / FOG_END;
+    numbers.set(cut, 20);
     let inside = 0;
     for (let begin = from; begin < to; begin += MOST) {
       const end = Math.min(to, begin + MOST);

@@ -6,8 +6,10 @@
 // Points are taken in pieces. Each piece is projected and sorted by size into lists first, and then the
 // lists are drawn: a loop over points of one size has branches that a processor predicts.
 
-/** Points of a piece, and bytes of an entry of a list: u, v, 1 / w, diameter, colour. */
-const PIECE: i32 = 256, ENTRY: usize = 32, LIST: usize = <usize>PIECE * ENTRY;
+/** Points of a piece, whose lists stay in the processor's first cache; bytes of an entry of a list: u, v,
+ * 1 / w, diameter, colour; bytes of a list.
+ */
+const PIECE: i32 = 128, ENTRY: usize = 32, LIST: usize = <usize>PIECE * ENTRY;
 /** Diameters up to which a point is four pixels, a square of at most 4, and a disc of at most 8 [pixels]. */
 const FOUR: f32 = 2.6, SQUARE: f32 = 4.5, SMALL: f32 = 8;
 /** Half of a square's side, as a share of the diameter. */
@@ -31,9 +33,9 @@ export function begin(depth: usize, colour: usize, wide: i32, high: i32): void {
 
 /** Draw points; return how many were inside of the picture.
  *
- * places, tints: (n, 3) u2 and (n) u4; 32 bytes behind each are free.  numbers: 20 f4, which are the 12 of
- * `screen`, size, least, most, near, and the 4 of `eye`, of `splat` in splats.js.  fog: its three tables, one
- * after the other.  lists: 4 lists of `LIST` bytes.
+ * places, tints: (n, 3) u2 and (n) u4; 32 bytes behind each are free.  numbers: 27 f4, which are the 12 of
+ * `screen`, size, least, most, near, the 4 of `eye` and the 7 of `cut` of `splat` in splats.js; the fourth of
+ * `eye` is in steps of the fog's tables.  fog: its three tables, one after the other.  lists: 4 lists of `LIST` bytes.
  */
 export function splat(places: usize, tints: usize, count: i32, numbers: usize, fog: usize, lists: usize): i32 {
   let inside = 0;
@@ -66,6 +68,9 @@ function project(places: usize, tints: usize, count: i32, numbers: usize, fog: u
   const eyeX = v128.load32_splat(numbers, 64), eyeY = v128.load32_splat(numbers, 68);
   const eyeZ = v128.load32_splat(numbers, 72), foggy = v128.load32_splat(numbers, 76);
   const wide = f32x4.splat(<f32>width), high = f32x4.splat(<f32>height), zero = f32x4.splat(0);
+  const cutX = v128.load32_splat(numbers, 80), cutY = v128.load32_splat(numbers, 84), cutZ = v128.load32_splat(numbers, 88);
+  const scale = v128.load32_splat(numbers, 92), limit = v128.load32_splat(numbers, 96);
+  const radius = v128.load32_splat(numbers, 100), narrowing = v128.load32_splat(numbers, 104);
   let inside = 0;
   for (let k = 0; k < count; k += 4, places += 24, tints += 16) {
     // Four places: x, y and z of each, from two overlapping loads.
@@ -76,14 +81,19 @@ function project(places: usize, tints: usize, count: i32, numbers: usize, fog: u
     const w = row(numbers, 2, x, y, z);
     const inverse = f32x4.div(f32x4.splat(1), w);
     const u = f32x4.mul(row(numbers, 0, x, y, z), inverse), v = f32x4.mul(row(numbers, 1, x, y, z), inverse);
-    const seen = v128.and(
+    const dx = f32x4.sub(x, eyeX), dy = f32x4.sub(y, eyeY), dz = f32x4.sub(z, eyeZ);
+    const away = f32x4.add(f32x4.add(square(dx), square(dy)), square(dz));
+    // What is between the camera and the user is left out.
+    const along = f32x4.add(f32x4.add(f32x4.mul(cutX, dx), f32x4.mul(cutY, dy)), f32x4.mul(cutZ, dz));
+    const beside = f32x4.sub(f32x4.mul(scale, away), square(along));
+    const cut = v128.and(f32x4.lt(along, limit), f32x4.lt(beside, square(f32x4.sub(radius, f32x4.mul(narrowing, along)))));
+    const seen = v128.andnot(v128.and(
       v128.and(f32x4.ge(w, near), i32x4.lt_s(ORDER, i32x4.splat(count - k))),
-      v128.and(v128.and(f32x4.ge(u, zero), f32x4.lt(u, wide)), v128.and(f32x4.ge(v, zero), f32x4.lt(v, high))));
+      v128.and(v128.and(f32x4.ge(u, zero), f32x4.lt(u, wide)), v128.and(f32x4.ge(v, zero), f32x4.lt(v, high)))), cut);
     let lanes = i32x4.bitmask(seen);
     if (lanes === 0) continue;
     inside += popcnt(lanes);
     const diameter = f32x4.min(f32x4.max(f32x4.mul(size, inverse), least), most);
-    const away = f32x4.add(f32x4.add(square(f32x4.sub(x, eyeX)), square(f32x4.sub(y, eyeY))), square(f32x4.sub(z, eyeZ)));
     const fogged = i32x4.shl(i32x4.min_s(i32x4.trunc_sat_f32x4_s(f32x4.mul(foggy, away)), i32x4.splat(FOG_STEPS - 1)), 2);
     // The numbers of each point in a row.
     const uv = v128.shuffle<f32>(u, v, 0, 4, 1, 5), uv2 = v128.shuffle<f32>(u, v, 2, 6, 3, 7);

@@ -32,6 +32,7 @@ export class Picture {
     this.colour = new Uint32Array(buffer, byteOffset, width * height);
     this.depth = arrays ? arrays.depth : new Float32Array(width * height);
     this.splat = arrays ? (...all) => this.kernel.splat(...all) : (...all) => splat(this, ...all);
+    this.loop = arrays ? "wasm" : "js";
     this.logarithms = null;
   }
 

@@ -5,11 +5,12 @@
 
 const SMOOTH_MS = 42, EASY_MS = 24;
 const LEAST_POINTS = 25e3, FIRST_SOFTWARE = 60e3;
-// Our own drawing begins with this many points. They are fewer if pictures take longer than `SMOOTH_MS`
-// and their points more than `OWN_MS` of it, and more again below half of that. Other work on the machine
-// makes pictures late, too, against which fewer points are no help: the least disturbed pictures count.
-// Fewer points are larger and cover as much: a fifth of them takes two thirds of the time.
-const FIRST_OWN = 200e3, LEAST_OWN = 120e3, OWN_MS = 18;
+// Our own drawing begins with this many points, of which about 200,000 are in reach of the picture. They are
+// fewer if pictures take longer than `SMOOTH_MS` and their points more than `OWN_MS` of it, and more again if
+// their points take less than a share of it, which is smaller once they are as many as at the beginning. Other
+// work on the machine makes pictures late, too, against which fewer points are little help: the least
+// disturbed pictures count. Fewer points are larger and cover as much: 60 % of them take 80 % of the time.
+const FIRST_OWN = 240e3, LEAST_OWN = 120e3, OWN_MS = 18, AGAIN = 0.75, MORE = 0.5;
 // Mean time between our own pictures, at least [ms]: a server has 30 states a second, and the processor serves
 // it, too. After a late picture the next one may come at the least time [ms].
 const OWN_INTERVAL_MS = 32, OWN_LEAST_MS = 15;
@@ -119,6 +120,6 @@ export class Quality {
   regulate(slow, long, points) {
     if (slow > SMOOTH_MS && long > OWN_MS) {
       this.most = Math.max(LEAST_OWN, Math.min(this.most, points) * Math.max(0.5, OWN_MS / long));
-    } else if (long < 0.5 * OWN_MS) this.most = Math.min(1.15 * this.most, 2 * FIRST_OWN);
+    } else if (long < OWN_MS * (this.most < FIRST_OWN ? AGAIN : MORE)) this.most = Math.min(1.15 * this.most, 2 * FIRST_OWN);
   }
 }

@@ -14,27 +14,23 @@ const FOG = 1024, NUMBERS = FOG + 3 * 4 * FOG_STEPS, LISTS = NUMBERS + 128, PLAC
 const TINTS = PLACES + 6 * MOST + 64, PICTURE = TINTS + 4 * MOST + 64;
 const PAGE = 65536;
 
-const compiled = await compile();
-
-/** Return the module, or null where a browser cannot compile it. */
-async function compile() {
-  try {
-    return await WebAssembly.compileStreaming(fetch(new URL("splats.wasm", import.meta.url)));
-  } catch (error) {
-    console.info(error);
-    return null;
-  }
-}
-
 export class Kernel {
-  /** Return the kernel, or null where a browser has none. */
-  static made() {
-    return compiled ? new Kernel() : null;
+  /** Return the kernel, or null where a browser cannot compile it. */
+  static async made() {
+    try {
+      const memory = new WebAssembly.Memory({ initial: 1 });
+      const file = fetch(new URL("splats.wasm", import.meta.url));
+      const { instance } = await WebAssembly.instantiateStreaming(file, { env: { memory } });
+      return new Kernel(memory, instance.exports);
+    } catch (error) {
+      console.info(error);
+      return null;
+    }
   }
 
-  constructor() {
-    this.memory = new WebAssembly.Memory({ initial: 1 });
-    this.functions = new WebAssembly.Instance(compiled, { env: { memory: this.memory } }).exports;
+  constructor(memory, functions) {
+    this.memory = memory;
+    this.functions = functions;
     this.fog = null;
   }
 

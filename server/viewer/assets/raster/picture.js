@@ -17,8 +17,14 @@ export class Picture {
     this.context = canvas.getContext("2d", { alpha: false });
     this.shadeTable = Uint16Array.from({ length: SHADES + 1 },
       (_, k) => Math.round(256 * Math.exp((-STRENGTH * DARKEST * k) / SHADES)));
-    this.kernel = Kernel.made();
+    this.kernel = null;
     this.resize(1, 1);
+    // Until it is there, pictures are drawn without it.
+    Kernel.made().then((kernel) => {
+      if (!kernel) return;
+      this.kernel = kernel;
+      this.allot();
+    });
   }
 
   resize(width, height) {
@@ -26,6 +32,12 @@ export class Picture {
     Object.assign(this, { width, height });
     this.canvas.width = width;
     this.canvas.height = height;
+    this.allot();
+  }
+
+  /** Make the arrays of the picture. */
+  allot() {
+    const { width, height } = this;
     const arrays = this.kernel?.resize(width, height);
     this.image = arrays ? new ImageData(arrays.colours, width, height) : new ImageData(width, height);
     const { buffer, byteOffset } = this.image.data;

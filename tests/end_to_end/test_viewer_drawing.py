@@ -26,6 +26,30 @@ BEFORE_DOOR, BY_WALL = "0,-6,0.1,90", "-7.6,-9,0.1,180"
 COLOURS = ("height", "rgb", "intensity", "classification", "scan", "verdict")
 # Blocks of pixels that are compared, and by how much most of them and all together may differ, of 255.
 BLOCK, MOST, TOGETHER = 23, 8.0, 2.5
+# Shares of pixels and points that may differ between the two inner loops: one computes in float32.
+ROUNDED, ROUNDED_POINTS = 0.01, 0.001
+# Draws the same points with both loops: [share of coloured pixels, of different ones, points inside twice].
+BOTH_LOOPS = """async ([size, cutting]) => {
+  const { Kernel } = await import("/raster/kernel.js"), { fogTables, splat } = await import("/raster/splats.js");
+  const [width, height, count, ground] = [320, 200, 40000, 0xff150e0a], pixels = width * height;
+  const kernel = await Kernel.made(), arrays = kernel.resize(width, height), fog = fogTables([0.04, 0.05, 0.08]);
+  const one = { width, height, depth: new Float32Array(pixels), colour: new Uint32Array(pixels).fill(ground) };
+  const other = new Uint32Array(arrays.colours.buffer, arrays.colours.byteOffset, pixels).fill(ground);
+  arrays.depth.fill(0);
+  let state = 2012;
+  const next = () => (state = (Math.imul(state, 1664525) + 1013904223) >>> 0);
+  const places = Uint16Array.from({ length: 3 * count }, () => next() >>> 16);
+  const colours = Uint32Array.from({ length: count }, () => 0xff000000 | (next() >>> 8));
+  // A cube of 8 m; the camera is in it, and looks along y.
+  const step = 8 / 65536, eye = [4, 1, 3].map((at) => at / step), scale = 160 * step;
+  const row = (x, y, z) => [x, y, z, -(x * eye[0] + y * eye[1] + z * eye[2])];
+  const screen = [...row(scale, 160 * step, 0), ...row(0, 100 * step, -scale), ...row(0, step, 0)];
+  const cut = cutting ? [0, step, 0, step * step, 3, 0.9, 0.2] : [0, 0, 0, 0, -1, 0, 0];
+  const rest = [3, count, screen, size, 1.6, 40, 0.05, [...eye, (step / 20) ** 2], fog, cut];
+  const inside = [splat(one, places, colours, ...rest), kernel.splat(places, colours, ...rest)];
+  const share = (of) => one.colour.reduce((sum, each, k) => sum + of(each, k), 0) / pixels;
+  return [share((each) => each !== ground), share((each, k) => each !== other[k]), ...inside];
+}"""
 # Shares of coloured pixels may differ by this much: a small square is larger than a small disc.
 SHARE = 0.02
 
@@ -103,6 +127,27 @@ def test_what_only_webgl_draws_is_over_the_own_picture(browser: Any, url: str) -
         viewed.wait_complete()
         check_similar(viewed.picture(), before, "after spheres")
         viewed.check_clean(url)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("size", [4, 12, 25, 60, 400])
+def test_both_inner_loops_draw_the_same(browser: Any, url: str, size: float, cut: bool) -> None:
+    with viewed_page(browser, url) as viewed:
+        filled, different, one, other = viewed.page.evaluate(BOTH_LOOPS, [size, cut])
+    assert filled > 0.3
+    assert different < ROUNDED
+    assert one > 1000 and abs(one - other) <= ROUNDED_POINTS * one
+
+
+def test_a_browser_without_webassembly_draws_the_same(browser: Any, url: str) -> None:
+    found = []
+    for before, loop in (("", "wasm"), ("delete window.WebAssembly", "js")):
+        with viewed_page(browser, f"{url}?at={BEFORE_DOOR}", before=before) as viewed:
+            viewed.wait_complete()
+            viewed.wait(f"s.drawing.loop === '{loop}'")
+            found.append(settled(viewed))
+            viewed.check_clean(url)
+    check_similar(*found, "without WebAssembly")
 
 
 def pictures(browser: Any, address: str) -> dict[str, np.ndarray]:

@@ -100,13 +100,15 @@ def browsing() -> Iterator[Any]:
 
 
 @contextmanager
-def viewed_page(browser: Any, url: str, *, full: bool = False) -> Iterator[ViewedPage]:
+def viewed_page(browser: Any, url: str, *, full: bool = False, before: str = "") -> Iterator[ViewedPage]:
     """Open a page of its own profile, 1280 x 720 pixels.
 
     full: with the settings of a new user; otherwise few points are drawn, which is faster without a
-    graphics processor.
+    graphics processor.  before: JavaScript that runs before the page's own.
     """
     context = browser.new_context(viewport={"width": 1280, "height": 720})
+    if before:
+        context.add_init_script(before)
     if not full:
         context.add_init_script(f"localStorage.setItem('solidcloud.settings', '{_LIGHT}')")
     try:

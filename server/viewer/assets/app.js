@@ -304,7 +304,7 @@ export class App {
 
   /** Draw, if the picture differs from the one before. */
   draw(now) {
-    if (this.quality.early(now - this.times.drawn)) return;
+    if (this.quality.early(now)) return;
     const { camera, drawing } = this.view;
     const seen = [
       ...[...camera.position.toArray(), ...camera.quaternion.toArray()].map(digits), camera.aspect, this.view.canvas.width,
@@ -331,15 +331,16 @@ export class App {
       if (this.intervals.length > 2 * KEPT_INTERVALS) this.intervals = this.intervals.slice(-KEPT_INTERVALS);
     }
     this.times.drawn = now;
+    this.quality.draws(now);
     this.drawnBefore = true;
     this.view.draw();
     this.pictured ||= this.tiles.shown + this.overview.shown > 0;
   }
 
-  /** Return what pictures take: intervals of those that moved since the last call [ms]; parts of our own drawing of the last one [ms], and its points. */
+  /** Return what pictures take: intervals of those that moved since the last call [ms]; parts of our own drawing of the last one [ms], its inner loop, and its points. */
   drawingFigures() {
     const { drawing } = this.view;
-    return { intervals: this.intervals.splice(0), most: this.quality.most, still: this.quality.still, canvas: this.view.shownCanvas === this.view.canvas ? "webgl" : "own", ...(drawing && { parts: { ...drawing.times }, ...drawing.shown }) };
+    return { intervals: this.intervals.splice(0), most: this.quality.most, still: this.quality.still, canvas: this.view.shownCanvas === this.view.canvas ? "webgl" : "own", ...(drawing && { parts: { ...drawing.times }, loop: drawing.picture.loop, ...drawing.shown }) };
   }
 
   /** Send the intent when it changes, and again while it lasts. */

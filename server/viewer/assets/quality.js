@@ -5,14 +5,15 @@
 
 const SMOOTH_MS = 42, EASY_MS = 24;
 const LEAST_POINTS = 25e3, FIRST_SOFTWARE = 60e3;
-// Our own drawing begins with this many points. They are fewer if pictures take longer than `SMOOTH_MS`
-// and their points more than `OWN_MS` of it, and more again below half of that. Other work on the machine
-// makes pictures late, too, against which fewer points are no help: the least disturbed pictures count.
-// Fewer points are larger and cover as much: a fifth of them takes two thirds of the time.
-const FIRST_OWN = 200e3, LEAST_OWN = 120e3, OWN_MS = 18;
-// Least time between two of our own pictures [ms]: a server has 30 states a second, and the processor
-// serves it, too.
-const OWN_INTERVAL_MS = 28;
+// Our own drawing begins with this many points, of which about 200,000 are in reach of the picture. They are
+// fewer if pictures take longer than `SMOOTH_MS` and their points more than `OWN_MS` of it, and more again if
+// their points take less than a share of it, which is smaller once they are as many as at the beginning. Other
+// work on the machine makes pictures late, too, against which fewer points are little help: the least
+// disturbed pictures count. Fewer points are larger and cover as much: 60 % of them take 80 % of the time.
+const FIRST_OWN = 240e3, LEAST_OWN = 120e3, OWN_MS = 18, AGAIN = 0.75, MORE = 0.5;
+// Mean time between our own pictures, at least [ms]: a server has 30 states a second, and the processor serves
+// it, too. After a late picture the next one may come at the least time [ms].
+const OWN_INTERVAL_MS = 32, OWN_LEAST_MS = 15;
 // A view that has not changed for this long is drawn in full [ms].
 const STILL_MS = 240;
 // A full picture takes a second in WebGL, and a tenth of a second in our own drawing [ms].
@@ -33,12 +34,18 @@ export class Quality {
     this.latest = "";
     this.changed = 0;
     this.drawn = 0;
+    this.due = 0;
     this.full = false;
   }
 
-  /** Return whether it is too early for another picture. since: the last one [ms]. */
-  early(since) {
-    return this.own && since < OWN_INTERVAL_MS;
+  /** Return whether it is too early for another picture. now: [ms]. */
+  early(now) {
+    return this.own && now < this.due;
+  }
+
+  /** Note that a picture is drawn. now: [ms]. */
+  draws(now) {
+    this.due = Math.max(this.due + OWN_INTERVAL_MS, now + OWN_LEAST_MS);
   }
 
   /** Note what a picture depends on. Returns whether the picture must be drawn.
@@ -113,6 +120,6 @@ export class Quality {
   regulate(slow, long, points) {
     if (slow > SMOOTH_MS && long > OWN_MS) {
       this.most = Math.max(LEAST_OWN, Math.min(this.most, points) * Math.max(0.5, OWN_MS / long));
-    } else if (long < 0.5 * OWN_MS) this.most = Math.min(1.15 * this.most, 2 * FIRST_OWN);
+    } else if (long < OWN_MS * (this.most < FIRST_OWN ? AGAIN : MORE)) this.most = Math.min(1.15 * this.most, 2 * FIRST_OWN);
   }
 }

@@ -140,8 +140,10 @@ class WebServer:
 def _file_response(file: StaticFile, hosts: set[str]) -> Response:
     """Return a file, with rules by which the page loads nothing from elsewhere."""
     sockets = " ".join(sorted(f"ws://{host}" for host in hosts))
+    # WebAssembly of the page's own modules may be compiled; `eval` stays forbidden.
     policy = (
-        f"default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+        "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; "
+        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
         f"connect-src 'self' {sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
     return _response(

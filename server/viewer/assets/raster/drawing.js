@@ -5,7 +5,7 @@
 // the spheres of the hierarchy, is drawn there over a rectangle with this picture's colours and depths.
 
 import {
-  DataTexture, FloatType, Frustum, GLSL3, Matrix4, Mesh, NearestFilter, OrthographicCamera, PlaneGeometry,
+  DataTexture, FloatType, GLSL3, Matrix4, Mesh, NearestFilter, OrthographicCamera, PlaneGeometry,
   RawShaderMaterial, RedFormat, Scene, Vector2,
 } from "../vendor/three.module.min.js";
 import { Picture, packed } from "./picture.js";
@@ -62,19 +62,19 @@ export class Drawing {
     const whole = rest.other === 0;
     picture.clear();
     times.push(performance.now());
-    const frustum = new Frustum().setFromProjectionMatrix(new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
-    this.shown = this.scan.draw(picture, found.scan, camera, frustum);
+    const view = new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
+    this.shown = this.scan.draw(picture, found.scan, camera, view);
     if (this.shown.given) this.spread += 0.3 * (Math.min(MOST_SPREAD, this.shown.chosen / this.shown.given) - this.spread);
     times.push(performance.now());
     for (const each of found.figures) {
       const { uSize, uColour } = each.material.uniforms;
-      figure(picture, each.geometry.attributes.position.array, screenRows(picture, camera, each.matrixWorld),
+      figure(picture, each.geometry.attributes.position.array, screenRows(picture, view, each.matrixWorld),
         uSize.value * shared.uScale.value, uColour.value.toArray());
     }
     times.push(performance.now());
     if (shading) picture.shade();
     times.push(performance.now());
-    for (const each of whole ? [...found.shapes, ...rest.shapes] : found.shapes) this.shape(each, camera);
+    for (const each of whole ? [...found.shapes, ...rest.shapes] : found.shapes) this.shape(each, view);
     times.push(performance.now());
     if (whole) picture.show();
     else this.hand(renderer, camera, over);
@@ -84,9 +84,10 @@ export class Drawing {
     this.times.all = times.at(-1) - times[0];
   }
 
-  shape(object, camera) {
+  /** view: from the world to the picture, as a matrix. */
+  shape(object, view) {
     const { geometry, material } = object;
-    const rows = screenRows(this.picture, camera, object.matrixWorld);
+    const rows = screenRows(this.picture, view, object.matrixWorld);
     const paint = {
       tint: packed(...material.color.toArray()), share: material.transparent ? Math.round(256 * material.opacity) : 256,
       test: material.depthTest, write: material.depthWrite && material.depthTest, front: material.side === 0,
@@ -132,7 +133,7 @@ class Rectangle {
       this.image = image;
       uColour.value?.dispose();
       uDepth.value?.dispose();
-      uColour.value = new DataTexture(new Uint8Array(image.data.buffer), width, height);
+      uColour.value = new DataTexture(new Uint8Array(image.data.buffer, image.data.byteOffset, image.data.length), width, height);
       uDepth.value = new DataTexture(depth, width, height, RedFormat, FloatType);
       for (const { value } of [uColour, uDepth]) value.minFilter = value.magFilter = NearestFilter;
     }

@@ -3,6 +3,9 @@
 // Depths are 1 / w, with w the distance along the view [m]: linear in the picture, larger when nearer,
 // 0 where nothing is. Colours are bytes red, green, blue, alpha, as one integer.
 
+import { Kernel } from "./kernel.js";
+import { splat } from "./splats.js";
+
 // Strength of the shading by depth, and the sum of steps from which on its table is black.
 const STRENGTH = 7, DARKEST = 1, SHADES = 1024;
 
@@ -14,7 +17,14 @@ export class Picture {
     this.context = canvas.getContext("2d", { alpha: false });
     this.shadeTable = Uint16Array.from({ length: SHADES + 1 },
       (_, k) => Math.round(256 * Math.exp((-STRENGTH * DARKEST * k) / SHADES)));
+    this.kernel = null;
     this.resize(1, 1);
+    // Until it is there, pictures are drawn without it.
+    Kernel.made().then((kernel) => {
+      if (!kernel) return;
+      this.kernel = kernel;
+      this.allot();
+    });
   }
 
   resize(width, height) {
@@ -22,9 +32,19 @@ export class Picture {
     Object.assign(this, { width, height });
     this.canvas.width = width;
     this.canvas.height = height;
-    this.image = new ImageData(width, height);
-    this.colour = new Uint32Array(this.image.data.buffer);
-    this.depth = new Float32Array(width * height);
+    this.allot();
+  }
+
+  /** Make the arrays of the picture. */
+  allot() {
+    const { width, height } = this;
+    const arrays = this.kernel?.resize(width, height);
+    this.image = arrays ? new ImageData(arrays.colours, width, height) : new ImageData(width, height);
+    const { buffer, byteOffset } = this.image.data;
+    this.colour = new Uint32Array(buffer, byteOffset, width * height);
+    this.depth = arrays ? arrays.depth : new Float32Array(width * height);
+    this.splat = arrays ? (...all) => this.kernel.splat(...all) : (...all) => splat(this, ...all);
+    this.loop = arrays ? "wasm" : "js";
     this.logarithms = null;
   }
 
@@ -42,7 +62,7 @@ export class Picture {
     const { width, height, colour, shadeTable } = this;
     this.logarithms ??= new Float32Array(width * height);
     const away = this.logarithms;
-    logarithms(new Int32Array(this.depth.buffer), away);
+    logarithms(new Int32Array(this.depth.buffer, this.depth.byteOffset, this.depth.length), away);
     const scale = SHADES / DARKEST;
     for (let row = 0; row < height; row += 1) {
       const above = row > 0 ? -width : 0, below = row < height - 1 ? width : 0;

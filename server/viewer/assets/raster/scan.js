@@ -1,27 +1,28 @@
 // The scan into a picture: tiles and overview, nearest first.
 
-import { Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
+import { Frustum, Matrix4, Sphere, Vector3 } from "../vendor/three.module.min.js";
 import { shared } from "../points_material.js";
 import { PointColours } from "./colours.js";
 import { boxesOf, seenRuns } from "./runs.js";
 import { screenRows } from "./shapes.js";
-import { fogTables, splat } from "./splats.js";
+import { fogTables } from "./splats.js";
 
 export class Scan {
   constructor() {
     this.colours = new PointColours();
     this.packed = new WeakMap();
     this.boxes = new WeakMap();
-    this.kept = { places: new Uint16Array(0), colours: new Uint32Array(0) };
     this.fog = fogTables(shared.uGround.value.toArray());
   }
 
-  /** Draw scan points. objects: of three.js, with the material of points_material.js.
+  /** Draw scan points. objects: of three.js, with the material of points_material.js.  view: from
+   * the world to the picture, as a matrix.
    *
    * Returns how many points they have, how many of them were given to the inner loop, and how many were
    * inside of the picture.
    */
-  draw(picture, objects, camera, frustum) {
+  draw(picture, objects, camera, view) {
+    const frustum = new Frustum().setFromProjectionMatrix(view);
     const ordered = [];
     for (const object of objects) {
       const count = object.geometry.drawRange.count;
@@ -38,68 +39,34 @@ export class Scan {
     }
     ordered.sort((one, other) => one.away - other.away);
     const found = { chosen: 0, given: 0, inside: 0 };
-    for (const tile of ordered) this.tile(picture, tile, camera, found);
+    for (const tile of ordered) this.tile(picture, tile, camera, view, found);
     return found;
   }
 
-  tile(picture, tile, camera, found) {
+  tile(picture, tile, camera, view, found) {
     const { matrix, sphere, attributes, source, places, count } = tile;
     const { elements } = matrix;
-    const screen = screenRows(picture, camera, matrix);
+    const screen = screenRows(picture, view, matrix);
     const runs = seenRuns(this.boxesOf(places), count, screen, picture.width, picture.height, camera.near);
     found.chosen += count;
     if (!runs.length) return;
     const last = runs.at(-1);
     const eye = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
-    const way = cutReaches(sphere, camera.position);
     const { x: least, y: most } = shared.uPixels.value;
-    const step = Math.hypot(elements[0], elements[1], elements[2]) / shared.uFog.value;
+    const step = Math.hypot(elements[0], elements[1], elements[2]), fog = step / shared.uFog.value;
+    const cut = cutOf(sphere, camera.position, elements, step);
     const colours = this.colours.around(this.colours.of(source, attributes, places, elements), places, last, elements, sphere);
-    const draw = (ofPlaces, ofColours, from, to) => splat(picture, ofPlaces, ofColours, from, to, screen, tile.size, least, most,
-      camera.near, [eye.x, eye.y, eye.z, step * step], this.fog);
     for (let k = 0; k < runs.length; k += 2) {
       const [from, to] = [runs[k], runs[k + 1]];
       found.given += to - from;
-      if (way) {
-        const left = this.cut(places, colours, from, to, elements, eye, way);
-        found.inside += draw(this.kept.places, this.kept.colours, 0, left);
-      } else found.inside += draw(places, colours, from, to);
+      found.inside += picture.splat(places, colours, from, to, screen, tile.size, least, most, camera.near,
+        [eye.x, eye.y, eye.z, fog * fog], this.fog, cut);
     }
   }
 
   boxesOf(places) {
     if (!this.boxes.has(places)) this.boxes.set(places, boxesOf(places));
     return this.boxes.get(places);
-  }
-
-  /** Keep the points that are not between the camera and the user, as the shader leaves them out; return how many.
-   *
-   * eye: camera in the tile's frame.
-   */
-  cut(places, colours, from, to, matrix, eye, { line, whole }) {
-    if (this.kept.colours.length < to - from) {
-      this.kept = { places: new Uint16Array(6 * (to - from)), colours: new Uint32Array(2 * (to - from)) };
-    }
-    const { kept } = this;
-    const radius = shared.uCut.value.w;
-    let left = 0;
-    // Along the line, as a function of a place in the tile's frame, whose axes are at right angles.
-    const [a, b, c] = [0, 4, 8].map((at) => line.x * matrix[at] + line.y * matrix[at + 1] + line.z * matrix[at + 2]);
-    const step = Math.hypot(matrix[0], matrix[1], matrix[2]);
-    for (let row = from, at = 3 * from; row < to; row += 1, at += 3) {
-      const x = places[at] - eye.x, y = places[at + 1] - eye.y, z = places[at + 2] - eye.z;
-      const along = a * x + b * y + c * z;
-      if (along < whole - 0.55) {
-        const wide = radius * (0.35 + 0.65 * (1 - along / whole));
-        if (step * step * (x * x + y * y + z * z) - along * along < wide * wide) continue;
-      }
-      kept.places[3 * left] = places[at];
-      kept.places[3 * left + 1] = places[at + 1];
-      kept.places[3 * left + 2] = places[at + 2];
-      kept.colours[left] = colours[row];
-      left += 1;
-    }
-    return left;
   }
 
   /** Return the points of an index in its order, in a frame of their box in 65,535 steps. */
@@ -145,15 +112,24 @@ function boxFrame(places) {
   return { low, step, matrix: new Matrix4().makeTranslation(...low).scale(new Vector3(step, step, step)), sphere };
 }
 
-/** Return the line from the camera to the user's shoulders, if what is left out on it may be in a sphere. */
-function cutReaches(sphere, camera) {
+const NOTHING_CUT = [0, 0, 0, 0, -1, 0, 0];
+
+/** Return what is left out between the camera and the user, as the shader does: `cut` of splats.js.
+ *
+ * sphere: that contains a tile, in the page's frame.  m: matrix of the tile's frame, whose axes are at right
+ * angles.  step: of the frame [m].
+ */
+function cutOf(sphere, camera, m, step) {
   const { x, y, z, w: radius } = shared.uCut.value;
-  if (radius <= 0) return null;
+  if (radius <= 0) return NOTHING_CUT;
   const line = new Vector3(x, y, z).sub(camera), whole = line.length();
   line.divideScalar(whole);
   const way = sphere.center.clone().sub(camera), along = way.dot(line);
   const beside = Math.sqrt(Math.max(0, way.lengthSq() - along * along));
   // Behind the camera nothing is seen.
-  if (along < -sphere.radius || along > whole + sphere.radius || beside > radius + sphere.radius) return null;
-  return { line, whole };
+  if (along < -sphere.radius || along > whole + sphere.radius || beside > radius + sphere.radius) return NOTHING_CUT;
+  return [
+    ...[0, 4, 8].map((at) => line.x * m[at] + line.y * m[at + 1] + line.z * m[at + 2]), step * step,
+    whole - 0.55, radius, (0.65 * radius) / whole,
+  ];
 }

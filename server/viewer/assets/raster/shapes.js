@@ -23,9 +23,11 @@ function lights() {
   return found;
 }
 
-/** Return rows for x, y (times w, pixels) and w of a place in an object's frame. */
-export function screenRows(picture, camera, matrixWorld) {
-  const { elements: m } = new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).multiply(matrixWorld);
+const combined = new Matrix4();
+
+/** Return rows for x, y (times w, pixels) and w of a place in an object's frame. view: from the world to the picture. */
+export function screenRows(picture, view, matrixWorld) {
+  const { elements: m } = combined.multiplyMatrices(view, matrixWorld);
   const { width, height } = picture;
   const rows = new Float64Array(12);
   for (let k = 0; k < 4; k += 1) {

@@ -15,16 +15,19 @@ export const FOG_STEPS = 1024, FOG_END = 8;
  * point, and the one after the last.  screen: 12 numbers, rows for x, y (times w, pixels) and w of a place.  size:
  * diameter at w = 1 [pixels].  least, most: of diameters [pixels].  near: least w.  eye: place of the
  * camera in the tile's frame, and the square of the frame's step over that of the fog's distance.
- * fog: `shares` of the ground's colour, by square of the distance; `red_blue` and `green`: those
- * shares of it.
+ * fog: `shares` of the ground's colour, by square of the distance; `redBlue` and `green`: those
+ * shares of it.  cut: what is left out around the line from the camera to the user: metres along the line for a
+ * step in x, y and z; the square of a step [m]; the length of what is left out [m], its radius at the camera [m],
+ * and how much narrower it is a metre away.
  */
-export function splat(picture, places, colours, from, to, screen, size, least, most, near, eye, fog) {
+export function splat(picture, places, colours, from, to, screen, size, least, most, near, eye, fog, cut) {
   const { depth, colour, width, height } = picture;
   const a = screen[0], b = screen[1], c = screen[2], d = screen[3], e = screen[4], f = screen[5];
   const g = screen[6], h = screen[7], p = screen[8], q = screen[9], r = screen[10], s = screen[11];
   const [eyeX, eyeY, eyeZ, foggy] = eye;
   const { shares, redBlue, green } = fog;
-  const scale = FOG_STEPS / FOG_END;
+  const [cutX, cutY, cutZ, scaled, limit, radius, narrowing] = cut;
+  const steps = FOG_STEPS / FOG_END;
   const lastColumn = width - 1, lastRow = height - 1;
   let inside = 0;
   for (let row = from, at = 3 * from; row < to; row += 1, at += 3) {
@@ -34,12 +37,17 @@ export function splat(picture, places, colours, from, to, screen, size, least, m
     const inverse = 1 / w;
     const u = (a * x + b * y + c * z + d) * inverse, v = (e * x + f * y + g * z + h) * inverse;
     if (!(u >= 0 && u < width && v >= 0 && v < height)) continue;
+    const dx = x - eyeX, dy = y - eyeY, dz = z - eyeZ, square = dx * dx + dy * dy + dz * dz;
+    const along = cutX * dx + cutY * dy + cutZ * dz;
+    if (along < limit) {
+      const wide = radius - narrowing * along;
+      if (scaled * square - along * along < wide * wide) continue;
+    }
     inside += 1;
     let diameter = size * inverse;
     if (diameter < least) diameter = least;
     else if (diameter > most) diameter = most;
-    const dx = x - eyeX, dy = y - eyeY, dz = z - eyeZ;
-    const step = (foggy * (dx * dx + dy * dy + dz * dz) * scale) | 0;
+    const step = (foggy * square * steps) | 0;
     const fogged = step < FOG_STEPS ? step : FOG_STEPS - 1;
     const rest = 256 - shares[fogged];
     const own = colours[row];
@@ -84,7 +92,7 @@ export function splat(picture, places, colours, from, to, screen, size, least, m
         }
       }
     } else {
-      const half = 0.5 * diameter, square = half * half;
+      const half = 0.5 * diameter, whole = half * half;
       let top = (v - half + 0.5) | 0, bottom = (v + half + 0.5) | 0;
       if (top < 0) top = 0;
       if (bottom > height) bottom = height;
@@ -97,7 +105,7 @@ export function splat(picture, places, colours, from, to, screen, size, least, m
         && inverse <= depth[middle + (column + arm < width ? column + arm : lastColumn)]) continue;
       for (let line = top * width; top < bottom; top += 1, line += width) {
         const away = top + 0.5 - v;
-        const reach = square - away * away;
+        const reach = whole - away * away;
         if (reach <= 0) continue;
         const side = Math.sqrt(reach);
         const first = (u - side + 0.5) | 0;

@@ -56,10 +56,12 @@ def test_page_and_its_modules_are_served_with_a_strict_policy(server: WebServer)
     assert b'src="main.js"' in content
     policy = fields["Content-Security-Policy"]
     assert "default-src 'none'" in policy
-    assert "script-src 'self';" in policy
+    assert "script-src 'self' 'wasm-unsafe-eval';" in policy
     for path in ("/main.js", "/vendor/three.module.min.js", "/panels/index.js"):
         status, _, fields = get(server, path)
         assert (status, fields["Content-Type"]) == (200, "text/javascript; charset=utf-8")
+    status, content, fields = get(server, "/raster/splats.wasm")
+    assert (status, fields["Content-Type"], content[:4]) == (200, "application/wasm", b"\0asm")
     assert get(server, "/?at=1,2,3,4")[0] == 200
 
 

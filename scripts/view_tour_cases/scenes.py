@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 from PIL import Image
 
 from .tour_page import TourPage, tour_page
+from .tour_strip import reduced
 
 # Opens the panel of one instrument.
-_INSTRUMENTS = {"instruments": True, "openEffects": False, "openAccuracy": False, "openHierarchy": False}
-# The panels of the plots and of the clash check fit.
-_LARGE = (1920, 1080)
+INSTRUMENTS = {"instruments": True, "openEffects": False, "openAccuracy": False, "openHierarchy": False}
+# Twice the size of a frame of the strip: its charts and list can be read.
+_SMALL = (896, 504)
 # Way of the clash check: waypoints (x, y) [m] past a column, through the door, through a column
 # of the nave and along its wall.
 _WAYPOINTS = ((-7.0, -9.0), (-4.7, -5.4), (-0.2, -3.2), (0.0, 2.4), (3.4, 3.2), (5.6, 6.5), (7.3, 9.0))
@@ -25,7 +26,7 @@ _STAIRS, _FLOORS, _ABOVE = (-2.9, -2.15), (0.0, 0.45), 0.08
 _PLAIN = """
 aside, footer { background: #0f151f !important; }
 .more, #title { display: none; }
-#view { visibility: hidden; }
+#view, #raster { visibility: hidden; }
 """
 
 
@@ -46,7 +47,7 @@ def arrive(browser: Any, url: str) -> Image.Image:
 def touch(browser: Any, url: str) -> Image.Image:
     """Return the user as it touches the cloister's wall, into which it still walks."""
     with tour_page(browser, url, "-8.0,-9.4,0.1,130") as page:
-        page.zoom(-4)
+        page.zoom(-3)
         # To the left and ahead: the view is along the wall.
         page.press("wa")
         page.wait("s.verdict === 'stopped' && s.contacts > 0")
@@ -71,7 +72,7 @@ def residency(browser: Any, url: str) -> Image.Image:
 def hierarchy(browser: Any, url: str) -> Image.Image:
     """Return the bounding spheres at a column."""
     with tour_page(
-        browser, url, "-4.1,-6.7,0.1,112", **{**_INSTRUMENTS, "openHierarchy": True, "level": 3}
+        browser, url, "-4.1,-6.7,0.1,112", **{**INSTRUMENTS, "openHierarchy": True, "level": 3}
     ) as page:
         page.wait("s.spheres && s.spheres.level === 3 && s.spheres.drawn > 0")
         return page.picture()
@@ -79,7 +80,7 @@ def hierarchy(browser: Any, url: str) -> Image.Image:
 
 def plots(browser: Any, url: str) -> Image.Image:
     """Return the page with the live plots after walks before the portal."""
-    options = {**_INSTRUMENTS, "openPlots": True, "size": _LARGE, "budget": 0.5}
+    options = {**INSTRUMENTS, "openPlots": True, "size": _SMALL, "budget": 0.5}
     with tour_page(browser, url, "1.2,-11,0.1,97", **options) as page:
         pace(page)
         return page.picture(bare=False)
@@ -95,7 +96,7 @@ def pace(page: TourPage) -> None:
 
 def clash(browser: Any, url: str) -> Image.Image:
     """Return the page at the deepest clash of a path."""
-    with tour_page(browser, url, "-2,-7,0.1,75", size=_LARGE, budget=0.8, panel=True, near=0.05) as page:
+    with tour_page(browser, url, "-2,-7,0.1,75", size=_SMALL, budget=0.8, panel=True, near=0.05) as page:
         check(page, clash_path())
         return page.picture(bare=False)
 
@@ -103,7 +104,7 @@ def clash(browser: Any, url: str) -> Image.Image:
 def meet(browser: Any, url: str) -> Image.Image:
     """Return what one user sees of another."""
     with (
-        tour_page(browser, url, "-0.4,-3.6,0.1,-100", size=(320, 180), budget=0.1, shading=False) as other,
+        tour_page(browser, url, "-1.1,-3.6,0.1,-95", size=(320, 180), budget=0.1, shading=False) as other,
         tour_page(browser, url, "0.6,-6.6,0.1,100") as page,
     ):
         page.wait("s.others.length === 1")
@@ -152,13 +153,13 @@ def panel_pictures(browser: Any, url: str, folder: Path) -> list[Path]:
 
     def write(name: str, image: Image.Image) -> None:
         path = folder / f"{name}.png"
-        image.quantize(200, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
+        reduced(image, 200).save(path, optimize=True)
         written.append(path)
 
     # A high page, on which no panel scrolls, and which is not a small screen with one column.
     light = {"size": (1000, 1700), "budget": 0.1, "shading": False}
     with tour_page(
-        browser, url, "1.2,-11,0.1,97", **light, **{**_INSTRUMENTS, "openPlots": True}, panel=True
+        browser, url, "1.2,-11,0.1,97", **light, **{**INSTRUMENTS, "openPlots": True}, panel=True
     ) as page:
         page.page.add_style_tag(content=_PLAIN)
         pace(page)

@@ -14,7 +14,7 @@ SIZE = (1280, 720)
 # A graphics card is not needed: SwiftShader draws.
 OPTIONS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 # A server may compile its kernels first [s].
-PATIENCE = 600.0
+PATIENCE = 300.0
 # Around the picture of a part of the page [pixels].
 _MARGIN = 12
 # Radians of a pixel by which the pointer drags the view (assets/input.js).
@@ -25,16 +25,32 @@ _BARE = "aside, header, footer, button, #notices { display: none !important; } #
 
 
 class TourPage:
-    """Page of one user. page: Playwright's."""
+    """Page of one user.
 
-    def __init__(self, page: Any) -> None:
+    page: Playwright's.  address: of the viewer, with the user's place.  bare: without panels.
+    """
+
+    def __init__(self, page: Any, address: str, *, bare: bool = False) -> None:
         self.page = page
+        self.address = address
+        self.bare = bare
 
-    def wait(self, expression: str) -> None:
-        """Wait until an expression of `window.solidcloud`, `s`, holds. Raise TimeoutError."""
-        end = time.monotonic() + PATIENCE
+    def open(self) -> None:
+        """Show the viewer."""
+        self.page.goto(self.address)
+        if self.bare:
+            self.page.add_style_tag(content=_BARE)
+
+    def wait(self, expression: str, most: float | None = None) -> None:
+        """Wait until an expression of `window.solidcloud`, `s`, holds.
+
+        most: no longer than this time [s]; otherwise raise TimeoutError after `PATIENCE`.
+        """
+        end = time.monotonic() + (PATIENCE if most is None else most)
         while not self.read(f"Boolean({expression})"):
             if time.monotonic() > end:
+                if most is not None:
+                    return
                 state = self.read("[s.place, s.verdict, s.missing, s.shown, s.fps, s.notices]")
                 raise TimeoutError(
                     f"{self.page.url}: {expression} does not hold after {PATIENCE:g} s; the page has {state}"
@@ -61,20 +77,35 @@ class TourPage:
         for key in keys:
             self.page.keyboard.up(key)
 
-    def look(self, yaw: float, pitch: float = 0.0) -> None:
-        """Drag the view by angles [degrees], to the left and up."""
+    def look(self, yaw: float, pitch: float = 0.0, seconds: float = 0.0) -> None:
+        """Drag the view by angles [degrees], to the left and up, for some seconds."""
         pixels = [math.radians(angle) / _PER_PIXEL for angle in (yaw, pitch)]
-        mouse, start = self.page.mouse, (SIZE[0] / 2, SIZE[1] / 2)
-        mouse.move(*start)
+        mouse, (x, y) = self.page.mouse, self._middle()
+        mouse.move(x, y)
         mouse.down()
-        mouse.move(start[0] - pixels[0], start[1] - pixels[1], steps=4)
+        begin, share = time.monotonic(), 0.0
+        while share < 1:
+            share = min(1.0, (time.monotonic() - begin) / seconds) if seconds else 1.0
+            # Begins and ends slowly.
+            eased = share * share * (3 - 2 * share)
+            mouse.move(x - pixels[0] * eased, y - pixels[1] * eased, steps=1 if seconds else 4)
+            if seconds:
+                self.rest(0.03)
         mouse.up()
 
     def zoom(self, steps: int) -> None:
         """Turn the wheel. steps: away from the user, if positive."""
-        self.page.mouse.move(SIZE[0] / 2, SIZE[1] / 2)
+        self.page.mouse.move(*self._middle())
         for _ in range(abs(steps)):
             self.page.mouse.wheel(0, 100 if steps > 0 else -100)
+
+    def rest(self, seconds: float) -> None:
+        """Do nothing for some seconds."""
+        self.page.wait_for_timeout(1000 * seconds)
+
+    def _middle(self) -> tuple[float, float]:
+        size = self.page.viewport_size
+        return size["width"] / 2, size["height"] / 2
 
     def picture(self, *, bare: bool = True, complete: bool = True) -> Image.Image:
         """Return the page. bare: without panels.  complete: once every point is drawn."""
@@ -99,20 +130,29 @@ class TourPage:
 
 @contextmanager
 def tour_page(
-    browser: Any, url: str, at: str, *, size: tuple[int, int] = SIZE, **settings: Any
+    browser: Any,
+    url: str,
+    at: str,
+    *,
+    size: tuple[int, int] = SIZE,
+    bare: bool = False,
+    arrived: bool = True,
+    **settings: Any,
 ) -> Iterator[TourPage]:
-    """Open a page of a new user, who stands at a place.
+    """Make a page of a new user, who stands at a place.
 
-    at: x, y, z [m] and direction [degrees] in the world, as in a link.  settings: of the page.
+    at: x, y, z [m] and direction [degrees] in the world, as in a link.  size: of the page [pixels].
+    bare: without panels.  arrived: open the page, and wait until the user stands.  settings: of the page.
     """
     context = browser.new_context(viewport={"width": size[0], "height": size[1]})
     context.set_default_timeout(1000 * PATIENCE)
     chosen = json.dumps(json.dumps({**_SETTINGS, **settings}))
     context.add_init_script(f"localStorage.setItem('solidcloud.settings', {chosen})")
     try:
-        page = TourPage(context.new_page())
-        page.page.goto(f"{url}?at={at}")
-        page.wait("s.place !== null")
+        page = TourPage(context.new_page(), f"{url}?at={at}", bare=bare)
+        if arrived:
+            page.open()
+            page.wait("s.place !== null")
         yield page
     finally:
         context.close()

@@ -12,10 +12,8 @@ import numpy as np
 
 from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
-from ...schemas.wire.scene_messages import SceneInfo
-from ...schemas.wire.warming_parts import MOTION
 from .clash_session import ClashSession
-from .feeds.scene_link import LinkStatus, OpenScene
+from .feeds.scene_link import LinkStatus, OpenScene, may_enter, same_picture
 from .page.page_messages import (
     PAGE_VERSION,
     Around,
@@ -47,13 +45,13 @@ log = logging.getLogger(__name__)
 _RETRY_SECONDS = 1.0
 # An intent without a following message ends after this time: the page may be hidden or frozen [s].
 _INTENT_SECONDS = 1.0
-# Parts of a server that a user needs from the first frame: a direction to look to, and motion.
-_ENTERING = frozenset({"raycast", MOTION})
 # Distance of the outer rays between user and camera from the middle one [m].
 _BOOM_RADIUS = 0.12
 # A page that takes tiles slowly asks again for those that are on their way: a tile that was sent is sent
 # again only after this time [s].
 _AGAIN_SECONDS = 3.0
+# Until a server that did not answer is asked again [s].
+_LATER_SECONDS = 0.2
 # Changes of residency that wait for a page that takes none: a page that misses some asks again for
 # the voxels near it every few seconds.
 _MOST_CHANGES = 64
@@ -254,7 +252,7 @@ class Browser:
             if overview is not None:
                 self._attempt(partial(self._send_overview, overview))
             if around is not None:
-                self._attempt(partial(self._send_voxels, around), again=True)
+                self._attempt(partial(self._send_voxels, around))
             elif key is not None:
                 self._send_tile(key)
 
@@ -269,11 +267,25 @@ class Browser:
 
     def _send_overview(self, scene: OpenScene) -> None:
         """Send the overview of a scene."""
-        self._send(self._parts.tiles.overview(scene))
+        if not self._answered(partial(self._parts.tiles.overview, scene)):
+            with self._work:
+                self._overview = self._overview or scene
 
     def _send_voxels(self, around: Around) -> None:
         """Send the voxels near a place."""
-        self._send(self._parts.tiles.voxels(around.place))
+        if not self._answered(partial(self._parts.tiles.voxels, around.place)):
+            with self._work:
+                self._around = self._around or around
+
+    def _answered(self, ask: Callable[[], bytes | None]) -> bool:
+        """Send an answer that the page waits for. Return False if it must be asked for again."""
+        try:
+            self._send(ask())
+        except BusyError as error:
+            log.debug("no answer: %s", error)
+            self._closed.wait(_LATER_SECONDS)
+            return False
+        return True
 
     def _send_boom(self, boom: Boom, scene: OpenScene) -> None:
         """Send how far the camera may be from the user."""
@@ -293,7 +305,7 @@ class Browser:
             self._send(
                 text_message("missing", key=list(key[:4]), detail=key[4], again=True, message=str(error))
             )
-            self._closed.wait(0.2)
+            self._closed.wait(_LATER_SECONDS)
         except SolidcloudError as error:
             self._send(
                 text_message("missing", key=list(key[:4]), detail=key[4], again=False, message=str(error))
@@ -313,21 +325,6 @@ class Browser:
         """Send a message, unless the page is closed."""
         if message is not None and self._connection.is_open():
             self._connection.send(message)
-
-
-def may_enter(info: SceneInfo) -> bool:
-    """Return whether a user can enter a scene: it has points, and the server has compiled what that needs."""
-    return bool(info.points) and not _ENTERING.intersection(info.compiling)
-
-
-def same_picture(one: SceneInfo, other: SceneInfo) -> bool:
-    """Return whether two descriptions of a scene are of the same points in the same frame."""
-    return (one.generation, one.points, one.bounds, one.up) == (
-        other.generation,
-        other.points,
-        other.bounds,
-        other.up,
-    )
 
 
 def status_message(status: LinkStatus, endpoint: str) -> str:

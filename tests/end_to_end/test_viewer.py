@@ -92,6 +92,8 @@ def test_user_walks_is_stopped_by_the_wall_and_slides_along_it(browser: Any, url
             viewed.wait("s.verdict === 'stopped' && s.touched")
             viewed.wait("s.contacts > 0")
             (touched, *_) = viewed.wait("s.touched.length && s.touched")
+            # The picture of a user who pushes, and does not move, is drawn in full.
+            viewed.wait("s.complete")
         stopped = viewed.read("s.place")
         assert WALL < stopped[0] < -8.3
         assert touched["normal"] is not None

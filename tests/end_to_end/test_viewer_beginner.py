@@ -25,6 +25,8 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: a
 SPAWN = (-7.0, -9.0, 0.1)
 # Beside the spawn without anything between, and beyond the wall.
 REACHED, BEYOND = "-6.5,-9,0.1,90", "-12,-9,0.1,90"
+# A place on the forecourt from which nothing is above, and the direction away from the façade.
+TO_THE_SKY = "-6.5,-9,0.1,-90"
 PHONE = {"width": 390, "height": 844}
 
 
@@ -86,6 +88,26 @@ def test_user_who_cannot_be_at_the_links_place_is_told_why(browser: Any, url: st
         assert viewed.read("s.place")[0] > -9
         text = viewed.page.inner_text("#notices")
         assert "You are not at the link's place" in text and "spawn" in text
+        viewed.check_clean(url)
+
+
+def test_user_who_sees_nothing_of_the_scan_is_told_how_to_find_it(browser: Any, url: str) -> None:
+    with viewed_page(browser, f"{url}?at={TO_THE_SKY}") as viewed:
+        viewed.wait_complete()
+        assert not {"sight", "standing"} & set(viewed.read("s.notices"))
+        mouse = viewed.page.mouse
+        mouse.move(600, 500)
+        mouse.down()
+        mouse.move(600, 20, steps=4)
+        mouse.up()
+        viewed.page.keyboard.press("v")
+        viewed.wait("s.notices.includes('sight')")
+        assert "H goes back to the start" in viewed.page.inner_text("#notices")
+        mouse.move(600, 20)
+        mouse.down()
+        mouse.move(600, 400, steps=4)
+        mouse.up()
+        viewed.wait("!s.notices.includes('sight')")
         viewed.check_clean(url)
 
 

@@ -9,12 +9,12 @@ import { VERDICTS } from "./colours.js";
 import { Contacts } from "./contacts.js";
 import { Input } from "./input.js";
 import { Link } from "./link.js";
-import { clear, notify } from "./notices.js";
+import { clear, notify, subjects } from "./notices.js";
 import { Overview } from "./overview.js";
 import { shared } from "./points_material.js";
 import { Quality } from "./quality.js";
 import { settings } from "./settings.js";
-import { showFigures, showProcess, showServer, showState, showVerdict, verdictOf } from "./status.js";
+import { showFigures, showProcess, showServer, showSight, showState, showVerdict, verdictOf } from "./status.js";
 import { Tiles } from "./tiles.js";
 
 // Numbers of the verdicts in the server's answers.
@@ -22,6 +22,8 @@ const NAMES = ["clear", "contact", "unknown"];
 const KEPT_INTERVALS = 600;
 // Without a user for this long, the scan as a whole is looked at in detail [ms].
 const USER_MS = 4000;
+// Until then nothing is said of a user who is not there, or sees nothing [ms].
+const PLACING_MS = 1500, UNSEEN_MS = 1500;
 const INTENT_MS = 1000 / 30, CHOOSE_MS = 180, FIGURES_MS = 500, BOOM_MS = 100;
 // Radius around the camera of what is not drawn between it and the user [m].
 const CUT = 0.9;
@@ -62,7 +64,7 @@ export class App {
     this.fps = 0;
     // Of pictures that moved [ms].
     this.intervals = [];
-    this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0 };
+    this.times = { picture: performance.now(), drawn: 0, intent: 0, choose: 0, figures: 0, boom: 0, seen: performance.now() };
     this.lastIntent = "";
     this.asked = false;
     // For panels: called with each state of the user, and with each refusal of the server; what else
@@ -354,13 +356,25 @@ export class App {
     this.link.send(intent);
   }
 
+  /** Say what a user without a place, or without the scan in view, may wait for or do. points: in the picture. */
+  sight(points, now) {
+    if (points || !this.state || this.rig.watched) this.times.seen = now;
+    const said = ["server", "scene", "process", "problem"].some((subject) => subjects().includes(subject));
+    showSight({
+      waits: this.scene !== null && !this.state && !said && !this.switching && now - this.welcomed > PLACING_MS,
+      sees: this.state ? now - this.times.seen < UNSEEN_MS : null,
+    });
+  }
+
   figures(now) {
     this.fps = (1000 * this.pictures) / Math.max(1, now - this.times.figures);
     this.pictures = 0;
     this.times.figures = now;
     const place = this.place();
+    const points = this.view.drawing?.shown.inside ?? this.tiles.shown + this.overview.shown;
+    this.sight(points, now);
     showFigures({
-      points: this.view.drawing?.shown.inside ?? this.tiles.shown + this.overview.shown,
+      points,
       fps: this.fps,
       roundTrip: this.state?.roundTrip ?? null,
       frameSeconds: this.state?.seconds ?? null,

@@ -14,8 +14,9 @@ const FIRST_OWN = 240e3, LEAST_OWN = 120e3, OWN_MS = 18, AGAIN = 0.75, MORE = 0.
 // Mean time between our own pictures, at least [ms]: a server has 30 states a second, and the processor serves
 // it, too. After a late picture the next one may come at the least time [ms].
 const OWN_INTERVAL_MS = 32, OWN_LEAST_MS = 15;
-// A view that has not changed for this long is drawn in full [ms].
-const STILL_MS = 240;
+// A view that has not changed for this long is drawn in full [ms]. While the user asks to move, a full
+// picture would delay the next ones: who pushes against a wall, and does not move, waits longer for it.
+const STILL_MS = 240, PUSHING_MS = 1000;
 // A full picture takes a second in WebGL, and a tenth of a second in our own drawing [ms].
 const GATHERED_MS = 1500, GATHERED_OWN_MS = 400;
 
@@ -51,12 +52,10 @@ export class Quality {
   /** Note what a picture depends on. Returns whether the picture must be drawn.
    *
    * seen: text of the camera and all that moves.  chosen: text of settings.  content: text of the
-   * scan that has arrived.  now: [ms].  asked: whether the user is asking to move: a full picture would
-   * delay the next one.
+   * scan that has arrived.  now: [ms].  asked: whether the user is asking to move.
    */
   look(seen, chosen, content, now, asked) {
     this.latest = content;
-    if (asked) this.changed = now;
     if (seen !== this.seen) {
       Object.assign(this, { seen, chosen, content, changed: now, full: false });
       return true;
@@ -70,7 +69,7 @@ export class Quality {
       Object.assign(this, { content, drawn: now });
       return true;
     }
-    if (this.full || asked || now - this.changed < STILL_MS) return false;
+    if (this.full || now - this.changed < (asked ? PUSHING_MS : STILL_MS)) return false;
     Object.assign(this, { full: true, drawn: now });
     return true;
   }

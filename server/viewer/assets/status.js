@@ -66,3 +66,16 @@ export function showState(state) {
     notify("loading", "Loading the way ahead", "The server reads the voxels in front of the user.", "", 0.8);
   }
 }
+
+/** Say that the user is not there yet, or that nothing of the scan is in view.
+ *
+ * waits: whether the server has no user of this page yet, and has said nothing about it.  sees: whether
+ * points of the scan are in the picture; null while there is no user.
+ */
+export function showSight({ waits, sees }) {
+  if (waits) notify("standing", "Looking for a place to stand", "You can walk in a moment.");
+  else clear("standing");
+  if (sees === false) {
+    notify("sight", "Nothing of the scan is in view", "Turn with Q and E or by dragging; H goes back to the start.");
+  } else clear("sight");
+}

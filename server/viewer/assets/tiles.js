@@ -20,6 +20,11 @@ const FINE = 1.4;
 const BEHIND = 4;
 // The list of voxels is asked for again after this way [m] or time [ms].
 const LIST_WAY = 1, LIST_MS = 3000;
+// A list of 4,096 voxels has 184 kB, and reaches far: it is asked for again later [ms of each voxel], and
+// after a longer way. What is in memory is known meanwhile from messages of changes.
+const LIST_VOXEL_MS = 6, LONG_LIST = 1000, LONG_LIST_WAY = 4;
+// A list that has not arrived by then was refused [ms].
+const LIST_LOST_MS = 15000;
 // States of a voxel in a message of changes.
 export const STATES = ["evicted", "loaded", "prefetched", "wasted"];
 
@@ -151,8 +156,10 @@ export class Tiles {
    * budget: of points that may be drawn when nothing moves.  drawn: that may be drawn now.  now: [ms].
    */
   choose(camera, focus, budget, drawn, now) {
-    if (!this.listed.waiting && (now - this.listed.time > LIST_MS || !this.listed.place
-      || this.listed.place.distanceTo(focus) > LIST_WAY)) {
+    const { waiting, time } = this.listed;
+    const { size } = this.voxels, way = size > LONG_LIST ? LONG_LIST_WAY : LIST_WAY;
+    if ((!waiting || now - time > LIST_LOST_MS) && (now - time > Math.max(LIST_MS, LIST_VOXEL_MS * size)
+      || !this.listed.place || this.listed.place.distanceTo(focus) > way)) {
       this.send({ type: "around", place: focus.toArray() });
       this.listed = { place: focus.clone(), time: now, waiting: true };
     }

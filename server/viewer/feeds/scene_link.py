@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ....schemas.errors import BadRequestError, SolidcloudError
 from ....schemas.wire.scene_messages import SceneInfo
-from ....schemas.wire.warming_parts import PARTS
+from ....schemas.wire.warming_parts import MOTION, PARTS
 from ...client import Client
 from ...zenoh_client.server_connection import scenes_at
 from ..page.view_frame import ViewFrame
@@ -23,6 +23,8 @@ _CHECK_SECONDS, _ANSWER_SECONDS = 0.7, 5.0
 _MOST_SILENT = 24
 # How long an answer to long work may take [s].
 _LONG_SECONDS = 30.0
+# Parts of a server that a user needs from the first frame: a direction to look to, and motion.
+_ENTERING = frozenset({"raycast", MOTION})
 # Interval of the attempts to find a server [s].
 _SEARCH_SECONDS = 0.5
 
@@ -169,3 +171,18 @@ class SceneLink(BackgroundThread):
             if (state, message) != self._status[1:3] or state == "connected":
                 self._status = LinkStatus(self._status.number + 1, state, message)
                 self._changed.notify_all()
+
+
+def may_enter(info: SceneInfo) -> bool:
+    """Return whether a user can enter a scene: it has points, and the server has compiled what that needs."""
+    return bool(info.points) and not _ENTERING.intersection(info.compiling)
+
+
+def same_picture(one: SceneInfo, other: SceneInfo) -> bool:
+    """Return whether two descriptions of a scene are of the same points in the same frame."""
+    return (one.generation, one.points, one.bounds, one.up) == (
+        other.generation,
+        other.points,
+        other.bounds,
+        other.up,
+    )

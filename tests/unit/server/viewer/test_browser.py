@@ -1,14 +1,16 @@
-"""Test that no error of its work ends a browser's thread."""
+"""Test that no error of its work ends a browser's thread, or leaves its page without what it waits for."""
 
 import json
 import logging
+import threading
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.server.viewer.browser import Browser
 from solidcloud.server.viewer.feeds.scene_link import LinkStatus
+from solidcloud.server.viewer.page.page_messages import Around
 from solidcloud.server.viewer.viewer_parts import Users
 
 
@@ -17,8 +19,12 @@ class Page:
 
     def __init__(self) -> None:
         self.problems: list[str] = []
+        self.sent: list[bytes] = []
 
     def send(self, message: str | bytes) -> None:
+        if isinstance(message, bytes):
+            self.sent.append(message)
+            return
         fields = json.loads(message)
         assert fields["type"] == "problem"
         self.problems.append(fields["message"])
@@ -62,3 +68,28 @@ def test_an_error_of_the_viewer_is_shown_and_logged(caplog: pytest.LogCaptureFix
     browser._attempt(lambda: done.append(1))
     assert page.problems == ["The viewer failed at something: its log says at what."] and done == [1]
     assert "no such axis" in caplog.text
+
+
+@pytest.mark.parametrize("what", ["overview", "voxels"])
+def test_what_the_page_waits_for_is_asked_for_again_until_the_server_answers(what: str) -> None:
+    page, scene, around = Page(), cast(Any, object()), Around((0.0, 0.0, 0.0))
+    browser = browser_of(page, "connected")
+    answers: list[bytes | Exception] = [BusyError("no answer within 5 s"), BusyError("no answer"), b"answer"]
+
+    def answer(_: object) -> bytes:
+        content = answers.pop(0)
+        if isinstance(content, Exception):
+            raise content
+        browser._closed.set()
+        return content
+
+    browser._parts = cast(Any, SimpleNamespace(tiles=SimpleNamespace(**{what: answer})))
+    if what == "overview":
+        browser._overview = scene
+    else:
+        browser._around = around
+    thread = threading.Thread(target=browser._send_tiles, daemon=True)
+    thread.start()
+    thread.join(30)
+    assert not thread.is_alive()
+    assert page.sent == [b"answer"]

@@ -6,9 +6,8 @@ from typing import Any
 import pytest
 from solidcloud.schemas.errors import BusyError
 from solidcloud.schemas.wire.warming_parts import MOTION
-from solidcloud.server.viewer.browser import may_enter
 from solidcloud.server.viewer.feeds import scene_link
-from solidcloud.server.viewer.feeds.scene_link import SceneLink
+from solidcloud.server.viewer.feeds.scene_link import SceneLink, may_enter
 
 
 def info(compiling: list[str], points: int = 9) -> Any:

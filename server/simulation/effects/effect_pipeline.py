@@ -118,7 +118,7 @@ class Pipeline:
         """
         begin = time.perf_counter()
         body.pose = np.ascontiguousarray(body.pose, np.float64)
-        target = np.array(target, np.float64)
+        target = np.array(target, np.float64, order="C")
         far = norm(target[:3, 3] - body.pose[:3, 3])
         if not far <= self.file.limits.longest_move:
             raise BadRequestError(

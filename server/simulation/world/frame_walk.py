@@ -65,10 +65,8 @@ def _settings(file: SceneFile, up: Vec) -> tuple[Any, float]:
     declared: dict[type, Any] = {type(effect): effect for effect in file.effects}
     stop, slide = declared.get(Stop, Stop()), declared.get(Slide)
     ground, step = declared.get(Ground), declared.get(Step)
-    reach, height = (
-        _NORMAL_REACH if slide is None else slide.normal_reach,
-        0.0 if step is None else step.height,
-    )
+    reach = _NORMAL_REACH if slide is None else slide.normal_reach
+    height = 0.0 if step is None else step.height
     walkable_slide, standing = -2.0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if ground is not None:
         walkable_slide = math.cos(math.radians(ground.slope))
@@ -113,7 +111,7 @@ class Walker:
     """
 
     def __init__(self, world: Any) -> None:
-        """Prepare the effects of the world's scene file, and compile the kernel."""
+        """Prepare the effects of the world's scene file."""
         self.native = True
         self._world = world
         self._settings, reach = _settings(world.file, world.up)
@@ -133,14 +131,11 @@ class Walker:
         starts, frame.walks = not frame.walks, True
         if starts:
             call.begin()
-        begin, target, pose, stood, fell = (
-            body.pose,
-            frame.target,
-            frame.pose,
-            body.on_ground,
-            body.fall_speed,
-        )
-        verdict, clear, bodies = int(frame.verdict), frame.clear, bool(frame.obstacles)
+        # Of the types that the kernel is compiled for; poses are C-contiguous float64 (`Pipeline.run`).
+        begin, target, pose = body.pose, frame.target, frame.pose
+        seconds, fell, tolerance = float(frame.seconds), float(body.fall_speed), float(budget.tolerance)
+        stood, clear, bodies = bool(body.on_ground), bool(frame.clear), bool(frame.obstacles)
+        verdict = int(frame.verdict)
         with world as seen:
             each, probe = seen[0], world.probe(body.avatar)
             data, residency = each.data, each.data.residency
@@ -153,10 +148,10 @@ class Walker:
                 try:
                     with residency.frozen():
                         held.call(
-                            walk_frame, parts, starts, begin, target, pose, frame.seconds, fell, stood, verdict, clear,
+                            walk_frame, parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear,
                             self._settings, probe.walking, thread.reference, held.reference, data.arrays.stop,
                             data.unknown, data.nothing_clear, alone, native, bodies, data.radius_units,
-                            budget.tolerance, budget.tolerance_units, squares,
+                            tolerance, budget.tolerance_units, squares,
                         )  # fmt: skip
                         log = thread.memory.log.tolist()
                         if used := log[state.USED]:

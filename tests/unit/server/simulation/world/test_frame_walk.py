@@ -84,6 +84,19 @@ def state_of(body: Body) -> tuple[object, ...]:
     return body.pose.tobytes(), body.fall_speed, body.on_ground, body.clear, body.generations, kept
 
 
+@pytest.mark.interpreted
+def test_poses_and_times_may_have_any_memory_order_and_type(case: archive_cases.Case) -> None:
+    target = effect_rooms.at(-0.48, 0.01, -0.6, 0.3)
+    with effect_rooms.play(case.archive, Stop(), Sweep(), Ground()) as play:
+        answers = []
+        for order, seconds in (("C", 1.0), ("F", 1), ("C", 1)):
+            body = play.body(effect_rooms.person(), effect_rooms.at(-0.5, 0.0, -0.6))
+            body.pose = np.array(body.pose, order=order)  # type: ignore[call-overload]
+            wish = np.array(target, order=order)  # type: ignore[call-overload]
+            answers.append(encode(play.pipeline.run(body, wish, seconds)))
+    assert answers[0] == answers[1] == answers[2]
+
+
 def test_only_frames_without_a_budget_run_effects_together(case: archive_cases.Case) -> None:
     effects = [Stop(), Sweep(), Ground()]
     with effect_rooms.play(case.archive, *effects, limits=SceneLimits(frame_visits=10**6)) as play:

@@ -155,7 +155,10 @@ class Walker:
                         )  # fmt: skip
                         log = thread.memory.log.tolist()
                         if used := log[state.USED]:
-                            probe.use(residency, thread.memory.used[:used].tolist())
+                            rows = thread.memory.used[:used]
+                            if log[state.REPEATS]:  # answering a query may have evicted some of them
+                                rows = rows[data.arrays.where[rows, 0] >= 0]
+                            probe.use(residency, rows.tolist())
                     break
                 except state.AskedError:
                     call.answer()

@@ -26,7 +26,7 @@ from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 from numba.experimental import structref
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 from .compile_progress import CompileProgress
 from .kernel_dispatcher import Kernel, rebuild_inner, reduce_inner
@@ -41,6 +41,7 @@ __all__ = [
     "kernel_files",
     "njit",
     "on_first_compilation",
+    "overload",
     "structref",
     "types",
     "without_linear_algebra",

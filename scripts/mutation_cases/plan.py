@@ -230,6 +230,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "server/kernels/motion/sweep_resident.py": (SERVER + "queries/test_resident_fast_path.py",),
     "server/kernels/walk/walk_state.py": WALK,
     "server/kernels/walk/walk_vectors.py": WALK,
+    "server/kernels/walk/walk_obstacles.py": (SERVER + "simulation/world/test_walk_bodies.py",),
+    "server/kernels/walk/walk_bodies.py": (SERVER + "simulation/world/test_walk_bodies.py",),
     "server/kernels/walk/walk_queries.py": (*WALK, SERVER + "simulation/world/test_motion_end.py"),
     "server/kernels/walk/walk_normals.py": (*WALK, SERVER + "simulation/world/test_contact_normal.py"),
     "server/kernels/walk/walk_motions.py": (*WALK, SERVER + "simulation/world/test_motion_end.py"),

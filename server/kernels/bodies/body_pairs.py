@@ -199,7 +199,7 @@ def _leaves_touch(
 
 
 @nb.njit(nogil=True, cache=True)
-def _touch(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, at, lanes, counters):
+def touch_bodies(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, at, lanes, counters):
     """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the search ended early.
 
     It ends early when the visits are spent or the stop flag is set. The descent follows [Fig12]
@@ -285,7 +285,7 @@ def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits,
         own[0] = 0
         own[1] = 0
         reach = units[i] + units[j] + margin_units
-        verdict[number] = _touch(
+        verdict[number] = touch_bodies(
             a, poses[i], scales[i], b, poses[j], scales[j], reach, origin, visits, stop, nodes, at, lanes, own
         )
         counters[0] += own[0]

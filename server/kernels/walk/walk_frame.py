@@ -38,6 +38,7 @@ from .walk_vectors import copy_pose
 def walk_frame(
     parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear, settings, avatar, memory, held, stop,
     unknown, unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares,
+    standing, own,
 ):  # fmt: skip
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
 
@@ -52,10 +53,12 @@ def walk_frame(
     are obstacles.  least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
     squares: (5,) int64, the normal reach, thrice and nine times that, squared [steps^2], or 0 if it is
     invalid; that of stored normals, and whether scan numbers are in memory.
+    standing: the bodies that may be in the way, see walk_bodies.py; None in a scene without `crowd`.
+    own: the avatar's row of them, -1 if it has none; ASKS if Python answers about bodies.
     """
     walk = Walk(
         settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units,
-        least_tolerance, tolerance_units, squares,
+        least_tolerance, tolerance_units, squares, standing, own,
     )  # fmt: skip
     log = memory.log
     if log[REPEATS] != 0:

@@ -24,11 +24,11 @@ from ..motion.sweep_resident import (
     sweep_resident,
 )
 from ..rays.nearest_in_memory import nearest_in_memory
+from .walk_obstacles import first_body, touches_no_body
 from .walk_state import (
     ANSWER,
     ARCHIVE,
     BODIES_AT,
-    BODIES_SWEPT,
     CLEAR,
     CLEAR_AT,
     CONTACT,
@@ -45,6 +45,7 @@ from .walk_state import (
     NEAREST,
     PART,
     REST,
+    STAYS,
     SWEPT,
     TOUCHED,
     UNKNOWN,
@@ -92,7 +93,7 @@ def count_visits(walk, visits, missed):
 
 @nb.njit(nogil=True, cache=True)
 def ask_at(walk, query, place):
-    """Ask about a place; see `_Call._answer` in frame_walk.py for the numbers that each query gives."""
+    """Ask about a place; see `WalkCall._answer` in walk_call.py for the numbers that each query gives."""
     for r in range(3):
         walk.memory.asked[r] = place[r]
     ask(walk.memory, query)
@@ -121,7 +122,12 @@ def first_hit(walk, to, tolerance, skin, below):
         if not (walk.native and _sweep(walk, to, tolerance, skin, row)):
             _ask_motion(walk, SWEPT, to, tolerance, skin, below)
         if walk.bodies:
-            _ask_motion(walk, BODIES_SWEPT, to, tolerance, skin, below)
+            clear = memory.tape[row, VERDICT] == CLEAR
+            query = first_body(
+                walk, walk.standing, to, tolerance, below, np.inf if clear else memory.tape[row, LOWER]
+            )
+            if query >= 0:
+                _ask_motion(walk, query, to, tolerance, skin, below)
         memory.log[KNOWN] = row + 1
     return -1 if memory.tape[row, VERDICT] == CLEAR else row
 
@@ -196,7 +202,7 @@ def is_clear(walk, pose, proved):
         verdict = CLEAR if proved else _collide(walk, pose) if walk.native else -1
         if verdict < 0:
             ask(memory, CLEAR_AT)
-        if verdict == CLEAR and walk.bodies:
+        if verdict == CLEAR and walk.bodies and not touches_no_body(walk, walk.standing, pose):
             ask(memory, BODIES_AT)
         memory.tape[row, ANSWER] = 1.0 if verdict == CLEAR else 0.0
         memory.log[KNOWN] = row + 1
@@ -221,7 +227,7 @@ def hit_at(walk, pose):
 def gives_way(walk, hit, to):
     """Let the touched body give way; return whether the motion to a pose (4, 4) should be tried again."""
     memory = walk.memory
-    if memory.tape[hit, NAMED] == 0.0:
+    if memory.tape[hit, NAMED] == 0.0 or memory.tape[hit, NAMED] == STAYS:
         return False
     row = next_row(memory)
     if row >= memory.log[KNOWN]:
@@ -251,7 +257,7 @@ def nearest_point(walk, place, reach):
 
 @nb.njit(nogil=True, cache=True)
 def lands(walk, reach, stood):
-    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in frame_walk.py.
+    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in walk_call.py.
 
     reach: distance below that is free [m].  stood: whether it stood in the last frame.
     """

@@ -3,13 +3,13 @@
 The frame's code asks queries, such as sweeps, one after the other. Each answer is a row of the tape.
 If a query cannot be answered in compiled code, because voxels have to be loaded or bodies are in the
 way, the frame is left with `AskedError`. Python writes the answer to the tape and calls the kernel
-again (server/simulation/world/frame_walk.py). The kernel repeats the frame from its beginning, with
+again (server/simulation/world/walk_call.py). The kernel repeats the frame from its beginning, with
 the known answers. Nothing in a frame depends on anything but its start and these answers, so it
 arrives at the same query again. There is therefore one implementation of a frame, whatever is in
 memory.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,9 @@ CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.
 MAX_UNDECIDED = 1e-4
 # Columns of a row of the tape. The first are those of `sweep_resident`. Then, for a hit: its verdict,
 # number of its archive (-1: not of the scan), whether the centres of the touching spheres, the
-# touching point, the end and the normal are known, the normal (3,), number of the body's name (0:
-# none), whether voxels are not in memory, and the length of the motion that was left [m]. The answer of
-# other queries is a number or three heights.
+# touching point, the end and the normal are known, the normal (3,), whether it is of a named body
+# (STAYS: of one that never gives way), whether voxels are not in memory, and the length of the motion
+# that was left [m]. The answer of other queries is a number or three heights.
 VERDICT = COLUMNS
 ARCHIVE, HAS_PAIR, HAS_POINT, HAS_END, HAS_NORMAL, NORMAL = (COLUMNS + n for n in range(1, 7))
 NAMED, UNLOADED, REST, ANSWER, HEIGHTS, ROW = (COLUMNS + n for n in (9, 10, 11, 12, 13, 16))
@@ -37,11 +37,18 @@ NAMED, UNLOADED, REST, ANSWER, HEIGHTS, ROW = (COLUMNS + n for n in (9, 10, 11, 
 FULL, SWEPT, BODIES_SWEPT, CLEAR_AT, BODIES_AT, TOUCHED, GIVES_WAY, NORMAL_AT, HIGHEST, NEAREST, LANDS = (
     range(11)
 )
+BODIES_HIT = 11  # the kernel found the body that ends a motion, and Python names it
+STAYS = 2.0
+# Elements of `asked` of BODIES_HIT after those of a motion: row of the body, fraction, centres of the two
+# spheres (6,), and block and lane of the body's point.
+HIT_ROW, HIT_FRACTION, HIT_PAIR, HIT_POINT = 3, 4, 5, 11
+# `Walk.own` where Python answers all queries about bodies.
+ASKS = -2
 
 # Elements of `log`, which repetitions keep: number of known rows, the query asked, whether the call
-# repeats a frame's part, number of voxels used, whether something in reach was not examined, and the
-# node visits of each part.
-KNOWN, ASKED, REPEATS, USED, MISSED, VISITS = range(6)
+# repeats a frame's part, number of voxels used, whether something in reach was not examined, whether
+# no body was touched where the frame began, and the node visits of each part.
+KNOWN, ASKED, REPEATS, USED, MISSED, APART, VISITS = range(7)
 # Parts of a frame, in their order, as bits. FOLLOW: the motion command.
 FOLLOW, SLIDE, STEP, GROUND = 1, 2, 4, 8
 PARTS = 4
@@ -70,7 +77,7 @@ _SETTINGS = [
 _AVATAR = ["body", "scratch", "box", "points", "radius"]
 _WALK = [
     "settings", "avatar", "memory", "held", "stop", "unknown", "unknown_everywhere", "alone", "native", "bodies",
-    "other_units", "least_tolerance", "tolerance_units", "squares",
+    "other_units", "least_tolerance", "tolerance_units", "squares", "standing", "own",
 ]  # fmt: skip
 
 
@@ -154,6 +161,8 @@ if nb.config.DISABLE_JIT:
         least_tolerance: float
         tolerance_units: int
         squares: NDArray[np.int64]
+        standing: Any
+        own: int
 
 else:
 

@@ -174,7 +174,7 @@ class Pipeline:
                 frame.verdict = world.collide(body.avatar, frame.pose, budget)
             # Bodies that overlap the avatar since the frame's start, such as a placed object, do
             # not block it, but the verdict reports them.
-            if any([each.overlaps(body.avatar, frame.pose) for each in frame.obstacles]):
+            if not frame.apart and any([each.overlaps(body.avatar, frame.pose) for each in frame.obstacles]):
                 frame.verdict = Verdict.CONTACT
             if budget.stop:  # results of effects from incomplete answers are discarded
                 raise StoppedError

@@ -10,7 +10,8 @@ turn. Bodies that overlap, by their initial poses or because a motion command pl
 there, can therefore always separate.
 """
 
-from typing import NamedTuple
+import threading
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,7 @@ class BodyObstacle:
         self._layout = bodies.layout
         self._overlapped: dict[int, bool] = {}
         self._hits: list[Hit] = []
+        self._shown = -1
 
     def sweep(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
@@ -87,6 +89,40 @@ class BodyObstacle:
         if hit is not None:
             self._hits.append(hit)
         return hit
+
+    @property
+    def lock(self) -> threading.RLock:
+        """Return the lock to hold while the kernel uses `reference`."""
+        return self._bodies.lock
+
+    def reference(self, avatar: AvatarModel) -> tuple[Any, int] | None:
+        """Return a reference to the bodies for the kernel `walk_frame`, and the mover's row or -1.
+
+        Return None if only Python can answer: the bodies are not users with the mover's avatar, or one
+        was touched when the frame began.
+        """
+        bodies = self._bodies
+        if self._wanted != USER or self._skip or not len(avatar.points) or any(self._overlapped.values()):
+            return None
+        found = bodies.reference(bodies.shape_of(avatar), self._wanted, self._margin_units)
+        self._shown = bodies.layout
+        return None if found is None else (found, bodies.row_of(self._mover, user=self._user))
+
+    def name_hit(
+        self, row: int, fraction: float, witness: NDArray[np.float64], point: tuple[int, int]
+    ) -> Hit | None:
+        """Return the hit that the kernel found; None if the bodies' rows have changed since `reference`.
+
+        row, fraction, witness: as `_FirstHit`.  point: block and lane of the body's point.
+        """
+        bodies = self._bodies
+        with bodies.lock:
+            if bodies.layout != self._shown:
+                return None
+            number = int(bodies.shapes[row].model.rows[point[0], point[1]])
+            hit = self._hit_of(_FirstHit(row, fraction, witness, number))
+            self._hits.append(hit)
+            return hit
 
     def is_own(self, hit: Hit) -> bool:
         """Return whether this obstacle reported the hit."""

@@ -119,7 +119,8 @@ class Frame:
     fall_speed, on_ground: new values of `Body`.
     simulated, skipped: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
-    walks, walk_hits: for frame_walk.py: whether a part has run, and the hits that Python answered with, by
+    apart: whether it is proved that no obstacle is touched at `pose`.
+    walks, walk_hits: for walk_call.py: whether a part has run, and the hits that Python answered with, by
     their row.  visits: node visits of each part in its last call.
     """
 
@@ -141,6 +142,7 @@ class Frame:
     skipped: list[str] = field(default_factory=list)
     reports: dict[str, Any] = field(default_factory=dict)
     effect_state: dict[str, Any] = field(default_factory=dict)
+    apart: bool = False
     walks: bool = False
     walk_hits: dict[int, Hit] | None = None
     visits: list[int] = field(default_factory=list)

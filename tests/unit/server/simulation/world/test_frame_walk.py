@@ -9,7 +9,7 @@ from solidcloud.schemas.scene.effect_table import AnyEffect, Contacts, Crowd, Gr
 from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
-from solidcloud.server.simulation.world import frame_walk
+from solidcloud.server.simulation.world import frame_walk, walk_call
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 
@@ -52,7 +52,7 @@ def test_frames_are_the_same_whoever_answers_their_queries(
     person = effect_rooms.person()
     with effect_rooms.play(case.archive, *effects, up=up) as play:
         plays = [play]
-        monkeypatch.setattr(frame_walk, "_ROWS", 2)
+        monkeypatch.setattr(walk_call, "_ROWS", 2)
         for _ in range(2):
             world = World(play.scene, play.pipeline.file)
             plays.append(Play(play.scene, world, make_pipeline(play.pipeline.file, world)))

@@ -119,6 +119,7 @@ def _leaves(sweep, chord, voxel, block, row):
     wide = abs(words[at + U(7)]) * (threshold + SLACK * both + SLACK * both)
     least, most = words[at + U(8)] - wide, words[at + U(9)] + wide
     square, boxed = both * both * ONE_SLACK, has_box(words, row)
+    some = False
     for j in range(LANES):
         dx, dy, dz = displacements[own, 0, j], displacements[own, 1, j], displacements[own, 2, j]
         wx, wy, wz = lanes[own, 0, j] - cx, lanes[own, 1, j] - cy, lanes[own, 2, j] - cz
@@ -135,6 +136,9 @@ def _leaves(sweep, chord, voxel, block, row):
             end = begin + latest * (nx * dx + ny * dy + nz * dz)
             near &= (min(begin, end) <= most) & (max(begin, end) >= least)
         keep[j] = near
+        some |= near
+    if not some:
+        return
     scene_block = ~ints[at + U(FIRST)]
     block_at = scene.where[voxel, 1] + scene_block * scene.block_words
     lane_at = scene.where[voxel, 2] + scene_block * 3 * LANES

@@ -59,6 +59,7 @@ from .screw_motion import pose_at
 # 0.87 to the band.
 LEAST_SAGITTA = 0.25
 U = np.uint64  # see placed_avatar.py
+ONE_CLASS = np.uint64(0)
 
 
 @njit_inlined
@@ -78,13 +79,15 @@ def _nodes_meet(words, row, x, y, z, dx, dy, dz, inverse, radius, latest, thresh
     if ex * ex + ey * ey + ez * ez > both * both * ONE_SLACK:
         return False
     if has_box(words, row):
+        # One branch on all sides costs less than six that are hard to predict.
         wide = span + SLACK * both + SLACK * both
-        for k in range(3):
-            begin, way = (wx, dx) if k == 0 else (wy, dy) if k == 1 else (wz, dz)
-            end, most = begin + latest * way, words[at + U(4) + U(k)] + wide
-            if min(begin, end) > most or max(begin, end) < -most:
-                return False
-        return True
+        ex, ey, ez = wx + latest * dx, wy + latest * dy, wz + latest * dz
+        mx, my, mz = words[at + U(4)] + wide, words[at + U(5)] + wide, words[at + U(6)] + wide
+        return (
+            (min(wx, ex) <= mx) & (max(wx, ex) >= -mx)
+            & (min(wy, ey) <= my) & (max(wy, ey) >= -my)
+            & (min(wz, ez) <= mz) & (max(wz, ez) >= -mz)
+        )  # fmt: skip
     nx, ny, nz = words[at + U(4)], words[at + U(5)], words[at + U(6)]
     begin = nx * wx + ny * wy + nz * wz
     end = begin + latest * (nx * dx + ny * dy + nz * dz)
@@ -194,6 +197,7 @@ def _sweep_voxel(sweep, chord, voxel):
     nodes, off, stack, counters = moving.nodes, moving.off, moving.stack, moving.counters
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - moving.frame[r])
+    widest = thresholds[0]  # of the only class, if there is one
     counters[0] += 1
     latest = _latest(moving)
     stack[0, 0], stack[0, 1] = 0, base
@@ -221,7 +225,7 @@ def _sweep_voxel(sweep, chord, voxel):
             latest = _latest(moving)
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[U(row) + U(3)]):
             counters[0] += avatar.count[a]
-            threshold = thresholds[node_class(ints, row, mask)]
+            threshold = widest if mask == ONE_CLASS else thresholds[node_class(ints, row, mask)]
             for child in range(a_first, a_first + avatar.count[a]):
                 if _nodes_meet(
                     words, row, nodes[0, child] - off[0], nodes[1, child] - off[1], nodes[2, child] - off[2],
@@ -237,7 +241,7 @@ def _sweep_voxel(sweep, chord, voxel):
             counters[0] += count
             for i in range(count):
                 child_row = base + (b_first + i) * ROW_WORDS
-                threshold = thresholds[node_class(ints, child_row, mask)]
+                threshold = widest if mask == ONE_CLASS else thresholds[node_class(ints, child_row, mask)]
                 if _nodes_meet(
                     words, child_row, x, y, z, dx, dy, dz, inverse, nodes[3, a], latest, threshold
                 ):

@@ -1,16 +1,13 @@
 """Queries about other bodies: in a scene without `crowd`, `Walk.standing` is None, and Python answers them.
 
 The code for bodies is then neither imported nor compiled (NUMERICS.md case 31). numba chooses by the type of
-`standing`.
+`standing`. The digest of compiled code covers walk_bodies.py too, because the functions below import it.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ....schemas.kernels import compiling as nb
 from .walk_state import BODIES_SWEPT
-
-if TYPE_CHECKING:  # the digest of compiled code covers the sources that are named here
-    pass
 
 
 def first_body(walk: Any, standing: Any, to: Any, tolerance: float, below: bool, until: float) -> int:

@@ -107,7 +107,7 @@ class Bodies:
         self._known: dict[int, Shape] = {}
         self._numbered = 0
         self._referred: tuple[Any, Any] = (None, None)
-        self._changes = 0  # of users' avatars
+        self._changes = 0  # of users' avatars, and of scratch
         # By user and object, see `_remember_origin`.
         self._came_from: dict[tuple[str, str], Vec] = {}
 
@@ -134,6 +134,7 @@ class Bodies:
             counters = self.scratch.counters
             self.scratch = make_body_scratch(nodes, blocks)
             self.scratch.counters[:] = counters
+            self._changes += 1
         shape = self._known[id(model.points)] = Shape(model, box, units, self._numbered, {})
         self._numbered += 1
         return shape
@@ -198,7 +199,7 @@ class Bodies:
         Return None unless all of them have the shape of the mover. wanted: kinds, bits.  margin_units:
         distance to keep, exact units.
         """
-        key = self.layout, self._changes, shape.number, wanted, margin_units, id(self.scratch)
+        key = self.layout, self._changes, shape.number, wanted, margin_units
         if self._referred[0] != key:
             made, radius = None, float(shape.model.radius)
             if (self.numbers[(self.kinds & wanted) != 0] == shape.number).all():

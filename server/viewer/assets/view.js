@@ -62,6 +62,8 @@ export class View {
     this.camera.up.set(0, 0, 1);
     this.points = new Scene();
     this.lines = new Scene();
+    // Otherwise each picture places all tiles again.
+    for (const scene of [this.points, this.lines]) scene.matrixAutoUpdate = false;
     this.shading = true;
     this.software = isSoftware(context);
     // Beyond one pixel of the picture per pixel of the style, shading costs more than it shows.

@@ -7,6 +7,8 @@ import { FOG_END, FOG_STEPS } from "./splats.js";
 
 // Points that are copied into the memory at once.
 const MOST = 16384;
+// Most points that are copied one by one.
+const FEW = 64;
 // Least width and height of a picture [pixels]: a row has a disc's largest width.
 const LEAST_SIDE = 64;
 // Addresses, and bytes of the lists: see splats.ts. The page's arrays are behind them.
@@ -48,6 +50,19 @@ export class Kernel {
     return { depth: new Float32Array(buffer, PICTURE, pixels), colours: new Uint8ClampedArray(buffer, colours, 4 * pixels) };
   }
 
+  /** Copy points into the memory. */
+  take(places, colours, begin, end) {
+    const { places: into, tints } = this;
+    if (end - begin > FEW) {
+      into.set(places.subarray(3 * begin, 3 * end));
+      tints.set(colours.subarray(begin, end));
+      return;
+    }
+    // Two views and their copies take longer than few points.
+    for (let at = 3 * begin, to = 0; at < 3 * end; at += 1, to += 1) into[to] = places[at];
+    for (let row = begin, to = 0; row < end; row += 1, to += 1) tints[to] = colours[row];
+  }
+
   /** Draw points, as `splat` of splats.js does. */
   splat(places, colours, from, to, screen, size, least, most, near, [eyeX, eyeY, eyeZ, foggy], fog, cut) {
     if (this.fog !== fog) {
@@ -55,7 +70,7 @@ export class Kernel {
       [fog.shares, fog.redBlue, fog.green].forEach((table, k) => new Int32Array(this.memory.buffer, FOG + 4 * FOG_STEPS * k, FOG_STEPS).set(table));
     }
     const { numbers } = this;
-    numbers.set(screen);
+    for (let k = 0; k < 12; k += 1) numbers[k] = screen[k];
     numbers[12] = size;
     numbers[13] = least;
     numbers[14] = most;
@@ -64,12 +79,11 @@ export class Kernel {
     numbers[17] = eyeY;
     numbers[18] = eyeZ;
     numbers[19] = (foggy * FOG_STEPS) / FOG_END;
-    numbers.set(cut, 20);
+    for (let k = 0; k < 7; k += 1) numbers[20 + k] = cut[k];
     let inside = 0;
     for (let begin = from; begin < to; begin += MOST) {
       const end = Math.min(to, begin + MOST);
-      this.places.set(places.subarray(3 * begin, 3 * end));
-      this.tints.set(colours.subarray(begin, end));
+      this.take(places, colours, begin, end);
       inside += this.functions.splat(PLACES, TINTS, end - begin, NUMBERS, FOG, LISTS);
     }
     return inside;

@@ -22,19 +22,17 @@ export class Scan {
    * inside of the picture.
    */
   draw(picture, objects, camera, view) {
-    const frustum = new Frustum().setFromProjectionMatrix(view);
+    const { planes } = new Frustum().setFromProjectionMatrix(view), { position } = camera;
     const ordered = [];
     for (const object of objects) {
-      const count = object.geometry.drawRange.count;
-      if (count <= 0 || (object.frustumCulled && !frustum.intersectsObject(object))) continue;
-      const tile = object.geometry.index ? this.pack(object.geometry) : {
-        places: object.geometry.attributes.position.array, attributes: arrays(object.geometry), matrix: object.matrixWorld, source: object.geometry,
-        sphere: object.geometry.boundingSphere.clone().applyMatrix4(object.matrixWorld),
-      };
+      const { geometry } = object, { count } = geometry.drawRange;
+      if (count <= 0) continue;
+      const tile = geometry.index ? this.pack(geometry) : tileOf(object);
+      if (object.frustumCulled && !meets(planes, tile.sphere)) continue;
       tile.count = Math.min(count, tile.places.length / 3);
       tile.size = object.material.uniforms.uSize.value * shared.uScale.value;
       // The overview is behind the tiles, mostly.
-      tile.away = object.geometry.index ? Infinity : tile.sphere.center.distanceTo(camera.position) - tile.sphere.radius;
+      tile.away = geometry.index ? Infinity : tile.sphere.center.distanceTo(position) - tile.sphere.radius;
       ordered.push(tile);
     }
     ordered.sort((one, other) => one.away - other.away);
@@ -44,17 +42,17 @@ export class Scan {
   }
 
   tile(picture, tile, camera, view, found) {
-    const { matrix, sphere, attributes, source, places, count } = tile;
+    const { matrix, inverse, sphere, attributes, source, places, count } = tile;
     const { elements } = matrix;
     const screen = screenRows(picture, view, matrix);
-    const runs = seenRuns(this.boxesOf(places), count, screen, picture.width, picture.height, camera.near);
+    const runs = count <= FEW ? [0, count] : seenRuns(this.boxesOf(places), count, screen, picture.width, picture.height, camera.near);
     found.chosen += count;
     if (!runs.length) return;
     const last = runs.at(-1);
-    const eye = camera.position.clone().applyMatrix4(inverse.copy(matrix).invert());
+    eye.copy(camera.position).applyMatrix4(inverse);
     const { x: least, y: most } = shared.uPixels.value;
     const step = Math.hypot(elements[0], elements[1], elements[2]), fog = step / shared.uFog.value;
-    const cut = cutOf(sphere, camera.position, elements, step);
+    const cut = cutOf(tile.away, sphere, camera.position, elements, step);
     const colours = this.colours.around(this.colours.of(source, attributes, places, elements), places, last, elements, sphere);
     for (let k = 0; k < runs.length; k += 2) {
       const [from, to] = [runs[k], runs[k + 1]];
@@ -94,7 +92,33 @@ export class Scan {
   }
 }
 
-const inverse = new Matrix4();
+// Tiles with at most this many points in a picture are given to the inner loop as a whole. A town of 10^8
+// points has thousands of them.
+const FEW = 256;
+const eye = new Vector3();
+
+/** Return what does not change of a tile while its points and its place are the same. */
+function tileOf(object) {
+  const { geometry, matrixWorld, userData } = object;
+  const found = userData.tile;
+  if (found && found.source === geometry && found.matrix.equals(matrixWorld)) return found;
+  userData.tile = {
+    places: geometry.attributes.position.array, attributes: arrays(geometry), source: geometry,
+    matrix: matrixWorld.clone(), inverse: matrixWorld.clone().invert(),
+    sphere: geometry.boundingSphere.clone().applyMatrix4(matrixWorld), count: 0, size: 0, away: 0,
+  };
+  return userData.tile;
+}
+
+/** Return whether a sphere meets the space within planes. */
+function meets(planes, { center, radius }) {
+  for (let k = 0; k < planes.length; k += 1) {
+    const { normal, constant } = planes[k];
+    if (normal.x * center.x + normal.y * center.y + normal.z * center.z + constant < -radius) return false;
+  }
+  return true;
+}
+
 const arrays = ({ attributes }) => Object.fromEntries(Object.entries(attributes).map(([name, { array }]) => [name, array]));
 
 /** Return a frame of the box of places, (n, 3) as one array. */
@@ -109,19 +133,20 @@ function boxFrame(places) {
   const step = Math.max(1e-6, ...high.map((value, axis) => (value - low[axis]) / 65534));
   const sphere = new Sphere(new Vector3(...low).add(new Vector3(...high)).multiplyScalar(0.5));
   sphere.radius = sphere.center.distanceTo(new Vector3(...high));
-  return { low, step, matrix: new Matrix4().makeTranslation(...low).scale(new Vector3(step, step, step)), sphere };
+  const matrix = new Matrix4().makeTranslation(...low).scale(new Vector3(step, step, step));
+  return { low, step, matrix, inverse: matrix.clone().invert(), sphere };
 }
 
 const NOTHING_CUT = [0, 0, 0, 0, -1, 0, 0];
 
 /** Return what is left out between the camera and the user, as the shader does: `cut` of splats.js.
  *
- * sphere: that contains a tile, in the page's frame.  m: matrix of the tile's frame, whose axes are at right
+ * away: least distance of the tile.  sphere: that contains it, in the page's frame.  m: matrix of the tile's frame, whose axes are at right
  * angles.  step: of the frame [m].
  */
-function cutOf(sphere, camera, m, step) {
+function cutOf(away, sphere, camera, m, step) {
   const { x, y, z, w: radius } = shared.uCut.value;
-  if (radius <= 0) return NOTHING_CUT;
+  if (radius <= 0 || away > Math.hypot(x - camera.x, y - camera.y, z - camera.z) + radius) return NOTHING_CUT;
   const line = new Vector3(x, y, z).sub(camera), whole = line.length();
   line.divideScalar(whole);
   const way = sphere.center.clone().sub(camera), along = way.dot(line);

@@ -8,6 +8,7 @@ import {
   Box3, BufferAttribute, BufferGeometry, Frustum, Matrix4, Points, Sphere, Vector3,
 } from "./vendor/three.module.min.js";
 import { pointsMaterial, shared } from "./points_material.js";
+import { TileGroup } from "./tile_group.js";
 
 const MAX_DETAIL = 8;
 // Most tiles that are asked for at once: the list is replaced as the view moves.
@@ -31,7 +32,8 @@ export const STATES = ["evicted", "loaded", "prefetched", "wasted"];
 export class Tiles {
   /** group: object for the points.  send: sends a message.  drawn: called with each voxel whose tile arrives. */
   constructor(group, send, drawn) {
-    this.group = group;
+    this.group = new TileGroup();
+    group.add(this.group);
     this.send = send;
     this.drawn = drawn;
     this.columns = new Set();
@@ -121,6 +123,7 @@ export class Tiles {
     object.matrixWorldNeedsUpdate = true;
     Object.assign(voxel, { object, detail, loaded: arrays.points.rows, total, radius });
     this.group.add(object);
+    this.group.changed();
     this.radius = Math.max(radius, 1e-4);
     this.changes += 1;
     this.show(voxel, Math.max(detail, voxel.wanted ?? detail));
@@ -136,6 +139,7 @@ export class Tiles {
   drop(voxel) {
     if (!voxel.object) return;
     this.group.remove(voxel.object);
+    this.group.changed();
     voxel.object.geometry.dispose();
     voxel.object.material.dispose();
     Object.assign(voxel, { object: null, detail: -1, loaded: 0, drawn: 0 });
@@ -226,6 +230,7 @@ export class Tiles {
     }
     smaller.boundingSphere = geometry.boundingSphere;
     voxel.object.geometry = smaller;
+    this.group.changed();
     geometry.dispose();
     // What is drawn now may be coarser than what is wanted.
     voxel.loaded = voxel.drawn;

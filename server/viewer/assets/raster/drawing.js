@@ -63,7 +63,7 @@ export class Drawing {
     picture.clear();
     times.push(performance.now());
     const view = new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
-    this.shown = this.scan.draw(picture, found.scan, camera, view);
+    this.shown = this.scan.draw(picture, found, camera, view);
     if (this.shown.given) this.spread += 0.3 * (Math.min(MOST_SPREAD, this.shown.chosen / this.shown.given) - this.spread);
     times.push(performance.now());
     for (const each of found.figures) {
@@ -145,16 +145,22 @@ class Rectangle {
   }
 }
 
-/** Return the visible objects of a scene by what draws them; `other`: how many this cannot draw. */
+/** Return the visible objects of a scene by what draws them, tiles as their group; `other`: how many this cannot draw. */
 function sorted(scene) {
-  const found = { scan: [], figures: [], shapes: [], other: 0 };
-  scene.traverseVisible((object) => {
-    if (!object.isPoints && !object.isMesh && !object.isLine) return;
+  const found = { tiles: null, scan: [], figures: [], shapes: [], other: 0 };
+  const sort = (object) => {
+    if (!object.visible) return;
+    if (object.isTileGroup) {
+      found.tiles = object;
+      return;
+    }
     const { material } = object;
     if (object.isPoints && material.name === SCAN) found.scan.push(object);
     else if (object.isPoints && material.name === FIGURE) found.figures.push(object);
-    else if ((material.isMeshBasicMaterial && !object.isInstancedMesh) || material.isLineBasicMaterial) found.shapes.push(object);
-    else found.other += 1;
-  });
+    else if ((object.isMesh && material.isMeshBasicMaterial && !object.isInstancedMesh) || (object.isLine && material.isLineBasicMaterial)) found.shapes.push(object);
+    else if (object.isPoints || object.isMesh || object.isLine) found.other += 1;
+    object.children.forEach(sort);
+  };
+  sort(scene);
   return found;
 }

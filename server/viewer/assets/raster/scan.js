@@ -15,25 +15,29 @@ export class Scan {
     this.fog = fogTables(shared.uGround.value.toArray());
   }
 
-  /** Draw scan points. objects: of three.js, with the material of points_material.js.  view: from
-   * the world to the picture, as a matrix.
+  /** Draw scan points. tiles: `TileGroup`, or null.  scan: other objects of three.js with the material
+   * of points_material.js: the overview.  view: from the world to the picture, as a matrix.
    *
    * Returns how many points they have, how many of them were given to the inner loop, and how many were
    * inside of the picture.
    */
-  draw(picture, objects, camera, view) {
-    const { planes } = new Frustum().setFromProjectionMatrix(view), { position } = camera;
+  draw(picture, { tiles, scan }, camera, view) {
     const ordered = [];
-    for (const object of objects) {
-      const { geometry } = object, { count } = geometry.drawRange;
-      if (count <= 0) continue;
-      const tile = geometry.index ? this.pack(geometry) : tileOf(object);
-      if (object.frustumCulled && !meets(planes, tile.sphere)) continue;
-      tile.count = Math.min(count, tile.places.length / 3);
+    const add = (tile, object, away) => {
+      tile.count = Math.min(object.geometry.drawRange.count, tile.places.length / 3);
       tile.size = object.material.uniforms.uSize.value * shared.uScale.value;
-      // The overview is behind the tiles, mostly.
-      tile.away = geometry.index ? Infinity : tile.sphere.center.distanceTo(position) - tile.sphere.radius;
-      ordered.push(tile);
+      tile.away = away;
+      if (tile.count > 0) ordered.push(tile);
+    };
+    // The overview is behind the tiles, mostly.
+    for (const object of scan) if (object.geometry.drawRange.count > 0) add(this.pack(object.geometry), object, Infinity);
+    if (tiles) {
+      const spheres = tiles.list(), planes = planesOf(view), { x, y, z } = camera.position;
+      tiles.children.forEach((object, k) => {
+        const at = 4 * k;
+        if (!meets(planes, spheres, at)) return;
+        add(tileOf(object), object, Math.hypot(spheres[at] - x, spheres[at + 1] - y, spheres[at + 2] - z) - spheres[at + 3]);
+      });
     }
     ordered.sort((one, other) => one.away - other.away);
     const found = { chosen: 0, given: 0, inside: 0 };
@@ -110,11 +114,17 @@ function tileOf(object) {
   return userData.tile;
 }
 
-/** Return whether a sphere meets the space within planes. */
-function meets(planes, { center, radius }) {
-  for (let k = 0; k < planes.length; k += 1) {
-    const { normal, constant } = planes[k];
-    if (normal.x * center.x + normal.y * center.y + normal.z * center.z + constant < -radius) return false;
+/** Return the planes around what a picture shows, (6, 4) as one array: unit normals inwards, and constants. */
+function planesOf(view) {
+  const { planes } = new Frustum().setFromProjectionMatrix(view);
+  return Float64Array.from(planes.flatMap(({ normal, constant }) => [normal.x, normal.y, normal.z, constant]));
+}
+
+/** Return whether a sphere, of (n, 4) from `at` on, meets the space within planes. */
+function meets(planes, spheres, at) {
+  const x = spheres[at], y = spheres[at + 1], z = spheres[at + 2], radius = spheres[at + 3];
+  for (let k = 0; k < 24; k += 4) {
+    if (planes[k] * x + planes[k + 1] * y + planes[k + 2] * z + planes[k + 3] < -radius) return false;
   }
   return true;
 }

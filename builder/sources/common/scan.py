@@ -31,7 +31,7 @@ BLOCK_POINTS = 1 << 18
 # (LAS) or a thousand properties (PLY); without this bound a block of them would take gigabytes.
 BLOCK_BYTES = 64 << 20
 
-# Bytes of a file hashed per read.
+# Bytes of a file hashed, or searched for other bytes than zero, per read.
 HASHED_BYTES = 1 << 20
 
 # Drop reason of points that are not finite or lie beyond MAX_COORDINATE.
@@ -223,6 +223,31 @@ def read_records(
                 "fetch the file again, it is truncated",
             )
         yield buffer[:wanted]
+
+
+def check_end(file: BufferedReader, path: Path, record_bytes: int, what: str) -> None:
+    """Refuse a file in which at least one more record follows those that its header declares.
+
+    A count that is too small, or 0, would leave out the points behind it without notice. Less than
+    a record may follow, and any number of zeros: some writers fill the last page with them.
+
+    file: at the end of the declared records.  what: plural noun for these, used in the message.
+    Raises ScanError.
+    """
+    begin = file.tell()
+    left = file.seek(0, 2) - begin
+    if left < record_bytes:
+        return
+    file.seek(begin)
+    while data := file.read(HASHED_BYTES):
+        check_interrupt()
+        if data.strip(b"\0"):
+            raise scan_error(
+                path,
+                f"{left} bytes behind the {what} that its header declares",
+                f"fewer than the {record_bytes} of another one, or zeros",
+                "fetch the file again: the count in its header is damaged",
+            )
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:

@@ -22,6 +22,7 @@ CHUNK_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20
 
 NEWLINE = b"\n"
+_ROW = re.compile(rb"^[^\S\n]*[^\s#]", re.MULTILINE)
 
 
 def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tuple[int, bytes]]:
@@ -92,19 +93,26 @@ def number_rows(
     delimiter: str | None,
     first_line: int,
     limit: int | None = None,
+    behind: int | None = None,
 ) -> Iterator[NDArray[np.float64]]:
     """Read rows of `columns` numbers each, in blocks of at most CHUNK_BYTES of text.
 
     file: open in binary mode, at the start of line number `first_line`.
     delimiter: "," or ";", or None for any run of blanks.
     limit: stop after that many rows.
+    behind: number of rows of any content that must follow these to the end of the file, because a
+    count that is too small would leave out points; None: not checked.
     Yields (n, columns) float64, n > 0. Blank lines and text after "#" are skipped. Numbers are
     rounded correctly (David Gay's algorithm, by way of CPython). Raises ScanError with the number
-    of the first line that is not `columns` numbers.
+    of the first line that is not `columns` numbers, and if not `behind` rows follow.
     numpy.loadtxt parses 3 to 4.7 million rows a second in a trial, against 1.3 million for
     bytes.split().
     """
+    following = 0
     for line, chunk in text_chunks(file, path, first_line):
+        if limit == 0:
+            following += _count_rows(chunk)
+            continue
         most = None
         if limit is not None:
             # loadtxt allocates max_rows rows at once, with as many columns as the first row has.
@@ -123,8 +131,21 @@ def number_rows(
         yield rows
         if limit is not None:
             limit -= len(rows)
-            if limit == 0:
+            if limit == 0 and behind is None:
                 return
+            following = _count_rows(chunk) - len(rows)
+    if limit == 0 and behind not in (None, following):
+        raise scan_error(
+            path,
+            f"{following} rows behind the points that its header declares",
+            f"{behind}",
+            "fetch the file again: a count in its header is damaged, or the file is truncated",
+        )
+
+
+def _count_rows(chunk: bytes) -> int:
+    """Return the number of lines that are neither blank nor a comment."""
+    return sum(1 for _ in _ROW.finditer(chunk))
 
 
 def _first_width(chunk: bytes, delimiter: str | None) -> int | None:

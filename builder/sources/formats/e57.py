@@ -27,7 +27,7 @@ from ..common.scan import (
     reader_library,
     scan_error,
 )
-from .e57_xml import check_e57, check_xml, xml_of
+from .e57_xml import Section, check_e57, check_xml, checked_xml, record_sections, records_held, xml_of
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 INVALID_STATE = "invalid state"
@@ -63,14 +63,28 @@ class E57Scan(Scan):
         pose: NDArray[np.float64],
         bounds: NDArray[np.float64] | None,
         fields: _Fields,
+        section: Section | None,
     ) -> None:
         super().__init__(path, "e57", index=index, declared_count=count, pose=pose, bounds=bounds)
-        self._fields = fields
+        self._fields, self._section = fields, section
         self.columns = frozenset([INTENSITY] * bool(fields.intensity) + [RGB] * bool(fields.colours))
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
-        if not self.declared_count:
-            return
+        if self.declared_count:
+            yield from self._records(block_points)
+        if self._section is not None:
+            with self.path.open("rb") as file:
+                held = records_held(file, self._section)
+            if held > (self.declared_count or 0):
+                raise scan_error(
+                    self.path,
+                    f"scan {self.index} of at least {held} records",
+                    f"the {self.declared_count} its header declares",
+                    "fetch the file again, or check the program that wrote it",
+                )
+
+    def _records(self, block_points: int) -> Iterator[ScanBlock]:
+        """Yield the blocks of the declared records."""
         libe57 = _libe57(self.path)
         with _image_file(self.path) as image:
             # The arrays must outlive the reader: it writes into them through raw pointers.
@@ -162,9 +176,11 @@ def open_e57(path: Path) -> list[Scan]:
             return []
         data3d = image.root()["data3D"]
         scans: list[Scan] = []
+        with path.open("rb") as file:
+            sections = dict(enumerate(record_sections(xml_of(file))))
         for index in range(len(data3d)):
             try:
-                scans.append(_open_scan(path, index, data3d[index]))
+                scans.append(_open_scan(path, index, data3d[index], sections.get(index)))
             except ScanError as error:
                 scans.append(BrokenScan(path, "e57", index, str(error)))
         if scans and all(scan.fault for scan in scans):
@@ -189,7 +205,7 @@ def _image_file(path: Path) -> Iterator[Any]:
         image.close()
 
 
-def _open_scan(path: Path, index: int, node: Any) -> Scan:
+def _open_scan(path: Path, index: int, node: Any, section: Section | None) -> Scan:
     """Return one scan from its XML node. Raises ScanError."""
     if not node.isDefined("points"):
         raise scan_error(
@@ -229,7 +245,7 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
             f"at most the {8 * path.stat().st_size} bits of the file",
             "fetch the file again, it is truncated or damaged",
         )
-    return E57Scan(path, index, count, pose, _bounds(numbers, pose), fields)
+    return E57Scan(path, index, count, pose, _bounds(numbers, pose), fields, section)
 
 
 def _colour_limits(node: Any, prototype: Any) -> tuple[tuple[str, float, float], ...]:
@@ -302,12 +318,12 @@ def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDAr
 def e57_bounds(path: Path) -> NDArray[np.float64] | None:
     """Return the bounds of all scans that an E57 file's XML declares, (2, 3) world frame [m].
 
-    Returns None where one scan has no bounds, because its points may then be anywhere. Ignores
-    checksums and reads the XML without libE57Format, which refuses a file with a broken page. May
-    raise anything.
+    Returns None where one scan has no bounds, because its points may then be anywhere. Reads the
+    XML without libE57Format, which refuses the file. May raise anything, also where the XML itself
+    may be damaged.
     """
     with path.open("rb") as file:
-        xml = xml_of(file)
+        xml = checked_xml(file)
     check_xml(xml)
     root = ElementTree.fromstring(xml)
     tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""

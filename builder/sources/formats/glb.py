@@ -6,9 +6,12 @@ with y up [glTF 2.0, 3.4]; this reader does not convert coordinates.
 """
 
 import json
+import re
 import struct
+from bisect import bisect_left
 from collections.abc import Iterator
 from io import BufferedReader
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,8 +44,34 @@ MAX_TRIANGLES = 1 << 24
 # instancing, compression.
 HARMLESS = ("KHR_lights_", "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
 
+# Properties of the objects that place vertices [glTF 2.0, 5]. Any other, beside "extensions" and
+# "extras", may be one of these whose name is damaged; to ignore it would move or lose vertices.
+PROPERTIES = {
+    "glTF": {
+        *("accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensionsUsed"),
+        *("extensionsRequired", "images", "materials", "meshes", "nodes", "samplers", "scene", "scenes"),
+        *("skins", "textures"),
+    },
+    "scenes": {"nodes", "name"},
+    "nodes": {
+        *("camera", "children", "skin", "matrix", "mesh", "rotation", "scale", "translation", "weights"),
+        "name",
+    },
+    "meshes": {"primitives", "weights", "name"},
+    "primitives": {"attributes", "indices", "material", "mode", "targets"},
+    "accessors": {
+        *("bufferView", "byteOffset", "componentType", "normalized", "count", "type", "max", "min", "sparse"),
+        "name",
+    },
+    "bufferViews": {"buffer", "byteOffset", "byteLength", "byteStride", "target", "name"},
+}
+ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|_.*")
+
 FLOAT = 5126
 INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
+# Bytes of a value by its type, and values in a row by its shape; some matrices have padding more.
+SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, FLOAT: 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
@@ -206,6 +235,7 @@ class _Document:
 
         Raises ScanError for more than MAX_PARTS nodes or primitives at nodes.
         """
+        self._check_properties("glTF", self.document)
         required = [str(name) for name in self.document.get("extensionsRequired", [])]
         if others := [name for name in required if not name.startswith(HARMLESS)]:
             raise scan_error(
@@ -241,7 +271,43 @@ class _Document:
                     meshes[node["mesh"]] = self._mesh(node["mesh"])
                 found += [_Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
             waiting += [(child, pose) for child in reversed(node.get("children", []))]
+        self._check_ends({primitive.vertices for mesh in meshes.values() for primitive in mesh})
         return found
+
+    def _check_ends(self, positions: set[_Accessor]) -> None:
+        """Refuse vertices behind which the binary chunk has room for another that nothing uses.
+
+        A count that is too small would leave these out. Raises ScanError.
+        """
+        used: list[tuple[int, int]] = []  # first byte, and first byte behind
+        free = set(range(len(self.document.get("bufferViews", []))))
+        for accessor in self.document.get("accessors", []):
+            if "bufferView" not in accessor:
+                continue
+            free.discard(accessor["bufferView"])
+            view = self._at("bufferViews", accessor["bufferView"])
+            width = SIZES.get(accessor.get("componentType"), 1) * WIDTHS.get(accessor.get("type"), 1)
+            begin = self._whole(view.get("byteOffset", 0)) + self._whole(accessor.get("byteOffset", 0))
+            stride = self._whole(view.get("byteStride", width)) or width
+            if count := self._whole(accessor.get("count", 0)):
+                used.append((begin, begin + (count - 1) * stride + width))
+        for number in free:  # pictures, and what extensions use
+            view = self._at("bufferViews", number)
+            begin = self._whole(view.get("byteOffset", 0))
+            used.append((begin, begin + self._whole(view["byteLength"])))
+        used.sort()
+        begins = [begin for begin, _ in used]
+        ends = list(accumulate((end for _, end in used), max))
+        for accessor in positions:
+            row = np.dtype(accessor.type).itemsize * accessor.width
+            at = accessor.start - self.start + accessor.rows * accessor.stride
+            before = bisect_left(begins, at + row)
+            if at + row <= self.size and not (before and ends[before - 1] > at):
+                raise _damaged(
+                    self.path,
+                    f"room for another vertex, which nothing uses, behind {accessor.rows} vertices",
+                    "a count of all of them",
+                )
 
     def _check_parts(self, parts: int, what: str) -> None:
         if parts > MAX_PARTS:
@@ -275,13 +341,22 @@ class _Document:
 
     def _primitive(self, primitive: dict[str, Any]) -> _Primitive | None:
         """Return a primitive's accessors, or None where it has no positions."""
+        self._check_properties("primitives", primitive)
         if primitive.get("extensions", {}).get("KHR_draco_mesh_compression") is not None:
             raise _damaged(
                 self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
             )
-        if "POSITION" not in primitive["attributes"]:
+        attributes = primitive["attributes"]
+        if others := [name for name in attributes if not ATTRIBUTE.fullmatch(name)]:
+            raise _damaged(self.path, f"the attribute {others[0][:60]!r}", "one of glTF, or its own with _")
+        if "POSITION" not in attributes:
             return None
-        vertices = self._accessor(primitive["attributes"]["POSITION"], "VEC3", {FLOAT: "<f4"})
+        vertices = self._accessor(attributes["POSITION"], "VEC3", {FLOAT: "<f4"})
+        counts = {self._at("accessors", number).get("count") for number in attributes.values()}
+        if len(counts) > 1:
+            raise _damaged(
+                self.path, f"attributes of {sorted(map(str, counts))} vertices", "the same number each"
+            )
         indices = None
         if "indices" in primitive:
             indices = self._accessor(primitive["indices"], "SCALAR", INDEX_TYPES)
@@ -326,7 +401,14 @@ class _Document:
         if not isinstance(number, int) or not 0 <= number < len(entries):
             raise _damaged(self.path, f"number {number!r} of {len(entries)} {name}", "an existing number")
         found: dict[str, Any] = entries[number]
+        self._check_properties(name, found)
         return found
+
+    def _check_properties(self, name: str, found: dict[str, Any]) -> None:
+        """Raise ScanError for an unknown property of an object. name: of its list."""
+        known = PROPERTIES.get(name, found.keys()) | {"extensions", "extras"}
+        if others := [key for key in found if key not in known]:
+            raise _damaged(self.path, f"the property {others[0][:60]!r} in {name}", "those of glTF 2.0")
 
     def _whole(self, number: Any) -> int:
         if not isinstance(number, int) or number < 0:

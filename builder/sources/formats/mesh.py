@@ -12,7 +12,15 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..common.scan import Scan, ScanBlock, SeekableScan, library_errors, read_records, scan_error
+from ..common.scan import (
+    Scan,
+    ScanBlock,
+    SeekableScan,
+    check_end,
+    library_errors,
+    read_records,
+    scan_error,
+)
 from ..common.text_rows import keyword_rows
 
 # A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
@@ -79,6 +87,9 @@ def open_stl(path: Path) -> list[Scan]:
     held = (size - STL_HEADER_BYTES) // STL_TRIANGLE.itemsize
     if triangles > held:
         raise _truncated_stl(path, f"{held} triangles at most", f"the {triangles} its header declares")
+    with library_errors(path), path.open("rb") as file:
+        file.seek(STL_HEADER_BYTES + triangles * STL_TRIANGLE.itemsize)
+        check_end(file, path, STL_TRIANGLE.itemsize, "triangles")
     return [BinaryStl(path, triangles)]
 
 

@@ -26,6 +26,7 @@ from ..common.scan import (
     ScanBlock,
     SeekableScan,
     apply_pose,
+    check_end,
     library_errors,
     quaternion_pose,
     read_records,
@@ -188,14 +189,12 @@ class AsciiPcd(Scan):
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header, seen = self._header, 0
-        if not header.points:
-            return
         fields = _read_fields(self, header)
         with self.path.open("rb") as file:
             file.seek(header.start)
             for rows in number_rows(
                 file, self.path, columns=header.columns, delimiter=None, first_line=header.lines + 1,
-                limit=header.points,
+                limit=header.points, behind=0,
             ):  # fmt: skip
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
@@ -215,6 +214,9 @@ def open_pcd(path: Path) -> list[Scan]:
         least = 2 * header.columns if header.kind == "ascii" else header.record_bytes
         if header.points * least > left + (header.kind == "ascii"):  # the last row may lack its line end
             raise _truncated(path, f"{left // least} points at most", f"the {header.points} declared")
+        if header.kind == "binary":
+            file.seek(header.start + header.points * header.record_bytes)
+            check_end(file, path, header.record_bytes, "points")
         return [(AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header)]
 
 

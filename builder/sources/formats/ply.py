@@ -12,12 +12,14 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.process.interrupts import check_interrupt
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, stack_channels, whole_bytes
 from ..common.scan import (
     INTENSITY_NAMES,
     Scan,
     ScanBlock,
     SeekableScan,
+    check_end,
     library_errors,
     read_records,
     reader_library,
@@ -27,6 +29,8 @@ from ..common.text_rows import LONGEST_LINE, number_rows
 
 # Maximum bytes of a header. A real one has a few hundred bytes.
 LONGEST_HEADER = 1 << 20
+# Bytes of elements with lists read at a time.
+LISTS_BYTES = 1 << 16
 
 
 class _Header(NamedTuple):
@@ -37,7 +41,9 @@ class _Header(NamedTuple):
     start: int  # byte offset of the body
     skip: int  # size of the data before the vertices: bytes in a binary file, lines in an ASCII one
     lines: int  # number of header lines
+    behind: int  # number of rows after the vertices in an ASCII file
     ascii: bool
+    order: str  # byte order of a binary file: "<" or ">"
     intensity: str | None  # the property's name
     rgb: tuple[str, ...]  # names of red, green and blue, or ()
     classification: str | None
@@ -81,8 +87,6 @@ class AsciiPly(Scan):
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header = self._header
-        if not header.points:
-            return
         # Rows become float64 records with the vertex's property names, like the records of a binary
         # file.
         names = header.record.names or ()
@@ -98,6 +102,7 @@ class AsciiPly(Scan):
                 delimiter=None,
                 first_line=header.lines + header.skip + 1,
                 limit=header.points,
+                behind=header.behind,
             ):
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
@@ -131,13 +136,68 @@ def _as_declared(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
 def open_ply(path: Path) -> list[Scan]:
     """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
-        header = _read_header(file, path)
+        header, later = _read_header(file, path)
         least = 2 * len(header.record.names or ()) if header.ascii else header.record.itemsize
         left = path.stat().st_size - header.start - (0 if header.ascii else header.skip)
         # The last ASCII row may lack its line end; allow one byte for it.
         if header.points * least > left + header.ascii:
             raise _truncated(path, max(0, left // least), header.points)
+        if not header.ascii:
+            size = header.record.itemsize
+            file.seek(header.start + header.skip + header.points * size)
+            for element, count in later:
+                _skip_element(file, path, element, count, header.order)
+            check_end(file, path, size, "elements")
         return [(AsciiPly if header.ascii else BinaryPly)(path, header)]
+
+
+def _skip_element(file: BinaryIO, path: Path, element: Any, count: int, order: str) -> None:
+    """Advance a binary file past an element of plyfile. Raises ScanError where the file is shorter.
+
+    A vertex count that is too small makes vertices the first bytes of the next element, a face for
+    instance, whose lists then end elsewhere than the file.
+    """
+    at, size = file.tell(), file.seek(0, 2)
+    # Of each list: bytes of fixed size before its length, type of the length, bytes of an item.
+    lists: list[tuple[int, np.dtype[Any], int]] = []
+    fixed = 0
+    for item in element.properties:
+        if hasattr(item, "list_dtype"):
+            length, value = map(np.dtype, item.list_dtype(order))
+            lists.append((fixed, length, value.itemsize))
+            fixed = 0
+        else:
+            fixed += np.dtype(item.dtype(order)).itemsize
+    if not lists:
+        at += count * fixed
+        count = 0
+    begin, data = at, b""
+    for number in range(count):
+        if not number % 4096:
+            check_interrupt()
+        for before, kind, width in lists:
+            at += before
+            past = at + kind.itemsize - begin
+            if past > len(data):
+                file.seek(at)
+                begin, data, past = at, file.read(LISTS_BYTES), kind.itemsize
+            if past > len(data):
+                at = size + 1
+                break
+            # A byte, the usual type of a length, needs no conversion: 0.1 us per face.
+            held = data[past - 1] if kind.itemsize == 1 else np.frombuffer(data, kind, 1, at - begin)[0]
+            at += kind.itemsize + max(0, int(held)) * width
+        at += fixed
+        if at > size:
+            break
+    if at > size:
+        raise scan_error(
+            path,
+            f"element {element.name!r} that ends at byte {at} of {size}",
+            "all elements that its header declares",
+            "fetch the file again: it is truncated, or a count in its header is damaged",
+        )
+    file.seek(at)
 
 
 def _truncated(path: Path, found: int, declared: int) -> Exception:
@@ -149,8 +209,11 @@ def _truncated(path: Path, found: int, declared: int) -> Exception:
     )
 
 
-def _read_header(file: BinaryIO, path: Path) -> _Header:
-    """Read and check the header; leaves the file position at the start of the body."""
+def _read_header(file: BinaryIO, path: Path) -> tuple[_Header, list[tuple[Any, int]]]:
+    """Read and check the header; leaves the file position at the start of the body.
+
+    Returns the elements of plyfile after the vertices, too, each with its count.
+    """
     lines: list[str] = []
     counts: list[int] = []
     while not lines or lines[-1] != "end_header":
@@ -179,7 +242,8 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
             path, f"elements: {found}", "an element 'vertex'", "check that this is a PLY of points"
         )
     skip = 0
-    for element, count in zip(ply, counts, strict=True):
+    elements = list(zip(ply, counts, strict=True))
+    for place, (element, count) in enumerate(elements):
         lists = any(isinstance(item, plyfile.PlyListProperty) for item in element.properties)
         if lists and (element.name == "vertex" or not ply.text):
             raise scan_error(
@@ -202,7 +266,10 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
         )
     intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
     colours, of_class = find_columns(record.names)
-    return _Header(
-        record, count, start, skip, len(lines), ply.text, intensity,
-        tuple(record.names[at] for at in colours), None if of_class is None else record.names[of_class],
+    later = elements[place + 1 :]
+    header = _Header(
+        record, count, start, skip, len(lines), sum(rows for _, rows in later), ply.text, ply.byte_order,
+        intensity, tuple(record.names[at] for at in colours),
+        None if of_class is None else record.names[of_class],
     )  # fmt: skip
+    return header, later

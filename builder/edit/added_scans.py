@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from ..passes.spool_pass import SpoolUnit, run_points, spool_range
 from ..passes.survey_pass import Survey, hash_file, join_ranges, ranges, survey_range, unopened_survey
 from ..sources.coincident_scans import is_one_position
 from ..sources.common.scan import Scan
-from ..sources.scan_files import InputFile
+from ..sources.scan_files import InputFile, open_scans
 from ..spool.spool import Spool
 from .archive_change import Change, scan_name
 
@@ -145,15 +146,22 @@ def source_of(survey: Survey) -> Source:
 def no_longer_unknown(header: Header, surveys: Sequence[Survey]) -> Header:
     """Return the header without the unknown regions of scans that are added now.
 
-    A build had left these scans out. They are matched by path.
+    A build had left these scans out. They are matched by path. The region of a file that could not
+    be opened stays until all scans in it are in the archive.
     """
     added = {(os.path.realpath(s.path), s.scan.index) for s in surveys if s.scan is not None}
+    there = {(os.path.realpath(s.path), s.index) for s in header.sources if not s.fault}
     files = {path for path, _ in added}
+
+    @cache
+    def is_complete(path: str) -> bool:
+        return path in files and {(path, scan.index) for scan in open_scans(Path(path))} <= added | there
+
     sources, gone = [], set()
     for source in header.sources:
         path = os.path.realpath(source.path)
         # The entry of a file that could not be opened stands for all scans in it.
-        here = (path, source.index) in added or (not source.format and path in files)
+        here = (path, source.index) in added if source.format else is_complete(path)
         if source.unknown is not None and here:
             gone.add(source.unknown)
             fault = f"{scan_name(source)}: left out at first, added in generation {header.generation + 1}"

@@ -25,8 +25,8 @@ from ..sources.common.colours import brightest
 from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
 from ..sources.scan_files import InputFile
 
-# A header's bounds are trusted if no point lies farther outside than this [m], which allows for
-# rounded bounds.
+# A header's bounds may be rounded: they are trusted if no point lies farther outside than this [m],
+# and grow by it where they stand for points that cannot be read.
 BOUNDS_WITHIN = 0.01
 
 
@@ -187,7 +187,8 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
         if count
         else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     )
-    nothing_lost = count == 0 and not_finite == 0
+    lost = not_finite + sum(part.dropped.get(NOT_FINITE, 0) for part in parts)
+    nothing_lost = count == 0 and lost == 0
     region = None if count or nothing_lost else _region(scan, low, high)
     return Survey(
         scan, scan.path, digest, count, low, high, not_finite, fault, region, nothing_lost, tuple(parts)
@@ -203,20 +204,24 @@ def unopened_survey(path: Path, fault: str, region: NDArray[np.float64] | None =
     if not fault:
         fault = f"{path}: holds no scan, expected at least one: leave it out"
         return Survey(None, path, "", 0, none, none, 0, fault, None, empty=True)
-    return Survey(None, path, "", 0, none, none, 0, fault, region)
+    return Survey(None, path, "", 0, none, none, 0, fault, None if region is None else _grown(region))
 
 
 def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return where a truncated scan may have had points: its header's bounds and the points read.
+    """Return where a scan with a fault may have had points: the bounds that its header declares.
 
     The result is None, not known, if there are no such bounds, or if a point read lies outside
     them, which shows that they are wrong.
     """
     if scan.bounds is None:
         return None
-    if (low < scan.bounds[0] - BOUNDS_WITHIN).any() or (high > scan.bounds[1] + BOUNDS_WITHIN).any():
-        return None
-    return np.stack([np.minimum(scan.bounds[0], low), np.maximum(scan.bounds[1], high)])
+    region = _grown(scan.bounds)
+    return None if (low < region[0]).any() or (high > region[1]).any() else region
+
+
+def _grown(bounds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a header's bounds (2, 3), grown by what their rounding may have cut off."""
+    return np.stack([bounds[0] - BOUNDS_WITHIN, bounds[1] + BOUNDS_WITHIN])
 
 
 def choose_lattice(surveys: list[Survey], config: BuildConfig) -> tuple[Lattice, str]:

@@ -93,8 +93,18 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
     A folder's files are sorted by path; the order does not depend on the file system. They include
     files of formats that open_scans() refuses. Files given by name keep their position, whatever
     their suffix. Links to folders below a folder are not followed.
-    Raises ScanError for a path that does not exist and for a folder without scan files.
+    Raises ScanError for a path that does not exist, for a folder that cannot be listed and for one
+    without scan files.
     """
+
+    def refuse(error: OSError) -> None:
+        raise scan_error(
+            Path(error.filename),
+            f"a folder that cannot be listed ({error.strerror})",
+            "to read all scans below it",
+            "allow it to be read, or name the other folders",
+        )
+
     files: list[Path] = []
     for path in map(Path, paths):
         _check_exists(path)
@@ -103,7 +113,7 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
             continue
         below = sorted(
             Path(folder, name)
-            for folder, _, names in os.walk(path)
+            for folder, _, names in os.walk(path, onerror=refuse)
             for name in names
             if Path(name).suffix.lower() in _IN_FOLDERS | UNSUPPORTED
         )
@@ -310,7 +320,8 @@ def _open_input(path: Path, entries: list[ScanEntry] | None, spacing: float | No
         for entry in entries:
             listed = scans_spaced(METRES[entry.units] * entry.scale)
             if entry.index >= len(listed):
-                raise ScanError(_missing_text(entry, len(listed)))
+                # The bounds in the file are not those of a scan that it has lost.
+                return InputFile(path, [], _missing_text(entry, len(listed)))
             scan = place_scan(
                 listed[entry.index], pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
             )

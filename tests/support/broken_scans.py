@@ -156,9 +156,12 @@ SEEDS: dict[str, Callable[[Path, np.ndarray], object]] = {
 }
 
 
-def write_seeds(folder: Path) -> dict[str, bytes]:
-    """Return all valid files: name -> content. They are also written below `folder`, which must exist."""
-    xyz = np.random.default_rng(12).uniform(-5, 5, (COUNT, 3)).round(3)
+def write_seeds(folder: Path, count: int = COUNT) -> dict[str, bytes]:
+    """Return all valid files: name -> content. They are also written below `folder`, which must exist.
+
+    count: of points, a multiple of 6.
+    """
+    xyz = np.random.default_rng(12).uniform(-5, 5, (count, 3)).round(3)
     content = {}
     for name, write in SEEDS.items():
         write(folder / name, xyz)

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ BLOCK_BYTES = 64 << 20
 
 # Bytes of a file hashed, or searched for other bytes than zero, per read.
 HASHED_BYTES = 1 << 20
+
+# Bytes that may follow the last record of a binary file: zeros, blanks, and the end of a text in DOS.
+BLANKS = b"\0 \t\r\n\x1a"
 
 # Drop reason of points that are not finite or lie beyond MAX_COORDINATE.
 NOT_FINITE = "not finite"
@@ -225,28 +228,23 @@ def read_records(
         yield buffer[:wanted]
 
 
-def check_end(file: BufferedReader, path: Path, record_bytes: int, what: str) -> None:
-    """Refuse a file in which at least one more record follows those that its header declares.
+def check_end(file: BinaryIO, path: Path, what: str) -> None:
+    """Refuse a file that continues after the records that its header declares.
 
-    A count that is too small, or 0, would leave out the points behind it without notice. Less than
-    a record may follow, and any number of zeros: some writers fill the last page with them.
+    A count that is too small, or 0, would leave out the points behind it without notice. Zeros and
+    blanks may follow: some writers fill the last page with zeros, others end it as a text.
 
     file: at the end of the declared records.  what: plural noun for these, used in the message.
     Raises ScanError.
     """
-    begin = file.tell()
-    left = file.seek(0, 2) - begin
-    if left < record_bytes:
-        return
-    file.seek(begin)
     while data := file.read(HASHED_BYTES):
         check_interrupt()
-        if data.strip(b"\0"):
+        if data.strip(BLANKS):
             raise scan_error(
                 path,
-                f"{left} bytes behind the {what} that its header declares",
-                f"fewer than the {record_bytes} of another one, or zeros",
-                "fetch the file again: the count in its header is damaged",
+                f"data behind the {what} that its header declares",
+                "the end of the file",
+                "fetch the file again, the count in its header may be damaged",
             )
 
 

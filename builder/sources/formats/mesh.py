@@ -89,7 +89,7 @@ def open_stl(path: Path) -> list[Scan]:
         raise _truncated_stl(path, f"{held} triangles at most", f"the {triangles} its header declares")
     with library_errors(path), path.open("rb") as file:
         file.seek(STL_HEADER_BYTES + triangles * STL_TRIANGLE.itemsize)
-        check_end(file, path, STL_TRIANGLE.itemsize, "triangles")
+        check_end(file, path, "triangles")
     return [BinaryStl(path, triangles)]
 
 

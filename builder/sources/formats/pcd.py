@@ -216,7 +216,7 @@ def open_pcd(path: Path) -> list[Scan]:
             raise _truncated(path, f"{left // least} points at most", f"the {header.points} declared")
         if header.kind == "binary":
             file.seek(header.start + header.points * header.record_bytes)
-            check_end(file, path, header.record_bytes, "points")
+            check_end(file, path, "points")
         return [(AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header)]
 
 

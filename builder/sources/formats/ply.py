@@ -147,7 +147,7 @@ def open_ply(path: Path) -> list[Scan]:
             file.seek(header.start + header.skip + header.points * size)
             for element, count in later:
                 _skip_element(file, path, element, count, header.order)
-            check_end(file, path, size, "elements")
+            check_end(file, path, "elements")
         return [(AsciiPly if header.ascii else BinaryPly)(path, header)]
 
 
@@ -242,8 +242,9 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[_Header, list[tuple[Any, i
             path, f"elements: {found}", "an element 'vertex'", "check that this is a PLY of points"
         )
     skip = 0
-    elements = list(zip(ply, counts, strict=True))
-    for place, (element, count) in enumerate(elements):
+    later = list(zip(ply, counts, strict=True))
+    while later:
+        element, count = later.pop(0)
         lists = any(isinstance(item, plyfile.PlyListProperty) for item in element.properties)
         if lists and (element.name == "vertex" or not ply.text):
             raise scan_error(
@@ -266,7 +267,6 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[_Header, list[tuple[Any, i
         )
     intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
     colours, of_class = find_columns(record.names)
-    later = elements[place + 1 :]
     header = _Header(
         record, count, start, skip, len(lines), sum(rows for _, rows in later), ply.text, ply.byte_order,
         intensity, tuple(record.names[at] for at in colours),

@@ -75,7 +75,7 @@ def test_points_that_are_all_unusable_were_somewhere(tmp_path: Path) -> None:
     assert "holds no usable point, expected at least one" in survey.fault
     assert (survey.empty, survey.region) == (False, None)
     scan.bounds = np.array([[0.0, 0, 0], [1.0, 1, 1]])
-    assert np.array_equal(survey_scan(scan).region, scan.bounds)
+    assert np.array_equal(survey_scan(scan).region, [[-0.01] * 3, [1.01] * 3])
 
 
 def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_a_scan_that_breaks_off_may_have_covered_header_and_points(tmp_path: Pat
     scan.bounds = np.array([low + 0.001, high + 9.0])  # rounded, but not by more
     region = survey_scan(scan).region
     assert region is not None
-    assert np.array_equal(region, [low, high + 9.0])
+    assert np.array_equal(region, [low + 0.001 - 0.01, high + 9.0 + 0.01])
     scan.bounds = np.array([low + 0.5, high + 9.0])
     assert survey_scan(scan).region is None, "a point lies outside: the header's bounds are wrong"
 

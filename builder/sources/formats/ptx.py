@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import MAX_COORDINATE
 from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
 from ..common.scan import Scan, library_errors, scan_error
-from ..common.text_rows import LONGEST_LINE, is_number
+from ..common.text_rows import LONGEST_LINE, is_number, open_text_file
 
 # Numbers in each header line after the two lines of the grid's size.
 HEAD = (3, 3, 3, 3, 4, 4, 4, 4)
@@ -27,7 +27,7 @@ def open_ptx(path: Path) -> list[Scan]:
     Reads the whole file to find the scans (counted_rows.py).
     """
     scans: list[Scan] = []
-    with library_errors(path), path.open("rb") as file:
+    with library_errors(path), open_text_file(path) as file:
         text, line = next_line(file, 1)
         while text:
             if len(scans) == MAX_SCANS:
@@ -37,14 +37,14 @@ def open_ptx(path: Path) -> list[Scan]:
             pose = _pose(file, path, line + 2)
             line += 2 + len(HEAD)
             start, count = file.tell(), columns * rows
-            fields = skip_rows(file, path, len(scans), count, line)
+            fields, after = skip_rows(file, path, len(scans), count, line)
             scans.append(
                 CountedRows(
                     path, "ptx", len(scans), count, start=start, line=line, columns=fields, pose=pose,
                     zeros_are_no_return=True,
                 )
             )  # fmt: skip
-            text, line = next_line(file, line + count)
+            text, line = next_line(file, after)
     if not scans:
         raise scan_error(path, "blank lines", "the header of a scan", "fetch the file again")
     return scans

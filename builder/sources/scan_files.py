@@ -30,6 +30,8 @@ from .scan_warnings import ScanFacts, find_warnings
 from .surface_samples import SurfaceSamples
 
 _FORMATS = {row.suffix: row for row in FORMATS}
+# How the names of AppleDouble files begin: macOS keeps a file's attributes in them.
+COMPANION = "._"
 _IN_FOLDERS = frozenset(row.suffix for row in FORMATS if row.in_folders)
 
 
@@ -38,12 +40,14 @@ class InputFile(NamedTuple):
 
     region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None:
     not known.
+    note: about the search of the folder whose first file this is, or "".
     """
 
     path: Path
     scans: list[Scan]
     fault: str = ""
     region: NDArray[np.float64] | None = None
+    note: str = ""
 
 
 def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
@@ -93,20 +97,27 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
     A folder's files are sorted by path; the order does not depend on the file system. They include
     files of formats that open_scans() refuses. Files given by name keep their position, whatever
     their suffix. Links to folders below a folder are not followed.
+    Files that macOS keeps beside others on foreign disks ("._name.las") are skipped in folders.
     Raises ScanError for a path that does not exist and for a folder without scan files.
     """
-    files: list[Path] = []
+    return [file for file, _ in _search(paths)]
+
+
+def _search(paths: Iterable[Path]) -> list[tuple[Path, str]]:
+    """Return the files of find_scan_files(), each with a note on the search of its folder, or ""."""
+    files: list[tuple[Path, str]] = []
     for path in map(Path, paths):
         _check_exists(path)
         if not path.is_dir():
-            files.append(path)
+            files.append((path, ""))
             continue
-        below = sorted(
+        found = sorted(
             Path(folder, name)
             for folder, _, names in os.walk(path)
             for name in names
             if Path(name).suffix.lower() in _IN_FOLDERS | UNSUPPORTED
         )
+        below = [file for file in found if not file.name.startswith(COMPANION)]
         if not below:
             raise scan_error(
                 path,
@@ -114,7 +125,9 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
                 f"files ending in {' '.join(sorted(_IN_FOLDERS))}",
                 "check the folder's name, or name its files",
             )
-        files += below
+        skipped = [file for file in found if file.name.startswith(COMPANION)]
+        note = f"{path}: {len(skipped)} files of macOS skipped, {skipped[0].name} first" if skipped else ""
+        files += zip(below, [note, *[""] * len(below)], strict=False)
     return files
 
 
@@ -154,20 +167,22 @@ def inspect_scans(
     the list's use, units, scale, up, pose and crs. Raise ScanError for a path that does not exist
     and a folder without scans, BadRequestError for a file that is named twice.
     """
-    inputs: list[tuple[Path, list[ScanEntry] | None]] = []
+    inputs: list[tuple[Path, list[ScanEntry] | None, str]] = []
     for path in map(Path, paths):
         if path.suffix.lower() == LIST_SUFFIX and path.is_file():
-            inputs += _by_file(read_scan_list(path)).items()
+            inputs += [(file, listed, "") for file, listed in _by_file(read_scan_list(path)).items()]
         else:
-            inputs += [(file, None) for file in find_scan_files([path])]
-    _check_once((path, entry.index) for path, listed in inputs for entry in listed or [ScanEntry(path)])
+            inputs += [(file, None, note) for file, note in _search([path])]
+    _check_once((path, entry.index) for path, listed, _ in inputs for entry in listed or [ScanEntry(path)])
     progress = progress or Silent()
     progress.start("inspect", len(inputs), "files")
     entries: list[ScanEntry] = []
     numbers: list[int] = []
     facts: list[ScanFacts] = []
-    for path, listed in inputs:
+    for path, listed, note in inputs:
         found, scans = _inspect_file(path, with_sha256)
+        if note:
+            found[0] = replace(found[0], warnings=(note, *found[0].warnings))
         if listed is not None:
             found, scans = _as_listed(listed, found, scans)
         for number, (scan, entry) in enumerate(zip(scans, found, strict=False), len(entries)):
@@ -253,7 +268,7 @@ def open_input_files(
     found: list[InputFile] = []
     for path in map(Path, paths):
         if path.suffix.lower() != LIST_SUFFIX or path.is_dir():
-            found += [_open_input(file, None, spacing) for file in find_scan_files([path])]
+            found += [_open_input(file, None, spacing)._replace(note=note) for file, note in _search([path])]
             continue
         used = [entry for entry in read_scan_list(path) if entry.use]
         if not used:

@@ -34,8 +34,9 @@ BLOCK_BYTES = 64 << 20
 # Bytes of a file hashed per read.
 HASHED_BYTES = 1 << 20
 
-# Drop reason of points that are not finite or lie beyond MAX_COORDINATE.
+# Drop reasons of points that are not finite, and of those that lie beyond MAX_COORDINATE.
 NOT_FINITE = "not finite"
+BEYOND = "beyond 1e9 m"
 
 # Drop reason of directions in which the scanner measured nothing.
 NO_RETURN = "no return"
@@ -102,6 +103,7 @@ class Scan(ABC):
     columns: columns that the points have besides coordinates: "intensity", "rgb", "classification".
     wanted: columns, of the last two, that blocks() delivers; set before a scan is read.
     fault: error found in this scan's header while other scans of the file are readable; or "".
+    notes: what the reader assumed where the header is wrong, one line each; they become warnings.
     """
 
     seekable = False
@@ -111,6 +113,7 @@ class Scan(ABC):
     columns: frozenset[str] = frozenset()
     wanted: frozenset[str] = frozenset()
     fault = ""
+    notes: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -317,7 +320,8 @@ def quaternion_pose(
 ) -> NDArray[np.float64]:
     """Return the pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m].
 
-    A part that is None becomes the identity. index: number of the scan, for the message.
+    A part that is None becomes the identity. So does a rotation of 0 0 0 0, which programs write that
+    know none, see `zero_rotation_note`. index: number of the scan, for the message.
     Raises ScanError for values that form no pose.
     """
     pose = np.eye(4)
@@ -330,7 +334,7 @@ def quaternion_pose(
             "four and three finite numbers",
             "register the scan again",
         )
-    if None not in quaternion:
+    if None not in quaternion and any(quaternion):
         w, x, y, z = (float(number or 0.0) for number in quaternion)
         length = np.sqrt(w * w + x * x + y * y + z * z)
         if not abs(length - 1.0) <= QUATERNION_SLACK:
@@ -349,6 +353,13 @@ def quaternion_pose(
     if None not in translation:
         pose[:3, 3] = [float(number or 0.0) for number in translation]
     return pose
+
+
+def zero_rotation_note(path: Path, index: int, rotation: Sequence[float | None]) -> tuple[str, ...]:
+    """Return the note about a scan whose rotation (a quaternion, or a matrix in one row) is zero, or ()."""
+    if None in rotation or any(rotation):
+        return ()
+    return (f"{path}: scan {index} has a rotation of zeros, read as no rotation: check how the scan lies",)
 
 
 def sha256_of(path: Path) -> str:

@@ -26,6 +26,7 @@ from ..common.scan import (
     quaternion_pose,
     reader_library,
     scan_error,
+    zero_rotation_note,
 )
 from .e57_xml import check_e57, check_xml, xml_of
 
@@ -229,7 +230,9 @@ def _open_scan(path: Path, index: int, node: Any) -> Scan:
             f"at most the {8 * path.stat().st_size} bits of the file",
             "fetch the file again, it is truncated or damaged",
         )
-    return E57Scan(path, index, count, pose, _bounds(numbers, pose), fields)
+    scan = E57Scan(path, index, count, pose, _bounds(numbers, pose), fields)
+    scan.notes = zero_rotation_note(path, index, [numbers[name] for name in _QUATERNION])
+    return scan
 
 
 def _colour_limits(node: Any, prototype: Any) -> tuple[tuple[str, float, float], ...]:

@@ -128,7 +128,7 @@ def build_archive(
             with Archive(target) as archive:
                 header, voxels, shards = archive.header, len(archive.voxels), archive.shard_count()
             facts = [ScanFacts(scan) for item in inputs for scan in item.scans]
-            found = _warn(facts, config, warn)
+            found = _warn(inputs, facts, config, warn)
             return _summary(build, header, inputs, voxels, shards, begin, found, already=True)
         check_target(target, config.overwrite)
         with build_directory(target, what, fresh=config.fresh) as build_dir:
@@ -153,7 +153,7 @@ def _build(
         build_dir.staffed = True
         surveys, faulty = survey_scans(inputs, about, build_dir, build)
         facts = [ScanFacts(s.scan, np.stack([s.low, s.high]), s.count) for s in surveys if s.scan is not None]
-        found = _warn(facts, config, warn)
+        found = _warn(inputs, facts, config, warn)
         lattice, lattice_source = choose_lattice(surveys, config)
         _check_request(surveys, lattice, config)
         build_dir.surveyed = True
@@ -197,10 +197,14 @@ def _build(
 
 
 def _warn(
-    facts: Sequence[ScanFacts], config: BuildConfig, warn: Callable[[str], None] | None
+    inputs: Sequence[InputFile],
+    facts: Sequence[ScanFacts],
+    config: BuildConfig,
+    warn: Callable[[str], None] | None,
 ) -> tuple[str, ...]:
     """Return the warnings about the scans, each of which is also passed to `warn`."""
-    found = tuple(warning.text for warning in find_warnings(facts, config.radius))
+    notes = [item.note for item in inputs if item.note]
+    found = (*notes, *(warning.text for warning in find_warnings(facts, config.radius)))
     if warn is not None:
         for text in found:
             warn(text)

@@ -77,7 +77,7 @@ def survey_added(change: Change, inputs: Sequence[InputFile], wanted: AddOptions
     if faults := [survey.fault for survey in surveys if survey.fault]:
         raise ScanError("\n  ".join(faults))
     if wanted.strict and (unclean := [survey for survey in surveys if survey.unclean]):
-        found = (f"{survey.path}: {survey.unclean} points that are not finite" for survey in unclean)
+        found = (f"{survey.path}: {survey.unclean}" for survey in unclean)
         raise ScanError("\n  ".join(found) + ", expected none with --strict: clean the scan")
     return surveys
 

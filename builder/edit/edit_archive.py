@@ -76,7 +76,11 @@ def add_scans(
         counts = dict(zip(new.keys.tolist(), new.counts.tolist(), strict=True))
         boxes = {key: box_of(key, new) for key in counts}
         names = tuple(scan_name(source) for source in added)
-        return rebuild(change, ChangeSpec(header, names, boxes, places=places, added=counts), check_unchanged)
+        spec = ChangeSpec(header, names, boxes, places=places, added=counts)
+        summary = rebuild(change, spec, check_unchanged)
+        notes = [item.note for item in inputs if item.note]
+        notes += [note for survey in surveys if survey.scan is not None for note in survey.scan.notes]
+        return summary._replace(warnings=(*notes, *summary.warnings))
 
 
 def remove_scans(

@@ -22,8 +22,9 @@ from ..resume.kept_work import BuildDirectory, Work, run_unfinished
 from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
 from ..sources.common.colours import brightest
-from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
+from ..sources.common.scan import BEYOND, NOT_FINITE, Scan, SourceLattice, sha256_of
 from ..sources.scan_files import InputFile
+from ..sources.scan_warnings import beyond_text
 
 # A header's bounds may be rounded: they are trusted if no point lies farther outside than this [m],
 # and grow by it where they stand for points that cannot be read.
@@ -61,15 +62,23 @@ class Survey:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Return the points left out, by reason. These include non-finite and too distant ones."""
+        """Return the points left out, by reason."""
         found = sum((Counter(part.dropped) for part in self.parts), Counter[str]())
         found[NOT_FINITE] += self.not_finite
+        found[BEYOND] += self.beyond
         return {reason: count for reason, count in found.items() if count}
 
     @property
-    def unclean(self) -> int:
-        """Return how many points, or triangles of a sampled mesh, were left out as not finite."""
-        return self.dropped.get(NOT_FINITE, 0)
+    def unclean(self) -> str:
+        """Return how many points, or triangles of a sampled mesh, were left out by their coordinates, or ""."""
+        words = {NOT_FINITE: "that are not finite", BEYOND: BEYOND}
+        found = self.dropped
+        return " and ".join(f"{found[each]} points {words[each]}" for each in words if each in found)
+
+    @property
+    def beyond(self) -> int:
+        """Return how many points were left out because they are too far away."""
+        return sum(part.beyond for part in self.parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +87,7 @@ class Part:
 
     fault: why it could not be read to its end, or "".
     brightest: greatest channel of its colours, if they are kept.
+    beyond: points that are finite and too far away.  farthest: greatest coordinate of these [m].
     """
 
     start: int
@@ -89,6 +99,8 @@ class Part:
     dropped: dict[str, int]
     fault: str
     brightest: float = 0.0
+    beyond: int = 0
+    farthest: float = 0.0
 
 
 class RangeUnit(NamedTuple):
@@ -119,12 +131,17 @@ def ranges(scan: Scan, points: int) -> list[RangeUnit]:
 def survey_range(unit: RangeUnit) -> Part:
     """Read a range of a scan once. A faulty scan is a result; only transient errors are raised."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    count = seen = 0
-    fault, greatest = "", 0.0
+    count = seen = beyond = 0
+    fault, greatest, farthest = "", 0.0, 0.0
     try:
         for block in unit.scan.blocks(start=unit.start, stop=unit.stop):
-            count += usable_bounds(block.xyz, MAX_COORDINATE, low, high)
+            usable = usable_bounds(block.xyz, MAX_COORDINATE, low, high)
+            count += usable
             seen += len(block.xyz)
+            if usable < len(block.xyz):
+                finite = np.abs(block.xyz[np.isfinite(block.xyz).all(axis=1)])
+                beyond += len(finite) - usable
+                farthest = max(farthest, float(finite.max(initial=0.0)))
             greatest = max(greatest, brightest(block.rgb))
     except ScanError as error:
         raise_transient(error, unit.scan.path)
@@ -135,10 +152,12 @@ def survey_range(unit: RangeUnit) -> Part:
         count,
         tuple(low.tolist()),
         tuple(high.tolist()),
-        seen - count,
+        seen - count - beyond,
         dict(unit.scan.dropped),
         fault,
         greatest,
+        beyond,
+        farthest,
     )
 
 
@@ -182,12 +201,16 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
             False,
             tuple(parts),
         )
-    fault = (
-        ""
-        if count
-        else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
-    )
-    lost = not_finite + sum(part.dropped.get(NOT_FINITE, 0) for part in parts)
+    beyond = sum(part.beyond for part in parts)
+    if not count and beyond:
+        text = beyond_text(scan.units, max(part.farthest for part in parts))
+        others = f" and {not_finite:,} that are not finite" if not_finite else ""
+        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}".replace(
+            ", expected", f"{others}, expected", 1
+        )
+    elif not count:
+        fault = f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
+    lost = not_finite + beyond + sum(part.dropped.get(NOT_FINITE, 0) for part in parts)
     nothing_lost = count == 0 and lost == 0
     region = None if count or nothing_lost else _region(scan, low, high)
     return Survey(
@@ -341,9 +364,8 @@ def _check_surveys(
         )
     unclean = [s for s in good if s.unclean]
     if unclean and config.strict:
-        wrong = sum(s.unclean for s in unclean)
         raise ScanError(
-            f"{unclean[0].path}: {wrong} points that are not finite, expected none with --strict: clean the scan"
+            f"{unclean[0].path}: {unclean[0].unclean}, expected none with --strict: clean the scan"
         )
 
 

@@ -210,8 +210,9 @@ def sample_scene(
         extent=None if bounds is None else float((bounds[1] - bounds[0]).max()),
         assumed=tuple(assumed),
         packed=None if packed is None else packed.bytes_a_point,
-        warnings=tuple(
-            warning.text for warning in find_warnings([ScanFacts(scan) for scan in scans], config.radius)
+        warnings=(
+            *(item.note for item in inputs if item.note),
+            *(w.text for w in find_warnings([ScanFacts(scan) for scan in scans], config.radius)),
         ),
     )
 

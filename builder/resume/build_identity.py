@@ -12,7 +12,7 @@ from ...schemas.archive.index import Source
 from ...schemas.errors import BadRequestError, FormatError
 from ..config import BuildConfig
 from ..run.software_versions import software_versions
-from ..sources.common.scan import NOT_FINITE, Scan, sha256_of
+from ..sources.common.scan import BEYOND, NOT_FINITE, Scan, sha256_of
 from ..sources.scan_files import InputFile
 
 # Most differences that a message names.
@@ -149,7 +149,7 @@ def is_up_to_date(
         return False
     sources = header.sources
     lost = any(s.fault for s in sources) and not config.skip_bad
-    unclean = any(NOT_FINITE in s.skipped for s in sources) and config.strict
+    unclean = any({NOT_FINITE, BEYOND} & set(s.skipped) for s in sources) and config.strict
     if not config.is_identity(header.options) or header.generation or lost or unclean:
         return False
     asked = {

@@ -91,7 +91,7 @@ class PlacedScan(Scan):
             bounds=None if bounds is None else self._bounds(bounds),
         )
         self.units, self.up, self.crs, self.seekable = units, up, inner.crs, inner.seekable
-        self.columns = inner.columns
+        self.columns, self.notes = inner.columns, inner.notes
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         return self._read_range(block_points, 0, None)

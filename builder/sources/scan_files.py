@@ -30,6 +30,9 @@ from .scan_warnings import ScanFacts, find_warnings
 from .surface_samples import SurfaceSamples
 
 _FORMATS = {row.suffix: row for row in FORMATS}
+# How the names of AppleDouble files begin: macOS keeps a file's attributes in them.
+COMPANION = "._"
+_APPLE_DOUBLE = b"\x00\x05\x16\x07"
 _IN_FOLDERS = frozenset(row.suffix for row in FORMATS if row.in_folders)
 
 
@@ -38,12 +41,14 @@ class InputFile(NamedTuple):
 
     region: (2, 3) world [m], where the points of a file that cannot be opened may have been; None:
     not known.
+    note: about the search of the folder whose first file this is, or "".
     """
 
     path: Path
     scans: list[Scan]
     fault: str = ""
     region: NDArray[np.float64] | None = None
+    note: str = ""
 
 
 def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
@@ -93,9 +98,15 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
     A folder's files are sorted by path; the order does not depend on the file system. They include
     files of formats that open_scans() refuses. Files given by name keep their position, whatever
     their suffix. Links to folders below a folder are not followed.
+    Files that macOS keeps beside others on foreign disks ("._name.las") are skipped in folders.
     Raises ScanError for a path that does not exist, for a folder that cannot be listed and for one
     without scan files.
     """
+    return [file for file, _ in _search(paths)]
+
+
+def _search(paths: Iterable[Path]) -> list[tuple[Path, str]]:
+    """Return the files of find_scan_files(), each with a note on the search of its folder, or ""."""
 
     def refuse(error: OSError) -> None:
         raise scan_error(
@@ -105,18 +116,20 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
             "allow it to be read, or name the other folders",
         )
 
-    files: list[Path] = []
+    files: list[tuple[Path, str]] = []
     for path in map(Path, paths):
         _check_exists(path)
         if not path.is_dir():
-            files.append(path)
+            files.append((path, ""))
             continue
-        below = sorted(
+        found = sorted(
             Path(folder, name)
             for folder, _, names in os.walk(path, onerror=refuse)
             for name in names
             if Path(name).suffix.lower() in _IN_FOLDERS | UNSUPPORTED
         )
+        skipped = [file for file in found if _is_companion(file)]
+        below = [file for file in found if file not in skipped]
         if not below:
             raise scan_error(
                 path,
@@ -124,8 +137,20 @@ def find_scan_files(paths: Iterable[Path]) -> list[Path]:
                 f"files ending in {' '.join(sorted(_IN_FOLDERS))}",
                 "check the folder's name, or name its files",
             )
-        files += below
+        note = f"{path}: {len(skipped)} files of macOS skipped, {skipped[0].name} first" if skipped else ""
+        files += zip(below, [note, *[""] * len(below)], strict=False)
     return files
+
+
+def _is_companion(path: Path) -> bool:
+    """Return whether a file holds only attributes of another; its name alone does not tell.
+
+    A file that cannot be read is none: opening it reports the reason.
+    """
+    try:
+        return path.name.startswith(COMPANION) and path.open("rb").read(4) == _APPLE_DOUBLE
+    except OSError:
+        return False
 
 
 def header_bounds(path: Path) -> NDArray[np.float64] | None:
@@ -164,20 +189,22 @@ def inspect_scans(
     the list's use, units, scale, up, pose and crs. Raise ScanError for a path that does not exist
     and a folder without scans, BadRequestError for a file that is named twice.
     """
-    inputs: list[tuple[Path, list[ScanEntry] | None]] = []
+    inputs: list[tuple[Path, list[ScanEntry] | None, str]] = []
     for path in map(Path, paths):
         if path.suffix.lower() == LIST_SUFFIX and path.is_file():
-            inputs += _by_file(read_scan_list(path)).items()
+            inputs += [(file, listed, "") for file, listed in _by_file(read_scan_list(path)).items()]
         else:
-            inputs += [(file, None) for file in find_scan_files([path])]
-    _check_once((path, entry.index) for path, listed in inputs for entry in listed or [ScanEntry(path)])
+            inputs += [(file, None, note) for file, note in _search([path])]
+    _check_once((path, entry.index) for path, listed, _ in inputs for entry in listed or [ScanEntry(path)])
     progress = progress or Silent()
     progress.start("inspect", len(inputs), "files")
     entries: list[ScanEntry] = []
     numbers: list[int] = []
     facts: list[ScanFacts] = []
-    for path, listed in inputs:
+    for path, listed, note in inputs:
         found, scans = _inspect_file(path, with_sha256)
+        if note:
+            found[0] = replace(found[0], warnings=(note, *found[0].warnings))
         if listed is not None:
             found, scans = _as_listed(listed, found, scans)
         for number, (scan, entry) in enumerate(zip(scans, found, strict=False), len(entries)):
@@ -263,7 +290,7 @@ def open_input_files(
     found: list[InputFile] = []
     for path in map(Path, paths):
         if path.suffix.lower() != LIST_SUFFIX or path.is_dir():
-            found += [_open_input(file, None, spacing) for file in find_scan_files([path])]
+            found += [_open_input(file, None, spacing)._replace(note=note) for file, note in _search([path])]
             continue
         used = [entry for entry in read_scan_list(path) if entry.use]
         if not used:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 from ...schemas.process.new_file import new_file
+from ...schemas.process.text_encoding import decode_text
 from .placed_scan import METRES, TURNS
 
 LIST_SUFFIX = ".toml"
@@ -133,7 +134,7 @@ def read_scan_list(path: Path) -> list[ScanEntry]:
     path = Path(path)
     text = ""
     try:
-        text = path.read_bytes().decode()
+        text = decode_text(path.read_bytes())
         document = tomllib.loads(text)
     except (OSError, ValueError) as error:
         found = _long_number(text) or error

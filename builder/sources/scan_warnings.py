@@ -1,9 +1,10 @@
 """Warnings about scans that a build accepts although they are probably a mistake.
 
-`inspect`, `plan` and `build` report: a scan that is probably in millimetres, a gap between scans far
-larger than the scans, the mesh of an avatar beside scans, and a radius that does not fit the spacing
-of the points. The checks use the bounds of headers, and read a few points of a scan only if these
-do not suffice. A warning is one line and never an error.
+`inspect`, `plan` and `build` report: what a reader assumed (`Scan.notes`), a scan that is probably in
+millimetres or beyond the limit of coordinates, a gap between scans far larger than the scans, the
+mesh of an avatar beside scans, and a radius that does not fit the spacing of the points. The checks
+use the bounds of headers, and read a few points of a scan only if these do not suffice. A warning
+is one line and never an error.
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from ...schemas.archive.units import MAX_COORDINATE
 from ...schemas.errors import ScanError
 from .common.scan import Scan
+from .placed_scan import METRES
 
 # Points that are read of a scan without known bounds; and points whose closest points are searched.
 FIRST_POINTS, SAMPLE_POINTS = 1 << 13, 1 << 10
@@ -118,14 +120,14 @@ class ScanFacts:
     @cached_property
     def _first(self) -> NDArray[np.float64]:
         """Return the first points of the scan (n, 3) [m]; none if it cannot be read."""
-        return _points(self.scan, 0, FIRST_POINTS)
+        return _usable(_points(self.scan, 0, FIRST_POINTS))
 
     @property
     def _middle(self) -> NDArray[np.float64]:
         """Return points (n, 3) [m] that follow one another, from the middle of the scan if it can seek."""
         declared = self.scan.declared_count
         if self.scan.seekable and declared and declared > SAMPLE_POINTS:
-            return _points(self.scan, (declared - SAMPLE_POINTS) // 2, SAMPLE_POINTS)
+            return _usable(_points(self.scan, (declared - SAMPLE_POINTS) // 2, SAMPLE_POINTS))
         return self._first[-SAMPLE_POINTS:]
 
 
@@ -135,14 +137,18 @@ def _points(scan: Scan, start: int, count: int) -> NDArray[np.float64]:
     stop = min(start + count, scan.declared_count) if scan.seekable and scan.declared_count else None
     try:
         for block in scan.blocks(count, start if stop else 0, stop):
-            xyz = block.xyz[(np.abs(block.xyz) <= MAX_COORDINATE).all(axis=1)]
-            found.append(xyz[:left])
+            found.append(block.xyz[np.isfinite(block.xyz).all(axis=1)][:left])
             left -= len(found[-1])
             if left <= 0:
                 break
     except ScanError:
         pass  # the build reports it
     return np.concatenate(found)
+
+
+def _usable(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points of (n, 3) that an archive can hold."""
+    return xyz[(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)]
 
 
 def closest_distances(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -167,6 +173,8 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
     """
     used = [(number, each) for number, each in enumerate(facts) if not each.scan.fault]
     found = [
+        *(ScanWarning(number, note) for number, each in used for note in each.scan.notes),
+        *_beyond_limit(used),
         *_wrong_units(used),
         *_gaps(used),
         *_avatars(used),
@@ -200,6 +208,31 @@ def _wrong_units(facts: _Numbered) -> list[ScanWarning]:
             )
         )
     return found
+
+
+def _beyond_limit(facts: _Numbered) -> list[ScanWarning]:
+    """Warn of scans without bounds whose first points are all beyond the limit of coordinates."""
+    found = []
+    for number, each in facts:
+        if each.box is None and len(points := _points(each.scan, 0, SAMPLE_POINTS)):
+            found.append(
+                ScanWarning(number, f"{each.name}: {beyond_text(each.scan.units, float(np.abs(points).max()))}")
+            )
+    return found
+
+
+def beyond_text(units: str, farthest: float) -> str:
+    """Return what is wrong with points beyond the limit of coordinates, and the likely unit.
+
+    units: read as.  farthest: greatest of their coordinates [m], taken from these units.
+    """
+    where = f"points beyond {MAX_COORDINATE:.0e} m".replace("e+0", "e")
+    if units == "m" and farthest * METRES["mm"] <= MAX_COORDINATE:
+        return (
+            f"{where}, expected all within it: the coordinates are probably in millimetres: write a list with "
+            '`solidcloud inspect`, set units = "mm" in it, and build the list'
+        )
+    return f"{where}, expected all within it: check its coordinates and their unit ({units})"
 
 
 def _gaps(facts: _Numbered) -> list[ScanWarning]:

@@ -1,5 +1,6 @@
 """Triangles of mesh files, OBJ, STL, PLY and GLB, and points spread over them."""
 
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .common.scan import NOT_FINITE, Scan, ScanBlock, library_errors, reader_library, scan_error
-from .common.text_rows import LONGEST_LINE, text_chunks
+from .common.text_rows import open_text_file, text_chunks
 from .formats.glb import GlbScan
+from .formats.ply import header_lines
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
 # sequence of this kind whose points keep farthest apart (Roberts 2018, "The unreasonable
@@ -31,7 +33,9 @@ LARGEST_MESH = 512 << 20
 
 # A face in an OBJ file, and in the header of a PLY file.
 _OBJ_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
-_PLY_FACE = re.compile(rb"element[ \t]+face[ \t]+0*[1-9]")
+_PLY_FACE = re.compile(r"element[ \t]+face[ \t]+0*[1-9]")
+# Letters of names and comments, which trimesh would decode -> "?".
+_ASCII = bytes(range(128)) + b"?" * 128
 
 
 class SurfaceSamples(Scan):
@@ -87,10 +91,7 @@ class SurfaceSamples(Scan):
 
     def _triangles(self) -> NDArray[np.float64]:
         """Return the corners of all triangles, (n, 3, 3). Raises ScanError."""
-        corners = (
-            self._vertices.triangles() if isinstance(self._vertices, GlbScan) else _by_trimesh(self.path)
-        )
-        # trimesh returns nothing for a file without faces, whether it has vertices or not.
+        corners = mesh_triangles(self._vertices)
         if not len(corners) and any(len(block.xyz) for block in self._vertices.blocks()):
             raise scan_error(
                 self.path, "vertices without faces", "a mesh to sample", "build it without --spacing"
@@ -117,6 +118,8 @@ def mesh_triangles(vertices: Scan) -> NDArray[np.float64]:
             )
         return corners.reshape(-1, 3, 3)
     if suffix in (".obj", ".ply") and _has_faces(path):
+        for _ in vertices.blocks():
+            pass  # checks that the file holds all its vertices, which trimesh does not
         with library_errors(path):
             return _by_trimesh(path)
     return np.empty((0, 3, 3))
@@ -124,15 +127,11 @@ def mesh_triangles(vertices: Scan) -> NDArray[np.float64]:
 
 def _has_faces(path: Path) -> bool:
     """Return whether an OBJ or PLY file has faces. Raises ScanError."""
-    with library_errors(path), path.open("rb") as file:
-        if path.suffix.lower() == ".obj":
+    with library_errors(path):
+        if path.suffix.lower() == ".ply":
+            return any(map(_PLY_FACE.match, header_lines(path)[0]))
+        with open_text_file(path) as file:
             return any(_OBJ_FACE.search(chunk) for _, chunk in text_chunks(file, path))
-        for line in iter(lambda: file.readline(LONGEST_LINE), b""):
-            if _PLY_FACE.match(line.strip()):
-                return True
-            if line.strip() == b"end_header":
-                break
-    return False
 
 
 def _check_size(path: Path) -> None:
@@ -148,14 +147,12 @@ def _check_size(path: Path) -> None:
 
 
 def _by_trimesh(path: Path) -> NDArray[np.float64]:
-    """Return the corners (n, 3, 3) of all triangles of an OBJ, STL or PLY file.
-
-    Raises ScanError.
-    """
+    """Return the corners (n, 3, 3) of all triangles of an OBJ or PLY file. Raises ScanError."""
     _check_size(path)
     trimesh = reader_library("trimesh", path)
     # With materials, trimesh would open any file that the OBJ names.
-    mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
+    kind = path.suffix.lower().removeprefix(".")
+    mesh = trimesh.load_mesh(_plain_mesh(path), file_type=kind, process=False, skip_materials=True)
     faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
     vertices = np.asarray(mesh.vertices, np.float64)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
@@ -166,6 +163,18 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
             "fetch the file again, it is truncated or damaged",
         )
     return np.asarray(vertices[faces], np.float64)
+
+
+def _plain_mesh(path: Path) -> io.BytesIO:
+    """Return an OBJ or PLY file without a byte order mark, and without letters that are not ASCII."""
+    if path.suffix.lower() == ".obj":
+        with open_text_file(path) as file:
+            return io.BytesIO(file.read().translate(_ASCII))
+    lines, start = header_lines(path)
+    is_text = any(line.split()[:2] == ["format", "ascii"] for line in lines)
+    with open_text_file(path) if is_text else path.open("rb") as file:
+        file.seek(start)
+        return io.BytesIO("".join(f"{line}\n" for line in lines).encode("ascii") + file.read())
 
 
 def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:

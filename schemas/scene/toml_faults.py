@@ -17,6 +17,7 @@ import msgspec
 from msgspec import inspect
 
 from ..errors import BadRequestError
+from ..process.text_encoding import decode_text
 
 _T = TypeVar("_T")
 
@@ -68,7 +69,7 @@ def load(text: bytes, where: str) -> dict[str, Any]:
     if len(text) > MAX_BYTES:
         raise BadRequestError(f"{where}: more than {MAX_BYTES:,} bytes: expected a scene file")
     try:
-        return tomllib.loads(_decoded(text))
+        return tomllib.loads(decode_text(text))
     except UnicodeDecodeError as error:
         line = text.count(b"\n", 0, error.start) + 1
         raise BadRequestError(f"{where}: line {line}: bytes that are not UTF-8: save it as UTF-8") from None
@@ -80,17 +81,12 @@ def load(text: bytes, where: str) -> dict[str, Any]:
         raise BadRequestError(f"{where}: nested too deeply") from None
 
 
-def _decoded(text: bytes) -> str:
-    """Decode a file's text without the byte order mark that some editors put in front."""
-    return text.decode("utf-8-sig")
-
-
 def toml_error(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
     """Return the error for a fault at a place of a file.
 
     text: the file's bytes, to find the line; None: no line.
     """
-    line = None if text is None else line_of(_decoded(text), place)
+    line = None if text is None else line_of(decode_text(text), place)
     at = f"line {line}: " if line else ""
     return BadRequestError(f"{where}: {at}{place}: {said}")
 

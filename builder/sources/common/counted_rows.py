@@ -1,9 +1,10 @@
 """Text blocks of rows whose count is declared before them, as in PTX and PTS files.
 
 Such a file does not state where its second block begins. Opening it therefore reads it once and
-counts line ends, in bounded memory (about 1 GB a second).
+counts lines, in bounded memory.
 """
 
+import re
 from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import check_interrupt
 from .colours import INTENSITY, RGB, whole_bytes
 from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
-from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, split_row
+from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, open_text_file, split_row
 
 # Bytes of the shortest row of three numbers, "0 0 0" and a line end. A declared count is checked
 # against the bytes left in the file.
 MIN_ROW_BYTES = 6
+# The end of a line before a blank line or a comment, which is no row.
+_NO_ROW = re.compile(rb"\n(?=[ \t\r]*(?:\n|#|//|;))")
 # Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
 # (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
 MAX_SCANS = 1 << 16
@@ -43,21 +46,20 @@ class CountedRows(Scan):
         """Describe a block of `count` rows.
 
         start, line: byte and line number of the first row.
-        columns: numbers in each row. With 4 or 7 columns the fourth is an intensity (x y z i, x y z
-        i r g b); with 6 it is red. Colours are from 0 to 255.
+        columns: numbers in each row, see `pts_columns`. Colours are from 0 to 255.
         """
         super().__init__(path, format, index=index, declared_count=count, pose=pose)
         self._start, self._line, self._columns = start, line, columns
         self._zeros_are_no_return = zeros_are_no_return
-        intensity, rgb = columns in (4, 7), columns in (6, 7)
-        self.columns = frozenset([INTENSITY] * intensity + [RGB] * rgb)
+        self._intensity, self._rgb = pts_columns(columns)
+        self.columns = frozenset([INTENSITY] * (self._intensity is not None) + [RGB] * bool(self._rgb))
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         count = self.declared_count or 0
         if not count:
             return
         seen = 0
-        with self.path.open("rb") as file:
+        with open_text_file(self.path) as file:
             file.seek(self._start)
             for rows in number_rows(
                 file, self.path, columns=self._columns, delimiter=None, first_line=self._line, limit=count
@@ -80,61 +82,78 @@ class CountedRows(Scan):
         xyz = apply_pose(self.pose, np.ascontiguousarray(rows[:, :3]))
         return ScanBlock(
             xyz,
-            rows[:, 3].astype(np.float32) if self._columns in (4, 7) else None,
-            whole_bytes(rows[:, self._columns - 3 :]) if self.delivers(RGB) else None,
+            None if self._intensity is None else rows[:, self._intensity].astype(np.float32),
+            whole_bytes(rows[:, self._rgb]) if self.delivers(RGB) else None,
         )
 
 
-def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> int:
-    """Advance the file past `count` rows; return the first row's number of columns, 0 without rows.
+def pts_columns(count: int) -> tuple[int | None, tuple[int, ...]]:
+    """Return the columns of the intensity, or None, and of red, green and blue, or (), in PTS and PTX.
+
+    count: numbers in a row. x y z i, x y z i r g b and x y z r g b are common. A fifth number has no
+    meaning of its own; of more than seven, only x, y and z are certain.
+    """
+    return 3 if count in (4, 5, 7) else None, (count - 3, count - 2, count - 1) if count in (6, 7) else ()
+
+
+def skip_rows(
+    file: BufferedReader, path: Path, index: int, count: int, first_line: int
+) -> tuple[int, int]:
+    """Advance the file past `count` rows; return the columns of the first one, and the next line's number.
 
     index: number of the scan, for messages.
     first_line: number of the line at the current file position.
+    Blank lines and comments are no rows (text_rows.py). Without rows there are 0 columns.
     Raises ScanError where there are fewer lines, or where the first row is not a point.
     """
     if not count:
-        return 0
+        return 0, first_line
     begin = file.tell()
     left = file.seek(0, 2) - begin
     file.seek(begin)
     if count * MIN_ROW_BYTES > left + 1:  # the last row may lack its line end
         raise _too_few(path, index, max(0, (left + 1) // MIN_ROW_BYTES), count)
-    raw = file.readline(LONGEST_LINE)
-    fields = split_row(raw.decode("latin-1"), None)
-    if len(fields) not in (3, 4, 6, 7) or not all(map(is_number, fields)):
+    while (raw := file.readline(LONGEST_LINE)) and not (fields := split_row(raw, None)):
+        first_line += 1
+    if not raw:
+        raise _too_few(path, index, 0, count)
+    if len(fields) < 3 or not all(map(is_number, fields)):
         raise scan_error(
             path,
-            f"line {first_line} is {' '.join(fields)[:60]!r}",
+            f"line {first_line} is {raw.decode('latin-1').strip()[:60]!r}",
             "x y z, optionally followed by an intensity, a colour or both",
             "check the program that wrote this file",
         )
-    wanted, last = count - 1, NEWLINE
+    wanted, line = count - 1, first_line + 1
     while wanted:
         check_interrupt()
+        begin = file.tell()
         data = file.read(CHUNK_BYTES)
+        data += file.readline(LONGEST_LINE)
         if not data:
-            # A last row without a line end counts too.
-            if wanted > 1 or last == NEWLINE:
-                raise _too_few(path, index, count - wanted, count)
-            break
-        found = data.count(NEWLINE)
+            raise _too_few(path, index, count - wanted, count)
+        # The last row may lack its line end. A match of _NO_ROW is the line end before such a line.
+        lines = NEWLINE + data + (b"" if data.endswith(NEWLINE) else NEWLINE)
+        others = [found.start() for found in _NO_ROW.finditer(lines)]
+        found = lines.count(NEWLINE) - 1 - len(others)
         if found >= wanted:
-            ends = np.flatnonzero(np.frombuffer(data, np.uint8) == NEWLINE[0])
-            file.seek(int(ends[wanted - 1]) + 1 - len(data), 1)
-            break
-        wanted, last = wanted - found, data[-1:]
-    return len(fields)
+            ends = np.flatnonzero(np.frombuffer(lines, np.uint8) == NEWLINE[0])
+            row_ends = ends[1:][~np.isin(ends[:-1], others)]
+            last = row_ends[wanted - 1]
+            file.seek(begin + min(int(last), len(data)))
+            return len(fields), line + int(np.searchsorted(ends, last))
+        wanted, line = wanted - found, line + lines.count(NEWLINE) - 1
+    return len(fields), line
 
 
 def next_line(file: BufferedReader, line: int) -> tuple[str, int]:
-    """Return the next non-blank line, stripped, and its number; "" at the end of the file.
+    """Return the next line, stripped, that is neither blank nor a comment, and its number.
 
-    line: number of the line at the current file position.
+    line: number of the line at the current file position. At the end of the file the text is "".
     """
     while raw := file.readline(LONGEST_LINE):
-        text = raw.decode("latin-1").strip()
-        if text:
-            return text, line
+        if split_row(raw, None):
+            return raw.decode("latin-1").strip(), line
         line += 1
     return "", line
 

@@ -31,14 +31,16 @@ BLOCK_POINTS = 1 << 18
 # (LAS) or a thousand properties (PLY); without this bound a block of them would take gigabytes.
 BLOCK_BYTES = 64 << 20
 
-# Bytes of a file hashed, or searched for other bytes than zero, per read.
+# Bytes of a file hashed per read; and searched for data behind the last record.
 HASHED_BYTES = 1 << 20
+SEARCHED_BYTES = 1 << 16
 
 # Bytes that may follow the last record of a binary file: zeros, blanks, and the end of a text in DOS.
 BLANKS = b"\0 \t\r\n\x1a"
 
-# Drop reason of points that are not finite or lie beyond MAX_COORDINATE.
+# Drop reasons of points that are not finite, and of those that lie beyond MAX_COORDINATE.
 NOT_FINITE = "not finite"
+BEYOND = "beyond 1e9 m"
 
 # Drop reason of directions in which the scanner measured nothing.
 NO_RETURN = "no return"
@@ -105,6 +107,7 @@ class Scan(ABC):
     columns: columns that the points have besides coordinates: "intensity", "rgb", "classification".
     wanted: columns, of the last two, that blocks() delivers; set before a scan is read.
     fault: error found in this scan's header while other scans of the file are readable; or "".
+    notes: what the reader assumed where the header is wrong, one line each; they become warnings.
     """
 
     seekable = False
@@ -114,6 +117,7 @@ class Scan(ABC):
     columns: frozenset[str] = frozenset()
     wanted: frozenset[str] = frozenset()
     fault = ""
+    notes: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -237,7 +241,7 @@ def check_end(file: BinaryIO, path: Path, what: str) -> None:
     file: at the end of the declared records.  what: plural noun for these, used in the message.
     Raises ScanError.
     """
-    while data := file.read(HASHED_BYTES):
+    while data := file.read(SEARCHED_BYTES):
         check_interrupt()
         if data.strip(BLANKS):
             raise scan_error(
@@ -340,7 +344,8 @@ def quaternion_pose(
 ) -> NDArray[np.float64]:
     """Return the pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m].
 
-    A part that is None becomes the identity. index: number of the scan, for the message.
+    A part that is None becomes the identity. So does a rotation of 0 0 0 0, which programs write that
+    know none, see `zero_rotation_note`. index: number of the scan, for the message.
     Raises ScanError for values that form no pose.
     """
     pose = np.eye(4)
@@ -353,7 +358,7 @@ def quaternion_pose(
             "four and three finite numbers",
             "register the scan again",
         )
-    if None not in quaternion:
+    if None not in quaternion and any(quaternion):
         w, x, y, z = (float(number or 0.0) for number in quaternion)
         length = np.sqrt(w * w + x * x + y * y + z * z)
         if not abs(length - 1.0) <= QUATERNION_SLACK:
@@ -372,6 +377,13 @@ def quaternion_pose(
     if None not in translation:
         pose[:3, 3] = [float(number or 0.0) for number in translation]
     return pose
+
+
+def zero_rotation_note(path: Path, index: int, rotation: Sequence[float | None]) -> tuple[str, ...]:
+    """Return the note about a scan whose rotation (a quaternion, or a matrix in one row) is zero, or ()."""
+    if None in rotation or any(rotation):
+        return ()
+    return (f"{path}: scan {index} has a rotation of zeros, read as no rotation: check how the scan lies",)
 
 
 def sha256_of(path: Path) -> str:

@@ -26,6 +26,7 @@ from ..common.scan import (
     quaternion_pose,
     reader_library,
     scan_error,
+    zero_rotation_note,
 )
 from .e57_xml import Section, check_e57, check_xml, checked_xml, record_sections, records_held, xml_of
 
@@ -245,7 +246,9 @@ def _open_scan(path: Path, index: int, node: Any, section: Section | None) -> Sc
             f"at most the {8 * path.stat().st_size} bits of the file",
             "fetch the file again, it is truncated or damaged",
         )
-    return E57Scan(path, index, count, pose, _bounds(numbers, pose), fields, section)
+    scan = E57Scan(path, index, count, pose, _bounds(numbers, pose), fields, section)
+    scan.notes = zero_rotation_note(path, index, [numbers[name] for name in _QUATERNION])
+    return scan
 
 
 def _colour_limits(node: Any, prototype: Any) -> tuple[tuple[str, float, float], ...]:

@@ -27,6 +27,7 @@ from ..common.scan import (
     library_errors,
     quaternion_pose,
     scan_error,
+    zero_rotation_note,
 )
 
 # Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
@@ -193,7 +194,10 @@ def open_glb(path: Path) -> list[Scan]:
     """Return the one scan of a GLB file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
         document, start, size = _read_header(file, path)
-        return [GlbScan(path, _Document(path, document, start, size).parts())]
+        resolved = _Document(path, document, start, size)
+        scan = GlbScan(path, resolved.parts())
+        scan.notes = resolved.notes
+        return [scan]
 
 
 def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int, int]:
@@ -211,7 +215,8 @@ def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int,
             f"{length} bytes with {words} of JSON in a file of {held}",
             f"at most the file's size, and at most {LONGEST_JSON} of JSON",
         )
-    document = json.loads(file.read(words))
+    # Names with letters of another encoding do not matter here.
+    document = json.loads(file.read(words).decode("utf-8-sig", "replace"))
     head = file.read(8)
     size, kind = struct.unpack("<I4s", head) if len(head) == 8 else (0, b"")
     if kind != b"BIN\0":
@@ -229,6 +234,7 @@ class _Document:
     def __init__(self, path: Path, document: dict[str, Any], start: int, size: int) -> None:
         """Hold the parsed JSON. start, size: of the binary chunk [bytes]."""
         self.path, self.document, self.start, self.size = path, document, start, size
+        self.notes: tuple[str, ...] = ()
 
     def parts(self) -> list[_Part]:
         """Return every primitive at each node of the scene, in one depth-first walk of the node tree.
@@ -330,6 +336,7 @@ class _Document:
         else:
             x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
             pose = quaternion_pose(self.path, number, (w, x, y, z), node.get("translation", (0, 0, 0)))
+            self.notes = self.notes or zero_rotation_note(self.path, 0, (w, x, y, z))
             pose[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         if not np.isfinite(pose).all() or pose[3].tolist() != [0, 0, 0, 1]:
             raise _damaged(

@@ -5,6 +5,7 @@ mesh; its OBJ loader omits vertices that no face uses and splits vertices that h
 coordinates.
 """
 
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from ....schemas.process.text_encoding import UTF8_MARK, is_utf16
 from ..common.scan import (
     Scan,
     ScanBlock,
@@ -21,10 +23,11 @@ from ..common.scan import (
     read_records,
     scan_error,
 )
-from ..common.text_rows import keyword_rows
+from ..common.text_rows import keyword_rows, open_text_file
 
 # A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
 STL_HEADER_BYTES = 84
+SOLID = re.compile(rb"(?:\xff\xfe|\xfe\xff)?\s*solid")
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -36,7 +39,7 @@ class VertexLines(Scan):
         self._keyword = keyword
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
-        with self.path.open("rb") as file:
+        with open_text_file(self.path) as file:
             for rows in keyword_rows(file, self.path, self._keyword):
                 for start in range(0, len(rows), block_points):
                     yield ScanBlock(rows[start : start + block_points], None)
@@ -78,8 +81,10 @@ def open_stl(path: Path) -> list[Scan]:
     with library_errors(path), path.open("rb") as file:
         start = file.read(1024)
         # Many binary files begin with "solid" too: their first 80 bytes may hold anything.
-        if start.lstrip().startswith(b"solid") and (b"facet" in start or b"endsolid" in start):
-            _check_ascii_end(file, path, size)
+        letters = start.replace(b"\0", b"") if is_utf16(start) else start.removeprefix(UTF8_MARK)
+        if SOLID.match(letters) and (b"facet" in letters or b"endsolid" in letters):
+            with open_text_file(path) as text:
+                _check_ascii_end(text, path)
             return [VertexLines(path, "vertex")]
     if len(start) < STL_HEADER_BYTES:
         raise _truncated_stl(path, f"{size} bytes", f"a header of {STL_HEADER_BYTES}")
@@ -93,9 +98,9 @@ def open_stl(path: Path) -> list[Scan]:
     return [BinaryStl(path, triangles)]
 
 
-def _check_ascii_end(file: BinaryIO, path: Path, size: int) -> None:
+def _check_ascii_end(file: BinaryIO, path: Path) -> None:
     """Check that an ASCII STL ends with the line that ends its last solid. Raises ScanError."""
-    file.seek(max(0, size - 1024))
+    file.seek(max(0, file.seek(0, 2) - 1024))
     lines = file.read().strip().splitlines()
     if not lines or not lines[-1].lstrip().startswith(b"endsolid"):
         raise _truncated_stl(path, f"a last line {lines[-1][:60] if lines else b''!r}", "'endsolid'")

@@ -6,11 +6,14 @@ a float. Organised clouds store directions without a return
 as NaN points in their grid; these are dropped as NO_RETURN.
 
 VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
+
+Missing lines of the header mean what they mean in that library: COLUMNS is an old name of FIELDS, COUNT
+and HEIGHT are 1, WIDTH is POINTS, and in text TYPE is F. Without WIDTH and POINTS the rest of the
+file is points.
 """
 
 import struct
 from collections.abc import Iterator
-from io import BufferedReader
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,8 +34,9 @@ from ..common.scan import (
     quaternion_pose,
     read_records,
     scan_error,
+    zero_rotation_note,
 )
-from ..common.text_rows import is_number, number_rows
+from ..common.text_rows import is_number, number_rows, open_text_file
 
 # Maximum bytes of a header. A real one has a few hundred bytes; a file without a DATA line in this
 # range is not a PCD file.
@@ -67,8 +71,9 @@ class _Header(NamedTuple):
     fields: dict[str, _Field]
     record_bytes: int
     columns: int
-    points: int
+    points: int | None  # None: not declared, the rest of a text is points
     pose: NDArray[np.float64]
+    notes: tuple[str, ...]
     kind: str
     start: int  # byte offset of the data
     lines: int  # number of header lines
@@ -190,7 +195,7 @@ class AsciiPcd(Scan):
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         header, seen = self._header, 0
         fields = _read_fields(self, header)
-        with self.path.open("rb") as file:
+        with open_text_file(self.path) as file:
             file.seek(header.start)
             for rows in number_rows(
                 file, self.path, columns=header.columns, delimiter=None, first_line=header.lines + 1,
@@ -200,30 +205,38 @@ class AsciiPcd(Scan):
                 for start in range(0, len(rows), block_points):
                     part = rows[start : start + block_points]
                     yield _block(self, {name: _number(part, field) for name, field in fields.items()})
-        if seen < header.points:
+        if header.points and seen < header.points:
             raise _truncated(self.path, f"{seen} points", f"the {header.points} its header declares")
 
 
 def open_pcd(path: Path) -> list[Scan]:
     """Return the one scan of a PCD file; reads its header only. Raises ScanError."""
-    with library_errors(path), path.open("rb") as file:
-        header = _read_header(file, path)
-        left = file.seek(0, 2) - header.start
+    with library_errors(path):
+        header = _read_header(path)
+        left = path.stat().st_size - header.start
         if header.kind == "binary_compressed":
-            return [CompressedPcd(path, header, _compressed_end(file, path, header, left))]
+            return [_noted(CompressedPcd(path, header, _compressed_end(path, header, left)), header)]
         least = 2 * header.columns if header.kind == "ascii" else header.record_bytes
-        if header.points * least > left + (header.kind == "ascii"):  # the last row may lack its line end
+        # The last row of a text may lack its line end.
+        if (header.points or 0) * least > left + (header.kind == "ascii"):
             raise _truncated(path, f"{left // least} points at most", f"the {header.points} declared")
         if header.kind == "binary":
-            file.seek(header.start + header.points * header.record_bytes)
-            check_end(file, path, "points")
-        return [(AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header)]
+            with path.open("rb") as file:
+                file.seek(header.start + (header.points or 0) * header.record_bytes)
+                check_end(file, path, "points")
+        return [_noted((AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header), header)]
 
 
-def _compressed_end(file: BufferedReader, path: Path, header: _Header, left: int) -> int:
+def _noted(scan: Scan, header: _Header) -> Scan:
+    scan.notes = header.notes
+    return scan
+
+
+def _compressed_end(path: Path, header: _Header, left: int) -> int:
     """Return the offset of the first byte after the compressed data; checks both of its sizes."""
-    file.seek(header.start)
-    packed, unpacked = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+    with path.open("rb") as file:
+        file.seek(header.start)
+        packed, unpacked = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if 8 + packed > left:
         raise _truncated(path, f"{left} bytes of data", f"{8 + packed}")
     if unpacked != header.points * header.record_bytes or unpacked > packed * MAX_EXPANSION:
@@ -239,20 +252,25 @@ def _truncated(path: Path, found: str, expected: str) -> Exception:
     return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
 
 
-def _read_header(file: BufferedReader, path: Path) -> _Header:
+def _read_header(path: Path) -> _Header:
     """Read and check the header. Raises ScanError."""
     entries: dict[str, list[str]] = {}
     lines = 0
-    while "DATA" not in entries:
-        raw = file.readline(LONGEST_HEADER)
-        lines += 1
-        words = raw.decode("latin-1").split()
-        if not raw or file.tell() > LONGEST_HEADER:
-            raise scan_error(
-                path, f"{lines - 1} lines and no DATA", "the header of a PCD file", "check that this is one"
-            )
-        if words and not words[0].startswith("#"):
-            entries[words[0].upper()] = words[1:]
+    with open_text_file(path) as file:
+        while "DATA" not in entries:
+            raw = file.readline(LONGEST_HEADER)
+            lines += 1
+            words = raw.decode("latin-1").split()
+            if not raw or file.tell() > LONGEST_HEADER:
+                raise scan_error(
+                    path,
+                    f"{lines - 1} lines and no DATA",
+                    "the header of a PCD file",
+                    "check that this is one",
+                )
+            if words and not words[0].startswith("#"):
+                entries[words[0].upper()] = words[1:]
+        start = file.tell()
 
     def refuse(name: str, expected: str) -> Exception:
         found = " ".join([name, *entries.get(name, ["missing"])])[:80]
@@ -266,22 +284,21 @@ def _read_header(file: BufferedReader, path: Path) -> _Header:
             raise refuse(name, f"{count} whole numbers")
         return [int(word) for word in words]
 
+    kind = " ".join(entries["DATA"]).lower()
+    if kind not in KINDS:
+        raise refuse("DATA", " or ".join(KINDS))
     names = [name.lower() for name in entries.get("FIELDS", entries.get("COLUMNS", []))]
-    sizes = numbers("SIZE", len(names))
+    # A record of binary data has no size without them.
+    is_text = kind == "ascii"
+    sizes = numbers("SIZE", len(names), ["4"] * len(names) if is_text else None)
     counts = numbers("COUNT", len(names), ["1"] * len(names))
-    types = [t.upper() for t in entries.get("TYPE", [])]
+    types = [t.upper() for t in entries.get("TYPE", ["F"] * len(names) if is_text else [])]
     if len(types) != len(names) or any(k not in TYPES for k in zip(types, sizes, strict=True)):
         raise refuse("TYPE", "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, for each field")
     if any(names.count(axis) != 1 for axis in "xyz"):
         raise refuse("FIELDS", "x, y and z once each")
     if any(counts[names.index(axis)] != 1 for axis in "xyz"):
         raise refuse("COUNT", "1 of x, y and z")
-    (width,), (height,) = numbers("WIDTH", 1), numbers("HEIGHT", 1)
-    if numbers("POINTS", 1, [str(width * height)]) != [width * height]:
-        raise refuse("POINTS", f"WIDTH times HEIGHT, {width * height}")
-    kind = " ".join(entries["DATA"])
-    if kind not in KINDS:
-        raise refuse("DATA", " or ".join(KINDS))
     view = entries.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
     if len(view) != 7 or not all(map(is_number, view)):
         raise refuse("VIEWPOINT", "seven numbers")
@@ -289,6 +306,17 @@ def _read_header(file: BufferedReader, path: Path) -> _Header:
     record_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
     if not 0 < record_bytes <= BLOCK_BYTES:
         raise refuse("COUNT", f"records of at most {BLOCK_BYTES} bytes")
+    points: int | None = None
+    if "POINTS" in entries or "WIDTH" in entries:
+        (height,) = numbers("HEIGHT", 1, ["1"])
+        (width,) = numbers("WIDTH", 1, entries.get("POINTS") if height == 1 else None)
+        points = width * height
+        if numbers("POINTS", 1, [str(points)]) != [points]:
+            raise refuse("POINTS", f"WIDTH times HEIGHT, {points}")
+    elif not is_text:
+        points, rest = divmod(path.stat().st_size - start, record_bytes)
+        if rest or kind == "binary_compressed":
+            raise refuse("POINTS", "the number of points")
     fields: dict[str, _Field] = {}
     for column, called in {**{axis: (axis,) for axis in "xyz"}, **COLUMN_NAMES}.items():
         for name in called:
@@ -298,5 +326,5 @@ def _read_header(file: BufferedReader, path: Path) -> _Header:
                 continue
             offset = sum(size * count for size, count in zip(sizes[:k], counts[:k], strict=True))
             fields[column] = _Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]], column == RGB)
-    pose = quaternion_pose(path, 0, place[3:], place[:3])
-    return _Header(fields, record_bytes, sum(counts), width * height, pose, kind, file.tell(), lines)
+    pose, notes = quaternion_pose(path, 0, place[3:], place[:3]), zero_rotation_note(path, 0, place[3:])
+    return _Header(fields, record_bytes, sum(counts), points, pose, notes, kind, start, lines)

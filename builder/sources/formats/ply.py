@@ -1,11 +1,14 @@
 """PLY reader: the vertices of one file, ASCII or binary of either byte order.
 
 plyfile reads the header. This module reads the body in blocks, because plyfile reads faces one by
-one and ASCII vertices into one array of the size that the header claims.
+one and ASCII vertices into one array of the size that the header claims. Lists, in the vertices or
+in elements before them, are skipped; in text, x, y, z and all columns in use come before a list.
 """
 
 import io
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import check_interrupt
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, stack_channels, whole_bytes
 from ..common.scan import (
+    BLOCK_BYTES,
     INTENSITY_NAMES,
     Scan,
     ScanBlock,
@@ -25,7 +29,7 @@ from ..common.scan import (
     reader_library,
     scan_error,
 )
-from ..common.text_rows import LONGEST_LINE, number_rows
+from ..common.text_rows import LONGEST_LINE, number_rows, open_text_file
 
 # Maximum bytes of a header. A real one has a few hundred bytes.
 LONGEST_HEADER = 1 << 20
@@ -33,20 +37,66 @@ LONGEST_HEADER = 1 << 20
 LISTS_BYTES = 1 << 16
 
 
+class _Property(NamedTuple):
+    """Property of an element. count: type of the number before a list; None: a single value."""
+
+    name: str
+    type: np.dtype[Any]
+    count: np.dtype[Any] | None
+
+
+class _Element(NamedTuple):
+    """Element of a PLY file: `count` records of some properties."""
+
+    name: str
+    count: int
+    properties: tuple[_Property, ...]
+
+    @property
+    def has_lists(self) -> bool:
+        """Return whether records differ in size."""
+        return any(each.count is not None for each in self.properties)
+
+    @property
+    def least_bytes(self) -> int:
+        """Return the least size of a record of a binary file."""
+        return sum((each.count or each.type).itemsize for each in self.properties)
+
+    def record(self, lengths: Sequence[int] = ()) -> np.dtype[np.void]:
+        """Return the layout of a record. lengths: of its lists, in order; see `count_name`."""
+        fields: list[Any] = []
+        left = iter(lengths)
+        for name, kind, count in self.properties:
+            if count is None:
+                fields.append((name, kind))
+            else:
+                fields += [(count_name(name), count), (name, kind, (next(left, 0),))]
+        return np.dtype(fields)
+
+
+def count_name(name: str) -> str:
+    """Return the name of the field with a list's length; no property has it, because names have no blank."""
+    return f"{name} count"
+
+
 class _Header(NamedTuple):
     """Description of a PLY file's vertices, from its header."""
 
-    record: np.dtype[np.void]  # layout of one vertex in a binary file
-    points: int
+    vertex: _Element
+    record: np.dtype[np.void]  # properties of a vertex up to its first list; all if it has none
+    before: tuple[_Element, ...]  # elements before the vertices
+    after: tuple[_Element, ...]  # elements after the vertices
     start: int  # byte offset of the body
-    skip: int  # size of the data before the vertices: bytes in a binary file, lines in an ASCII one
     lines: int  # number of header lines
-    behind: int  # number of rows after the vertices in an ASCII file
     ascii: bool
-    order: str  # byte order of a binary file: "<" or ">"
     intensity: str | None  # the property's name
     rgb: tuple[str, ...]  # names of red, green and blue, or ()
     classification: str | None
+
+    @property
+    def points(self) -> int:
+        """Return the number of vertices."""
+        return self.vertex.count
 
     @property
     def columns(self) -> frozenset[str]:
@@ -65,11 +115,85 @@ class BinaryPly(SeekableScan):
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         header = self._header
         with self.path.open("rb") as file:
-            file.seek(header.start + header.skip + start * header.record.itemsize)
+            skip = sum(each.count * each.least_bytes for each in header.before)
+            file.seek(header.start + skip + start * header.record.itemsize)
             for record in read_records(
                 file, self.path, header.record, stop - start, block_points, "vertices"
             ):
                 yield _block(self, record, header)
+
+
+class ListPly(Scan):
+    """Vertices of one binary PLY file with lists in or before its vertices, hence read from the start."""
+
+    def __init__(self, path: Path, header: _Header) -> None:
+        super().__init__(path, "ply", declared_count=header.points)
+        self._header, self.columns = header, header.columns
+
+    def _read(self, block_points: int) -> Iterator[ScanBlock]:
+        header = self._header
+        with self.path.open("rb") as file:
+            file.seek(header.start)
+            for element in header.before:
+                _skip_element(file, self.path, element)
+            for record in _list_records(file, self.path, header.vertex, block_points):
+                yield _block(self, record, header)
+            _check_rest(file, self.path, header)
+
+
+def _list_records(
+    file: BufferedReader, path: Path, element: _Element, block_points: int
+) -> Iterator[NDArray[np.void]]:
+    """Read the records of an element with lists from the current position, in blocks.
+
+    Yields (n,), n > 0, records whose lists have the same lengths. Records are guessed to be like the
+    one before them, twice as many each time; those after the first unlike one are read again.
+    Raises ScanError.
+    """
+    seen, step = 0, 1
+    while seen < element.count:
+        check_interrupt()
+        begin = file.tell()
+        lengths = _list_lengths(file, path, element)
+        record = element.record(lengths)
+        file.seek(begin)
+        most = min(step, element.count - seen, block_points, BLOCK_BYTES // record.itemsize)
+        records = np.frombuffer(
+            data := file.read(most * record.itemsize), record, len(data) // record.itemsize
+        )
+        if not len(records):
+            raise _truncated(path, seen, element.count, element.name)
+        alike = np.ones(len(records), bool)
+        names = [count_name(each.name) for each in element.properties if each.count is not None]
+        for name, length in zip(names, lengths, strict=True):
+            alike &= records[name] == length
+        unlike = np.flatnonzero(~alike)
+        good = int(unlike[0]) if len(unlike) else len(records)
+        yield records[:good]
+        file.seek(begin + good * record.itemsize)
+        seen, step = seen + good, 2 * step if good == most else 1
+
+
+def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> list[int]:
+    """Return the lengths of the lists of the record at the file's position. Raises ScanError."""
+    lengths, size = [], 0
+    for _, kind, count in element.properties:
+        if count is None:
+            size += kind.itemsize
+            file.seek(kind.itemsize, 1)
+            continue
+        length = int(np.frombuffer(file.read(count.itemsize).ljust(count.itemsize, b"\0"), count)[0])
+        size += count.itemsize + length * kind.itemsize
+        if length < 0 or size > BLOCK_BYTES:
+            raise scan_error(
+                path,
+                f"a list of {length} values in element {element.name!r}",
+                f"0 or more, in a record of at most {BLOCK_BYTES} bytes",
+                "fetch the file again, it is damaged",
+            )
+        lengths.append(length)
+        file.seek(length * kind.itemsize, 1)
+    return lengths
 
 
 def _skip_lines(file: BinaryIO, lines: int) -> None:
@@ -92,17 +216,19 @@ class AsciiPly(Scan):
         names = header.record.names or ()
         row = np.dtype([(name, np.float64) for name in names])
         seen = 0
-        with self.path.open("rb") as file:
+        skip = sum(each.count for each in header.before)
+        with open_text_file(self.path) as file:
             file.seek(header.start)
-            _skip_lines(file, header.skip)
+            _skip_lines(file, skip)
             for rows in number_rows(
                 file,
                 self.path,
                 columns=len(names),
                 delimiter=None,
-                first_line=header.lines + header.skip + 1,
+                first_line=header.lines + skip + 1,
                 limit=header.points,
-                behind=header.behind,
+                more=header.vertex.has_lists,
+                behind=sum(each.count for each in header.after),
             ):
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
@@ -135,141 +261,166 @@ def _as_declared(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
 
 def open_ply(path: Path) -> list[Scan]:
     """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
-    with library_errors(path), path.open("rb") as file:
-        header, later = _read_header(file, path)
-        least = 2 * len(header.record.names or ()) if header.ascii else header.record.itemsize
-        left = path.stat().st_size - header.start - (0 if header.ascii else header.skip)
+    with library_errors(path):
+        header = _read_header(path)
+        skip = 0 if header.ascii else sum(each.count * each.least_bytes for each in header.before)
+        least = 2 * len(header.vertex.properties) if header.ascii else header.vertex.least_bytes
+        left = path.stat().st_size - header.start - skip
         # The last ASCII row may lack its line end; allow one byte for it.
         if header.points * least > left + header.ascii:
             raise _truncated(path, max(0, left // least), header.points)
-        if not header.ascii:
-            size = header.record.itemsize
-            file.seek(header.start + header.skip + header.points * size)
-            for element, count in later:
-                _skip_element(file, path, element, count, header.order)
-            check_end(file, path, "elements")
-        return [(AsciiPly if header.ascii else BinaryPly)(path, header)]
+        if header.ascii:
+            return [AsciiPly(path, header)]
+        if header.vertex.has_lists or any(each.has_lists for each in header.before):
+            return [ListPly(path, header)]
+        with path.open("rb") as file:
+            file.seek(header.start + skip + header.points * header.vertex.least_bytes)
+            _check_rest(file, path, header)
+        return [BinaryPly(path, header)]
 
 
-def _skip_element(file: BinaryIO, path: Path, element: Any, count: int, order: str) -> None:
-    """Advance a binary file past an element of plyfile. Raises ScanError where the file is shorter.
+def _check_rest(file: BufferedReader, path: Path, header: _Header) -> None:
+    """Check that the elements after the vertices of a binary file end with it. Raises ScanError.
 
     A vertex count that is too small makes vertices the first bytes of the next element, a face for
-    instance, whose lists then end elsewhere than the file.
+    instance, whose lists then end elsewhere. file: at the end of the vertices.
     """
+    for element in header.after:
+        _skip_element(file, path, element)
+    check_end(file, path, "elements")
+
+
+def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
+    """Advance a binary file past an element. Raises ScanError where the file is shorter."""
     at, size = file.tell(), file.seek(0, 2)
-    # Of each list: bytes of fixed size before its length, type of the length, bytes of an item.
+    # Of each list: bytes before its length, type of the length, bytes of a value.
     lists: list[tuple[int, np.dtype[Any], int]] = []
     fixed = 0
-    for item in element.properties:
-        if hasattr(item, "list_dtype"):
-            length, value = map(np.dtype, item.list_dtype(order))
-            lists.append((fixed, length, value.itemsize))
-            fixed = 0
+    for _, kind, length in element.properties:
+        if length is None:
+            fixed += kind.itemsize
         else:
-            fixed += np.dtype(item.dtype(order)).itemsize
+            lists.append((fixed, length, kind.itemsize))
+            fixed = 0
     if not lists:
-        at += count * fixed
-        count = 0
+        at += element.count * fixed
     begin, data = at, b""
-    for number in range(count):
+    for number in range(element.count if lists else 0):
         if not number % 4096:
             check_interrupt()
-        for before, kind, width in lists:
+        for before, length, width in lists:
             at += before
-            past = at + kind.itemsize - begin
+            past = at + length.itemsize - begin
             if past > len(data):
                 file.seek(at)
-                begin, data, past = at, file.read(LISTS_BYTES), kind.itemsize
+                begin, data, past = at, file.read(LISTS_BYTES), length.itemsize
             if past > len(data):
                 at = size + 1
                 break
-            # A byte, the usual type of a length, needs no conversion: 0.1 us per face.
-            held = data[past - 1] if kind.itemsize == 1 else np.frombuffer(data, kind, 1, at - begin)[0]
-            at += kind.itemsize + max(0, int(held)) * width
+            # A byte, the usual type of a length, needs no conversion: 0.1 us a face.
+            held = data[past - 1] if length.itemsize == 1 else np.frombuffer(data, length, 1, at - begin)[0]
+            at += length.itemsize + max(0, int(held)) * width
         at += fixed
         if at > size:
             break
     if at > size:
         raise scan_error(
             path,
-            f"element {element.name!r} that ends at byte {at} of {size}",
+            f"a file of {size} bytes that ends within its element {element.name!r}",
             "all elements that its header declares",
             "fetch the file again: it is truncated, or a count in its header is damaged",
         )
     file.seek(at)
 
 
-def _truncated(path: Path, found: int, declared: int) -> Exception:
+def _truncated(path: Path, found: int, declared: int, what: str = "vertices") -> Exception:
     return scan_error(
         path,
-        f"the file ends after {found} vertices at most",
+        f"the file ends after {found} {what} at most",
         f"the {declared} its header declares",
         "fetch the file again, it is truncated",
     )
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[_Header, list[tuple[Any, int]]]:
-    """Read and check the header; leaves the file position at the start of the body.
+def header_lines(path: Path) -> tuple[list[str], int]:
+    """Return the lines of a PLY file's header without comments, and the offset of its body.
 
-    Returns the elements of plyfile after the vertices, too, each with its count.
+    Raises ScanError.
     """
     lines: list[str] = []
+    with open_text_file(path) as file:
+        while not lines or lines[-1] != "end_header":
+            raw = file.readline(LONGEST_HEADER)
+            # Letters that are not ASCII occur in comments, and in names that nothing here reads. Some
+            # writers leave blanks at the ends of lines ("ply "), which plyfile refuses.
+            line = raw.decode("ascii", "backslashreplace").strip()
+            if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
+                raise scan_error(
+                    path,
+                    f"line {len(lines) + 1} is {line[:60]!r}",
+                    "a PLY header, from 'ply' to 'end_header'",
+                    "check that this is a PLY file",
+                )
+            lines.append("comment" if line.startswith(("comment", "obj_info")) else line)
+        return lines, file.tell()
+
+
+def _read_header(path: Path) -> _Header:
+    """Read and check the header. Raises ScanError."""
+    lines, start = header_lines(path)
     counts: list[int] = []
-    while not lines or lines[-1] != "end_header":
-        raw = file.readline(LONGEST_HEADER)
-        # Some writers leave blanks at the ends of lines ("ply "), which plyfile refuses.
-        line = raw.decode("ascii", "replace").strip()
-        if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
-            raise scan_error(
-                path,
-                f"line {len(lines) + 1} is {line[:60]!r}",
-                "a PLY header, from 'ply' to 'end_header'",
-                "check that this is a PLY file",
-            )
+    for number, line in enumerate(lines):
         words = line.split()
         if len(words) == 3 and words[0] == "element" and words[2].isdecimal():
             counts.append(int(words[2]))
             # plyfile reads the declared number of records. Declare none: only the header is needed.
-            line = f"element {words[1]} 0"
-        lines.append(line)
-    start = file.tell()
+            lines[number] = f"element {words[1]} 0"
     plyfile = reader_library("plyfile", path)
     ply = plyfile.PlyData.read(io.BytesIO(("\n".join(lines) + "\n").encode("ascii")))
-    if "vertex" not in ply:
-        found = ", ".join(element.name for element in ply) or "none"
+    order = "=" if ply.text else ply.byte_order
+    elements = [
+        _Element(element.name, count, tuple(_property(path, each, order) for each in element.properties))
+        for element, count in zip(ply, counts, strict=True)
+    ]
+    at = next((k for k, element in enumerate(elements) if element.name == "vertex"), None)
+    if at is None:
+        found = ", ".join(element.name for element in elements) or "none"
         raise scan_error(
             path, f"elements: {found}", "an element 'vertex'", "check that this is a PLY of points"
         )
-    skip = 0
-    later = list(zip(ply, counts, strict=True))
-    while later:
-        element, count = later.pop(0)
-        lists = any(isinstance(item, plyfile.PlyListProperty) for item in element.properties)
-        if lists and (element.name == "vertex" or not ply.text):
-            raise scan_error(
-                path,
-                f"element {element.name!r} has a list property and comes no later than the vertices",
-                "vertices of fixed size, first in the file",
-                "write the PLY with its vertices first and no lists in them",
-            )
-        if element.name == "vertex":
-            break
-        skip += count if ply.text else count * element.dtype().itemsize
-    record = element.dtype("=" if ply.text else ply.byte_order)
-    missing = [name for name in "xyz" if name not in record.names]
+    vertex = elements[at]
+    # Where rows of text have lists, only the columns before the first one have a fixed place.
+    used = list(itertools.takewhile(lambda each: each.count is None, vertex.properties))
+    known = tuple(used) if ply.text else tuple(each for each in vertex.properties if each.count is None)
+    record = vertex._replace(properties=known).record()
+    names = record.names or ()
+    missing = [name for name in "xyz" if name not in names]
     if missing:
         raise scan_error(
             path,
-            f"vertices without {', '.join(missing)}",
+            f"vertices without {', '.join(missing)}"
+            + (" before their first list" if len(known) < len(vertex.properties) else ""),
             "properties x, y and z",
             "check the program that wrote this file",
         )
-    intensity = next((name for name in record.names if name.lower() in INTENSITY_NAMES), None)
-    colours, of_class = find_columns(record.names)
-    header = _Header(
-        record, count, start, skip, len(lines), sum(rows for _, rows in later), ply.text, ply.byte_order,
-        intensity, tuple(record.names[at] for at in colours),
-        None if of_class is None else record.names[of_class],
+    intensity = next((name for name in names if name.lower() in INTENSITY_NAMES), None)
+    colours, of_class = find_columns(names)
+    return _Header(
+        vertex, record, tuple(elements[:at]), tuple(elements[at + 1 :]), start, len(lines), ply.text, intensity,
+        tuple(names[each] for each in colours), None if of_class is None else names[of_class],
     )  # fmt: skip
-    return header, later
+
+
+def _property(path: Path, given: Any, order: str) -> _Property:
+    """Return a property of plyfile with its types in this byte order. Raises ScanError."""
+    if not hasattr(given, "len_dtype"):
+        return _Property(given.name, np.dtype(given.dtype(order)), None)
+    count, kind = (np.dtype(each) for each in given.list_dtype(order))
+    if count.kind not in "iu":
+        raise scan_error(
+            path,
+            f"the list {given.name!r} with lengths of type {count.name}",
+            "whole numbers",
+            "check the program that wrote this file",
+        )
+    return _Property(given.name, kind, count)

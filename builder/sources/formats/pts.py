@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
 from ..common.scan import Scan, library_errors, scan_error
+from ..common.text_rows import open_text_file
 from .text import open_text
 
 
@@ -17,7 +18,7 @@ def open_pts(path: Path) -> list[Scan]:
     Reads the whole file to find the blocks (counted_rows.py).
     """
     scans: list[Scan] = []
-    with library_errors(path), path.open("rb") as file:
+    with library_errors(path), open_text_file(path) as file:
         text, line = next_line(file, 1)
         if not _is_count(text):
             return open_text(path)
@@ -32,9 +33,9 @@ def open_pts(path: Path) -> list[Scan]:
             if len(scans) == MAX_SCANS:
                 raise scan_error(path, f"over {MAX_SCANS} blocks of points", "fewer", "split the file")
             count, start, line = int(text), file.tell(), line + 1
-            columns = skip_rows(file, path, len(scans), count, line)
+            columns, after = skip_rows(file, path, len(scans), count, line)
             scans.append(CountedRows(path, "pts", len(scans), count, start=start, line=line, columns=columns))
-            text, line = next_line(file, line + count)
+            text, line = next_line(file, after)
     return scans
 
 

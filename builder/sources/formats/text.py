@@ -1,21 +1,23 @@
 """Text scans, one point a line: XYZ, TXT, CSV, and PTS without counts.
 
 The first lines of the file determine the layout:
-- The file begins with optional comments ("#" or "//" first) and blank lines, then an optional
-  header row of names. Rows of numbers follow, separated by blanks, commas or semicolons, with LF or
-  CRLF.
-- A first line that is one whole number is the count of points. It is checked against the rows:
-  fewer rows mean a truncated file, more rows a broken one.
+- The file begins with optional comments ("#", "//" or ";" first) and blank lines, then an optional
+  header row of names. Rows of numbers follow, separated by blanks, commas or semicolons
+  (text_rows.py says what is skipped, and which numbers are read).
+- Where semicolons or blanks separate the numbers, they may have decimal commas.
+- A line that is one whole number, before the rows, is the count of points. It is checked against
+  the rows: fewer rows mean a truncated file, more rows a broken one.
 - x, y and z are the columns with these names in the header (a row, or a comment with as many
   names as there are columns), else the first three.
 - The intensity is the column that the header names intensity or scalar_intensity. A PTS file
-  needs no header: its fourth column is the intensity where its rows have 4 or 7 numbers (x y z i, x
-  y z i r g b); with 6 the fourth is red. In any other file without a header a fourth column may
-  mean anything and is ignored.
+  needs no header, see `pts_columns`. In any other file without a header a fourth column may mean
+  anything and is ignored.
 - Colour and class are the columns that the header names red, green, blue (or r, g, b) and
-  classification (or class, label), and the last three numbers of a PTS row of 6 or 7.
+  classification (or class, label).
 """
 
+import csv
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -23,11 +25,14 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, whole_bytes
+from ..common.counted_rows import pts_columns
 from ..common.scan import INTENSITY_NAMES, Scan, ScanBlock, library_errors, scan_error
-from ..common.text_rows import LONGEST_LINE, is_number, number_rows, split_row
+from ..common.text_rows import LONGEST_LINE, is_number, number_rows, open_text_file, split_row
 
 # Maximum lines before the first row of numbers; a file with a longer preamble is not a point list.
 LONGEST_PREAMBLE = 1000
+# First line of a CSV file that tells Excel the delimiter.
+_SEPARATOR_LINE = re.compile(r"sep=.?", re.IGNORECASE)
 
 
 class _Layout(NamedTuple):
@@ -64,7 +69,7 @@ class TextScan(Scan):
             return
         layout = self._layout
         seen = 0
-        with self.path.open("rb") as file:
+        with open_text_file(self.path) as file:
             file.seek(layout.start)
             for rows in number_rows(
                 file, self.path, columns=layout.columns, delimiter=layout.delimiter, first_line=layout.line
@@ -93,7 +98,7 @@ class TextScan(Scan):
 
 def open_text(path: Path) -> list[Scan]:
     """Return the one scan of a text file; reads its first lines only. Raises ScanError."""
-    with library_errors(path), path.open("rb") as file:
+    with library_errors(path), open_text_file(path) as file:
         return [TextScan(path, _find_layout(file, path))]
 
 
@@ -109,15 +114,16 @@ def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
             if names or count:
                 raise scan_error(path, "no rows of numbers", "one point a line", "fetch the file again")
             return None
-        text = raw.decode("utf-8-sig", "replace").strip()
-        if text.startswith(("#", "//")):
-            comment = text.lstrip("#/ \t")
+        text = raw.decode("utf-8", "replace").strip()
+        # Several semicolons separate names, of which the first may be empty.
+        if text.startswith(("#", "//")) or (text.startswith(";") and text.count(";") == 1):
+            comment = text.lstrip("#/; \t")
             continue
-        if not text:
+        if not text or _SEPARATOR_LINE.fullmatch(text):
             continue
-        delimiter = ";" if ";" in text else "," if "," in text else None
-        fields = split_row(text, delimiter)
-        if count is None and names is None and len(fields) == 1 and fields[0].isdecimal():
+        delimiter = _delimiter(raw)
+        fields = split_row(raw, delimiter)
+        if count is None and len(fields) == 1 and fields[0].isdecimal():
             count = int(fields[0])
         elif any(map(is_number, fields)):
             return _layout_of(
@@ -153,18 +159,16 @@ def _layout_of(
         raise scan_error(
             path,
             f"line {found.line} is {' '.join(fields)[:60]!r}",
-            "at least three numbers (x, y, z)",
-            "check that this is a point list, one point a line",
+            "at least three numbers (x, y, z), and nothing else",
+            "check that this is a point list, one point a line; remove columns that are no numbers",
         )
     layout = found._replace(columns=len(fields), delimiter=delimiter)
     called = _split_names(names[1] if names else comment)
     if names is None and (len(called) != len(fields) or not {"x", "y", "z"} <= set(called)):
         if path.suffix.lower() != ".pts":
             return layout
-        n = len(fields)
-        return layout._replace(
-            intensity=3 if n in (4, 7) else None, rgb=(n - 3, n - 2, n - 1) if n in (6, 7) else ()
-        )
+        intensity, rgb = pts_columns(len(fields))
+        return layout._replace(intensity=intensity, rgb=rgb)
     if len(called) != len(fields) or any(called.count(axis) != 1 for axis in "xyz"):
         line, text = names or (0, comment)
         raise scan_error(
@@ -185,5 +189,21 @@ def _layout_of(
 
 def _split_names(text: str) -> list[str]:
     """Return the names of a header row, in lower case, without quotes."""
-    delimiter = ";" if ";" in text else "," if "," in text else None
-    return [name.strip().strip("\"'").lower() for name in text.split(delimiter)]
+    delimiter = next((each for each in ";,\t" if each in text), None)
+    names = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True)) if delimiter else text.split()
+    while len(names) > 1 and not names[-1].strip():
+        names.pop()  # a delimiter at the line's end
+    return [name.strip().strip("\"'").lower() for name in names]
+
+
+def _delimiter(line: bytes) -> str | None:
+    """Return what separates the fields of a line: ";" or ",", or None for blanks."""
+    if b";" in line:
+        return ";"
+    if b"," not in line:
+        return None
+    # Numbers with decimal commas, separated by blanks, are no numbers if separated by commas.
+    fields = split_row(line, None)
+    if len(fields) > 2 and all(map(is_number, fields)) and not all(map(is_number, split_row(line, ","))):
+        return None
+    return ","

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ....schemas.errors import BadRequestError, SolidcloudError
+from ....schemas.process.text_encoding import decode_text
 from ....schemas.scene.effect_table import effect_name
 from ....schemas.scene.scene_file import parse_scene, read_scene, scene_name
 from ....schemas.wire.warming_parts import SERVING_WORDS
@@ -80,7 +81,7 @@ def scene_with_effects(file: Path, names: Collection[str]) -> str:
 
     Raise BadRequestError for the name of another effect.
     """
-    content: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+    content: dict[str, Any] = tomllib.loads(decode_text(file.read_bytes()))
     effects = content.get("effects", [{"effect": "stop"}])
     known = {effect["effect"] for effect in effects}
     for name in names:

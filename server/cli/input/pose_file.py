@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError, ScanError
 from ....schemas.process.new_file import new_path
+from ....schemas.process.text_encoding import decode_text
 
 COLUMNS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 RAY_COLUMNS = ("x", "y", "z", "dx", "dy", "dz")
@@ -77,7 +78,7 @@ def parse_path(name: str, text: str) -> tuple[NDArray[np.float64], NDArray[np.fl
 def _text(path: Path, expected: str) -> str:
     """Return the text of a file. Raise ScanError."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return decode_text(path.read_bytes())
     except OSError as error:
         raise ScanError(f"{path}: {error.strerror}: expected {expected}: check the path") from None
     except UnicodeDecodeError as error:

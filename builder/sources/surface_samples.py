@@ -33,6 +33,10 @@ LARGEST_MESH = 512 << 20
 
 # A face in an OBJ file, and in the header of a PLY file.
 _OBJ_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
+# A face in an OBJ file that does not name at least three vertices: trimesh leaves out most of these.
+_BROKEN_OBJ_FACE = re.compile(
+    rb"^[ \t]*f(?=\s|\Z)(?!(?:[ \t]+-?0*[1-9]\d*(?:/-?\d*){0,2}){3,}[ \t\r]*(?:#.*)?$).*", re.MULTILINE
+)
 _PLY_FACE = re.compile(r"element[ \t]+face[ \t]+0*[1-9]")
 # Letters of names and comments, which trimesh would decode -> "?".
 _ASCII = bytes(range(128)) + b"?" * 128
@@ -169,7 +173,15 @@ def _plain_mesh(path: Path) -> io.BytesIO:
     """Return an OBJ or PLY file without a byte order mark, and without letters that are not ASCII."""
     if path.suffix.lower() == ".obj":
         with open_text_file(path) as file:
-            return io.BytesIO(file.read().translate(_ASCII))
+            text = file.read().translate(_ASCII)
+        if broken := _BROKEN_OBJ_FACE.search(text.replace(b"\\\r\n", b"").replace(b"\\\n", b"")):
+            raise scan_error(
+                path,
+                f"the face {broken[0].decode().strip()[:60]!r}",
+                "at least three vertices, counted from 1",
+                "fetch the file again, it is damaged",
+            )
+        return io.BytesIO(text)
     lines, start = header_lines(path)
     is_text = any(line.split()[:2] == ["format", "ascii"] for line in lines)
     with open_text_file(path) if is_text else path.open("rb") as file:

@@ -82,7 +82,8 @@ def test_skip_bad_leaves_a_scan_out_and_marks_where_it_may_have_been(
         lattice = header.lattice.to_lattice(corners)
         assert (box[0] <= lattice[0]).all()
         assert (lattice[1] <= box[1]).all()
-        assert np.abs(box - lattice).max() <= 2
+        # It is larger by a centimetre, because bounds may be rounded.
+        assert np.abs(box - lattice).max() <= 2 + 0.01 / header.lattice.step
 
 
 def test_skip_bad_knows_nothing_free_where_bounds_are_lost(

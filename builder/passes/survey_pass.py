@@ -22,7 +22,7 @@ from ..resume.kept_work import BuildDirectory, Work, run_unfinished
 from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
 from ..sources.common.colours import brightest
-from ..sources.common.scan import NOT_FINITE, Scan, SourceLattice, sha256_of
+from ..sources.common.scan import CLASS, NOT_FINITE, SYNTHETIC, WITHHELD, Scan, SourceLattice, sha256_of
 from ..sources.scan_files import InputFile
 
 # A header's bounds are trusted if no point lies farther outside than this [m], which allows for
@@ -182,9 +182,11 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
             False,
             tuple(parts),
         )
+    # A scan whose points are withheld, or of a class that is left out, is empty by choice.
+    chosen = any(reason.startswith((WITHHELD, SYNTHETIC, CLASS)) for part in parts for reason in part.dropped)
     fault = (
         ""
-        if count
+        if count or chosen
         else f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     )
     nothing_lost = count == 0 and not_finite == 0
@@ -327,7 +329,7 @@ def _check_surveys(
         raise ScanError(
             f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)"
         )
-    if not good:
+    if not any(s.count for s in good):
         first = inputs[0].path if inputs else "nothing"
         raise ScanError(f"{first}: no usable scan, expected at least one: check the files")
     if ("scan" in config.keep or config.filter_passes) and len(good) > MAX_SCANS:

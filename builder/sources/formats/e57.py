@@ -27,6 +27,7 @@ from ..common.scan import (
     reader_library,
     scan_error,
 )
+from ..placed_scan import axis_metres
 from .e57_xml import check_e57, check_xml, xml_of
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -299,9 +300,10 @@ def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDAr
     return checked_bounds(np.stack([centers.min(axis=0) - half, centers.max(axis=0) + half]))
 
 
-def e57_bounds(path: Path) -> NDArray[np.float64] | None:
+def e57_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
     """Return the bounds of all scans that an E57 file's XML declares, (2, 3) world frame [m].
 
+    units: see `axis_metres`; "": metres, as the standard has it.
     Returns None where one scan has no bounds, because its points may then be anywhere. Ignores
     checksums and reads the XML without libE57Format, which refuses a file with a broken page. May
     raise anything.
@@ -312,6 +314,7 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
     root = ElementTree.fromstring(xml)
     tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""
     boxes: list[NDArray[np.float64]] = []
+    metres = axis_metres(units or "m")
     for scan in root.iterfind(f"{tag}data3D/{tag}vectorChild"):
         numbers = {
             name: _xml_number(scan, [tag + part for part in name.split("/")])
@@ -321,9 +324,9 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
         if box is None:
             return None
         boxes.append(box)
-    if not boxes:
+    if not boxes or metres is None:
         return None
-    return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+    return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]) * metres
 
 
 def _xml_number(element: ElementTree.Element, names: list[str]) -> float | None:

@@ -120,7 +120,7 @@ def build_archive(
     target = Path(target)
     build = Transaction("build", target, building_folder(target), config, progress)
     with made_parents(target), locked(target), build.machine_errors():
-        inputs = open_input_files(paths, config.spacing, config.keep)
+        inputs = open_input_files(paths, config.spacing, config.keep, config.drop_classes)
         what = describe_build(inputs, config)
         recover(target)
         if not config.overwrite and not config.fresh and _is_whole(inputs, build):

@@ -76,6 +76,8 @@ def survey_added(change: Change, inputs: Sequence[InputFile], wanted: AddOptions
         ]
     if faults := [survey.fault for survey in surveys if survey.fault]:
         raise ScanError("\n  ".join(faults))
+    if not any(survey.count for survey in surveys):
+        raise ScanError(f"{surveys[0].path}: no usable point, expected at least one: nothing to add")
     if wanted.strict and (unclean := [survey for survey in surveys if survey.unclean]):
         found = (f"{survey.path}: {survey.unclean}" for survey in unclean)
         raise ScanError("\n  ".join(found) + ", expected none with --strict: clean the scan")

@@ -26,7 +26,7 @@ from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
 from ...schemas.process.new_file import sync_path
 from ..build_limits import bytes_beside_records, readers_that_fit
-from ..config import BuildConfig
+from ..config import BuildConfig, parse_classes
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import position_hash_sum
 from ..passes.level_pass import replace_level, write_level
@@ -149,7 +149,7 @@ def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> Bui
     Raise BadRequestError for options under which no scan can be added later.
     """
     stored = dict(header.options)
-    known = set(BuildConfig().identity()) | {"cells", "leaf_cells", "models", "normal_reach"}
+    known = set(BuildConfig().identity()) | {"cells", "leaf_cells", "models", "normal_reach", "drop_classes"}
     if others := sorted(set(stored) - known):
         raise BadRequestError(
             f"{target}: built with {', '.join(others)}, which depend on all scans together: build again"
@@ -157,6 +157,7 @@ def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> Bui
     for name in ("keep", "models"):
         if name in stored:
             stored[name] = frozenset(filter(None, stored[name].split(",")))
+    stored["drop_classes"] = parse_classes(stored.get("drop_classes", ""))
     return BuildConfig(**stored, jobs=jobs, memory_bytes=memory_bytes)
 
 

@@ -50,7 +50,9 @@ def add_scans(
             "--new and --again together: expected one of them: skip scans already in the archive, or add them twice?"
         )
     with changing(Path(target), jobs, memory_bytes, progress) as change:
-        inputs = open_input_files(paths, change.config.spacing, change.config.keep)
+        inputs = open_input_files(
+            paths, change.config.spacing, change.config.keep, change.config.drop_classes
+        )
         what = describe_build(inputs, change.config)
 
         def check_unchanged() -> None:

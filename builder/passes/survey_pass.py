@@ -22,7 +22,16 @@ from ..resume.kept_work import BuildDirectory, Work, run_unfinished
 from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
 from ..sources.common.colours import brightest
-from ..sources.common.scan import BEYOND, NOT_FINITE, Scan, SourceLattice, sha256_of
+from ..sources.common.scan import (
+    BEYOND,
+    CLASS,
+    NOT_FINITE,
+    SYNTHETIC,
+    WITHHELD,
+    Scan,
+    SourceLattice,
+    sha256_of,
+)
 from ..sources.scan_files import InputFile
 from ..sources.scan_warnings import beyond_text
 
@@ -201,6 +210,8 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
             False,
             tuple(parts),
         )
+    # A scan whose points are withheld, or of a class that is left out, is empty by choice.
+    chosen = any(reason.startswith((WITHHELD, SYNTHETIC, CLASS)) for part in parts for reason in part.dropped)
     beyond = sum(part.beyond for part in parts)
     if not count and beyond:
         text = beyond_text(scan.units, max(part.farthest for part in parts))
@@ -208,7 +219,7 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
         fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}".replace(
             ", expected", f"{others}, expected", 1
         )
-    elif not count:
+    elif not count and not chosen:
         fault = f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     lost = not_finite + beyond + sum(part.dropped.get(NOT_FINITE, 0) for part in parts)
     nothing_lost = count == 0 and lost == 0
@@ -355,7 +366,7 @@ def _check_surveys(
         raise ScanError(
             f"{faulty[0].fault}{more} (--skip-bad leaves such scans out and marks their region unknown)"
         )
-    if not good:
+    if not any(s.count for s in good):
         first = inputs[0].path if inputs else "nothing"
         raise ScanError(f"{first}: no usable scan, expected at least one: check the files")
     if ("scan" in config.keep or config.filter_passes) and len(good) > MAX_SCANS:

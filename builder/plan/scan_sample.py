@@ -308,5 +308,6 @@ def plan_build(
     Raise ScanError and BadRequestError as a build would, as far as a sample can detect the error.
     """
     rates = rates or load_rates()
-    scene = sample_scene(open_input_files(paths, config.spacing), config, rates, quick=quick)
+    inputs = open_input_files(paths, config.spacing, drop_classes=config.drop_classes)
+    scene = sample_scene(inputs, config, rates, quick=quick)
     return estimate(scene, config, rates, target)

@@ -1,11 +1,13 @@
 """Scan placed in the world: converted to metres, turned to z up, moved by a pose, in float64."""
 
 import copy
+import math
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.errors import ScanError
 from .common.scan import BOUNDS_MARGIN, Scan, ScanBlock, SourceLattice, apply_pose, checked_bounds
 
 # Length units [m]. "us-ft": the US survey foot, which older state plane coordinates use.
@@ -20,6 +22,17 @@ METRES = {
     "us-ft": 1200 / 3937,
     "yd": 0.9144,
 }
+# Units of a file in degrees of latitude and longitude, and in a unit whose length is not known. A
+# build does not take them.
+DEGREES, UNKNOWN = "deg", "?"
+# A stated length names the unit that it equals within this relative difference. Files round the
+# US survey foot to 0.3048006, a difference of 3e-8; it differs from the foot by 2e-6.
+SAME_UNIT = 1e-7
+# Form of a unit in messages.
+EXPECTED_UNITS = (
+    f'{", ".join(METRES)}, a number of metres such as "0.3047972654", or two of these for x and y, and for '
+    'heights, such as "m+us-ft"'
+)
 # Up axis -> source axis of the world's x, y and z, and the sign of each: rotations, never
 # reflections.
 TURNS: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
@@ -28,6 +41,34 @@ TURNS: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     "x": ((1, 2, 0), (1, 1, 1)),
 }
 _IDENTITY = np.eye(4)
+
+
+def axis_metres(units: str) -> tuple[float, float, float] | None:
+    """Return the lengths [m] of the units of x, y and z, where z is up; None for text that is no unit.
+
+    units: a key of METRES, or the length of another unit in metres as decimal text; for heights in
+    another unit than x and y, two of these with "+" between them.
+    """
+    horizontal, plus, vertical = units.partition("+")
+    across = _metres(horizontal)
+    upward = _metres(vertical) if plus else across
+    return None if across is None or upward is None else (across, across, upward)
+
+
+def _metres(unit: str) -> float | None:
+    try:
+        metres = METRES[unit] if unit in METRES else float(unit)
+    except ValueError:
+        return None
+    return metres if 0 < metres < math.inf else None
+
+
+def unit_name(metres: float) -> str:
+    """Return the name of a unit of this length [m], or the length as text if no unit has it."""
+    for name, length in METRES.items():
+        if math.isclose(metres, length, rel_tol=SAME_UNIT):
+            return name
+    return repr(metres)
 
 
 def place_scan(
@@ -42,17 +83,27 @@ def place_scan(
 
     pose: (4, 4), scan in metres with z up -> world; None or the scan's own pose: keep the scan's
     pose.
-    units: a key of METRES; None: the scan's own.
-    up: a key of TURNS; None: the scan's own.
+    units: see `axis_metres`; None or "": the scan's own.
+    up: a key of TURNS; None or "": the scan's own.
     scale: an additional factor, above 0.
+    Raises ScanError if the scan's own unit is not a length.
     """
     units, up = units or scan.units, up or scan.up
+    metres = axis_metres(units)
+    if metres is None:
+        raise ScanError(
+            f"{scan.path}: {scan.units_note or f'coordinates in {units}'}, expected a length: project the scan to a "
+            f"coordinate system in metres; or, if the file is wrong, give its units in a list of `solidcloud inspect`: "
+            f"{EXPECTED_UNITS}"
+        )
     if pose is not None and np.array_equal(pose, scan.pose):
         pose = None
-    if pose is None and METRES[units] * scale == 1 and up == "z":
+    if pose is None and all(length * scale == 1 for length in metres) and up == "z":
         if (scan.units, scan.up) != (units, up):
             scan = copy.copy(scan)
-            scan.units, scan.up = units, up
+            if scan.units != units:
+                scan.units, scan.units_note = units, ""
+            scan.up = up
         return scan
     return PlacedScan(scan, pose, units, up, scale)
 
@@ -76,11 +127,12 @@ class PlacedScan(Scan):
             inner, bounds = copy.copy(inner), None
             inner.pose, inner.bounds = _IDENTITY, None
         self._inner = inner
-        self._factor = METRES[units] * scale
         self._axes, self._signs = TURNS[up]
+        # For each axis of the world: a length of the file [m].
+        self._factors = tuple(length * scale for length in axis_metres(units) or ())
         self._given = _IDENTITY if given is None else given
         turn = np.eye(4)
-        turn[:3, :3] = np.eye(3)[list(self._axes)] * self._factor * np.array(self._signs)[:, None]
+        turn[:3, :3] = np.eye(3)[list(self._axes)] * np.multiply(self._factors, self._signs)[:, None]
         super().__init__(
             inner.path,
             inner.format,
@@ -91,13 +143,14 @@ class PlacedScan(Scan):
             bounds=None if bounds is None else self._bounds(bounds),
         )
         self.units, self.up, self.crs, self.seekable = units, up, inner.crs, inner.seekable
+        self.units_note = inner.units_note if units == inner.units else ""
         self.columns, self.notes = inner.columns, inner.notes
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         return self._read_range(block_points, 0, None)
 
     def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
-        self._inner.wanted = self.wanted
+        self._inner.wanted, self._inner.drop_classes = self.wanted, self.drop_classes
         for block in self._inner.blocks(block_points, start, stop):
             self.dropped = self._inner.dropped
             yield block._replace(xyz=apply_pose(self._given, self._turned(block.xyz)))
@@ -107,18 +160,18 @@ class PlacedScan(Scan):
         """Return the points in metres with z up, (n, 3); changing a sign is exact, hence one rounding."""
         turned = np.empty_like(xyz)
         with np.errstate(over="ignore"):  # values beyond float64 become infinite; the caller counts them
-            for axis, (source, sign) in enumerate(zip(self._axes, self._signs, strict=True)):
-                np.multiply(xyz[:, source], sign * self._factor, out=turned[:, axis])
+            for axis, source in enumerate(self._axes):
+                np.multiply(xyz[:, source], self._signs[axis] * self._factors[axis], out=turned[:, axis])
         return turned
 
     def _lattice(self) -> SourceLattice | None:
-        """Return the source's lattice with its axes exchanged; None where points are moved off it."""
+        """Return the source's lattice, scaled and with its axes exchanged; None if a pose moves the points."""
         inner = self._inner.lattice
-        if inner is None or self._factor != 1 or not np.array_equal(self._given, _IDENTITY):
+        if inner is None or not np.array_equal(self._given, _IDENTITY):
             return None
-        (i, j, k), (a, b, c) = self._axes, self._signs
-        scale, offset = inner.scale, inner.offset
-        return SourceLattice((scale[i], scale[j], scale[k]), (a * offset[i], b * offset[j], c * offset[k]))
+        scale = np.multiply(self._factors, np.take(inner.scale, self._axes))
+        offset = np.multiply(self._factors, self._signs) * np.take(inner.offset, self._axes)
+        return SourceLattice(tuple(scale.tolist()), tuple(offset.tolist()))
 
     def _bounds(self, bounds: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return a box (2, 3) that encloses every point of the box `bounds` (2, 3) once placed."""

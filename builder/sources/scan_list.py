@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...schemas.errors import BadRequestError
 from ...schemas.process.new_file import new_file
 from ...schemas.process.text_encoding import decode_text
-from .placed_scan import METRES, TURNS
+from .placed_scan import DEGREES, EXPECTED_UNITS, TURNS, UNKNOWN, axis_metres
 
 LIST_SUFFIX = ".toml"
 _VERSION = 1
@@ -48,10 +48,12 @@ class ScanEntry:
     count: points that the header declares; None: not declared.
     bounds: (2, 3) as declared, in the file's units, in its frame or where its pose puts it; None:
     not declared.
-    pose: (4, 4), or None.  units, up: keys of METRES and TURNS.  scale: additional factor.
+    pose: (4, 4), or None.  units: see `axis_metres`, up: a key of TURNS; "": what the file states.
+    scale: additional factor.
     crs: text of the coordinate reference system, or "".  sha256: of the file, "" if not requested.
     use: whether a build reads the scan.  fault: why it cannot be read, or "".
-    warnings: what looks wrong, one line each.  columns: see `Scan`. Both are not written to a list.
+    warnings: what looks wrong, one line each.  columns: see `Scan`.  classes: points that were read, by
+    class and flag (`Scan.count_classes`); None: not counted. These three are not written to a list.
     """
 
     path: Path
@@ -60,8 +62,8 @@ class ScanEntry:
     count: int | None = None
     bounds: NDArray[np.float64] | None = None
     pose: NDArray[np.float64] | None = None
-    units: str = "m"
-    up: str = "z"
+    units: str = ""
+    up: str = ""
     scale: float = 1.0
     crs: str = ""
     sha256: str = ""
@@ -69,6 +71,7 @@ class ScanEntry:
     fault: str = ""
     warnings: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
+    classes: Mapping[str, int] | None = None
 
 
 def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
@@ -80,7 +83,7 @@ def write_scan_list(path: Path, entries: Sequence[ScanEntry]) -> None:
     """
     folder = Path(path).parent
     tables = [_table(entry, folder) for entry in entries]
-    head = _HEAD.format(units=", ".join(METRES))
+    head = _HEAD.format(units=EXPECTED_UNITS)
     text = head + "\n" + tomli_w.dumps({"version": _VERSION, "scan": tables})
     for entry in entries:
         if _BROKEN_NAME.search(str(entry.path)):
@@ -204,6 +207,11 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 63
 
 
+def _is_units(value: Any) -> bool:
+    # A list that `inspect` wrote for a file without a unit of length says so until it is edited.
+    return isinstance(value, str) and (value in (DEGREES, UNKNOWN) or axis_metres(value) is not None)
+
+
 _TEXT = _Field("text in quotes", lambda value: isinstance(value, str))
 _FIELDS = {
     "path": _Field(
@@ -211,7 +219,7 @@ _FIELDS = {
     ),
     "index": _Field("a whole number, 0 or more, of 63 bits", _is_whole),
     "use": _Field("true or false", lambda value: isinstance(value, bool)),
-    "units": _Field(" or ".join(METRES), lambda value: isinstance(value, str) and value in METRES),
+    "units": _Field(EXPECTED_UNITS, _is_units),
     "scale": _Field("a number above 0", lambda value: _is_number(value) and value > 0),
     "up": _Field(" or ".join(TURNS), lambda value: isinstance(value, str) and value in TURNS),
     "pose": _Field("four rows of four numbers that move points, the last 0 0 0 1", _is_pose),
@@ -249,8 +257,8 @@ def _entry(path: Path, number: int, table: Any) -> ScanEntry:
         table.get("count"),
         np.array([table["low"], table["high"]], np.float64) if "low" in table else None,
         np.array(table["pose"], np.float64) if "pose" in table else None,
-        table.get("units", "m"),
-        table.get("up", "z"),
+        table.get("units", ""),
+        table.get("up", ""),
         float(table.get("scale", 1.0)),
         table.get("crs", ""),
         table.get("sha256", ""),

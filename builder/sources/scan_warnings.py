@@ -1,12 +1,13 @@
 """Warnings about scans that a build accepts although they are probably a mistake.
 
-`inspect`, `plan` and `build` report: what a reader assumed (`Scan.notes`), a scan that is probably in
-millimetres or beyond the limit of coordinates, a gap between scans far larger than the scans, the
-mesh of an avatar beside scans, and a radius that does not fit the spacing of the points. The checks
-use the bounds of headers, and read a few points of a scan only if these do not suffice. A warning
-is one line and never an error.
+`inspect`, `plan` and `build` report: what a reader assumed (`Scan.notes`), units that files state, a
+scan that is probably in millimetres or beyond the limit of coordinates, a gap between scans far
+larger than the scans, the mesh of an avatar beside scans, and a radius that does not fit the
+spacing of the points. The checks use the bounds of headers, and read a few points of a scan only if
+these do not suffice. A warning is one line and never an error.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -175,6 +176,7 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
     found = [
         *(ScanWarning(number, note) for number, each in used for note in each.scan.notes),
         *_beyond_limit(used),
+        *_stated_units(used),
         *_wrong_units(used),
         *_gaps(used),
         *_avatars(used),
@@ -184,6 +186,23 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
 
 
 _Numbered = Sequence[tuple[int, ScanFacts]]
+
+
+def _stated_units(facts: _Numbered) -> list[ScanWarning]:
+    """Tell which units other than the metre the files state, once for all scans of one statement."""
+    first: dict[str, tuple[int, ScanFacts]] = {}
+    counts = Counter(each.scan.units_note for _, each in facts)
+    for number, each in facts:
+        first.setdefault(each.scan.units_note, (number, each))
+    return [
+        ScanWarning(
+            number,
+            f"{each.name}{f' and {counts[note] - 1} more' if counts[note] > 1 else ''}: {note}"
+            f"{'' if each.scan.units == 'm' else ': converted to metres'}",
+        )
+        for note, (number, each) in first.items()
+        if note
+    ]
 
 
 def _wrong_units(facts: _Numbered) -> list[ScanWarning]:

@@ -131,7 +131,8 @@ def describe(name: str, path: Path) -> Whole:
     header: Span = (0, len(data))
     if suffix in (".las", ".laz"):
         start, size = struct.unpack_from("<I", data, 96)[0], struct.unpack_from("<H", data, 105)[0]
-        plain = [[(start + size * k, start + size * k + 12)] for k in range(n)]
+        # The coordinates, and the flags, one of which deletes the point.
+        plain = [[(at, at + 12), (at + 15, at + 16)] for at in range(start, start + size * n, size)]
         own = plain if suffix == ".las" else _laz_own(data, n, start)
         placing, header = [(131, 179)], (0, start)
         legacy, wide = Field((107, 111), "<I"), Field((247, 255), "<Q")

@@ -5,10 +5,12 @@ declares. A scan is therefore small and can be pickled: thousands can be listed 
 processes.
 """
 
+import copy
 import errno
 import hashlib
 import importlib
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BufferedReader
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import MAX_COORDINATE
 from ....schemas.errors import ScanError, SolidcloudError
 from ....schemas.process.interrupts import check_interrupt
+from .colours import CLASSIFICATION
 
 # A block of 2^18 points is 6 MiB of float64: large enough to hide the cost of one round of the
 # Python loop, small enough that a few blocks are negligible beside any --memory.
@@ -48,6 +51,10 @@ NO_RETURN = "no return"
 # Maximum deviation of a quaternion's length from 1 (NUMERICS.md, case 4). float32 rounding passes;
 # |q| = 1.01, which would stretch space by 1.5 %, does not.
 QUATERNION_SLACK = 1e-6
+
+# Drop reasons of points that their file flags as deleted, and as made by a program; and, with a
+# number, of the points of a class. Only the first are left out without being asked for.
+WITHHELD, SYNTHETIC, CLASS = "withheld", "synthetic", "class"
 
 # Margin added to computed bounds [m]: covers float64 rounding up to 1e9 m (0.12 um per operation).
 BOUNDS_MARGIN = 1e-6
@@ -100,12 +107,14 @@ class Scan(ABC):
     while it is iterated.
     seekable: True where blocks() can begin and end at any point and reads only that range
     (`SeekableScan`).
-    units: length unit of the coordinates, a key of METRES (placed_scan.py). up: the axis that points up,
-    "z", "y" or "x". Both are what the format prescribes, or the usual value where it prescribes
+    units: unit of the coordinates, see `axis_metres` (placed_scan.py). up: the axis that points up,
+    "z", "y" or "x". Both are what the file or its format states, or the usual value where these state
     none. blocks() does not convert coordinates.
+    units_note: which unit the file states, and where, if that is not the metre; or "".
     crs: the coordinate reference system's text, or "".
     columns: columns that the points have besides coordinates: "intensity", "rgb", "classification".
     wanted: columns, of the last two, that blocks() delivers; set before a scan is read.
+    drop_classes: numbers of classes, and SYNTHETIC, whose points blocks() leaves out; likewise.
     fault: error found in this scan's header while other scans of the file are readable; or "".
     notes: what the reader assumed where the header is wrong, one line each; they become warnings.
     """
@@ -113,9 +122,11 @@ class Scan(ABC):
     seekable = False
     units = "m"
     up = "z"
+    units_note = ""
     crs = ""
     columns: frozenset[str] = frozenset()
     wanted: frozenset[str] = frozenset()
+    drop_classes: frozenset[int | str] = frozenset()
     fault = ""
     notes: tuple[str, ...] = ()
 
@@ -141,7 +152,8 @@ class Scan(ABC):
 
     def delivers(self, column: str) -> bool:
         """Return whether blocks() delivers "rgb" or "classification"."""
-        return column in self.columns and column in self.wanted
+        wanted = column in self.wanted or (column == CLASSIFICATION and bool(self.drop_classes))
+        return wanted and column in self.columns
 
     def blocks(
         self, block_points: int = BLOCK_POINTS, start: int = 0, stop: int | None = None
@@ -160,7 +172,29 @@ class Scan(ABC):
         with library_errors(self.path):
             for block in blocks:
                 check_interrupt()
-                yield block
+                yield self._without_classes(block)
+
+    def count_classes(self, start: int = 0, stop: int | None = None) -> Counter[str]:
+        """Count the points of a range by class, and by WITHHELD and SYNTHETIC if they have such flags.
+
+        The keys are the drop reasons, and "points" for all that were read. Raises as blocks() does.
+        """
+        scan, found = copy.copy(self), Counter[str]()
+        scan.wanted = frozenset({CLASSIFICATION})
+        for block in scan.blocks(BLOCK_POINTS, start, stop):
+            found += class_counts(block.classification)
+        return found
+
+    def _without_classes(self, block: ScanBlock) -> ScanBlock:
+        """Return the points of a block whose class is not left out; count the others."""
+        if block.classification is None or not self.drop_classes:
+            return block
+        counts = np.bincount(block.classification, minlength=256)
+        drop = [number for number in self.drop_classes if isinstance(number, int) and counts[number]]
+        for number in drop:
+            reason = f"{CLASS} {number}"
+            self.dropped[reason] = self.dropped.get(reason, 0) + int(counts[number])
+        return block.taken(~np.isin(block.classification, drop)) if drop else block
 
     def _read_range(self, block_points: int, start: int, stop: int | None) -> Iterator[ScanBlock]:
         """Return the blocks of a range. Only the whole range is allowed; SeekableScan overrides this."""
@@ -250,6 +284,16 @@ def check_end(file: BinaryIO, path: Path, what: str) -> None:
                 "the end of the file",
                 "fetch the file again, the count in its header may be damaged",
             )
+
+
+def class_counts(classes: NDArray[np.uint8] | None) -> Counter[str]:
+    """Return how many of points (n,) are in each class, and "points": n."""
+    if classes is None:
+        return Counter()
+    counts = np.bincount(classes, minlength=256)
+    return Counter(
+        {"points": len(classes), **{f"{CLASS} {k}": int(counts[k]) for k in np.flatnonzero(counts)}}
+    )
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:

@@ -28,6 +28,7 @@ from ..common.scan import (
     scan_error,
     zero_rotation_note,
 )
+from ..placed_scan import axis_metres
 from .e57_xml import Section, check_e57, check_xml, checked_xml, record_sections, records_held, xml_of
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -318,9 +319,10 @@ def _bounds(numbers: dict[str, float | None], pose: NDArray[np.float64]) -> NDAr
     return checked_bounds(np.stack([centers.min(axis=0) - half, centers.max(axis=0) + half]))
 
 
-def e57_bounds(path: Path) -> NDArray[np.float64] | None:
+def e57_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
     """Return the bounds of all scans that an E57 file's XML declares, (2, 3) world frame [m].
 
+    units: see `axis_metres`; "": metres, as the standard has it.
     Returns None where one scan has no bounds, because its points may then be anywhere. Reads the
     XML without libE57Format, which refuses the file. May raise anything, also where the XML itself
     may be damaged.
@@ -331,6 +333,7 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
     root = ElementTree.fromstring(xml)
     tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""
     boxes: list[NDArray[np.float64]] = []
+    metres = axis_metres(units or "m")
     for scan in root.iterfind(f"{tag}data3D/{tag}vectorChild"):
         numbers = {
             name: _xml_number(scan, [tag + part for part in name.split("/")])
@@ -340,9 +343,9 @@ def e57_bounds(path: Path) -> NDArray[np.float64] | None:
         if box is None:
             return None
         boxes.append(box)
-    if not boxes:
+    if not boxes or metres is None:
         return None
-    return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+    return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]) * metres
 
 
 def _xml_number(element: ElementTree.Element, names: list[str]) -> float | None:

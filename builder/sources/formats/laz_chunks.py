@@ -11,10 +11,9 @@ import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
 from ..common.scan import scan_error
 
-LASZIP_VLR = (b"laszip encoded", 22204)
-VLR_HEADER_BYTES = 54
 CHUNKED = 2  # the compressor of point formats 0 to 5
 VARIABLE = 0xFFFFFFFF  # special value of points per chunk: each chunk has its own point count
 LAYERED = 3  # the compressor of point formats 6 to 10: each chunk is split into layers
@@ -24,27 +23,31 @@ LAYERED = 3  # the compressor of point formats 6 to 10: each chunk is split into
 # layer per byte.
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 EXTRA_BYTES = 14
+# Most bytes that may be left of the last chunk once its points are decompressed. Nothing is left of
+# those that LASzip and lazrs write; four bytes end the code of a chunk without points.
+LEFT_BYTES = 4
 
 
 def check_chunks(
     file: BinaryIO,
     path: Path,
     *,
-    header_size: int,
-    vlr_count: int,
+    laszip: bytes,
     start: int,
     record_bytes: int,
     points: int,
-) -> bytes:
+) -> int:
     """Check that a LAZ file's chunks and chunk table lie within the file and hold all its points.
 
+    laszip: the LASzip record.
     start: offset of the point data.
     record_bytes, points: size and count of the uncompressed records, as declared.
-    Reads a few bytes per chunk (usually 50,000 points). Returns the LASzip record, which the
-    decompressor needs. Raises ScanError.
+    Reads a few bytes per chunk (usually 50,000 points). Returns -1, or the number of bytes behind
+    the chunks if these do not tell how many points the last one has: see `check_chunk_end`. Raises
+    ScanError.
     """
     size = file.seek(0, 2)
-    laszip, items = _laszip_record(file, path, header_size, vlr_count)
+    items = _items(path, laszip)
     compressor, chunk_points = struct.unpack_from("<H10xI", laszip)
     if compressor not in (CHUNKED, LAYERED):
         raise scan_error(
@@ -67,7 +70,7 @@ def check_chunks(
             path, f"{chunks} chunks in {table - start - 8} bytes", f"a point of {record_bytes} bytes in each"
         )
     if compressor != LAYERED:
-        return laszip
+        return size - table
     layers = sum(LAYERS.get(kind, length if kind == EXTRA_BYTES else 0) for kind, length in items)
     sizes = struct.Struct(f"<{1 + layers}I")
     at, seen, number = start + 8, 0, 0
@@ -85,7 +88,32 @@ def check_chunks(
     # Writers that end each chunk explicitly leave an empty chunk after the last.
     if seen != points or not number <= chunks <= number + 1:
         raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
-    return laszip
+    return -1
+
+
+def check_chunk_end(decompressor: Any, path: Path, behind: int) -> None:
+    """Check that a decompressor which has delivered all declared points is at the end of the chunks.
+
+    behind: number of bytes that follow the chunks. Raises ScanError.
+    """
+    try:
+        with blocking_interrupts():
+            decompressor.read_raw_bytes_into(bytearray(behind + LEFT_BYTES + 1))
+    except Exception:
+        check_interrupt()
+        return  # the file ends before: as it should
+    raise _damaged(path, "further points in the last chunk", "as many as the header declares")
+
+
+def chunk_bytes(file: BinaryIO, start: int, end: int) -> int:
+    """Return how many bytes of chunks there are between the offsets `start` and `end`, at most.
+
+    start: offset of the point data, which begin with the offset of the chunk table.
+    """
+    file.seek(start)
+    raw = file.read(8)
+    table = struct.unpack("<q", raw)[0] if len(raw) == 8 else -1
+    return (table if start + 8 <= table <= end else end) - start - 8
 
 
 class LazTail(io.RawIOBase):
@@ -104,7 +132,7 @@ class LazTail(io.RawIOBase):
         start: offset of its point data.
         laszip: its LASzip record.
         point: number of the point whose chunk is the first here; `skip` is the number of points
-        before it in that chunk.
+        before it in that chunk, and `behind` the number of bytes after the chunks.
         """
         vlr = lazrs.LazVlr(laszip)
         file.seek(start)
@@ -121,6 +149,7 @@ class LazTail(io.RawIOBase):
         self._file, self._from = file, at
         self._past = 8 + sum(size for _, size in chunks[first:])
         self._table = table.getvalue()
+        self.behind = len(self._table)
         self._at = 0
 
     def readable(self) -> bool:
@@ -147,26 +176,14 @@ class LazTail(io.RawIOBase):
         return len(data)
 
 
-def _laszip_record(
-    file: BinaryIO, path: Path, header_size: int, vlr_count: int
-) -> tuple[bytes, list[tuple[int, int]]]:
-    """Return the LASzip record, and (type, bytes) of each item of a point that it lists."""
-    file.seek(header_size)
-    for _ in range(vlr_count):
-        user, record_id, length = struct.unpack_from(
-            "<16sHH", file.read(VLR_HEADER_BYTES).ljust(54, b"\0"), 2
+def _items(path: Path, laszip: bytes) -> list[tuple[int, int]]:
+    """Return (type, bytes) of each item of a point that the LASzip record lists."""
+    count = struct.unpack_from("<H", laszip, 32)[0] if len(laszip) >= 34 else 0
+    if len(laszip) < 34 + 6 * count or not count:
+        raise _damaged(
+            path, "no whole record 22204 of 'laszip encoded'", "this record before the points of a LAZ file"
         )
-        if (user.rstrip(b"\0"), record_id) == LASZIP_VLR:
-            record = file.read(length)
-            count = struct.unpack_from("<H", record, 32)[0] if length >= 34 else 0
-            if len(record) < 34 + 6 * count or not count:
-                break
-            items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
-            return record, items
-        file.seek(length, 1)
-    raise _damaged(
-        path, "no whole record 22204 of 'laszip encoded'", "this record before the points of a LAZ file"
-    )
+    return [struct.unpack_from("<HH", laszip, 34 + 6 * k) for k in range(count)]
 
 
 def _chunk_table(file: BinaryIO, path: Path, start: int, size: int) -> tuple[int, int]:

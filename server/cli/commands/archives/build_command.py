@@ -86,6 +86,13 @@ def build(
             "where at least SCANS other scans cover the place (have points within 8 times METRES)."
         ),
     ] = None,
+    drop_classes: Annotated[
+        str,
+        typer.Option(
+            help="Classes of points to leave out, separated by commas: numbers, and synthetic for points with that "
+            "flag in LAS. 7 and 18 are noise in LAS. Withheld points are always left out."
+        ),
+    ] = "",
     scheduler: Annotated[
         str | None,
         typer.Option(help="Address of a dask scheduler whose workers run the build: tcp://HOST:PORT."),
@@ -125,7 +132,7 @@ def build(
 
     if not dry_run:
         check_free(output)  # before loading numba, which takes a second
-    from .....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_radius, parse_rule
+    from .....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_classes, parse_radius, parse_rule
     from .....schemas.errors import BadRequestError
 
     if cell_points is not None and leaf_cells is not None:
@@ -157,6 +164,7 @@ def build(
         thin=thin,
         outliers=parse_rule(outliers, "--outliers"),
         moving=parse_rule(moving, "--moving"),
+        drop_classes=parse_classes(drop_classes),
         scheduler=scheduler,
         cluster=cluster,
     )
@@ -236,7 +244,6 @@ def _estimate(scans: Sequence[Path], output: Path, config: "BuildConfig", as_jso
     from .plan_command import print_plan
 
     with interruptible():
-        found = estimate(
-            sample_scene(open_input_files(scans, config.spacing), config), config, load_rates(), output
-        )
+        inputs = open_input_files(scans, config.spacing, drop_classes=config.drop_classes)
+        found = estimate(sample_scene(inputs, config), config, load_rates(), output)
     print_plan(found, as_json)

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from .....builder.sources.scan_list import ScanEntry
 
 DEFAULT_LIST = Path("scans.toml")
+# Points that are counted by a flag of LAS, or as noise (low and high).
+WITHHELD = "withheld"
+FLAGGED = (WITHHELD, "class 7", "class 18", "synthetic")
 
 
 def inspect(
@@ -38,7 +41,8 @@ def inspect(
 ) -> None:
     """Describe scans and write a list to edit.
 
-    The description comes from the headers of the scans; of a scans.toml, its edits are kept.
+    The description comes from the headers of the scans; of a scans.toml, its edits are kept. Points
+    that are withheld, noise (classes 7 and 18) or synthetic are counted, in large files by a sample.
 
     --stray: dust and what is left of passing people stop walking avatars in mid air. Points hang if
     their group in cubes of 0.1 m has fewer than 500 points, touches no other group, and is above one
@@ -69,7 +73,15 @@ def inspect(
     if as_json:
         print_json([{**_plain(entry), "stray": _plain_stray(found, k)} for k, entry in enumerate(entries)])
     else:
-        print("\n".join([*_lines(entries), *([] if found is None else _stray_lines(entries, found))]))
+        print(
+            "\n".join(
+                [
+                    *_lines(entries),
+                    *_flag_lines(entries),
+                    *([] if found is None else _stray_lines(entries, found)),
+                ]
+            )
+        )
     # Without --output the list is only a convenience, and an existing list may hold hours of edits.
     if not as_json and not output and DEFAULT_LIST.exists() and not overwrite:
         print(
@@ -107,7 +119,43 @@ def _plain(entry: "ScanEntry") -> dict[str, Any]:
         "fault": entry.fault,
         "warnings": list(entry.warnings),
         "columns": list(entry.columns),
+        "flagged": _flagged(entry),
     }
+
+
+def _flagged(entry: "ScanEntry") -> dict[str, Any] | None:
+    """Return how many points a build leaves out or could leave out; None if they were not counted.
+
+    exact: all points were read; otherwise the numbers are estimated from those that were.
+    """
+    read = entry.classes["points"] if entry.classes else 0
+    if not read or entry.classes is None:
+        return None
+    total = read if entry.count is None else entry.count
+    flags = {name: round(entry.classes.get(name, 0) * total / read) for name in FLAGGED}
+    return {"exact": read >= total, **flags}
+
+
+def _flag_lines(entries: "list[ScanEntry]") -> list[str]:
+    """Format the flagged points, a line for each scan that has some."""
+    lines = []
+    for entry in entries:
+        found = _flagged(entry) or {}
+        about = "" if found.get("exact") else "about "
+        counts = {name: f"{about}{found[name]:,}" for name in FLAGGED if found.get(name)}
+        parts = (
+            [f"{counts[WITHHELD]} points withheld, which a build leaves out"] if WITHHELD in counts else []
+        )
+        drop = [name for name in counts if name != WITHHELD]
+        if drop:
+            option = ",".join(name.removeprefix("class ") for name in drop)
+            text = ", ".join(
+                f"{counts[name]} {name if name == 'synthetic' else f'of {name}'}" for name in drop
+            )
+            parts.append(f"{text}: `build --drop-classes {option}` leaves these out")
+        if parts:
+            lines.append(f"{_name(entry)}: {'; '.join(parts)}")
+    return lines
 
 
 def _plain_stray(found: "StrayPoints | None", number: int) -> dict[str, Any] | None:

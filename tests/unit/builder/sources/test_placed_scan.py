@@ -34,14 +34,14 @@ def test_the_axis_that_is_up_becomes_z_by_a_turn(up: str, las: Scan) -> None:
 
 
 @pytest.mark.parametrize("up", TURNS)
-def test_a_turned_scan_stays_on_its_lattice_and_one_that_is_scaled_or_posed_does_not(
-    up: str, las: Scan
+@pytest.mark.parametrize("units", ["m", "us-ft", "m+ft"])
+def test_a_turned_or_scaled_scan_stays_on_its_lattice_and_a_posed_one_does_not(
+    units: str, up: str, las: Scan
 ) -> None:
-    turned = place_scan(las, up=up)
+    turned = place_scan(las, up=up, units=units)
     assert turned.lattice is not None
     steps = (read(turned) - turned.lattice.offset) / turned.lattice.scale
     assert np.abs(steps - np.rint(steps)).max() < 1e-6
-    assert place_scan(las, up=up, units="ft").lattice is None
     assert place_scan(las, up=up, pose=TURN).lattice is None
 
 
@@ -76,6 +76,15 @@ def test_blocks_ranges_and_processes_change_no_bit(las: Scan) -> None:
     part = np.concatenate([block.xyz for block in moved.blocks(50, 123, 400)])
     assert np.array_equal(part, whole[123:400])
     assert np.array_equal(read(pickle.loads(pickle.dumps(moved))), whole)
+
+
+@pytest.mark.parametrize("up", TURNS)
+def test_heights_may_have_a_unit_of_their_own(up: str, las: Scan) -> None:
+    turned = read(place_scan(las, up=up))
+    assert np.array_equal(read(place_scan(las, up=up, units="m+us-ft")), turned * [1, 1, 1200 / 3937])
+    assert np.array_equal(
+        read(place_scan(las, up=up, units="0.3047972654+2.0")), turned * [0.3047972654, 0.3047972654, 2]
+    )
 
 
 @pytest.mark.parametrize("up", TURNS)

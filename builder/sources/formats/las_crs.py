@@ -1,0 +1,253 @@
+"""Coordinate reference system of a LAS file, as WKT or GeoTIFF keys: its text and its units of length.
+
+There is no database of systems: a unit counts as stated if WKT or a key of its own names it, not if
+it follows from the EPSG code of a projection.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from ..placed_scan import DEGREES, UNKNOWN, unit_name
+
+# Variable length records of the user "LASF_Projection" [LAS 1.4 R15, 3].
+WKT, GEO_KEYS, GEO_DOUBLES, GEO_TEXTS = 2112, 34735, 34736, 34737
+
+# GeoTIFF keys that identify the system [OGC 19-008r4, 7]; other keys refine it.
+KEY_NAMES = {
+    1024: "model",
+    1026: "citation",
+    2048: "geodetic EPSG",
+    2049: "geodetic citation",
+    3072: "projected EPSG",
+    3073: "projected citation",
+    3076: "linear units EPSG",
+    4096: "vertical EPSG",
+    4097: "vertical citation",
+    4099: "vertical units EPSG",
+}
+MODEL, GEOGRAPHIC, GEODETIC, ANGULAR_UNIT = 1024, 2, 2048, 2054
+PROJECTED = range(3072, 3096)  # keys of a projection
+# Keys of a unit of length, each with that of its size in metres, for a unit without EPSG code; the
+# first pair is of projected systems, the second of geocentric ones.
+LINEAR_UNITS, VERTICAL_UNIT = ((3076, 3077), (2052, 2053)), ((4099, 0),)
+NO_CODE = (0, 32767)  # undefined, and defined by the file itself
+
+# EPSG code of a unit of length -> metres [EPSG dataset, unit of measure].
+EPSG_METRES = {
+    1025: 0.001,
+    1033: 0.01,
+    9001: 1.0,
+    9002: 0.3048,
+    9003: 1200 / 3937,
+    9005: 0.3047972654,
+    9014: 1.8288,
+    9030: 1852.0,
+    9031: 1.0000135965,
+    9033: 79200 / 3937,
+    9034: 792 / 3937,
+    9035: 6336000 / 3937,
+    9036: 1000.0,
+    9037: 0.9143917962,
+    9040: 0.914398414616029,
+    9041: 0.304799471538676,
+    9080: 0.304799510248147,
+    9084: 0.914398530744441,
+    9093: 1609.344,
+    9094: 0.304799710181509,
+    9095: 0.3048007491,
+    9096: 0.9144,
+    9097: 20.1168,
+    9098: 0.201168,
+}
+
+# WKT 1 and 2 [OGC 12-063r5, 18-010r11]: nodes of systems whose unit is that of x and y, or of
+# heights, and of units. The system inside another one, or that a bound one is related to, is none.
+GEOGRAPHIC_NODES = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS"}
+GEODETIC_NODES = {"GEODCRS", "GEODETICCRS"}  # geographic or geocentric
+PLANE_NODES = {
+    "PROJCS", "PROJCRS", "PROJECTEDCRS", "DERIVEDPROJCRS", "GEOCCS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS",
+}  # fmt: skip
+VERTICAL_NODES = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
+OUTER_NODES = {"COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS"}
+UNIT_NODES = {"UNIT", "LENGTHUNIT", "ANGLEUNIT"}
+
+
+class Units(NamedTuple):
+    """Units that a file states. name: as `axis_metres` takes it.  note: as in `Scan.units_note`."""
+
+    name: str
+    note: str
+
+
+class _Unit(NamedTuple):
+    """Unit of some axes.  metres: None for an angle or an unknown length.  where: what states it."""
+
+    metres: float | None
+    where: str
+    angular: bool = False
+
+
+def crs_text(found: Mapping[int, bytes]) -> str:
+    """Return the text of the system: WKT, or the identifying GeoTIFF keys; "" without either.
+
+    found: number -> projection record.
+    """
+    if wkt := _wkt(found):
+        return wkt
+    return "; ".join(
+        f"{KEY_NAMES[key]} {value}"
+        for key, value in geo_keys(found).items()
+        if key in KEY_NAMES and value != ""
+    )
+
+
+def stated_units(found: Mapping[int, bytes]) -> Units | None:
+    """Return the units that the records of a file state; None where they state none.
+
+    found: number -> projection record. Heights without a unit of their own have that of x and y.
+    """
+    tree, whole = _parse_wkt(_wkt(found))
+    across, upward = _wkt_units(tree) if whole and tree else (None, None)
+    if across is None and upward is None:
+        across, upward = _key_units(geo_keys(found))
+    if across is None and upward is None:
+        return None if whole else Units("m", "its WKT ends too soon: taken as metres")
+    for unit in filter(None, (across, upward)):
+        if unit.angular:
+            return Units(DEGREES, f"coordinates in degrees of latitude and longitude, as {unit.where} states")
+        if unit.metres is None:
+            return Units(UNKNOWN, f"coordinates in a unit whose length is not known, as {unit.where} states")
+    plane = unit_name(across.metres) if across and across.metres else "m"
+    height = unit_name(upward.metres) if upward and upward.metres else plane
+    if plane == height:
+        where = (across or upward or _Unit(None, "")).where
+        return Units(plane, "" if plane == "m" else f"coordinates in {_long_name(plane)}, as {where} states")
+    across_text = (
+        f"{_long_name(plane)}, as {across.where} states" if across else "metres, as no unit is stated"
+    )
+    where = upward.where if upward else ""
+    return Units(
+        f"{plane}+{height}", f"x and y in {across_text}; heights in {_long_name(height)}, as {where} states"
+    )
+
+
+def _long_name(name: str) -> str:
+    """Return the name of a unit for a message."""
+    return {"m": "metres", "ft": "feet (ft)", "us-ft": "US survey feet (us-ft)"}.get(
+        name, f"units of {name} m"
+    )
+
+
+def geo_keys(found: Mapping[int, bytes]) -> dict[int, int | float | str]:
+    """Return the values of the GeoTIFF keys of a file; those that cannot be read are left out."""
+    keys, texts, numbers = (found.get(number, b"") for number in (GEO_KEYS, GEO_TEXTS, GEO_DOUBLES))
+    words = struct.unpack(f"<{len(keys) // 2}H", keys[: len(keys) // 2 * 2])
+    values: dict[int, int | float | str] = {}
+    for k in range(1, 1 + min(words[3] if len(words) > 3 else 0, len(words) // 4 - 1)):
+        key, place, count, value = words[4 * k : 4 * k + 4]
+        if place == 0:
+            values[key] = value
+        elif place == GEO_TEXTS:
+            values[key] = texts[value : value + count].decode("ascii", "replace").strip("|\0 ")
+        elif place == GEO_DOUBLES and 8 * value + 8 <= len(numbers):
+            (values[key],) = struct.unpack_from("<d", numbers, 8 * value)
+    return values
+
+
+def _key_units(keys: Mapping[int, int | float | str]) -> tuple[_Unit | None, _Unit | None]:
+    """Return the units of x and y and of heights that GeoTIFF keys state."""
+    across = next(filter(None, (_key_unit(keys, *pair) for pair in LINEAR_UNITS)), None)
+    model = keys.get(MODEL)
+    # Without a model, a system of latitude and longitude is one that names nothing else.
+    plain = model in (None, *NO_CODE) and across is None and not keys.keys() & PROJECTED
+    if model == GEOGRAPHIC or (plain and (GEODETIC in keys or ANGULAR_UNIT in keys)):
+        key = MODEL if model == GEOGRAPHIC else GEODETIC if GEODETIC in keys else ANGULAR_UNIT
+        across = _Unit(None, f"GeoTIFF key {key} = {keys[key]}", True)
+    return across, _key_unit(keys, *VERTICAL_UNIT[0])
+
+
+def _key_unit(keys: Mapping[int, int | float | str], code: int, size: int) -> _Unit | None:
+    """Return the unit that a key names by its EPSG code, or another by its size [m]."""
+    number, metres = keys.get(code), keys.get(size)
+    if isinstance(number, int) and number not in NO_CODE:
+        angular = 9101 <= number <= 9122
+        return _Unit(EPSG_METRES.get(number), f"GeoTIFF key {code} = {number}", angular)
+    if isinstance(metres, float) and metres > 0:
+        return _Unit(metres, f"GeoTIFF key {size} = {metres:.12g}")
+    return None
+
+
+class _Node(NamedTuple):
+    """Node of WKT, in capitals, and what it holds: texts, numbers as text, and nodes."""
+
+    name: str
+    values: list["str | _Node"]
+
+    def child(self, names: set[str]) -> "_Node | None":
+        """Return the first node of one of these names right inside this one."""
+        return next((v for v in self.values if isinstance(v, _Node) and v.name in names), None)
+
+
+_UNPRINTABLE = re.compile(r"[^ -~]")
+_TOKEN = re.compile(r'"((?:[^"]|"")*)"|([\[(])|([\])])|([^\s,\[\]()"]+)')
+
+
+def _wkt(found: Mapping[int, bytes]) -> str:
+    return found.get(WKT, b"").split(b"\0")[0].decode("utf-8", "replace").strip()
+
+
+def _parse_wkt(text: str) -> tuple[_Node | None, bool]:
+    """Return the first node of WKT, None without one, and whether all nodes end."""
+    path = [_Node("", [])]
+    for quoted, opens, closes, word in _TOKEN.findall(text):
+        values = path[-1].values
+        if opens:
+            name = values.pop() if values and isinstance(values[-1], str) else ""
+            assert isinstance(name, str)
+            values.append(_Node(name.upper(), []))
+            path.append(values[-1])  # type: ignore[arg-type]  # the node
+        elif not closes:
+            values.append(word or quoted)
+        elif len(path) > 1:
+            path.pop()
+    first = next((value for value in path[0].values if isinstance(value, _Node)), None)
+    return first, len(path) == 1
+
+
+def _wkt_units(node: _Node) -> tuple[_Unit | None, _Unit | None]:
+    """Return the units of x and y and of heights that a system in WKT states."""
+    if node.name in OUTER_NODES:
+        across = upward = None
+        for part in (value for value in node.values if isinstance(value, _Node)):
+            of_part = _wkt_units(part)
+            across, upward = across or of_part[0], upward or of_part[1]
+        return across, upward
+    if node.name in VERTICAL_NODES:
+        return None, _node_unit(node, node)
+    kind = node.child({"CS"})
+    if node.name in GEOGRAPHIC_NODES or (
+        node.name in GEODETIC_NODES and kind and "ellipsoidal" in kind.values
+    ):
+        return _Unit(None, f"its WKT {node.name}", True), None
+    if node.name not in PLANE_NODES | GEODETIC_NODES:
+        return None, None
+    axes = [part for part in node.values if isinstance(part, _Node) and part.name == "AXIS"]
+    return _node_unit(node, node), _node_unit(axes[2], node) if len(axes) > 2 else None
+
+
+def _node_unit(holder: _Node, system: _Node) -> _Unit | None:
+    """Return the unit right inside a node of a system, or inside its first axis."""
+    axis = holder.child({"AXIS"})
+    unit = holder.child(UNIT_NODES) or (axis and axis.child(UNIT_NODES))
+    if unit is None or len(unit.values) < 2:
+        return None
+    name, size = (_UNPRINTABLE.sub("?", str(value))[:40] for value in unit.values[:2])
+    where = f"its WKT {system.name} {unit.name} {name!r} of {size}"
+    try:
+        metres = float(size)
+    except ValueError:
+        metres = 0.0
+    return _Unit(metres if 0 < metres < math.inf else None, where, unit.name == "ANGLEUNIT")

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import replace
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,12 +89,10 @@ def open_scans(path: Path, *, spacing: float | None = None) -> list[Scan]:
         return [SurfaceSamples(scans[0], spacing)] if spacing is not None and form.is_mesh else scans
 
 
-def _reader(name: str) -> Callable[[Path], Any]:
+def _reader(name: str) -> Callable[..., Any]:
     """Return a function of `formats/` by its module and name, as format_table.py gives them."""
     module, function = name.split(".")
-    found: Callable[[Path], Any] = getattr(
-        importlib.import_module(f".formats.{module}", __package__), function
-    )
+    found: Callable[..., Any] = getattr(importlib.import_module(f".formats.{module}", __package__), function)
     return found
 
 
@@ -214,12 +213,17 @@ def inspect_scans(
             found[0] = replace(found[0], warnings=(note, *found[0].warnings))
         if listed is not None:
             found, scans = _as_listed(listed, found, scans)
-        for number, (scan, entry) in enumerate(zip(scans, found, strict=False), len(entries)):
-            if entry.use:
-                placed = place_scan(scan, pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale)
-                numbers.append(number)
-                facts.append(ScanFacts(placed))
-        entries += found
+        for scan, entry in zip_longest(scans, found):
+            if scan and entry.use:
+                try:
+                    placed = place_scan(
+                        scan, pose=entry.pose, units=entry.units, up=entry.up, scale=entry.scale
+                    )
+                    numbers.append(len(entries))
+                    facts.append(ScanFacts(placed))
+                except ScanError as error:
+                    entry = replace(entry, fault=str(error))
+            entries.append(entry)
         progress.advance(1)
     progress.finish()
     for warning in find_warnings(facts):

@@ -242,14 +242,15 @@ class LasScan(SeekableScan):
 
     def _block(self, records: NDArray[np.void]) -> ScanBlock:
         """Build a block from point records, without those that their flags leave out."""
-        flags = records["flags"]
         for reason, bits in FLAG_BITS.items():
-            if reason == WITHHELD or reason in self.drop_classes:
-                chosen = (flags & bits[self._is_new]) != 0
-                if count := int(np.count_nonzero(chosen)):
-                    self.dropped[reason] = self.dropped.get(reason, 0) + count
-                    records = records[~chosen]
-                    flags = records["flags"]
+            flag = bits[self._is_new]
+            # Most blocks have none of these points. A reduction takes 0.2 ns a point, a mask 1.7.
+            if (reason == WITHHELD or reason in self.drop_classes) and np.bitwise_or.reduce(
+                records["flags"]
+            ) & flag:
+                chosen = (records["flags"] & flag) != 0
+                self.dropped[reason] = self.dropped.get(reason, 0) + int(np.count_nonzero(chosen))
+                records = records[~chosen]
         for name in self._header.lost_axes():
             if records[name].any():
                 raise scan_error(

@@ -62,7 +62,7 @@ def test_las_classes_are_without_the_flags_beside_them(format: int, tmp_path: Pa
     import laspy
 
     las = laspy.read(path)
-    las.withheld[:], las.key_point[:] = 1, 1
+    las.synthetic[:], las.key_point[:] = 1, 1
     las.write(str(path))
     assert np.array_equal(read_scan(path).classes, truth.classes)
 

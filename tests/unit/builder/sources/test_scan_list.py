@@ -220,7 +220,7 @@ def test_a_missing_file_of_a_list_is_a_fault_and_of_the_command_an_error(folder:
         ("index", -1, r"scan 1 \(a.las\): index is '-1', expected a whole number"),
         ("index", True, "index is 'True', expected a whole number"),
         ("use", "no", "use is 'no', expected true or false"),
-        ("units", "feet", "units is 'feet', expected m or mm or .* or us-ft"),
+        ("units", "feet", "units is 'feet', expected m, mm, .* us-ft, yd"),
         ("scale", 0, "scale is '0', expected a number above 0"),
         ("scale", float("nan"), "scale is 'nan', expected a number above 0"),
         ("up", "Y", "up is 'Y', expected z or y or x"),

@@ -65,28 +65,23 @@ class E57Scan(Scan):
         pose: NDArray[np.float64],
         bounds: NDArray[np.float64] | None,
         fields: _Fields,
-        section: Section | None,
+        held: int,
     ) -> None:
+        """Create the scan. held: records that its section holds at least."""
         super().__init__(path, "e57", index=index, declared_count=count, pose=pose, bounds=bounds)
-        self._fields, self._section = fields, section
+        self._fields, self._held = fields, held
         self.columns = frozenset([INTENSITY] * bool(fields.intensity) + [RGB] * bool(fields.colours))
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
-        if self.declared_count:
-            yield from self._records(block_points)
-        if self._section is not None:
-            with self.path.open("rb") as file:
-                held = records_held(file, self._section)
-            if held > (self.declared_count or 0):
-                raise scan_error(
-                    self.path,
-                    f"scan {self.index} of at least {held} records",
-                    f"the {self.declared_count} its header declares",
-                    "fetch the file again, or check the program that wrote it",
-                )
-
-    def _records(self, block_points: int) -> Iterator[ScanBlock]:
-        """Yield the blocks of the declared records."""
+        if self._held > (self.declared_count or 0):
+            raise scan_error(
+                self.path,
+                f"scan {self.index} of at least {self._held} records",
+                f"the {self.declared_count} its header declares",
+                "fetch the file again, or check the program that wrote it",
+            )
+        if not self.declared_count:
+            return
         libe57 = _libe57(self.path)
         with _image_file(self.path) as image:
             # The arrays must outlive the reader: it writes into them through raw pointers.
@@ -247,7 +242,13 @@ def _open_scan(path: Path, index: int, node: Any, section: Section | None) -> Sc
             f"at most the {8 * path.stat().st_size} bits of the file",
             "fetch the file again, it is truncated or damaged",
         )
-    scan = E57Scan(path, index, count, pose, _bounds(numbers, pose), fields, section)
+    held = 0
+    if section is not None:
+        with path.open("rb") as file:
+            held = records_held(file, section)
+    # The bounds are those of the records that were counted, if the count is wrong.
+    bounds = _bounds(numbers, pose) if held <= count else None
+    scan = E57Scan(path, index, count, pose, bounds, fields, held)
     scan.notes = zero_rotation_note(path, index, [numbers[name] for name in _QUATERNION])
     return scan
 

@@ -8,6 +8,7 @@ processes.
 import errno
 import hashlib
 import importlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -53,6 +54,7 @@ INTENSITY_NAMES = ("intensity", "scalar_intensity")
 
 
 _IDENTITY = np.eye(4)
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class SourceLattice(NamedTuple):
@@ -229,7 +231,11 @@ def read_records(
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:
-    """Build the error for an unreadable scan, in the one message form all readers use."""
+    """Build the error for an unreadable scan, in the one message form all readers use.
+
+    found may hold names of the file, whose control characters are escaped.
+    """
+    found = _CONTROL.sub(lambda each: ascii(each[0])[1:-1], found)
     return ScanError(f"{path}: {found}, expected {expected}: {what_to_do}")
 
 

@@ -112,7 +112,7 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
                 path, f"line {at} holds a zero byte", "text", "fetch the file again, it is damaged"
             )
         end = data.rfind(NEWLINE) + 1
-        chunk, rest = data[:end], data[end:]
+        chunk, rest = line_ends(data[:end]), data[end:]
         if len(rest) > LONGEST_LINE:
             raise scan_error(
                 path,
@@ -124,7 +124,12 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
             yield line, chunk
             line += chunk.count(NEWLINE)
     if rest:
-        yield line, rest
+        yield line, line_ends(rest)
+
+
+def line_ends(lines: bytes) -> bytes:
+    """Return whole lines that end in LF, of the same length: a CR alone ends a line too."""
+    return lines.replace(b"\r\n", b" \n").replace(b"\r", NEWLINE) if b"\r" in lines else lines
 
 
 def split_row(line: bytes, delimiter: str | None) -> list[str]:

@@ -205,7 +205,9 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
     if not count and beyond:
         text = beyond_text(scan.units, max(part.farthest for part in parts))
         others = f" and {not_finite:,} that are not finite" if not_finite else ""
-        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}".replace(", expected", f"{others}, expected", 1)
+        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}".replace(
+            ", expected", f"{others}, expected", 1
+        )
     elif not count:
         fault = f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     nothing_lost = count == 0 and not_finite == 0 and beyond == 0

@@ -216,7 +216,9 @@ def _beyond_limit(facts: _Numbered) -> list[ScanWarning]:
     for number, each in facts:
         if each.box is None and len(points := _points(each.scan, 0, SAMPLE_POINTS)):
             found.append(
-                ScanWarning(number, f"{each.name}: {beyond_text(each.scan.units, float(np.abs(points).max()))}")
+                ScanWarning(
+                    number, f"{each.name}: {beyond_text(each.scan.units, float(np.abs(points).max()))}"
+                )
             )
     return found
 

@@ -106,9 +106,7 @@ def pts_columns(count: int) -> tuple[int | None, tuple[int, ...]]:
     return 3 if count in (4, 5, 7) else None, (count - 3, count - 2, count - 1) if count in (6, 7) else ()
 
 
-def skip_rows(
-    file: BufferedReader, path: Path, index: int, count: int, first_line: int
-) -> tuple[int, int]:
+def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> tuple[int, int]:
     """Advance the file past `count` rows; return the columns of the first one, and the next line's number.
 
     index: number of the scan, for messages.

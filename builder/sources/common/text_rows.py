@@ -47,8 +47,8 @@ _QUOTED = re.compile(rb"""(["'])([^\s"',;]*)\1""")
 class _CleanedText(io.RawIOBase):
     """Bytes of a text file up to its end mark, with CR turned into LF. Offsets are those of the file."""
 
-    def __init__(self, path: Path, end: int, cr: bool) -> None:
-        self._file, self._end, self._cr = path.open("rb", buffering=0), end, cr
+    def __init__(self, file: io.RawIOBase, end: int, cr: bool) -> None:
+        self._file, self._end, self._cr = file, end, cr
 
     def readable(self) -> bool:
         return True
@@ -82,11 +82,15 @@ def open_text_file(path: Path) -> io.BufferedReader:
         file.seek(max(0, size - 64))
         mark = _END_MARK.search(file.read())
     if is_utf16(head):
-        raise scan_error(path, "text in UTF-16", "ASCII or UTF-8", "save it as UTF-8 (in Windows: not as Unicode)")
+        raise scan_error(
+            path, "text in UTF-16", "ASCII or UTF-8", "save it as UTF-8 (in Windows: not as Unicode)"
+        )
     first_end = _LINE_END.search(head)
     cr = first_end is not None and first_end[0] == b"\r"
     end = size - len(mark[0]) if mark else size
-    text = io.BufferedReader(_CleanedText(path, end, cr)) if cr or mark else path.open("rb")
+    text: io.BufferedReader = path.open("rb")
+    if cr or mark:
+        text = io.BufferedReader(_CleanedText(text.detach(), end, cr))
     text.seek(len(UTF8_MARK) if head.startswith(UTF8_MARK) else 0)
     return text
 

@@ -108,7 +108,8 @@ def with_plain_letters(path: Path) -> Iterator[Path | None]:
     with path.open("rb") as file:
         raw = xml_of(file)
         plain = plain_letters(raw)
-        offset, length = struct.unpack("<24xQQ", file.seek(0) or file.read(40))
+        file.seek(0)
+        offset, length = struct.unpack("<24xQQ", file.read(40))
         first, at = divmod(offset, PAGE_BYTES)
         count = -(-(at + length) // (PAGE_BYTES - 4))
         file.seek(first * PAGE_BYTES)
@@ -135,12 +136,13 @@ def with_plain_letters(path: Path) -> Iterator[Path | None]:
 
 def _checksums(pages: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the checksums (n, 4) of pages (n, PAGE_BYTES): CRC-32C, big-endian [ASTM E2807, 7]."""
-    table = np.arange(256, dtype=np.uint32)
+    table: NDArray[np.uint32] = np.arange(256, dtype=np.uint32)
+    one, eight = np.uint32(1), np.uint32(8)
     for _ in range(8):
-        table = table >> 1 ^ np.where(table & 1, np.uint32(0x82F63B78), np.uint32(0))
-    found = np.full(len(pages), 0xFFFFFFFF, np.uint32)
+        table = table >> one ^ (table & one) * np.uint32(0x82F63B78)
+    found: NDArray[np.uint32] = np.full(len(pages), 0xFFFFFFFF, np.uint32)
     for column in pages[:, :-4].T:
-        found = found >> 8 ^ table[(found ^ column) & 0xFF]
+        found = found >> eight ^ table[(found ^ column) & np.uint32(0xFF)]
     return (~found).astype(">u4")[:, None].view(np.uint8)
 
 

@@ -35,45 +35,45 @@ LONGEST_HEADER = 1 << 20
 
 
 class _Property(NamedTuple):
-    """Property of an element. count: type of the number before a list; None: a single value."""
+    """Property of an element. length: type of the number before a list; None: a single value."""
 
     name: str
     type: np.dtype[Any]
-    count: np.dtype[Any] | None
+    length: np.dtype[Any] | None
 
 
 class _Element(NamedTuple):
-    """Element of a PLY file: `count` records of some properties."""
+    """Element of a PLY file: so many records of some properties."""
 
     name: str
-    count: int
+    records: int
     properties: tuple[_Property, ...]
 
     @property
     def has_lists(self) -> bool:
         """Return whether records differ in size."""
-        return any(each.count is not None for each in self.properties)
+        return any(each.length is not None for each in self.properties)
 
     @property
     def least_bytes(self) -> int:
         """Return the least size of a record of a binary file."""
-        return sum((each.count or each.type).itemsize for each in self.properties)
+        return sum((each.length or each.type).itemsize for each in self.properties)
 
     def record(self, lengths: Sequence[int] = ()) -> np.dtype[np.void]:
-        """Return the layout of a record. lengths: of its lists, in order; see `count_name`."""
+        """Return the layout of a record. lengths: of its lists, in order; see `length_name`."""
         fields: list[Any] = []
         left = iter(lengths)
-        for name, kind, count in self.properties:
-            if count is None:
+        for name, kind, length in self.properties:
+            if length is None:
                 fields.append((name, kind))
             else:
-                fields += [(count_name(name), count), (name, kind, (next(left, 0),))]
+                fields += [(length_name(name), length), (name, kind, (next(left, 0),))]
         return np.dtype(fields)
 
 
-def count_name(name: str) -> str:
+def length_name(name: str) -> str:
     """Return the name of the field with a list's length; no property has it, because names have no blank."""
-    return f"{name} count"
+    return f"{name} length"
 
 
 class _Header(NamedTuple):
@@ -92,7 +92,7 @@ class _Header(NamedTuple):
     @property
     def points(self) -> int:
         """Return the number of vertices."""
-        return self.vertex.count
+        return self.vertex.records
 
     @property
     def columns(self) -> frozenset[str]:
@@ -111,7 +111,7 @@ class BinaryPly(SeekableScan):
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         header = self._header
         with self.path.open("rb") as file:
-            skip = sum(each.count * each.least_bytes for each in header.before)
+            skip = sum(each.records * each.least_bytes for each in header.before)
             file.seek(header.start + skip + start * header.record.itemsize)
             for record in read_records(
                 file, self.path, header.record, stop - start, block_points, "vertices"
@@ -132,7 +132,7 @@ class ListPly(Scan):
             file.seek(header.start)
             for element in header.before:
                 if not element.has_lists:
-                    file.seek(element.count * element.least_bytes, 1)
+                    file.seek(element.records * element.least_bytes, 1)
                     continue
                 for _ in _list_records(file, self.path, element, block_points):
                     pass
@@ -150,18 +150,20 @@ def _list_records(
     Raises ScanError.
     """
     seen, step = 0, 1
-    while seen < element.count:
+    while seen < element.records:
         check_interrupt()
         begin = file.tell()
         lengths = _list_lengths(file, path, element)
         record = element.record(lengths)
         file.seek(begin)
-        most = min(step, element.count - seen, block_points, BLOCK_BYTES // record.itemsize)
-        records = np.frombuffer(data := file.read(most * record.itemsize), record, len(data) // record.itemsize)
+        most = min(step, element.records - seen, block_points, BLOCK_BYTES // record.itemsize)
+        records = np.frombuffer(
+            data := file.read(most * record.itemsize), record, len(data) // record.itemsize
+        )
         if not len(records):
-            raise _truncated(path, seen, element.count, element.name)
+            raise _truncated(path, seen, element.records, element.name)
         alike = np.ones(len(records), bool)
-        names = [count_name(each.name) for each in element.properties if each.count is not None]
+        names = [length_name(each.name) for each in element.properties if each.length is not None]
         for name, length in zip(names, lengths, strict=True):
             alike &= records[name] == length
         unlike = np.flatnonzero(~alike)
@@ -215,7 +217,7 @@ class AsciiPly(Scan):
         names = header.record.names or ()
         row = np.dtype([(name, np.float64) for name in names])
         seen = 0
-        skip = sum(each.count for each in header.before)
+        skip = sum(each.records for each in header.before)
         with open_text_file(self.path) as file:
             file.seek(header.start)
             _skip_lines(file, skip)
@@ -261,7 +263,7 @@ def open_ply(path: Path) -> list[Scan]:
     """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
     with library_errors(path):
         header = _read_header(path)
-        skip = 0 if header.ascii else sum(each.count * each.least_bytes for each in header.before)
+        skip = 0 if header.ascii else sum(each.records * each.least_bytes for each in header.before)
         least = 2 * len(header.vertex.properties) if header.ascii else header.vertex.least_bytes
         left = path.stat().st_size - header.start - skip
         # The last ASCII row may lack its line end; allow one byte for it.
@@ -330,8 +332,8 @@ def _read_header(path: Path) -> _Header:
         )
     vertex = elements[at]
     # Where rows of text have lists, only the columns before the first one have a fixed place.
-    used = list(itertools.takewhile(lambda each: each.count is None, vertex.properties))
-    known = tuple(used) if ply.text else tuple(each for each in vertex.properties if each.count is None)
+    used = list(itertools.takewhile(lambda each: each.length is None, vertex.properties))
+    known = tuple(used) if ply.text else tuple(each for each in vertex.properties if each.length is None)
     record = vertex._replace(properties=known).record()
     names = record.names or ()
     missing = [name for name in "xyz" if name not in names]

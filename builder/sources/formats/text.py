@@ -197,7 +197,9 @@ def _layout_of(
 def _split_names(text: str) -> list[str]:
     """Return the names of a header row, in lower case, without quotes."""
     delimiter = next((each for each in ";,\t" if each in text), None)
-    names = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True)) if delimiter else text.split()
+    names = (
+        next(csv.reader([text], delimiter=delimiter, skipinitialspace=True)) if delimiter else text.split()
+    )
     while len(names) > 1 and not names[-1].strip():
         names.pop()  # a delimiter at the line's end
     return [name.strip().strip("\"'").lower() for name in names]

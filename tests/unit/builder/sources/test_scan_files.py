@@ -6,7 +6,6 @@ The expected points never pass through the code under test.
 import hashlib
 import os
 import pickle
-import re
 import subprocess
 import sys
 import tracemalloc
@@ -105,7 +104,7 @@ def unlike_plain(case: Case, data: bytes, kind: str) -> bytes:
         return head.replace(b"\r\n", b"\n").replace(b"\n", b"\r") + rest
     if kind == "ctrl-z":
         return head + b"\x1a" + rest if not rest else data
-    letters = "Süd – ß\x9b\x1b[31m".encode(kind.removeprefix("letters "), "replace")
+    letters = "Süd — ß\x9b\x1b[31m".encode(kind.removeprefix("letters "), "replace")
     comment = {
         ".ply": b"comment %s\nobj_info %s\n" % (letters, letters),
         ".obj": b"# %s\ng %s\nusemtl %s\n" % (letters, letters, letters),
@@ -116,7 +115,11 @@ def unlike_plain(case: Case, data: bytes, kind: str) -> bytes:
     return named[:first] + comment + named[first:]
 
 
-IN_TEXT = [case for case in CASES if not case.name.endswith((".las", ".laz", ".e57", ".glb")) and case.name != "binary.stl"]
+IN_TEXT = [
+    case
+    for case in CASES
+    if not case.name.endswith((".las", ".laz", ".e57", ".glb")) and case.name != "binary.stl"
+]
 
 
 @pytest.mark.parametrize("kind", ["mark", "cr", "ctrl-z", "letters utf-8", "letters latin-1"])
@@ -199,7 +202,9 @@ def test_points_too_far_away_are_counted_apart(tmp_path: Path) -> None:
     with pytest.raises(ScanError, match=found):
         build_archive([path], tmp_path / "strict", BuildConfig(jobs=1, strict=True))
     path.write_text("0 -1e300 0\nnan 0 0\n")
-    with pytest.raises(ScanError, match=r"1 points beyond 1e9 m and 1 that are not finite, .*: check its coord"):
+    with pytest.raises(
+        ScanError, match=r"1 points beyond 1e9 m and 1 that are not finite, .*: check its coord"
+    ):
         build_archive([path], tmp_path / "far", BuildConfig(jobs=1))
 
 
@@ -375,7 +380,9 @@ def test_companions_of_macos_are_skipped_in_folders_with_a_line(
     assert line in added.warnings
     for command in ("inspect", "plan", "build"):
         capsys.readouterr()
-        assert run([command, str(folder), *(["-o", str(tmp_path / command)] if command != "plan" else [])]) == 0
+        assert (
+            run([command, str(folder), *(["-o", str(tmp_path / command)] if command != "plan" else [])]) == 0
+        )
         assert line in capsys.readouterr().err.replace("\n", "")
     (folder / "a.xyz").unlink()
     with pytest.raises(ScanError, match="a folder without scans"):

@@ -94,7 +94,7 @@ def test_an_e57_pose_that_is_not_rigid_is_refused(pose: dict, message: str, tmp_
         open_scans(path)
 
 
-@pytest.mark.parametrize("name", ["Süd – ✓", "S\udcfcd", "a\x01b", "a\udced\udca0\udc80b", "<\uffff"])
+@pytest.mark.parametrize("name", ["Süd — ✓", "S\udcfcd", "a\x01b", "a\udced\udca0\udc80b", "<\uffff"])
 def test_letters_of_e57_names_stop_nothing(name: str, local: np.ndarray, tmp_path: Path) -> None:
     """Issue 35: names in another encoding than UTF-8, and letters that XML does not allow."""
     path, letters = tmp_path / "named.e57", name.encode("utf-8", "surrogateescape").replace(b"<", b"&lt;")

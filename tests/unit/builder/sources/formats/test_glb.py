@@ -51,7 +51,7 @@ def test_letters_of_names_and_a_rotation_of_zeros_are_read(tmp_path: Path) -> No
 
     path = write_square(tmp_path / "a.glb", change)
     path.write_bytes(path.read_bytes().replace(b"SuedX", "S\xfcd\x1b\x9b".encode("latin-1")))
-    assert np.array_equal(read_all(path), SQUARE + [1, 2, 3])
+    assert np.array_equal(read_all(path), SQUARE + np.array([1, 2, 3]))
     (note,) = open_scans(path)[0].notes
     assert note == f"{path}: scan 0 has a rotation of zeros, read as no rotation: check how the scan lies"
     document = json.dumps(glb_document(4, 6)).encode()

@@ -130,7 +130,7 @@ def test_a_list_of_no_length_is_refused(tmp_path: Path) -> None:
     head = PLY.replace("ascii", "binary_little_endian").replace("element", face + "element", 1)
     for kind, length in (("char", b"\xff"), ("uint", b"\xff\xff\xff\xff")):
         path.write_bytes((head.format(kind, 1) + "end_header\n").encode() + length + bytes(100))
-        with pytest.raises(ScanError, match="a list of (-1|4294967295) values in element 'face'"):
+        with pytest.raises(ScanError, match=r"a list of (-1|4294967295) values in element 'face'"):
             read_all(path)
     path.write_bytes((head.format("float", 1) + "end_header\n").encode() + bytes(100))
     with pytest.raises(ScanError, match="list 'n' with lengths of type float32"):

@@ -191,6 +191,16 @@ def test_inspect_plan_and_build_say_the_same(tmp_path: Path, capsys: pytest.Capt
     assert json.loads(capsys.readouterr().out)["warnings"] == [text]
 
 
+def test_a_small_object_in_millimetres_is_called_that(tmp_path: Path) -> None:
+    """Issue 35: nothing shorter than 1 km was."""
+    around = np.random.default_rng(0).normal(size=(3000, 3))
+    gear = around / np.linalg.norm(around, axis=1)[:, None] * [196, 302, 320]
+    (entry,) = inspect_scans([write_xyz(tmp_path / "gear.xyz", gear)])
+    assert MILLIMETRES in entry.warnings[0]
+    (entry,) = inspect_scans([write_xyz(tmp_path / "terrain.xyz", gear * [1, 1, 0.2])])
+    assert entry.warnings == ()
+
+
 def write_turnless(path: Path, points: NDArray[np.float64]) -> Path:
     """Write points with a rotation of zeros and the translation 1, 2, 3."""
     if path.suffix == ".e57":

@@ -18,7 +18,7 @@ ALLOWED = {
     "schemas/process": "errors.py",
     "schemas/archive": "errors.py kernels process",
     "schemas/wire": "archive errors.py",
-    "schemas/scene": "archive errors.py wire",
+    "schemas/scene": "archive errors.py process wire",
     "builder/kernels/neighbours": "kernels/points kernels/trees",
     "builder/build_limits.py": "config.py",
     "builder/run": "build_limits.py",

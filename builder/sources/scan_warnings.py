@@ -27,6 +27,9 @@ FEW_POINTS = 50
 # A scan at least this long [m] with points at least this far apart [m] is probably in millimetres:
 # a storey is 2,500 mm high, and a laser scan's points are 2 to 50 mm apart.
 LONG, SPARSE = 1000.0, 2.0
+# So is a shorter scan, of at least this length [m], whose least extent is this share of its length: an
+# object, because terrain and rooms with points so far apart are flatter.
+OBJECT_LENGTH, OBJECT_SHARE = 50.0, 0.3
 # In map coordinates the terrain may be long and its points far apart; but not as high as this [m],
 # nor as high as this share of its length.
 HIGH, STEEP = 1000.0, 0.03
@@ -209,10 +212,12 @@ def _wrong_units(facts: _Numbered) -> list[ScanWarning]:
     """Warn of scans that are probably in millimetres but read as metres."""
     found = []
     for number, each in facts:
-        if each.length < LONG or each.scan.units != "m" or each.scan.crs:
+        if each.length < OBJECT_LENGTH or each.scan.units != "m" or each.scan.crs:
             continue
         assert each.box is not None
         size = each.box[1] - each.box[0]
+        if each.length < LONG and float(size.min()) < OBJECT_SHARE * each.length:
+            continue
         on_a_map = float(np.abs(each.box).max()) > ON_A_MAP * each.length
         if on_a_map and float(size.min()) < max(HIGH, STEEP * each.length):
             continue
@@ -235,7 +240,9 @@ def _beyond_limit(facts: _Numbered) -> list[ScanWarning]:
     for number, each in facts:
         if each.box is None and len(points := _points(each.scan, 0, SAMPLE_POINTS)):
             found.append(
-                ScanWarning(number, f"{each.name}: {beyond_text(each.scan.units, float(np.abs(points).max()))}")
+                ScanWarning(
+                    number, f"{each.name}: {beyond_text(each.scan.units, float(np.abs(points).max()))}"
+                )
             )
     return found
 

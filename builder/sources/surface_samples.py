@@ -186,7 +186,9 @@ def _plain_mesh(path: Path) -> io.BytesIO:
     is_text = any(line.split()[:2] == ["format", "ascii"] for line in lines)
     with open_text_file(path) if is_text else path.open("rb") as file:
         file.seek(start)
-        return io.BytesIO("".join(f"{line}\n" for line in lines).encode("ascii") + file.read())
+        # trimesh expects the format in the second line.
+        head = "".join(f"{line}\n" for line in lines if line != "comment")
+        return io.BytesIO(head.encode("ascii") + file.read())
 
 
 def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:

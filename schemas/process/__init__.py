@@ -1,4 +1,4 @@
-"""Helpers around the operating system: interrupts, error messages of the OS, durable new files.
+"""Helpers around the operating system: interrupts, OS errors, durable new files, encodings of text.
 
 May import schemas/errors.py.
 Begin with new_file.py.

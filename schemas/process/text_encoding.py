@@ -6,12 +6,12 @@ UTF8_MARK = codecs.BOM_UTF8
 _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def decode_text(data: bytes) -> str:
+def decode_text(data: bytes, errors: str = "strict") -> str:
     """Decode the whole of a small text file: UTF-8, or UTF-16 with its mark; the mark is left out.
 
-    Raises UnicodeDecodeError.
+    errors: as in bytes.decode(). Raises UnicodeDecodeError by default.
     """
-    return data.decode("utf-16" if data.startswith(_UTF16_MARKS) else "utf-8-sig")
+    return data.decode("utf-16" if data.startswith(_UTF16_MARKS) else "utf-8-sig", errors)
 
 
 def is_utf16(head: bytes) -> bool:

@@ -4,6 +4,7 @@ Such a file does not state where its second block begins. Opening it therefore r
 counts lines, in bounded memory.
 """
 
+import io
 import re
 from collections.abc import Iterator
 from io import BufferedReader
@@ -15,13 +16,22 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import check_interrupt
 from .colours import INTENSITY, RGB, whole_bytes
 from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
-from .text_rows import CHUNK_BYTES, LONGEST_LINE, NEWLINE, is_number, number_rows, open_text_file, split_row
+from .text_rows import (
+    CHUNK_BYTES,
+    LONGEST_LINE,
+    NEWLINE,
+    is_number,
+    line_ends,
+    number_rows,
+    open_text_file,
+    split_row,
+)
 
 # Bytes of the shortest row of three numbers, "0 0 0" and a line end. A declared count is checked
 # against the bytes left in the file.
 MIN_ROW_BYTES = 6
 # The end of a line before a blank line or a comment, which is no row.
-_NO_ROW = re.compile(rb"\n(?=[ \t\r]*(?:\n|#|//|;))")
+_NO_ROW = re.compile(rb"\n(?=[ \t]*(?:\n|#|//|;))")
 # Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
 # (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
 MAX_SCANS = 1 << 16
@@ -96,9 +106,7 @@ def pts_columns(count: int) -> tuple[int | None, tuple[int, ...]]:
     return 3 if count in (4, 5, 7) else None, (count - 3, count - 2, count - 1) if count in (6, 7) else ()
 
 
-def skip_rows(
-    file: BufferedReader, path: Path, index: int, count: int, first_line: int
-) -> tuple[int, int]:
+def skip_rows(file: BufferedReader, path: Path, index: int, count: int, first_line: int) -> tuple[int, int]:
     """Advance the file past `count` rows; return the columns of the first one, and the next line's number.
 
     index: number of the scan, for messages.
@@ -113,19 +121,8 @@ def skip_rows(
     file.seek(begin)
     if count * MIN_ROW_BYTES > left + 1:  # the last row may lack its line end
         raise _too_few(path, index, max(0, (left + 1) // MIN_ROW_BYTES), count)
-    while (raw := file.readline(LONGEST_LINE)) and not (fields := split_row(raw, None)):
-        first_line += 1
-    if not raw:
-        raise _too_few(path, index, 0, count)
-    if len(fields) < 3 or not all(map(is_number, fields)):
-        raise scan_error(
-            path,
-            f"line {first_line} is {raw.decode('latin-1').strip()[:60]!r}",
-            "x y z, optionally followed by an intensity, a colour or both",
-            "check the program that wrote this file",
-        )
-    wanted, line = count - 1, first_line + 1
-    while wanted:
+    columns, wanted, line = 0, count, first_line
+    while True:
         check_interrupt()
         begin = file.tell()
         data = file.read(CHUNK_BYTES)
@@ -133,7 +130,8 @@ def skip_rows(
         if not data:
             raise _too_few(path, index, count - wanted, count)
         # The last row may lack its line end. A match of _NO_ROW is the line end before such a line.
-        lines = NEWLINE + data + (b"" if data.endswith(NEWLINE) else NEWLINE)
+        lines = line_ends(NEWLINE + data + (b"" if data.endswith(NEWLINE) else NEWLINE))
+        columns = columns or _first_columns(path, lines[1:], line)
         others = [found.start() for found in _NO_ROW.finditer(lines)]
         found = lines.count(NEWLINE) - 1 - len(others)
         if found >= wanted:
@@ -141,9 +139,24 @@ def skip_rows(
             row_ends = ends[1:][~np.isin(ends[:-1], others)]
             last = row_ends[wanted - 1]
             file.seek(begin + min(int(last), len(data)))
-            return len(fields), line + int(np.searchsorted(ends, last))
+            return columns, line + int(np.searchsorted(ends, last))
         wanted, line = wanted - found, line + lines.count(NEWLINE) - 1
-    return len(fields), line
+
+
+def _first_columns(path: Path, lines: bytes, line: int) -> int:
+    """Return the columns of the first row in some lines, 0 without one. line: number of the first line."""
+    for number, raw in enumerate(io.BytesIO(lines), line):
+        if not (fields := split_row(raw, None)):
+            continue
+        if len(fields) < 3 or not all(map(is_number, fields)):
+            raise scan_error(
+                path,
+                f"line {number} is {raw.decode('latin-1').strip()[:60]!r}",
+                "x y z, optionally followed by an intensity, a colour or both",
+                "check the program that wrote this file",
+            )
+        return len(fields)
+    return 0
 
 
 def next_line(file: BufferedReader, line: int) -> tuple[str, int]:

@@ -9,6 +9,7 @@ import copy
 import errno
 import hashlib
 import importlib
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -64,6 +65,7 @@ INTENSITY_NAMES = ("intensity", "scalar_intensity")
 
 
 _IDENTITY = np.eye(4)
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class SourceLattice(NamedTuple):
@@ -297,7 +299,11 @@ def class_counts(classes: NDArray[np.uint8] | None) -> Counter[str]:
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:
-    """Build the error for an unreadable scan, in the one message form all readers use."""
+    """Build the error for an unreadable scan, in the one message form all readers use.
+
+    found may hold names of the file, whose control characters are escaped.
+    """
+    found = _CONTROL.sub(lambda each: ascii(each[0])[1:-1], found)
     return ScanError(f"{path}: {found}, expected {expected}: {what_to_do}")
 
 

@@ -48,8 +48,8 @@ _QUOTED = re.compile(rb"""(["'])([^\s"',;]*)\1""")
 class _CleanedText(io.RawIOBase):
     """Bytes of a text file up to its end mark, with CR turned into LF. Offsets are those of the file."""
 
-    def __init__(self, path: Path, end: int, cr: bool) -> None:
-        self._file, self._end, self._cr = path.open("rb", buffering=0), end, cr
+    def __init__(self, file: io.RawIOBase, end: int, cr: bool) -> None:
+        self._file, self._end, self._cr = file, end, cr
 
     def readable(self) -> bool:
         return True
@@ -89,7 +89,9 @@ def open_text_file(path: Path) -> io.BufferedReader:
     first_end = _LINE_END.search(head)
     cr = first_end is not None and first_end[0] == b"\r"
     end = size - len(mark[0]) if mark else size
-    text = io.BufferedReader(_CleanedText(path, end, cr)) if cr or mark else path.open("rb")
+    text: io.BufferedReader = path.open("rb")
+    if cr or mark:
+        text = io.BufferedReader(_CleanedText(text.detach(), end, cr))
     text.seek(len(UTF8_MARK) if head.startswith(UTF8_MARK) else 0)
     return text
 
@@ -115,7 +117,7 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
                 path, f"line {at} holds a zero byte", "text", "fetch the file again, it is damaged"
             )
         end = data.rfind(NEWLINE) + 1
-        chunk, rest = data[:end], data[end:]
+        chunk, rest = line_ends(data[:end]), data[end:]
         if len(rest) > LONGEST_LINE:
             raise scan_error(
                 path,
@@ -127,7 +129,12 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
             yield line, chunk
             line += chunk.count(NEWLINE)
     if rest:
-        yield line, rest
+        yield line, line_ends(rest)
+
+
+def line_ends(lines: bytes) -> bytes:
+    """Return whole lines that end in LF, of the same length: a CR alone ends a line too."""
+    return lines.replace(b"\r\n", b" \n").replace(b"\r", NEWLINE) if b"\r" in lines else lines
 
 
 def split_row(line: bytes, delimiter: str | None) -> list[str]:

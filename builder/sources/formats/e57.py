@@ -4,8 +4,9 @@ pye57's own read_scan() reads a whole scan at once, of the size that the header 
 underlying reader fills buffers of any size repeatedly; this module uses it.
 """
 
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -29,7 +30,17 @@ from ..common.scan import (
     zero_rotation_note,
 )
 from ..placed_scan import axis_metres
-from .e57_xml import Section, check_e57, check_xml, checked_xml, record_sections, records_held, xml_of
+from .e57_xml import (
+    Section,
+    check_e57,
+    check_xml,
+    checked_xml,
+    plain_letters,
+    record_sections,
+    records_held,
+    with_plain_letters,
+    xml_of,
+)
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 INVALID_STATE = "invalid state"
@@ -194,12 +205,18 @@ def _libe57(path: Path) -> Any:
 
 @contextmanager
 def _image_file(path: Path) -> Iterator[Any]:
-    """Open the file with libE57Format and close it at the end."""
-    image = _libe57(path).ImageFile(str(path), "r")
-    try:
+    """Open the file, or a copy with letters that libE57Format reads, and close it at the end."""
+    open_file = _libe57(path).ImageFile
+    with ExitStack() as held:
+        try:
+            image = open_file(os.fsencode(path), "r")
+        except Exception:
+            copy = held.enter_context(with_plain_letters(path))
+            if copy is None:
+                raise
+            image = open_file(os.fsencode(copy), "r")
+        held.callback(image.close)
         yield image
-    finally:
-        image.close()
 
 
 def _open_scan(path: Path, index: int, node: Any, section: Section | None) -> Scan:
@@ -329,7 +346,7 @@ def e57_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
     may be damaged.
     """
     with path.open("rb") as file:
-        xml = checked_xml(file)
+        xml = plain_letters(checked_xml(file))
     check_xml(xml)
     root = ElementTree.fromstring(xml)
     tag = root.tag.rpartition("}")[0] + "}" if "}" in root.tag else ""

@@ -1,16 +1,24 @@
-"""Check of an E57 file's header and XML before libE57Format reads them, and of the records' number.
+"""Check of an E57 file's header, XML and number of records, and repair of its letters.
 
 The library's time grows with the square of the nesting depth of elements: 30,000 levels, in a file
 of 0.7 MB, take 2 s; ten times as many take minutes. The library also creates a node for every
 element, however many there are.
 """
 
+import re
+import shutil
 import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..common.scan import scan_error
 
@@ -21,6 +29,8 @@ PAGE_BYTES = 1024  # the last four bytes are the page's checksum [ASTM E2807, 7]
 # A scan has about 60 elements, nested at most nine deep; extensions add some.
 MAX_ELEMENTS = 1 << 18
 DEEPEST = 64
+# Bytes that are not UTF-8, and characters that XML 1.0 does not allow.
+_FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff\udc80-\udcff]+")
 
 
 class XmlLimitError(ValueError):
@@ -48,7 +58,7 @@ def check_e57(path: Path) -> None:
             )
         xml = xml_of(file)
     try:
-        check_xml(xml)
+        check_xml(plain_letters(xml))
     except XmlLimitError as error:
         raise _damaged(path, str(error), "the description of some scans") from None
     except expat.ExpatError:
@@ -82,6 +92,60 @@ def check_xml(xml: bytes) -> None:
     parser.EndElementHandler = end
     parser.StartDoctypeDeclHandler = declares
     parser.Parse(xml, True)
+
+
+def plain_letters(xml: bytes) -> bytes:
+    """Return XML with "?" for each byte of letters that are not UTF-8 or that XML does not allow."""
+    text = xml.decode("utf-8", "surrogateescape")
+    return _FORBIDDEN.sub(lambda found: "?" * len(found[0].encode("utf-8", "surrogateescape")), text).encode()
+
+
+@contextmanager
+def with_plain_letters(path: Path) -> Iterator[Path | None]:
+    """Make a copy of an E57 file with `plain_letters`; None if that does not make its XML readable.
+
+    libE57Format reads no other letters, and only from a file. Some programs write names in the
+    encoding of their computer. Pages with a wrong checksum are left to the library.
+    """
+    with path.open("rb") as file:
+        raw = xml_of(file)
+        plain = plain_letters(raw)
+        file.seek(0)
+        offset, length = struct.unpack("<24xQQ", file.read(40))
+        first, at = divmod(offset, PAGE_BYTES)
+        count = -(-(at + length) // (PAGE_BYTES - 4))
+        file.seek(first * PAGE_BYTES)
+        pages = np.frombuffer(bytearray(file.read(count * PAGE_BYTES)), np.uint8).reshape(-1, PAGE_BYTES)
+    try:
+        check_xml(plain)
+    except (XmlLimitError, expat.ExpatError):
+        plain = raw
+    if plain == raw or not np.array_equal(pages[:, -4:], _checksums(pages)):
+        yield None
+        return
+    section = pages[:, :-4].reshape(-1)
+    section[at : at + length] = np.frombuffer(plain, np.uint8)
+    pages[:, :-4] = section.reshape(count, -1)
+    pages[:, -4:] = _checksums(pages)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "scan.e57")
+        shutil.copyfile(path, copy)
+        with copy.open("r+b") as file:
+            file.seek(first * PAGE_BYTES)
+            file.write(pages.tobytes())
+        yield copy
+
+
+def _checksums(pages: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the checksums (n, 4) of pages (n, PAGE_BYTES): CRC-32C, big-endian [ASTM E2807, 7]."""
+    table: NDArray[np.uint32] = np.arange(256, dtype=np.uint32)
+    one, eight = np.uint32(1), np.uint32(8)
+    for _ in range(8):
+        table = table >> one ^ (table & one) * np.uint32(0x82F63B78)
+    found: NDArray[np.uint32] = np.full(len(pages), 0xFFFFFFFF, np.uint32)
+    for column in pages[:, :-4].T:
+        found = found >> eight ^ table[(found ^ column) & np.uint32(0xFF)]
+    return (~found).astype(">u4")[:, None].view(np.uint8)
 
 
 def xml_of(file: BufferedReader) -> bytes:
@@ -120,28 +184,13 @@ def checked_xml(file: BufferedReader) -> bytes:
     xml = xml_of(file)
     file.seek(24)
     offset, _ = struct.unpack("<QQ", file.read(16))
-    past = _logical(offset) + len(xml)
-    pages = {0, *range(offset // PAGE_BYTES, -(-past // (PAGE_BYTES - 4)))}
-    for page in sorted(pages):
-        file.seek(page * PAGE_BYTES)
-        raw = file.read(PAGE_BYTES)
-        crc = 0xFFFFFFFF
-        for byte in raw[:-4]:
-            crc = crc >> 8 ^ _CRC32C[(crc ^ byte) & 255]
-        if len(raw) < PAGE_BYTES or (crc ^ 0xFFFFFFFF).to_bytes(4, "big") != raw[-4:]:
-            raise ValueError(f"the checksum of page {page} does not match")
+    first, past = offset // PAGE_BYTES, -(-(_logical(offset) + len(xml)) // (PAGE_BYTES - 4))
+    for begin, end in ((0, 1), (first, past)):
+        file.seek(begin * PAGE_BYTES)
+        pages = np.frombuffer(file.read((end - begin) * PAGE_BYTES), np.uint8).reshape(-1, PAGE_BYTES)
+        if len(pages) < end - begin or not np.array_equal(pages[:, -4:], _checksums(pages)):
+            raise ValueError("a page whose checksum does not match")
     return xml
-
-
-def _crc_table() -> list[int]:
-    table = list(range(256))
-    for _ in range(8):
-        table = [value >> 1 ^ (0x82F63B78 if value & 1 else 0) for value in table]
-    return table
-
-
-# Remainders of the CRC-32C, which closes each page [ASTM E2807, 7].
-_CRC32C = _crc_table()
 
 
 class Section(NamedTuple):

@@ -215,8 +215,8 @@ def _read_header(file: BufferedReader, path: Path) -> tuple[dict[str, Any], int,
             f"{length} bytes with {words} of JSON in a file of {held}",
             f"at most the file's size, and at most {LONGEST_JSON} of JSON",
         )
-    # Names with letters of another encoding do not matter here.
-    document = json.loads(file.read(words).decode("utf-8-sig", "replace"))
+    # Names with letters of another encoding, or with control characters, do not matter here.
+    document = json.loads(file.read(words).decode("utf-8-sig", "replace"), strict=False)
     head = file.read(8)
     size, kind = struct.unpack("<I4s", head) if len(head) == 8 else (0, b"")
     if kind != b"BIN\0":

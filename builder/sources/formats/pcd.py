@@ -71,7 +71,8 @@ class _Header(NamedTuple):
     fields: dict[str, _Field]
     record_bytes: int
     columns: int
-    points: int | None  # None: not declared, the rest of a text is points
+    points: int  # 0 if it is not declared: the rest of a text is points
+    is_counted: bool
     pose: NDArray[np.float64]
     notes: tuple[str, ...]
     kind: str
@@ -189,7 +190,8 @@ class AsciiPcd(Scan):
     """Points of an ASCII PCD file."""
 
     def __init__(self, path: Path, header: _Header) -> None:
-        super().__init__(path, "pcd", declared_count=header.points, pose=header.pose)
+        count = header.points if header.is_counted else None
+        super().__init__(path, "pcd", declared_count=count, pose=header.pose)
         self._header, self.columns = header, header.column_names
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
@@ -199,13 +201,13 @@ class AsciiPcd(Scan):
             file.seek(header.start)
             for rows in number_rows(
                 file, self.path, columns=header.columns, delimiter=None, first_line=header.lines + 1,
-                limit=header.points, behind=0,
+                limit=self.declared_count, behind=0,
             ):  # fmt: skip
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
                     part = rows[start : start + block_points]
                     yield _block(self, {name: _number(part, field) for name, field in fields.items()})
-        if header.points and seen < header.points:
+        if seen < header.points:
             raise _truncated(self.path, f"{seen} points", f"the {header.points} its header declares")
 
 
@@ -218,11 +220,11 @@ def open_pcd(path: Path) -> list[Scan]:
             return [_noted(CompressedPcd(path, header, _compressed_end(path, header, left)), header)]
         least = 2 * header.columns if header.kind == "ascii" else header.record_bytes
         # The last row of a text may lack its line end.
-        if (header.points or 0) * least > left + (header.kind == "ascii"):
+        if header.points * least > left + (header.kind == "ascii"):
             raise _truncated(path, f"{left // least} points at most", f"the {header.points} declared")
         if header.kind == "binary":
             with path.open("rb") as file:
-                file.seek(header.start + (header.points or 0) * header.record_bytes)
+                file.seek(header.start + header.points * header.record_bytes)
                 check_end(file, path, "points")
         return [_noted((AsciiPcd if header.kind == "ascii" else BinaryPcd)(path, header), header)]
 
@@ -306,8 +308,8 @@ def _read_header(path: Path) -> _Header:
     record_bytes = sum(size * count for size, count in zip(sizes, counts, strict=True))
     if not 0 < record_bytes <= BLOCK_BYTES:
         raise refuse("COUNT", f"records of at most {BLOCK_BYTES} bytes")
-    points: int | None = None
-    if "POINTS" in entries or "WIDTH" in entries:
+    points, is_counted = 0, "POINTS" in entries or "WIDTH" in entries
+    if is_counted:
         (height,) = numbers("HEIGHT", 1, ["1"])
         (width,) = numbers("WIDTH", 1, entries.get("POINTS") if height == 1 else None)
         points = width * height
@@ -327,4 +329,4 @@ def _read_header(path: Path) -> _Header:
             offset = sum(size * count for size, count in zip(sizes[:k], counts[:k], strict=True))
             fields[column] = _Field(offset, sum(counts[:k]), TYPES[types[k], sizes[k]], column == RGB)
     pose, notes = quaternion_pose(path, 0, place[3:], place[:3]), zero_rotation_note(path, 0, place[3:])
-    return _Header(fields, record_bytes, sum(counts), points, pose, notes, kind, start, lines)
+    return _Header(fields, record_bytes, sum(counts), points, is_counted, pose, notes, kind, start, lines)

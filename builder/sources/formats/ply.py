@@ -38,45 +38,45 @@ LISTS_BYTES = 1 << 16
 
 
 class _Property(NamedTuple):
-    """Property of an element. count: type of the number before a list; None: a single value."""
+    """Property of an element. length: type of the number before a list; None: a single value."""
 
     name: str
     type: np.dtype[Any]
-    count: np.dtype[Any] | None
+    length: np.dtype[Any] | None
 
 
 class _Element(NamedTuple):
-    """Element of a PLY file: `count` records of some properties."""
+    """Element of a PLY file: so many records of some properties."""
 
     name: str
-    count: int
+    records: int
     properties: tuple[_Property, ...]
 
     @property
     def has_lists(self) -> bool:
         """Return whether records differ in size."""
-        return any(each.count is not None for each in self.properties)
+        return any(each.length is not None for each in self.properties)
 
     @property
     def least_bytes(self) -> int:
         """Return the least size of a record of a binary file."""
-        return sum((each.count or each.type).itemsize for each in self.properties)
+        return sum((each.length or each.type).itemsize for each in self.properties)
 
     def record(self, lengths: Sequence[int] = ()) -> np.dtype[np.void]:
-        """Return the layout of a record. lengths: of its lists, in order; see `count_name`."""
+        """Return the layout of a record. lengths: of its lists, in order; see `length_name`."""
         fields: list[Any] = []
         left = iter(lengths)
-        for name, kind, count in self.properties:
-            if count is None:
+        for name, kind, length in self.properties:
+            if length is None:
                 fields.append((name, kind))
             else:
-                fields += [(count_name(name), count), (name, kind, (next(left, 0),))]
+                fields += [(length_name(name), length), (name, kind, (next(left, 0),))]
         return np.dtype(fields)
 
 
-def count_name(name: str) -> str:
+def length_name(name: str) -> str:
     """Return the name of the field with a list's length; no property has it, because names have no blank."""
-    return f"{name} count"
+    return f"{name} length"
 
 
 class _Header(NamedTuple):
@@ -96,7 +96,7 @@ class _Header(NamedTuple):
     @property
     def points(self) -> int:
         """Return the number of vertices."""
-        return self.vertex.count
+        return self.vertex.records
 
     @property
     def columns(self) -> frozenset[str]:
@@ -115,7 +115,7 @@ class BinaryPly(SeekableScan):
     def _read_between(self, block_points: int, start: int, stop: int) -> Iterator[ScanBlock]:
         header = self._header
         with self.path.open("rb") as file:
-            skip = sum(each.count * each.least_bytes for each in header.before)
+            skip = sum(each.records * each.least_bytes for each in header.before)
             file.seek(header.start + skip + start * header.record.itemsize)
             for record in read_records(
                 file, self.path, header.record, stop - start, block_points, "vertices"
@@ -151,20 +151,20 @@ def _list_records(
     Raises ScanError.
     """
     seen, step = 0, 1
-    while seen < element.count:
+    while seen < element.records:
         check_interrupt()
         begin = file.tell()
         lengths = _list_lengths(file, path, element)
         record = element.record(lengths)
         file.seek(begin)
-        most = min(step, element.count - seen, block_points, BLOCK_BYTES // record.itemsize)
+        most = min(step, element.records - seen, block_points, BLOCK_BYTES // record.itemsize)
         records = np.frombuffer(
             data := file.read(most * record.itemsize), record, len(data) // record.itemsize
         )
         if not len(records):
-            raise _truncated(path, seen, element.count, element.name)
+            raise _truncated(path, seen, element.records, element.name)
         alike = np.ones(len(records), bool)
-        names = [count_name(each.name) for each in element.properties if each.count is not None]
+        names = [length_name(each.name) for each in element.properties if each.length is not None]
         for name, length in zip(names, lengths, strict=True):
             alike &= records[name] == length
         unlike = np.flatnonzero(~alike)
@@ -185,15 +185,19 @@ def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> list[i
         length = int(np.frombuffer(file.read(count.itemsize).ljust(count.itemsize, b"\0"), count)[0])
         size += count.itemsize + length * kind.itemsize
         if length < 0 or size > BLOCK_BYTES:
-            raise scan_error(
-                path,
-                f"a list of {length} values in element {element.name!r}",
-                f"0 or more, in a record of at most {BLOCK_BYTES} bytes",
-                "fetch the file again, it is damaged",
-            )
+            raise _bad_list(path, element, length, f"in a record of at most {BLOCK_BYTES} bytes")
         lengths.append(length)
         file.seek(length * kind.itemsize, 1)
     return lengths
+
+
+def _bad_list(path: Path, element: _Element, length: int, where: str) -> Exception:
+    return scan_error(
+        path,
+        f"a list of {length} values in element {element.name!r}",
+        f"0 or more, {where}",
+        "fetch the file again: it is truncated, or a count in its header is damaged",
+    )
 
 
 def _skip_lines(file: BinaryIO, lines: int) -> None:
@@ -216,7 +220,7 @@ class AsciiPly(Scan):
         names = header.record.names or ()
         row = np.dtype([(name, np.float64) for name in names])
         seen = 0
-        skip = sum(each.count for each in header.before)
+        skip = sum(each.records for each in header.before)
         with open_text_file(self.path) as file:
             file.seek(header.start)
             _skip_lines(file, skip)
@@ -228,7 +232,7 @@ class AsciiPly(Scan):
                 first_line=header.lines + skip + 1,
                 limit=header.points,
                 more=header.vertex.has_lists,
-                behind=sum(each.count for each in header.after),
+                behind=sum(each.records for each in header.after),
             ):
                 seen += len(rows)
                 for start in range(0, len(rows), block_points):
@@ -263,7 +267,7 @@ def open_ply(path: Path) -> list[Scan]:
     """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
     with library_errors(path):
         header = _read_header(path)
-        skip = 0 if header.ascii else sum(each.count * each.least_bytes for each in header.before)
+        skip = 0 if header.ascii else sum(each.records * each.least_bytes for each in header.before)
         least = 2 * len(header.vertex.properties) if header.ascii else header.vertex.least_bytes
         left = path.stat().st_size - header.start - skip
         # The last ASCII row may lack its line end; allow one byte for it.
@@ -293,22 +297,23 @@ def _check_rest(file: BufferedReader, path: Path, header: _Header) -> None:
 def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
     """Advance a binary file past an element. Raises ScanError where the file is shorter."""
     at, size = file.tell(), file.seek(0, 2)
-    # Of each list: bytes before its length, type of the length, bytes of a value.
-    lists: list[tuple[int, np.dtype[Any], int]] = []
+    # Of each list: bytes before its length, type of the length, whether it is an unsigned byte, and
+    # bytes of a value.
+    lists: list[tuple[int, np.dtype[Any], bool, int]] = []
     fixed = 0
     for _, kind, length in element.properties:
         if length is None:
             fixed += kind.itemsize
         else:
-            lists.append((fixed, length, kind.itemsize))
+            lists.append((fixed, length, length == np.uint8, kind.itemsize))
             fixed = 0
     if not lists:
-        at += element.count * fixed
+        at += element.records * fixed
     begin, data = at, b""
-    for number in range(element.count if lists else 0):
+    for number in range(element.records if lists else 0):
         if not number % 4096:
             check_interrupt()
-        for before, length, width in lists:
+        for before, length, is_byte, width in lists:
             at += before
             past = at + length.itemsize - begin
             if past > len(data):
@@ -317,9 +322,11 @@ def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
             if past > len(data):
                 at = size + 1
                 break
-            # A byte, the usual type of a length, needs no conversion: 0.1 us a face.
-            held = data[past - 1] if length.itemsize == 1 else np.frombuffer(data, length, 1, at - begin)[0]
-            at += length.itemsize + max(0, int(held)) * width
+            # A byte is the usual type of a length; its conversion would take most of the time.
+            held = data[past - 1] if is_byte else int(np.frombuffer(data, length, 1, at - begin)[0])
+            at += length.itemsize + held * width
+            if held < 0 or at > size:
+                raise _bad_list(path, element, held, f"within the file of {size} bytes")
         at += fixed
         if at > size:
             break
@@ -390,8 +397,8 @@ def _read_header(path: Path) -> _Header:
         )
     vertex = elements[at]
     # Where rows of text have lists, only the columns before the first one have a fixed place.
-    used = list(itertools.takewhile(lambda each: each.count is None, vertex.properties))
-    known = tuple(used) if ply.text else tuple(each for each in vertex.properties if each.count is None)
+    used = list(itertools.takewhile(lambda each: each.length is None, vertex.properties))
+    known = tuple(used) if ply.text else tuple(each for each in vertex.properties if each.length is None)
     record = vertex._replace(properties=known).record()
     names = record.names or ()
     missing = [name for name in "xyz" if name not in names]

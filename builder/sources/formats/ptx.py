@@ -89,11 +89,7 @@ def _pose(
     position, axes = np.array(found[0]), np.array(found[1:4])
     if notes and np.array_equal(position, pose[:3, 3]) and not (axes - np.eye(3) * axes.any()).any():
         pose[:3, :3], pose[3] = np.eye(3), [0, 0, 0, 1]
-    if (
-        not np.isfinite(pose).all()
-        or pose[3].tolist() != [0, 0, 0, 1]
-        or np.linalg.matrix_rank(pose) < 4
-    ):
+    if not np.isfinite(pose).all() or pose[3].tolist() != [0, 0, 0, 1] or np.linalg.matrix_rank(pose) < 4:
         raise scan_error(
             path,
             f"lines {line + 4} to {line + 7} are {found[4:]}",

@@ -112,7 +112,12 @@ def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
         raw = file.readline(LONGEST_LINE)
         if not raw:
             if names or count:
-                raise scan_error(path, "no rows of numbers", "one point a line", "fetch the file again")
+                raise scan_error(
+                    path,
+                    f"no rows of numbers after {(names[1] if names else str(count))[:60]!r}",
+                    "one point a line",
+                    "check that its numbers have decimal points, and that the file is complete",
+                )
             return None
         text = raw.decode("utf-8", "replace").strip()
         # Several semicolons separate names, of which the first may be empty.
@@ -128,6 +133,7 @@ def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
         elif any(map(is_number, fields)):
             return _layout_of(
                 path,
+                text,
                 fields,
                 delimiter,
                 _Layout(start, line, 0, None, (0, 1, 2), None, (), None, count),
@@ -148,6 +154,7 @@ def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
 
 def _layout_of(
     path: Path,
+    text: str,
     fields: list[str],
     delimiter: str | None,
     found: _Layout,
@@ -158,7 +165,7 @@ def _layout_of(
     if len(fields) < 3 or not all(map(is_number, fields)):
         raise scan_error(
             path,
-            f"line {found.line} is {' '.join(fields)[:60]!r}",
+            f"line {found.line} is {text[:60]!r}",
             "at least three numbers (x, y, z), and nothing else",
             "check that this is a point list, one point a line; remove columns that are no numbers",
         )
@@ -170,10 +177,10 @@ def _layout_of(
         intensity, rgb = pts_columns(len(fields))
         return layout._replace(intensity=intensity, rgb=rgb)
     if len(called) != len(fields) or any(called.count(axis) != 1 for axis in "xyz"):
-        line, text = names or (0, comment)
+        line, header = names or (0, comment)
         raise scan_error(
             path,
-            f"line {line} names the columns {text[:60]!r} for rows of {len(fields)} fields",
+            f"line {line} names the columns {header[:60]!r} for rows of {len(fields)} fields",
             "a name for each column, with x, y and z once each",
             "correct that line",
         )
@@ -190,7 +197,9 @@ def _layout_of(
 def _split_names(text: str) -> list[str]:
     """Return the names of a header row, in lower case, without quotes."""
     delimiter = next((each for each in ";,\t" if each in text), None)
-    names = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True)) if delimiter else text.split()
+    names = (
+        next(csv.reader([text], delimiter=delimiter, skipinitialspace=True)) if delimiter else text.split()
+    )
     while len(names) > 1 and not names[-1].strip():
         names.pop()  # a delimiter at the line's end
     return [name.strip().strip("\"'").lower() for name in names]

@@ -78,10 +78,11 @@ def parse_path(name: str, text: str) -> tuple[NDArray[np.float64], NDArray[np.fl
 def _text(path: Path, expected: str) -> str:
     """Return the text of a file. Raise ScanError."""
     try:
-        return decode_text(path.read_bytes())
+        # Comments in another encoding do not matter, and file names keep their bytes.
+        return decode_text(path.read_bytes(), "surrogateescape")
     except OSError as error:
         raise ScanError(f"{path}: {error.strerror}: expected {expected}: check the path") from None
-    except UnicodeDecodeError as error:
+    except UnicodeDecodeError as error:  # UTF-16 of an odd number of bytes
         raise ScanError(f"{path}: {error}: expected {expected}: check the file") from None
 
 

@@ -9,16 +9,23 @@ import pickle
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pye57
 import pytest
 from scan_cases import CASES, Case, Truth, rows_of, write_e57
+from solidcloud.builder.config import BuildConfig
+from solidcloud.builder.edit.edit_archive import add_scans
+from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.sources.common.scan import Scan, sha256_of
 from solidcloud.builder.sources.format_table import FORMATS
-from solidcloud.builder.sources.scan_files import find_scan_files, header_bounds, open_scans
+from solidcloud.builder.sources.scan_files import find_scan_files, header_bounds, inspect_scans, open_scans
+from solidcloud.builder.sources.scan_list import write_scan_list
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.server.cli.main import run
 
 COUNT = 1000  # no multiple of the small block, 7
 
@@ -76,6 +83,129 @@ def test_small_blocks_give_the_same_bits_as_large_ones(case: Case, written: Path
         assert np.array_equal(small_xyz.view(np.uint64), xyz.view(np.uint64))
         assert (intensity is None) == (small_intensity is None)
         assert intensity is None or np.array_equal(small_intensity, intensity)
+
+
+def binary_start(case: Case, data: bytes) -> int:
+    """Return where the binary data after a header in text begin; the length of a file that is text."""
+    if case.name in ("little.ply", "big.ply", "single.ply"):
+        return data.index(b"end_header\n") + 11
+    if case.name in ("binary.pcd", "packed.pcd"):
+        return data.index(b"\n", data.index(b"DATA")) + 1
+    return len(data)
+
+
+def unlike_plain(case: Case, data: bytes, kind: str) -> bytes:
+    """Return a file with the same points and with what editors and other programs add to text."""
+    start = binary_start(case, data)
+    head, rest = data[:start], data[start:]
+    if kind == "mark":
+        return b"\xef\xbb\xbf" + data
+    if kind == "cr":
+        return head.replace(b"\r\n", b"\n").replace(b"\n", b"\r") + rest
+    if kind == "ctrl-z":
+        return head + b"\x1a" + rest if not rest else data
+    letters = "Süd — ß\x9b\x1b[31m".encode(kind.removeprefix("letters "), "replace")
+    comment = {
+        ".ply": b"comment %s\nobj_info %s\n" % (letters, letters),
+        ".obj": b"# %s\ng %s\nusemtl %s\n" % (letters, letters, letters),
+        ".stl": b"",
+    }.get(Path(case.name).suffix, b"# %s\n" % letters)
+    first = data.index(b"\n") + 1 if case.name.endswith(".ply") else 0
+    named = data.replace(b"solid a\n", b"solid %s\n" % letters)
+    return named[:first] + comment + named[first:]
+
+
+IN_TEXT = [
+    case
+    for case in CASES
+    if not case.name.endswith((".las", ".laz", ".e57", ".glb")) and case.name != "binary.stl"
+]
+
+
+@pytest.mark.parametrize("kind", ["mark", "cr", "ctrl-z", "letters utf-8", "letters latin-1"])
+@pytest.mark.parametrize("case", IN_TEXT, ids=[case.name for case in IN_TEXT])
+def test_text_is_read_whatever_an_editor_made_of_it(
+    case: Case, kind: str, truth: Truth, tmp_path: Path
+) -> None:
+    """Issue 35: marks, line ends and letters of text stopped builds; a mesh is sampled from the same text."""
+    path, other = tmp_path / case.name, tmp_path / f"other{Path(case.name).suffix}"
+    case.write(path, truth)
+    other.write_bytes(unlike_plain(case, path.read_bytes(), kind))
+    for spacing in (None, 20.0):
+        (plain,), (found,) = open_scans(path, spacing=spacing), open_scans(other, spacing=spacing)
+        (xyz, intensity), (other_xyz, other_intensity) = read(plain), read(found)
+        assert len(xyz) and np.array_equal(other_xyz, xyz)
+        assert (intensity is None) == (other_intensity is None)
+        assert intensity is None or np.array_equal(other_intensity, intensity)
+
+
+@pytest.mark.parametrize("code", ["utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("case", IN_TEXT, ids=[case.name for case in IN_TEXT])
+def test_utf_16_is_called_that(case: Case, code: str, truth: Truth, tmp_path: Path) -> None:
+    """Issue 35: Windows calls it Unicode."""
+    path = tmp_path / case.name
+    case.write(path, truth)
+    path.write_bytes(path.read_bytes().decode("latin-1").encode(code))
+    with pytest.raises(ScanError, match=r"text in UTF-16, expected ASCII or UTF-8: save it as UTF-8"):
+        read(*open_scans(path))
+
+
+@pytest.fixture
+def few(truth: Truth) -> Truth:
+    """Return points that lie in one voxel."""
+    return Truth(truth.xyz[:64] / 100 + [990.0, -1980.0, 30.0], truth.intensity[:64])
+
+
+def test_names_of_any_letters_reach_the_index(few: Truth, tmp_path: Path) -> None:
+    """Issue 35: libE57Format refused a file name that is not UTF-8."""
+    paths = []
+    for case in CASES:
+        paths.append(Path(os.fsdecode(os.fsencode(tmp_path) + b"/S\xfcd \x1b[31m " + case.name.encode())))
+        case.write(tmp_path / case.name, few)
+        (tmp_path / case.name).rename(paths[-1])
+    assert [entry.fault for entry in inspect_scans(paths)] == [""] * len(CASES)
+    summary = build_archive(paths, tmp_path / "hall", BuildConfig(jobs=1, resolution=0.001))
+    with Archive(summary.archive) as archive:
+        assert {source.path for source in archive.header.sources} == set(map(str, paths))
+
+
+def test_millimetres_of_a_map_are_called_that_and_are_read_as_such(few: Truth, tmp_path: Path) -> None:
+    """Issue 35: "holds no usable point: leave it out". The integers of LAS cannot reach so far."""
+    cases = [case for case in CASES if not case.name.endswith((".las", ".laz"))]
+    paths = [tmp_path / case.name for case in cases]
+    for case, path in zip(cases, paths, strict=True):
+        case.write(path, Truth(few.xyz * 1000 + [5.0e8, 5.4e9, 1e6], few.intensity))
+    with pytest.raises(ScanError) as caught:
+        build_archive(paths, tmp_path / "hall", BuildConfig(jobs=1))
+    what = (
+        "points beyond 1e9 m, expected all within it: the coordinates are probably in millimetres: write a list with "
+        '`solidcloud inspect`, set units = "mm" in it, and build the list'
+    )
+    for case, path in zip(cases, paths, strict=True):
+        assert f"{path}: scan 0 holds {len(few.xyz) + case.repeats} {what}" in str(caught.value)
+    entries = inspect_scans(paths)
+    assert all(entry.warnings[0] == f"{entry.path}: {what}" for entry in entries)
+    listed = tmp_path / "scans.toml"
+    write_scan_list(listed, [replace(entry, units="mm", up="z") for entry in entries])
+    assert not any(what in warning for entry in inspect_scans([listed]) for warning in entry.warnings)
+    summary = build_archive([listed], tmp_path / "hall", BuildConfig(jobs=1, resolution=0.001))
+    assert summary.points == sum(len(few.xyz) + case.repeats for case in cases) and summary.skipped == {}
+
+
+def test_points_too_far_away_are_counted_apart(tmp_path: Path) -> None:
+    """Issue 35: and not as points that are not finite."""
+    path = tmp_path / "a.xyz"
+    path.write_text("1 2 3\n4 5 6\n2e9 0 0\n0 -1e300 0\nnan 0 0\n")
+    summary = build_archive([path], tmp_path / "hall", BuildConfig(jobs=1, resolution=0.001))
+    assert summary.points == 2 and summary.skipped == {"not finite": 1, "beyond 1e9 m": 2}
+    found = "1 points that are not finite and 2 points beyond 1e9 m, expected none with --strict"
+    with pytest.raises(ScanError, match=found):
+        build_archive([path], tmp_path / "strict", BuildConfig(jobs=1, strict=True))
+    path.write_text("0 -1e300 0\nnan 0 0\n")
+    with pytest.raises(
+        ScanError, match=r"1 points beyond 1e9 m and 1 that are not finite, .*: check its coord"
+    ):
+        build_archive([path], tmp_path / "far", BuildConfig(jobs=1))
 
 
 SEEKABLE = {"a.las", "a.laz", "little.ply", "big.ply", "single.ply", "binary.stl", "binary.pcd"}
@@ -231,6 +361,33 @@ def test_a_folder_gives_its_scans_sorted_and_files_stay_as_given(tmp_path: Path)
     (tmp_path / "none").mkdir()
     with pytest.raises(ScanError, match="a folder without scans"):
         find_scan_files([tmp_path / "none"])
+
+
+def test_companions_of_macos_are_skipped_in_folders_with_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Issue 35: macOS puts ._a.xyz beside a.xyz on foreign disks, and .DS_Store into each folder."""
+    folder = tmp_path / "hall"
+    folder.mkdir()
+    for name in ("._a.xyz", "._b.las", ".DS_Store", "._.DS_Store", "Thumbs.db"):
+        (folder / name).write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X")
+    (folder / "a.xyz").write_text("1 2 3\n4 5 6\n")
+    line = f"{folder}: 2 files of macOS skipped, ._a.xyz first"
+    assert find_scan_files([folder]) == [folder / "a.xyz"]
+    summary = build_archive([folder], tmp_path / "archive", BuildConfig(jobs=1, resolution=0.001))
+    assert summary.points == 2 and line in summary.warnings
+    added = add_scans(tmp_path / "archive", [folder], again=True, jobs=1)
+    assert line in added.warnings
+    for command in ("inspect", "plan", "build"):
+        capsys.readouterr()
+        assert (
+            run([command, str(folder), *(["-o", str(tmp_path / command)] if command != "plan" else [])]) == 0
+        )
+        assert line in capsys.readouterr().err.replace("\n", "")
+    (folder / "a.xyz").unlink()
+    with pytest.raises(ScanError, match="a folder without scans"):
+        find_scan_files([folder])
+    assert find_scan_files([folder / "._a.xyz"]) == [folder / "._a.xyz"]  # given by name
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, float("nan"), float("inf")])

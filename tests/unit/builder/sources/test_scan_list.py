@@ -57,6 +57,14 @@ def test_a_list_is_read_back_as_it_was_written(place: str, folder: Path) -> None
     assert len(read) == 6 and all(map(same, [*entries, odd], read))
 
 
+@pytest.mark.parametrize("code", ["utf-8-sig", "utf-16"])
+def test_a_list_of_any_editor_is_read(code: str, folder: Path) -> None:
+    """Issue 35."""
+    write_scan_list(folder / "scans.toml", inspect_scans([folder]))
+    (folder / "scans.toml").write_bytes((folder / "scans.toml").read_text("utf-8").encode(code))
+    assert len(read_scan_list(folder / "scans.toml")) == 5
+
+
 def test_paths_in_a_list_move_with_it(folder: Path, tmp_path: Path) -> None:
     write_scan_list(folder / "scans.toml", inspect_scans([folder / "a.las"]))
     assert 'path = "a.las"' in (folder / "scans.toml").read_text()

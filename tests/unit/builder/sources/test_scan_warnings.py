@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.builder.sources.scan_files import inspect_scans
+from scan_formats import cartesian, glb_document, glb_vertices, ptx_scan, write_e57, write_glb, write_pcd
+from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
 from solidcloud.builder.sources.scan_warnings import (
     ScanFacts,
     closest_distances,
@@ -188,6 +189,63 @@ def test_inspect_plan_and_build_say_the_same(tmp_path: Path, capsys: pytest.Capt
     assert json.loads(capsys.readouterr().out)["warnings"] == [text]
     assert run([*build, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["warnings"] == [text]
+
+
+def test_a_small_object_in_millimetres_is_called_that(tmp_path: Path) -> None:
+    """Issue 35: nothing shorter than 1 km was."""
+    around = np.random.default_rng(0).normal(size=(3000, 3))
+    gear = around / np.linalg.norm(around, axis=1)[:, None] * [196, 302, 320]
+    (entry,) = inspect_scans([write_xyz(tmp_path / "gear.xyz", gear)])
+    assert MILLIMETRES in entry.warnings[0]
+    (entry,) = inspect_scans([write_xyz(tmp_path / "terrain.xyz", gear * [1, 1, 0.2])])
+    assert entry.warnings == ()
+
+
+def write_turnless(path: Path, points: NDArray[np.float64]) -> Path:
+    """Write points with a rotation of zeros and the translation 1, 2, 3."""
+    if path.suffix == ".e57":
+        rows = {"columns": cartesian(points), "rotation": np.zeros(4), "translation": np.array([1.0, 2, 3])}
+        write_e57(path, [rows])
+    elif path.suffix == ".pcd":
+        kind = path.stem
+        write_pcd(path, points, points[:, 0], kind, viewpoint="1 2 3 0 0 0 0")
+    elif path.suffix == ".ptx":
+        lines = ptx_scan(points, points[:, 0]).splitlines()
+        zeros, place = ["0 0 0 0"] * 3, "1 2 3"
+        axes = ["0 0 0"] * 3 if path.stem == "axes" else ["1 0 0", "0 1 0", "0 0 1"]
+        path.write_text("\n".join([*lines[:2], place, *axes, *zeros, f"{place} 1", *lines[10:]]))
+    else:
+        document = glb_document(len(points))
+        document["nodes"] = [{"mesh": 0, "rotation": [0, 0, 0, 0], "translation": [1, 2, 3]}]
+        write_glb(path, document, glb_vertices(points))
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["a.e57", "ascii.pcd", "binary.pcd", "binary_compressed.pcd", "a.ptx", "axes.ptx", "a.glb"]
+)
+def test_a_rotation_of_zeros_is_no_rotation_with_a_warning(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Issue 35: pye57 wrote 0 0 0 0 for no rotation, and other programs read it as that."""
+    points = room((1.0, 1.0, 1.0), 0.25) + 1.0
+    path = write_turnless(tmp_path / name, points)
+    (scan,) = open_scans(path)
+    found = np.concatenate([block.xyz for block in scan.blocks()])
+    assert np.array_equal(found, points + np.array([1, 2, 3]))
+    text = f"{path}: scan 0 has a rotation of zeros, read as no rotation: check how the scan lies"
+    build = ["build", str(path), "-o", str(tmp_path / "hall"), "--jobs", "1", "--resolution", "0.001"]
+    add = ["add", str(tmp_path / "hall"), str(path), "--again"]
+    for command in (
+        ["inspect", str(path), "-o", str(tmp_path / "scans.toml")],
+        ["plan", str(path)],
+        build,
+        add,
+    ):
+        assert run(command) == 0
+        assert f"warning: {text}" in capsys.readouterr().err.splitlines()
+    assert run(["build", str(tmp_path / "scans.toml"), "-o", str(tmp_path / "listed"), "--jobs", "1"]) == 0
+    assert f"warning: {text}" in capsys.readouterr().err.splitlines()
 
 
 def test_build_warns_of_its_radius(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.scene_file import parse_scene
-from solidcloud.schemas.scene.toml_faults import decode, format_value, line_of, suggestion
+from solidcloud.schemas.scene.toml_faults import decode, format_value, line_of, load, suggestion
 
 TOP = 'format = 1\n[[archives]]\npath = "hall"\n'
 
@@ -121,6 +121,12 @@ def test_what_no_editor_writes_is_told_as_well(text: str, said: str) -> None:
     with pytest.raises(BadRequestError) as found:
         decode(text.encode(), _Outer, "x.toml")
     assert str(found.value) == f"x.toml: {said}"
+
+
+@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "utf-16"])
+def test_the_text_of_any_editor_is_read(code: str) -> None:
+    """Issue 35."""
+    assert load("[names]\na = 'ü'\n".encode(code), "x.toml") == {"names": {"a": "ü"}}
 
 
 def test_a_file_is_read_a_few_times_to_find_a_line_of_a_long_list(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,7 +84,7 @@ def test_e57_spherical_coordinates_become_cartesian(local: np.ndarray, tmp_path:
     ("pose", "message"),
     [
         ({"rotation": np.array([1.01, 0, 0, 0])}, "quaternion of length 1.01"),
-        ({"rotation": np.zeros(4)}, "quaternion of length 0"),
+        ({"rotation": np.array([1e-9, 0, 0, 0])}, "quaternion of length 1e-09"),
     ],
 )
 def test_an_e57_pose_that_is_not_rigid_is_refused(pose: dict, message: str, tmp_path: Path) -> None:
@@ -92,6 +92,20 @@ def test_an_e57_pose_that_is_not_rigid_is_refused(pose: dict, message: str, tmp_
     write_e57(path, [{"columns": cartesian(np.ones((3, 3))), **pose}])
     with pytest.raises(ScanError, match=message):
         open_scans(path)
+
+
+@pytest.mark.parametrize("name", ["Süd — ✓", "S\udcfcd", "a\x01b", "a\udced\udca0\udc80b", "<\uffff"])
+def test_letters_of_e57_names_stop_nothing(name: str, local: np.ndarray, tmp_path: Path) -> None:
+    """Issue 35: names in another encoding than UTF-8, and letters that XML does not allow."""
+    path, letters = tmp_path / "named.e57", name.encode("utf-8", "surrogateescape").replace(b"<", b"&lt;")
+    write_e57(path, [{"columns": cartesian(local)}], crs="N" * len(letters))
+    path.write_bytes(with_checksums(path.read_bytes().replace(b"N" * len(letters), letters)))
+    assert np.array_equal(read_all(path), local)
+    assert "S?d" in open_scans(path)[0].crs or name != "S\udcfcd"
+    # A damaged page is not repaired.
+    path.write_bytes(path.read_bytes().replace(letters, letters[:-1] + b"!"))
+    with pytest.raises(ScanError, match="checksum"):
+        read_all(path)
 
 
 def test_e57_bounds_hold_the_scan_wherever_its_pose_puts_it(local: np.ndarray, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Test GLB: node transforms, shared meshes, sampled surfaces, and inconsistent documents."""
 
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -39,6 +41,31 @@ def test_vertices_are_where_the_nodes_put_them(tmp_path: Path) -> None:
     assert np.array_equal(read_all(path), expected)
     assert np.array_equal(read_all(path, block_points=3), expected)
     assert open_scans(path)[0].declared_count == 8 and open_scans(path)[0].up == "y"
+
+
+def test_letters_of_names_and_a_rotation_of_zeros_are_read(tmp_path: Path) -> None:
+    """Issue 35: names in Latin-1, a byte order mark in the JSON, and the rotation 0 0 0 0."""
+
+    def change(document: dict) -> None:
+        document["nodes"] = [{"mesh": 0, "name": "SuedX", "rotation": [0, 0, 0, 0], "translation": [1, 2, 3]}]
+
+    path = write_square(tmp_path / "a.glb", change)
+    path.write_bytes(path.read_bytes().replace(b"SuedX", "S\xfcd\x1b\x9b".encode("latin-1")))
+    assert np.array_equal(read_all(path), SQUARE + np.array([1, 2, 3]))
+    (note,) = open_scans(path)[0].notes
+    assert note == f"{path}: scan 0 has a rotation of zeros, read as no rotation: check how the scan lies"
+    document = json.dumps(glb_document(4, 6)).encode()
+    path.write_bytes(_glb_of(b"\xef\xbb\xbf" + document))
+    assert np.array_equal(read_all(path), SQUARE)
+
+
+def _glb_of(words: bytes) -> bytes:
+    """Return the file of the square with these bytes as its JSON."""
+    words += b" " * (-len(words) % 4)
+    binary = glb_vertices(SQUARE) + CORNERS.tobytes()
+    binary += b"\0" * (-len(binary) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(words) + len(binary), len(words), b"JSON")
+    return head + words + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
 def test_parts_that_share_their_vertices_give_them_once(tmp_path: Path) -> None:

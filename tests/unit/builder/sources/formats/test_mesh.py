@@ -30,6 +30,13 @@ def test_obj_vertices_come_as_they_stand_in_the_file(tmp_path: Path) -> None:
     assert read_all(path).tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]]
 
 
+def test_vertices_between_line_ends_of_two_kinds_are_not_lost(tmp_path: Path) -> None:
+    """Issue 35: a CR within a line of a file with LF hid the vertex behind it."""
+    path = tmp_path / "a.obj"
+    path.write_bytes(b"o a\nv 1 2 3\rv 4 5 6\nv 7 8 9\r\n")
+    assert read_all(path).tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+
+
 @pytest.mark.parametrize("line", ["v 1 2", "v", "v 1 b 3", "v 1 2 # 3"])
 def test_a_broken_obj_vertex_is_refused_with_its_line(line: str, tmp_path: Path) -> None:
     path = tmp_path / "a.obj"

@@ -57,6 +57,35 @@ def test_whole_numbers_and_capitals_are_fields_too(tmp_path: Path) -> None:
     assert read(path)[0].tolist() == [[-70000, 4, -7], [2, 5, 8], [3, 255, 9]]
 
 
+@pytest.mark.parametrize(
+    "head",
+    [
+        "VERSION .5\nCOLUMNS x y z\nDATA ascii\n",
+        "# .PCD v.5\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n",
+        "FIELDS x y z\nWIDTH 2\nDATA ASCII\n",
+        "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nDATA binary\n",
+        "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 2\nDATA binary\n",
+        "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nHEIGHT 2\nWIDTH 1\nDATA binary\n",
+    ],
+)
+def test_what_old_headers_leave_out_has_its_usual_value(head: str, tmp_path: Path) -> None:
+    """Issue 35."""
+    path = tmp_path / "a.pcd"
+    xyz = np.array([[1.5, 2, 3], [4, 5, 6.25]])
+    rows = xyz.astype("<f8").tobytes() if "binary" in head else b"1.5 2 3\n4 5 6.25\n"
+    path.write_bytes(head.encode() + rows)
+    assert np.array_equal(read(path)[0], xyz)
+    assert open_scans(path)[0].declared_count in (2, None)
+    if "binary" in head:
+        path.write_bytes(head.encode().replace(b"SIZE", b"#SIZE") + rows)
+        with pytest.raises(ScanError, match="SIZE missing, expected 3 whole numbers"):
+            open_scans(path)
+    if "POINTS" not in head and "WIDTH" not in head and "binary" in head:
+        path.write_bytes(head.encode() + rows[:-1])
+        with pytest.raises(ScanError, match="POINTS missing, expected the number of points"):
+            open_scans(path)
+
+
 LIES = {
     "points that are not the grid": (
         "POINTS 500",

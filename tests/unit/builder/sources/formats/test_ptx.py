@@ -69,6 +69,7 @@ PTX_FAULTS = {
     "a position of two numbers": (2, "1 2", "line 3 is '1 2', expected 3 numbers"),
     "a matrix with a word": (7, "1 0 x 0", "line 8 is '1 0 x 0', expected 4 numbers"),
     "a matrix that is flat": (6, "0 0 0 0", "expected an invertible matrix with last column"),
+    "a matrix of zeros beside axes": ((6, 7, 8), "0 0 0 0", "expected an invertible matrix with last column"),
     "a matrix that projects": (6, "1 0 0 1", "expected an invertible matrix with last column"),
     "a matrix without a value": (6, "nan 0 0 0", "expected an invertible matrix with last column"),
     "a row of two": (10, "1 2", "line 11 is '1 2', expected x y z"),
@@ -80,10 +81,46 @@ PTX_FAULTS = {
 def test_a_broken_ptx_is_refused_with_its_line(fault: str, tmp_path: Path) -> None:
     at, text, message = PTX_FAULTS[fault]
     lines = lines_of()
-    lines[at] = text
+    for each in at if isinstance(at, tuple) else (at,):
+        lines[each] = text
     path = tmp_path / "a.ptx"
     path.write_text("\n".join(lines))
     with pytest.raises(ScanError, match=message):
+        read_each(path)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6, 7, 9])
+@pytest.mark.parametrize("head", ["2\n", "# by hand\n2\n", ""])
+def test_pts_rows_may_have_any_columns_behind_x_y_and_z(head: str, count: int, tmp_path: Path) -> None:
+    """Issue 35: five were refused."""
+    path = tmp_path / "a.pts"
+    rows = [[1.5, 2, 3, 40, 50, 60, 70, 80, 90][:count], [4, 5, 6, 41, 51, 61, 71, 81, 91][:count]]
+    path.write_text(head + "".join(" ".join(map(str, row)) + "\n" for row in rows))
+    (scan,) = open_scans(path)
+    scan.wanted = frozenset(["rgb"])
+    (block,) = scan.blocks()
+    assert block.xyz.tolist() == [[1.5, 2, 3], [4, 5, 6]]
+    assert (block.intensity is not None) == (count in (4, 5, 7)) == ("intensity" in scan.columns)
+    assert (block.rgb is not None) == (count in (6, 7)) == ("rgb" in scan.columns)
+    assert block.rgb is None or block.rgb[1].tolist() == rows[1][-3:]
+
+
+@pytest.mark.parametrize("chunk", [7, 1 << 22])
+def test_blank_lines_and_comments_are_not_counted_as_rows(
+    chunk: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Issue 35."""
+    monkeypatch.setattr(CHUNK, chunk)
+    path = tmp_path / "a.pts"
+    path.write_text("\n# by hand\n2\n\n1 2 3\n\n // c\n\r\n 4 5 6 # d\n\n1\n; e\n7 8 9\n  \n1\n\n1 1 1\n#")
+    assert [xyz.tolist() for xyz in read_each(path)] == [[[1, 2, 3], [4, 5, 6]], [[7, 8, 9]], [[1, 1, 1]]]
+    path.write_text("2\n1 2 3\n\n4 5 6\n\n7 8 9\n")
+    with pytest.raises(ScanError, match="line 6 is '7 8 9' after the last of 2 points"):
+        read_each(path)
+    path.write_text("3\n1 2 3\r4 5 6\n7 8 9\r\n1\n4 4 4", newline="")
+    assert [len(xyz) for xyz in read_each(path)] == [3, 1]
+    path.write_text("3\n1 2 3\n\n4 5 6\n#\n\n\n\n")
+    with pytest.raises(ScanError, match="2 rows at most, expected the 3"):
         read_each(path)
 
 

@@ -47,6 +47,27 @@ def intensities(path: Path) -> list[float] | None:
         ("a.txt", "# of x, y and z\n1 2 3\n", [[1, 2, 3]], None),  # a sentence, no header
         ("a.txt", "nan 1e999 -3\n", [[np.nan, np.inf, -3]], None),  # counted by the caller
         ("a.txt", "# nothing\n\n", [], None),
+        # Issue 35: what other programs write and read.
+        ("a.csv", "1,2,3,\n4,5,6,\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.csv", "x,y,z,\n1,2,3\n4,5,6,,\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.csv", "X;Y;Z\n1,5;2;-3,25\n4;5,5;6e-1\n", [[1.5, 2, -3.25], [4, 5.5, 0.6]], None),
+        ("a.csv", "1;2;3\n4,5;6;7\n", [[1, 2, 3], [4.5, 6, 7]], None),
+        ("a.txt", "1,5\t2\t-3,25\n4\t5,5\t6\n", [[1.5, 2, -3.25], [4, 5.5, 6]], None),
+        ("a.txt", "1 2 3\n4,5 5 6\n", [[1, 2, 3], [4.5, 5, 6]], None),
+        ("a.csv", 'sep=;\n"X";"Y";"Z"\n"1";"2";"3"\n', [[1, 2, 3]], None),
+        ("a.csv", '"1.5","2","3"\n"4",5,"6"\n', [[1.5, 2, 3], [4, 5, 6]], None),
+        ("a.csv", '"1,5";"2";"3"\n', [[1.5, 2, 3]], None),
+        ("a.csv", 'x,y,z,"mean, of all"\n1,2,3,4\n', [[1, 2, 3]], None),
+        ("a.txt", "X\tY\tZ\tScalar field\n1\t2\t3\t4\n", [[1, 2, 3]], None),
+        ("a.txt", "; by hand\n1 2 3\n// 9 9 9\n ; 9 9 9\n4 5 6 # c\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.csv", "i;x;y;z\n0;1;2;3\n", [[1, 2, 3]], None),
+        ("a.csv", ";x;y;z\n0;1;2;3\n", [[1, 2, 3]], None),
+        ("a.csv", "// ok; 1,2.5\n1;2;3\n# 1.5, no\n4,5;6;7\n", [[1, 2, 3], [4.5, 6, 7]], None),
+        ("a.txt", "x y z\n2\n1 2 3\n4 5 6\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.xyz", "1 2 3\n4 5 6\r7 8 9\r\n", [[1, 2, 3], [4, 5, 6], [7, 8, 9]], None),
+        ("a.xyz", "1 2 3\r\r\n4 5 6\r\r\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.xyz", "1 2 3\n4 5 6\n\x1a\r\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.xyz", "1 2 3\n4 5 6\x1a", [[1, 2, 3], [4, 5, 6]], None),
         ("a.pts", "0\n", [], None),
     ],
 )
@@ -68,7 +89,19 @@ def test_text_layouts(
         ("1 2 3\n4 5 x6\n", "line 2 is '4 5 x6'"),
         ("1,2,3\n4,,6\n", "line 2 is '4,,6'"),
         ("1,2,3\n4 5 6\n", "line 2"),
-        ("1;2;3\n4,5;6;7\n", "line 2 is '4,5;6;7'"),  # a decimal comma
+        ("1,5;2;3\n1.234;6;7\n", "decimal commas and points"),  # one of them separates thousands
+        ("1.5;2;3\n1,234;6;7\n", "decimal commas and points"),
+        ("1.234,5;2;3\n", "line 1 is '1.234,5;2;3', expected at least three numbers"),
+        ("1 2 3\n4,5 6\n", "line 2 is '4,5 6'"),
+        ("1 2 3\n4, 5, 6\n", "line 2 is '4, 5, 6'"),
+        ('"1,5","2,5","3,5"\n', "check that its numbers have decimal points"),
+        ("1;2;3\n;5;6\n", "line 2 is ';5;6'"),  # no comment
+        ("1,2,3,4\n5,6,7,\n", "line 2 is '5,6,7,'"),
+        ("1,2,3\n5,6,\n", "line 2 is '5,6,'"),
+        ("1,2,3\n4,5,6,7,\n", "line 2 is '4,5,6,7,'"),
+        ("1 2 3\n4 5\x1a6\n7 8 9\n", "line 2 is"),
+        ("1 2 3\n\x1a\n7 8 9\n", "line 2 is"),
+        ("1 2 3 wall\n", "expected at least three numbers .*, and nothing else: .* remove columns"),
         ("1 2\n3 4\n", "line 1 is '1 2', expected at least three numbers"),
         ("1 2 z\n", "line 1"),
         ("x y z\nx y z\n1 2 3\n", "line 2 is 'x y z'"),

@@ -68,6 +68,8 @@ def test_other_effects_leave_the_rest_of_the_scene(file: Path) -> None:
 
 def test_all_effects_can_be_switched_off(file: Path) -> None:
     assert parse_scene(scene_with_effects(file, []).encode(), "made").effects == []
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert parse_scene(scene_with_effects(file, []).encode(), "made").effects == []
 
 
 def test_effects_that_the_file_does_not_declare_are_refused(file: Path) -> None:

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.server.cli.input.pose_file import parse_path, read_path, read_poses, write_poses
+from solidcloud.server.cli.input.pose_file import (
+    RAY_COLUMNS,
+    parse_path,
+    read_path,
+    read_poses,
+    read_rays,
+    write_poses,
+)
 
 HEADER = "t,x,y,z,qw,qx,qy,qz\n"
 
@@ -49,6 +56,19 @@ def test_quaternions_turn_as_scipy_says(tmp_path: Path, rng: np.random.Generator
     (tmp_path / "a.csv").write_text(HEADER + rows)
     expected = Rotation.from_quat(q, scalar_first=True).as_matrix()
     assert np.abs(read_poses(tmp_path / "a.csv")[1][:, :3, :3] - expected).max() < 1e-14
+
+
+@pytest.mark.parametrize("code", ["utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("name", ["walk.csv", "walk.tum", "rays.csv"])
+def test_the_text_of_any_editor_is_read(name: str, code: str, tmp_path: Path) -> None:
+    """Issue 35: of a spreadsheet, of a redirection on Windows, and with an old comment."""
+    path, rows = tmp_path / name, "1,2,3,0,0,1"
+    text = f"{','.join(RAY_COLUMNS)}\n{rows}\n" if name == "rays.csv" else f"{HEADER}0,1,2,3,1,0,0,0\n"
+    text = "# für\n0 1 2 3 0 0 0 1\n" if name == "walk.tum" else text
+    path.write_bytes(text.encode(code))
+    assert (read_rays(path)[0] if name == "rays.csv" else read_path(path)[1][:, :3, 3]).tolist() == [
+        [1, 2, 3]
+    ]
 
 
 def test_quaternion_near_unit_length_is_normalised(tmp_path: Path) -> None:

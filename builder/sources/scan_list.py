@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 from ...schemas.process.new_file import new_file
-from .placed_scan import DEGREES, EXPECTED_UNITS, TURNS, UNKNOWN, axis_metres
+from .common.units import DEGREES, EXPECTED_UNITS, UNKNOWN, axis_metres
+from .placed_scan import TURNS
 
 LIST_SUFFIX = ".toml"
 _VERSION = 1

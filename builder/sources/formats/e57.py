@@ -27,7 +27,7 @@ from ..common.scan import (
     reader_library,
     scan_error,
 )
-from ..placed_scan import axis_metres
+from ..common.units import axis_metres
 from .e57_xml import check_e57, check_xml, xml_of
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")

@@ -10,7 +10,6 @@ from ..schemas.archive.normal_reach import MAX_NORMAL_REACH, NORMAL_REACH
 from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError
-from .sources.common.scan import SYNTHETIC
 
 DEFAULT_STEP = 1e-4
 DEFAULT_VOXEL = 8.0
@@ -60,16 +59,6 @@ def parse_rule(text: str | None, option: str) -> tuple[float, int] | None:
         raise BadRequestError(
             f"{option} {text!r}: expected a distance in metres and a count, such as 0.1,5"
         ) from None
-
-
-def parse_classes(text: str) -> frozenset[int | str]:
-    """Parse `--drop-classes`, such as `7,18,synthetic`; raise BadRequestError for anything else."""
-    words = [word.strip() for word in text.split(",") if word.strip()]
-    if not all(word == SYNTHETIC or (word.isdecimal() and int(word) < 256) for word in words):
-        raise BadRequestError(
-            f"--drop-classes {text}: expected numbers from 0 to 255, or {SYNTHETIC}, separated by commas"
-        )
-    return frozenset(word if word == SYNTHETIC else int(word) for word in words)
 
 
 def _is_rule(rule: tuple[float, int] | None) -> bool:
@@ -123,7 +112,7 @@ class BuildConfig:
     the distance; None: keep all.
     moving: (distance [m], scans): leave out points that other scans saw through
     (builder/passes/filter_rules.py); None: keep all.
-    drop_classes: numbers of classes, and SYNTHETIC for points with that flag in LAS, to leave out.
+    drop_classes: numbers of classes, and "synthetic" for points with that flag in LAS, to leave out.
     scheduler: address of a dask scheduler whose workers do the work.
     cluster: "local:N", a cluster of N workers that is started for the build. If both are None,
     processes on this machine do the work.

@@ -26,7 +26,7 @@ from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
 from ...schemas.process.new_file import sync_path
 from ..build_limits import bytes_beside_records, readers_that_fit
-from ..config import BuildConfig, parse_classes
+from ..config import BuildConfig
 from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import position_hash_sum
 from ..passes.level_pass import replace_level, write_level
@@ -35,6 +35,7 @@ from ..passes.verify import voxel_faults
 from ..resume.lock import locked
 from ..resume.transaction import Transaction
 from ..run.executor import Progress
+from ..sources.common.colours import parse_classes
 from ..spool.run_files import spool_dtype
 from ..voxel.record_points import leaves_of
 

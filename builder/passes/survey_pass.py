@@ -21,17 +21,8 @@ from ..kernels.points.spool_rows import usable_bounds
 from ..resume.kept_work import BuildDirectory, Work, run_unfinished
 from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
-from ..sources.common.colours import brightest
-from ..sources.common.scan import (
-    BEYOND,
-    CLASS,
-    NOT_FINITE,
-    SYNTHETIC,
-    WITHHELD,
-    Scan,
-    SourceLattice,
-    sha256_of,
-)
+from ..sources.common.colours import CLASS, SYNTHETIC, WITHHELD, brightest
+from ..sources.common.scan import BEYOND, NOT_FINITE, Scan, SourceLattice, sha256_of
 from ..sources.scan_files import InputFile
 from ..sources.scan_warnings import beyond_text
 

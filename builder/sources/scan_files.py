@@ -8,7 +8,6 @@ reading past the first, and from small scans without declared bounds (coincident
 import importlib
 import math
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import replace
 from functools import cache
@@ -23,11 +22,12 @@ from ...schemas.errors import BadRequestError, ScanError
 from ...schemas.process.interrupts import check_interrupt
 from ..run.executor import Progress, Silent
 from ..run.transient_errors import raise_transient
+from .class_counts import count_classes, counted_points
 from .coincident_scans import coincident_scan
-from .common.colours import CLASSIFICATION
 from .common.scan import Scan, library_errors, scan_error, sha256_of
+from .common.units import axis_metres
 from .format_table import FORMATS, UNSUPPORTED
-from .placed_scan import axis_metres, place_scan
+from .placed_scan import place_scan
 from .scan_list import LIST_SUFFIX, ScanEntry, read_scan_list
 from .scan_warnings import ScanFacts, find_warnings
 from .surface_samples import SurfaceSamples
@@ -36,9 +36,6 @@ _FORMATS = {row.suffix: row for row in FORMATS}
 # How the names of AppleDouble files begin: macOS keeps a file's attributes in them.
 COMPANION = "._"
 _APPLE_DOUBLE = b"\x00\x05\x16\x07"
-# Points read in total, at least of a file, and in how many ranges, to count those of a class; and bytes
-# of a file that cannot seek and is read whole for this. LAZ takes about 0.2 s for 10^6 points.
-COUNTED_POINTS, LEAST_COUNTED, COUNTED_RANGES, COUNTED_BYTES = 10**7, 1 << 15, 4, 16 << 20
 _IN_FOLDERS = frozenset(row.suffix for row in FORMATS if row.in_folders)
 
 
@@ -206,7 +203,7 @@ def inspect_scans(
     entries: list[ScanEntry] = []
     numbers: list[int] = []
     facts: list[ScanFacts] = []
-    counted = max(LEAST_COUNTED, COUNTED_POINTS // max(1, len(inputs)))
+    counted = counted_points(len(inputs))
     for path, listed, note in inputs:
         found, scans = _inspect_file(path, with_sha256, counted)
         if note:
@@ -259,7 +256,7 @@ def _as_listed(
 def _inspect_file(path: Path, with_sha256: bool, counted: int) -> tuple[list[ScanEntry], list[Scan]]:
     """List the scans of one file; return the entries, and the scans unless they cannot be opened.
 
-    counted: see `_count_classes`.
+    counted: see `count_classes`.
     """
     digest = ""
     try:
@@ -285,33 +282,11 @@ def _inspect_file(path: Path, with_sha256: bool, counted: int) -> tuple[list[Sca
             fault=scan.fault,
             warnings=tuple(filter(None, [coincident_scan(scan)])),
             columns=tuple(sorted(scan.columns)),
-            classes=_count_classes(scan, counted),
+            classes=count_classes(scan, counted),
         )
         for scan in scans
     ]
     return entries, scans
-
-
-def _count_classes(scan: Scan, most: int) -> Counter[str] | None:
-    """Count the points of a scan by class and flag, see `Scan.count_classes`.
-
-    most: if the scan has more points and can seek, this many are read, in ranges over all of it. The
-    result is None for other large files, and for a scan without classes or that cannot be read.
-    """
-    count = scan.declared_count or 0
-    try:
-        if scan.fault or CLASSIFICATION not in scan.columns:
-            return None
-        if count <= most if scan.seekable else scan.path.stat().st_size <= COUNTED_BYTES:
-            return scan.count_classes()
-        if not scan.seekable:
-            return None
-        part = most // COUNTED_RANGES
-        starts = [k * (count - part) // (COUNTED_RANGES - 1) for k in range(COUNTED_RANGES)]
-        return sum((scan.count_classes(start, start + part) for start in starts), Counter[str]())
-    except (ScanError, OSError):
-        check_interrupt()
-        return None  # the build reports it
 
 
 def open_input_files(

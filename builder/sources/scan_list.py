@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from ...schemas.errors import BadRequestError
 from ...schemas.process.new_file import new_file
 from ...schemas.process.text_encoding import decode_text
-from .placed_scan import DEGREES, EXPECTED_UNITS, TURNS, UNKNOWN, axis_metres
+from .common.units import DEGREES, EXPECTED_UNITS, UNKNOWN, axis_metres
+from .placed_scan import TURNS
 
 LIST_SUFFIX = ".toml"
 _VERSION = 1

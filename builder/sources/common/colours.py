@@ -5,10 +5,13 @@ without saying so. The brightest channel of a scan decides, as in other programs
 the numbers of the file, the survey finds the greatest of a scan, and `eight_bits` converts.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ....schemas.errors import BadRequestError
 
 # Names of red, green and blue, and of the class, in lower case; the first that a file has are used.
 COLOUR_NAMES = (
@@ -19,6 +22,29 @@ COLOUR_NAMES = (
 CLASS_NAMES = ("classification", "scalar_classification", "class", "label")
 # Columns of a scan besides its coordinates, as `Scan.columns` names them.
 INTENSITY, RGB, CLASSIFICATION = "intensity", "rgb", "classification"
+# Drop reasons of points that their file flags as deleted, and as made by a program; and, with a
+# number, of the points of a class. Only the first are left out without being asked for.
+WITHHELD, SYNTHETIC, CLASS = "withheld", "synthetic", "class"
+
+
+def parse_classes(text: str) -> frozenset[int | str]:
+    """Parse `--drop-classes`, such as `7,18,synthetic`; raise BadRequestError for anything else."""
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not all(word == SYNTHETIC or (word.isdecimal() and int(word) < 256) for word in words):
+        raise BadRequestError(
+            f"--drop-classes {text}: expected numbers from 0 to 255, or {SYNTHETIC}, separated by commas"
+        )
+    return frozenset(word if word == SYNTHETIC else int(word) for word in words)
+
+
+def class_counts(classes: NDArray[np.uint8] | None) -> Counter[str]:
+    """Return how many of points (n,) are in each class, and "points": n."""
+    if classes is None:
+        return Counter()
+    counts = np.bincount(classes, minlength=256)
+    return Counter(
+        {"points": len(classes), **{f"{CLASS} {k}": int(counts[k]) for k in np.flatnonzero(counts)}}
+    )
 
 
 def find_columns(names: Sequence[str]) -> tuple[tuple[int, ...], int | None]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ....schemas.archive.units import MAX_COORDINATE
 from ....schemas.errors import ScanError, SolidcloudError
 from ....schemas.process.interrupts import check_interrupt
-from .colours import CLASSIFICATION
+from .colours import CLASS, CLASSIFICATION, class_counts
 
 # A block of 2^18 points is 6 MiB of float64: large enough to hide the cost of one round of the
 # Python loop, small enough that a few blocks are negligible beside any --memory.
@@ -52,10 +52,6 @@ NO_RETURN = "no return"
 # Maximum deviation of a quaternion's length from 1 (NUMERICS.md, case 4). float32 rounding passes;
 # |q| = 1.01, which would stretch space by 1.5 %, does not.
 QUATERNION_SLACK = 1e-6
-
-# Drop reasons of points that their file flags as deleted, and as made by a program; and, with a
-# number, of the points of a class. Only the first are left out without being asked for.
-WITHHELD, SYNTHETIC, CLASS = "withheld", "synthetic", "class"
 
 # Margin added to computed bounds [m]: covers float64 rounding up to 1e9 m (0.12 um per operation).
 BOUNDS_MARGIN = 1e-6
@@ -109,7 +105,7 @@ class Scan(ABC):
     while it is iterated.
     seekable: True where blocks() can begin and end at any point and reads only that range
     (`SeekableScan`).
-    units: unit of the coordinates, see `axis_metres` (placed_scan.py). up: the axis that points up,
+    units: unit of the coordinates, see `axis_metres` (units.py). up: the axis that points up,
     "z", "y" or "x". Both are what the file or its format states, or the usual value where these state
     none. blocks() does not convert coordinates.
     units_note: which unit the file states, and where, if that is not the metre; or "".
@@ -286,16 +282,6 @@ def check_end(file: BinaryIO, path: Path, what: str) -> None:
                 "the end of the file",
                 "fetch the file again, the count in its header may be damaged",
             )
-
-
-def class_counts(classes: NDArray[np.uint8] | None) -> Counter[str]:
-    """Return how many of points (n,) are in each class, and "points": n."""
-    if classes is None:
-        return Counter()
-    counts = np.bincount(classes, minlength=256)
-    return Counter(
-        {"points": len(classes), **{f"{CLASS} {k}": int(counts[k]) for k in np.flatnonzero(counts)}}
-    )
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:

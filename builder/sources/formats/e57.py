@@ -29,7 +29,7 @@ from ..common.scan import (
     scan_error,
     zero_rotation_note,
 )
-from ..placed_scan import axis_metres
+from ..common.units import axis_metres
 from .e57_xml import (
     Section,
     check_e57,

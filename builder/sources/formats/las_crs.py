@@ -10,7 +10,7 @@ import struct
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..placed_scan import DEGREES, UNKNOWN, unit_name
+from ..common.units import DEGREES, UNKNOWN, unit_name
 
 # Variable length records of the user "LASF_Projection" [LAS 1.4 R15, 3].
 WKT, GEO_KEYS, GEO_DOUBLES, GEO_TEXTS = 2112, 34735, 34736, 34737

@@ -11,7 +11,7 @@ from scan_campaign import edit_list
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit.edit_archive import add_scans
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.sources import scan_files
+from solidcloud.builder.sources import class_counts
 from solidcloud.builder.sources.scan_list import read_scan_list
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import Header
@@ -161,8 +161,8 @@ def test_inspect_counts_what_may_be_left_out(
         "a.laz: 300 points withheld, which a build leaves out; 300 of class 7: `build --drop-classes 7` leaves"
         in capsys.readouterr().out
     )
-    monkeypatch.setattr(scan_files, "COUNTED_POINTS", 400)
-    monkeypatch.setattr(scan_files, "LEAST_COUNTED", 1)
+    monkeypatch.setattr(class_counts, "COUNTED_POINTS", 400)
+    monkeypatch.setattr(class_counts, "LEAST_COUNTED", 1)
     assert run(["inspect", "a.laz", "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)
     assert found["flagged"] == {

@@ -132,7 +132,8 @@ def build(
 
     if not dry_run:
         check_free(output)  # before loading numba, which takes a second
-    from .....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_classes, parse_radius, parse_rule
+    from .....builder.config import DEFAULT_CELL_POINTS, BuildConfig, parse_radius, parse_rule
+    from .....builder.sources.common.colours import parse_classes
     from .....schemas.errors import BadRequestError
 
     if cell_points is not None and leaf_cells is not None:

@@ -122,6 +122,8 @@ def test_a_header_says_where_a_broken_scan_was_unless_the_list_puts_it_elsewhere
     assert np.array_equal(open_input_files([folder / "scans.toml"])[0].region, bounds)
     assert np.array_equal(open_input_files([las])[0].region, bounds)
     edit_list(folder / "scans.toml", {"units": "ft"})
+    assert np.allclose(open_input_files([folder / "scans.toml"])[0].region, bounds * 0.3048)
+    edit_list(folder / "scans.toml", {"up": "y"})
     assert open_input_files([folder / "scans.toml"])[0].region is None
 
 

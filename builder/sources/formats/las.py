@@ -35,17 +35,17 @@ from .las_crs import crs_text, stated_units
 from .las_header import (
     LASZIP,
     LASZIP_RECORD,
-    RECORDS_BEHIND,
     VLR,
     LasHeader,
     check_count,
     check_header,
     find_records,
+    points_end,
     projection_records,
     read_header,
     read_points,
 )
-from .laz_chunks import LazTail, check_chunk_end, check_chunks
+from .laz_chunks import LazTail, check_chunk_end, check_chunks, readable_records
 
 # Offset of red, green and blue in the formats that have them, and of the class: its low five bits
 # up to format 5, a byte of its own from 6 on.
@@ -217,23 +217,39 @@ def las_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
     """Return the bounds that the header of a damaged LAS file declares, (2, 3) [m].
 
     units: see `axis_metres`; "": what the file states.
-    May raise any exception. An inconsistent header is rejected, as are bounds that do not hold the
-    first points, and those in a unit that is not known: if a skipped scan were recorded at a wrong
-    place, queries would report its real place as clear.
+    May raise any exception. An inconsistent header is rejected, as are bounds that do not hold every
+    point that can be read, and those in a unit that is not known: if a skipped scan were recorded at
+    a wrong place, queries would report its real place as clear.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
         header = read_header(file, path)
         check_header(header, path, size=1 << 62)  # every check but those against the file's size
-        # The first point of a compressed file is raw, behind the place of the chunk table.
-        start = header.offset_to_points + 8 * header.compressed
-        first = read_points(file, header, start, 1 if header.compressed else RECORDS_BEHIND)
         records = find_records(file, header.header_size, header.offset_to_points, VLR)
         projection = projection_records(file, header, records, size)
     stated = stated_units(projection)
     metres = axis_metres(units or (stated.name if stated else "m"))
     # The record that states the unit may be lost.
     cut_off = not units and (header.offset_to_points > size or (header.evlrs[1] and not projection))
-    if header.bounds is None or metres is None or cut_off or not header.holds(first).all():
+    if header.bounds is None or metres is None or cut_off:
         return None
-    return header.bounds * metres
+    with path.open("rb") as file:
+        readable = _readable_points(file, path, header, records.get((LASZIP, LASZIP_RECORD), b""))
+        return header.bounds * metres if all(header.holds(xyz).all() for xyz in readable) else None
+
+
+def _readable_points(
+    file: BinaryIO, path: Path, header: LasHeader, laszip: bytes
+) -> Iterator[NDArray[np.float64]]:
+    """Yield the points (n, 3) of a damaged file that can be read, whatever number it declares."""
+    at = header.offset_to_points
+    if header.compressed:
+        # The first point is raw, behind the place of the chunk table.
+        yield read_points(file, header, at + 8, 1)
+        for record in readable_records(file, path, laszip, at, header.record_bytes):
+            yield header.xyz(np.frombuffer(record, header.layout()))
+        return
+    left = (points_end(header, path.stat().st_size) - at) // header.record_bytes
+    while left > 0 and len(xyz := read_points(file, header, at, min(left, BLOCK_POINTS))):
+        yield xyz[(xyz != header.offset).any(axis=1)]  # bytes of 0 that fill a block are no points
+        at, left = at + len(xyz) * header.record_bytes, left - len(xyz)

@@ -202,8 +202,7 @@ def check_count(file: BinaryIO, path: Path, header: LasHeader, size: int) -> Non
     other than 0, only records that lie within the bounds count as points.
     """
     start, points = header.offset_to_points, header.points
-    ends = [at for at in (header.waveforms, header.evlrs[0] if header.evlrs[1] else 0) if at >= start]
-    end = min([size, *ends])
+    end = points_end(header, size)
     if header.compressed:
         more = 0 if points else chunk_bytes(file, start, end) // header.record_bytes
     else:
@@ -212,7 +211,10 @@ def check_count(file: BinaryIO, path: Path, header: LasHeader, size: int) -> Non
         if points and more:
             behind = read_points(file, header, start, min(more, RECORDS_BEHIND))
             blank = (behind == header.offset).all(axis=1)  # bytes of 0 that fill a block
-            more = more if (header.holds(behind) & ~blank).any() else 0
+            # Bounds that do not hold the declared points say nothing about those behind them.
+            first = read_points(file, header, header.offset_to_points, min(points, RECORDS_BEHIND))
+            found = ~blank & (header.holds(behind) | ~header.holds(first).all())
+            more = more if found.any() else 0
     if more:
         raise scan_error(
             path,
@@ -220,6 +222,12 @@ def check_count(file: BinaryIO, path: Path, header: LasHeader, size: int) -> Non
             "the number of all points",
             "the header is damaged, or was not finished: repair or export the file again",
         )
+
+
+def points_end(header: LasHeader, size: int) -> int:
+    """Return where the points end at the latest: at waveforms, at records, or with the file."""
+    ends = [header.waveforms, header.evlrs[0] if header.evlrs[1] else 0]
+    return min([size, *(at for at in ends if at >= header.offset_to_points)])
 
 
 def read_points(file: BinaryIO, header: LasHeader, at: int, count: int) -> NDArray[np.float64]:

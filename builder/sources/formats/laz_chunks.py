@@ -8,11 +8,13 @@ layer.
 
 import io
 import struct
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ....schemas.errors import ScanError
 from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
-from ..common.scan import scan_error
+from ..common.scan import library_errors, reader_library, scan_error
 
 CHUNKED = 2  # the compressor of point formats 0 to 5
 VARIABLE = 0xFFFFFFFF  # special value of points per chunk: each chunk has its own point count
@@ -71,14 +73,9 @@ def check_chunks(
         )
     if compressor != LAYERED:
         return size - table
-    layers = sum(LAYERS.get(kind, length if kind == EXTRA_BYTES else 0) for kind, length in items)
-    sizes = struct.Struct(f"<{1 + layers}I")
     at, seen, number = start + 8, 0, 0
     while seen < points and at < table:
-        file.seek(at + record_bytes)
-        raw = file.read(sizes.size)
-        count, *layer_bytes = sizes.unpack(raw) if len(raw) == sizes.size else (0,)
-        at += record_bytes + sizes.size + sum(layer_bytes)
+        count, at = _chunk_head(file, items, record_bytes, at)
         if not count or at > table:
             raise _damaged(
                 path, f"chunk {number} that ends at byte {at}", f"its end before the table at {table}"
@@ -144,12 +141,18 @@ class LazTail(io.RawIOBase):
             at, self.skip, first = at + size, self.skip - points, first + 1
         if first == len(chunks):
             raise ValueError(f"point {point} lies after the last chunk")
-        table = io.BytesIO()
-        lazrs.write_chunk_table(table, chunks[first:], vlr)
-        self._file, self._from = file, at
-        self._past = 8 + sum(size for _, size in chunks[first:])
-        self._table = table.getvalue()
+        self._hold(lazrs, file, vlr, at, chunks[first:])
         self.behind = len(self._table)
+
+    def _hold(
+        self, lazrs: Any, file: BinaryIO, vlr: Any, at: int, chunks: Sequence[tuple[int, int]], gap: int = 0
+    ) -> None:
+        """Present chunks (points, bytes) from an offset of the file on, and a gap before their table."""
+        table = io.BytesIO()
+        lazrs.write_chunk_table(table, chunks, vlr)
+        self._file, self._from = file, at
+        self._past = 8 + sum(size for _, size in chunks)
+        self._table, self._gap = table.getvalue(), gap
         self._at = 0
 
     def readable(self) -> bool:
@@ -159,7 +162,7 @@ class LazTail(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        self._at = offset + (0, self._at, self._past + len(self._table))[whence]
+        self._at = offset + (0, self._at, self._past + self._gap + len(self._table))[whence]
         return self._at
 
     def readinto(self, buffer: Any) -> int:
@@ -169,11 +172,72 @@ class LazTail(io.RawIOBase):
             self._file.seek(self._from + self._at - 8)
             data = self._file.read(min(len(view), self._past - self._at))
         else:
-            part, begin = (struct.pack("<q", self._past), 0) if self._at < 8 else (self._table, self._past)
-            data = part[self._at - begin : self._at - begin + len(view)]
+            table = self._past + self._gap
+            part, begin = (struct.pack("<q", table), 0) if self._at < 8 else (self._table, table)
+            data = part[self._at - begin : self._at - begin + len(view)] if self._at >= begin else b""
         view[: len(data)] = data
         self._at += len(data)
         return len(data)
+
+
+class _WholeChunks(LazTail):
+    """Chunks of a damaged LAZ file, behind which the file ends for a reader."""
+
+    def __init__(
+        self, lazrs: Any, file: BinaryIO, laszip: bytes, at: int, chunks: Sequence[tuple[int, int]]
+    ) -> None:
+        self._hold(lazrs, file, lazrs.LazVlr(laszip), at, chunks, gap=1)
+
+
+def readable_records(
+    file: BinaryIO, path: Path, laszip: bytes, start: int, record_bytes: int
+) -> Iterator[bytearray]:
+    """Yield the records of a damaged LAZ file that can be decompressed, each overwritten by the next.
+
+    Of layered chunks those that lie whole in the file are read, of others all up to the first
+    fault. Parameters as for `check_chunks`. Raises ScanError.
+    """
+    lazrs = reader_library("lazrs", path)
+    items = _items(path, laszip)
+    compressor, chunk_points = struct.unpack_from("<H10xI", laszip)
+    if compressor not in (CHUNKED, LAYERED) or sum(length for _, length in items) != record_bytes:
+        return
+    at, end = start + 8, start + 8 + chunk_bytes(file, start, file.seek(0, 2))
+    chunks = [(chunk_points, end - at)]
+    if compressor == LAYERED:
+        chunks, past = [], at
+        while past < end:
+            begin = past
+            count, past = _chunk_head(file, items, record_bytes, begin)
+            if not count or past > end:
+                break
+            chunks.append((count, past - begin))
+    points = sum(count for count, _ in chunks) if compressor == LAYERED else 1 << 62
+    record, seen = bytearray(record_bytes), 0
+    with library_errors(path):
+        tail = _WholeChunks(lazrs, file, laszip, at, chunks)
+        decompressor = lazrs.LasZipDecompressor(tail, laszip) if chunks else None
+    while seen < points and decompressor is not None:
+        try:
+            with library_errors(path), blocking_interrupts():
+                decompressor.decompress_many(record)
+        except ScanError:
+            return
+        yield record
+        seen += 1
+
+
+def _chunk_head(file: BinaryIO, items: list[tuple[int, int]], record_bytes: int, at: int) -> tuple[int, int]:
+    """Return the number of points of the layered chunk at an offset, and the offset of its end.
+
+    The number is 0 where the file ends.
+    """
+    layers = sum(LAYERS.get(kind, length if kind == EXTRA_BYTES else 0) for kind, length in items)
+    sizes = struct.Struct(f"<{1 + layers}I")
+    file.seek(at + record_bytes)
+    raw = file.read(sizes.size)
+    count, *layer_bytes = sizes.unpack(raw) if len(raw) == sizes.size else (0,)
+    return count, at + record_bytes + sizes.size + sum(layer_bytes)
 
 
 def _items(path: Path, laszip: bytes) -> list[tuple[int, int]]:

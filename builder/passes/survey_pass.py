@@ -23,7 +23,7 @@ from ..resume.transaction import Transaction
 from ..run.transient_errors import raise_transient
 from ..sources.common.colours import CLASS, SYNTHETIC, WITHHELD, brightest
 from ..sources.common.scan import BEYOND, NOT_FINITE, Scan, SourceLattice, sha256_of
-from ..sources.scan_files import InputFile
+from ..sources.scan_files import InputFile, trusted_bounds
 from ..sources.scan_warnings import beyond_text
 
 # A header's bounds may be rounded: they are trusted if no point lies farther outside than this [m],
@@ -238,9 +238,10 @@ def _region(scan: Scan, low: NDArray[np.float64], high: NDArray[np.float64]) -> 
     The result is None, not known, if there are no such bounds, or if a point read lies outside
     them, which shows that they are wrong.
     """
-    if scan.bounds is None:
+    bounds = trusted_bounds(scan)
+    if bounds is None:
         return None
-    region = _grown(scan.bounds)
+    region = _grown(bounds)
     return None if (low < region[0]).any() or (high > region[1]).any() else region
 
 

@@ -96,6 +96,9 @@ class PlacedScan(Scan):
         self.units_note = inner.units_note if units == inner.units else ""
         self.columns, self.notes = inner.columns, inner.notes
 
+    def trusted_bounds(self) -> NDArray[np.float64] | None:
+        return None if self._inner.trusted_bounds() is None else self.bounds
+
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         return self._read_range(block_points, 0, None)
 

@@ -159,7 +159,7 @@ def header_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
 
     units: see `axis_metres`; "": what the file states.
     Returns (2, 3) world frame [m], low and high corner, or None where they are unknown. Never
-    raises, and reads only the header.
+    raises. Points are read only to contradict the bounds.
     """
     form = _FORMATS.get(Path(path).suffix.lower())
     if form is None or not form.bounds:
@@ -171,6 +171,15 @@ def header_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
         check_interrupt()
         # Best effort on a file known to be broken; open_scans() or blocks() has already raised its
         # error.
+        return None
+
+
+def trusted_bounds(scan: Scan) -> NDArray[np.float64] | None:
+    """Return `Scan.trusted_bounds`; None if the scan's file cannot be read."""
+    try:
+        with library_errors(scan.path):
+            return scan.trusted_bounds()
+    except ScanError:
         return None
 
 

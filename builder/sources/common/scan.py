@@ -148,6 +148,13 @@ class Scan(ABC):
         self.bounds = bounds
         self.dropped: dict[str, int] = {}
 
+    def trusted_bounds(self) -> NDArray[np.float64] | None:
+        """Return the bounds of a scan that cannot be read to its end, or None if they may be damaged.
+
+        A reader that can read more points than blocks() delivers checks that they lie within.
+        """
+        return self.bounds
+
     def delivers(self, column: str) -> bool:
         """Return whether blocks() delivers "rgb" or "classification"."""
         wanted = column in self.wanted or (column == CLASSIFICATION and bool(self.drop_classes))

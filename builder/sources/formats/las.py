@@ -79,6 +79,11 @@ class LasScan(SeekableScan):
         has_rgb = header.point_format in RGB_OFFSETS
         self.columns = frozenset([INTENSITY, CLASSIFICATION] + [RGB] * has_rgb)
 
+    def trusted_bounds(self) -> NDArray[np.float64] | None:
+        with self.path.open("rb") as file:
+            readable = _readable_points(file, self.path, self._header, self._laszip)
+            return self.bounds if all(self._header.holds(xyz).all() for xyz in readable) else None
+
     @property
     def _record(self) -> np.dtype[np.void]:
         """Return the layout of a record, with the fields that are read."""

@@ -73,6 +73,7 @@ PLANE_NODES = {
 VERTICAL_NODES = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 OUTER_NODES = {"COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS"}
 UNIT_NODES = {"UNIT", "LENGTHUNIT", "ANGLEUNIT"}
+DEEPEST = 100  # nodes inside one another; real ones are ten
 
 
 class Units(NamedTuple):
@@ -200,10 +201,12 @@ def _wkt(found: Mapping[int, bytes]) -> str:
 
 
 def _parse_wkt(text: str) -> tuple[_Node | None, bool]:
-    """Return the first node of WKT, None without one, and whether all nodes end."""
+    """Return the first node of WKT, None without one or if it is nested too deeply, and whether all end."""
     path = [_Node("", [])]
     for quoted, opens, closes, word in _TOKEN.findall(text):
         values = path[-1].values
+        if len(path) > DEEPEST:
+            return None, True
         if opens:
             name = values.pop() if values and isinstance(values[-1], str) else ""
             assert isinstance(name, str)

@@ -32,9 +32,11 @@ _BROKEN_NAME = re.compile("[\ud800-\udfff]")
 _HEAD = """\
 # Scans for `solidcloud build`, as their headers describe them. Edit by hand:
 #   use    false leaves a scan out: the archive has no information about its region.
-#   units  unit of length in the file: {units}.
+#   units  unit of length in the file; without this line, what the file states, else metres:
+#          {units}.
 #   scale  additional factor of the coordinates.
-#   up     axis of the file that points up: z, y or x. Scans are turned to make it z.
+#   up     axis of the file that points up: z, y or x; without this line, what its format has. Scans
+#          are turned to make it z.
 #   pose   four rows of four: where the scan is, in metres with z up, after units, scale and up. The value
 #          written here is the file's own pose, in its own units; unchanged or removed, it is applied first.
 # For information only: count, low and high (declared bounds in the file's units), crs, sha256, fault.

@@ -156,7 +156,6 @@ class LasScan(SeekableScan):
             with blocking_interrupts():
                 decompressor.decompress_many(raw[: count * self._record.itemsize])
             yield buffer[:count]
-
         if stop == self.declared_count and self._behind >= 0:
             check_chunk_end(decompressor, self.path, tail.behind if tail else self._behind)
 

@@ -70,9 +70,10 @@ GEODETIC_NODES = {"GEODCRS", "GEODETICCRS"}  # geographic or geocentric
 PLANE_NODES = {
     "PROJCS", "PROJCRS", "PROJECTEDCRS", "DERIVEDPROJCRS", "GEOCCS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS",
 }  # fmt: skip
-VERTICAL_NODES = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
+VERTICAL_NODES = {"VERT_CS", "VERTCS", "VERTCRS", "VERTICALCRS"}
 OUTER_NODES = {"COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS"}
 UNIT_NODES = {"UNIT", "LENGTHUNIT", "ANGLEUNIT"}
+DEEPEST = 100  # nodes inside one another; real ones are ten
 
 
 class Units(NamedTuple):
@@ -200,10 +201,15 @@ def _wkt(found: Mapping[int, bytes]) -> str:
 
 
 def _parse_wkt(text: str) -> tuple[_Node | None, bool]:
-    """Return the first node of WKT, None without one, and whether all nodes end."""
-    path = [_Node("", [])]
+    """Return a node that holds those of WKT, None if they are nested too deeply, and whether all end.
+
+    Some programs write the system of heights behind the other, without a node around both.
+    """
+    path = [_Node("COMPOUNDCRS", [])]
     for quoted, opens, closes, word in _TOKEN.findall(text):
         values = path[-1].values
+        if len(path) > DEEPEST:
+            return None, True
         if opens:
             name = values.pop() if values and isinstance(values[-1], str) else ""
             assert isinstance(name, str)
@@ -213,8 +219,7 @@ def _parse_wkt(text: str) -> tuple[_Node | None, bool]:
             values.append(word or quoted)
         elif len(path) > 1:
             path.pop()
-    first = next((value for value in path[0].values if isinstance(value, _Node)), None)
-    return first, len(path) == 1
+    return path[0], len(path) == 1
 
 
 def _wkt_units(node: _Node) -> tuple[_Unit | None, _Unit | None]:

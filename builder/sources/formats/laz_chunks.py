@@ -28,6 +28,7 @@ EXTRA_BYTES = 14
 # Most bytes that may be left of the last chunk once its points are decompressed. Nothing is left of
 # those that LASzip and lazrs write; four bytes end the code of a chunk without points.
 LEFT_BYTES = 4
+READ_BYTES = 1 << 20
 
 
 def check_chunks(
@@ -93,9 +94,13 @@ def check_chunk_end(decompressor: Any, path: Path, behind: int) -> None:
 
     behind: number of bytes that follow the chunks. Raises ScanError.
     """
+    left = behind + LEFT_BYTES + 1
     try:
-        with blocking_interrupts():
-            decompressor.read_raw_bytes_into(bytearray(behind + LEFT_BYTES + 1))
+        while left:
+            data = bytearray(min(left, READ_BYTES))
+            with blocking_interrupts():
+                decompressor.read_raw_bytes_into(data)
+            left -= len(data)
     except Exception:
         check_interrupt()
         return  # the file ends before: as it should

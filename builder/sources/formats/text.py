@@ -9,6 +9,7 @@ The first lines of the file determine the layout:
   the rows: fewer rows mean a truncated file, more rows a broken one.
 - x, y and z are the columns with these names in the header (a row, or a comment with as many
   names as there are columns), else the first three.
+- The unit is that which stands behind the names x, y and z of the header: "x_mm", "x [mm]".
 - The intensity is the column that the header names intensity or scalar_intensity. A PTS file
   needs no header, see `pts_columns`. In any other file without a header a fourth column may mean
   anything and is ignored.
@@ -28,11 +29,15 @@ from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, whole
 from ..common.counted_rows import pts_columns
 from ..common.scan import INTENSITY_NAMES, Scan, ScanBlock, library_errors, scan_error
 from ..common.text_rows import LONGEST_LINE, is_number, number_rows, open_text_file, split_row
+from ..common.units import METRES
 
 # Maximum lines before the first row of numbers; a file with a longer preamble is not a point list.
 LONGEST_PREAMBLE = 1000
 # First line of a CSV file that tells Excel the delimiter.
 _SEPARATOR_LINE = re.compile(r"sep=.?", re.IGNORECASE)
+
+# Name of a column with its unit: "x_mm", "x [mm]", "x (mm)".
+_AXIS_UNIT = re.compile(r"([xyz]) ?[_ \[(] ?([a-z-]+) ?[\])]?")
 
 
 class _Layout(NamedTuple):
@@ -47,6 +52,7 @@ class _Layout(NamedTuple):
     rgb: tuple[int, ...]  # column numbers, or ()
     classification: int | None
     points: int | None  # the count that the first line declares
+    units: str = "m"  # that the header states
 
 
 class TextScan(Scan):
@@ -56,6 +62,8 @@ class TextScan(Scan):
         """Create the scan; layout is None for a file without rows."""
         super().__init__(path, "text", declared_count=layout.points if layout else 0)
         self._layout = layout
+        if layout is not None and layout.units != "m":
+            self.units, self.units_note = layout.units, f"coordinates in {layout.units}, as its header states"
         if layout is not None:
             held = {
                 INTENSITY: layout.intensity is not None,
@@ -170,7 +178,7 @@ def _layout_of(
             "check that this is a point list, one point a line; remove columns that are no numbers",
         )
     layout = found._replace(columns=len(fields), delimiter=delimiter)
-    called = _split_names(names[1] if names else comment)
+    called, units = _without_units(_split_names(names[1] if names else comment))
     if names is None and (len(called) != len(fields) or not {"x", "y", "z"} <= set(called)):
         if path.suffix.lower() != ".pts":
             return layout
@@ -191,7 +199,21 @@ def _layout_of(
         intensity=intensity,
         rgb=rgb,
         classification=classification,
+        units=units,
     )
+
+
+def _without_units(names: list[str]) -> tuple[list[str], str]:
+    """Return the names of columns, x, y and z without the unit behind them, and these units, else "m".
+
+    A name that is followed by anything else, or by different units of x and y, stays as it is.
+    """
+    found = {match[1]: match[2] for match in map(_AXIS_UNIT.fullmatch, names) if match}
+    plane, height = found.get("x", ""), found.get("z", "")
+    if found.keys() != set("xyz") or found["y"] != plane or not {plane, height} <= METRES.keys():
+        return names, "m"
+    short = [match[1] if (match := _AXIS_UNIT.fullmatch(name)) else name for name in names]
+    return short, plane if plane == height else f"{plane}+{height}"
 
 
 def _split_names(text: str) -> list[str]:

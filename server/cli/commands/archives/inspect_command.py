@@ -244,8 +244,8 @@ def _lines(entries: "list[ScanEntry]") -> list[str]:
 def _row(entry: "ScanEntry") -> tuple[str, ...]:
     """Return the cells of one line of the table."""
     low, high = ("", "") if entry.bounds is None else (_place(corner) for corner in entry.bounds.tolist())
-    other = [entry.units] if entry.units != "m" else []
-    other += [f"{entry.up} up"] if entry.up != "z" else []
+    other = [entry.units] if entry.units not in ("", "m") else []
+    other += [f"{entry.up} up"] if entry.up not in ("", "z") else []
     return (
         "broken" if entry.fault else entry.format,
         "" if entry.fault else "?" if entry.count is None else f"{entry.count:,}",

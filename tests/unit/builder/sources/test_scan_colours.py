@@ -55,6 +55,18 @@ def test_a_placed_scan_keeps_colours_and_classes(tmp_path: Path) -> None:
     assert np.array_equal(block.classification, truth.classes)
 
 
+@pytest.mark.parametrize("name", list(filter(has_classes, WRITERS)))
+def test_points_of_classes_that_are_left_out_are_counted(name: str, tmp_path: Path) -> None:
+    """Issue 35, row 8, in every format that has classes."""
+    truth = coloured(9)
+    (scan,) = open_scans(WRITERS[name](tmp_path / name, truth))
+    scan.drop_classes = frozenset({int(truth.classes[0]), int(truth.classes[1])})
+    kept = ~np.isin(truth.classes, list(scan.drop_classes))
+    xyz = np.concatenate([block.xyz for block in scan.blocks(50)])
+    assert np.abs(xyz - truth.xyz[kept]).max() < 1e-3
+    assert scan.dropped == {f"class {k}": (truth.classes == k).sum() for k in scan.drop_classes}
+
+
 @pytest.mark.parametrize("format", [1, 3, 6, 8])
 def test_las_classes_are_without_the_flags_beside_them(format: int, tmp_path: Path) -> None:
     truth = coloured(7, classes=256 if format > 5 else 32)

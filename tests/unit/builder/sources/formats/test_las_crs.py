@@ -54,6 +54,7 @@ STATED = [
     (f'COMPD_CS["c",{PLANE % FOOT},{HEIGHT % METRE}]', "us-ft+m"),
     (f'COMPD_CS["c",{PLANE % METRE},{HEIGHT % FOOT}]', "m+us-ft"),
     (f'LOCAL_CS["site (a] b""c)",{FOOT}]', "us-ft"),
+    (f'{PLANE % METRE},VERTCS["h",VDATUM["d"],PARAMETER["Direction",1],{FOOT}]', "m+us-ft"),
     (GEOGRAPHIC, "deg"),
     (f'COMPD_CS["c",{GEOGRAPHIC},{HEIGHT % FOOT}]', "deg"),
     ('GEOCCS["g",DATUM["d"],UNIT["metre",1]]', "m"),
@@ -66,7 +67,7 @@ STATED = [
     (PLANE % 'UNIT["ell"]', None),
     (PLANE % 'UNIT["ell",nothing]', "?"),
     ("EPSG:2264", None),
-    ("COMPD_CS[" * 300 + "]" * 300, None),
+    ("COMPD_CS[" * 5000 + "]" * 5000, None),
     ("", None),
 ]  # fmt: skip
 

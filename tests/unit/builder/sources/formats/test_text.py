@@ -177,3 +177,32 @@ def test_no_more_rows_are_made_room_for_than_the_bytes_hold(tmp_path: Path) -> N
         tracemalloc.stop()
     assert rows.shape == (1, 20_000)
     assert peak < 40 << 20
+
+
+@pytest.mark.parametrize(
+    ("header", "units"),
+    [
+        ("x_mm,y_mm,z_mm", "mm"),
+        ("X [cm],Y [cm],Z [cm],Intensity", "cm"),
+        ("X (m);Y (m);Z (m)", "m"),
+        ("# x (us-ft), y (us-ft), z (m)", "us-ft+m"),
+        ("x,y,z_mm", None),
+        ("x_mm,y_m,z_mm", None),
+        ("x_ell,y_ell,z_ell", None),
+    ],
+)
+def test_the_unit_behind_the_names_of_coordinates_is_used_or_they_are_refused(
+    header: str, units: str | None, tmp_path: Path
+) -> None:
+    """Issue 35, row 5."""
+    delimiter = ";" if ";" in header else ","
+    (tmp_path / "a.csv").write_text(
+        f"{header}\n" + delimiter.join("1234"[: header.count(delimiter) + 1]) + "\n"
+    )
+    if units is None:
+        with pytest.raises(ScanError, match="names the columns"):
+            open_scans(tmp_path / "a.csv")
+        return
+    (scan,) = open_scans(tmp_path / "a.csv")
+    assert (scan.units, bool(scan.units_note)) == (units, units != "m")
+    assert next(scan.blocks()).xyz.tolist() == [[1, 2, 3]]

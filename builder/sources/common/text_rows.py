@@ -37,10 +37,11 @@ _LINE_END = re.compile(rb"\r\n?|\n")
 _COMMENT = re.compile(rb"#.*|^[ \t]*(?://|;).*", re.MULTILINE)
 _COMMENT_OR_FIELDS = re.compile(rb"#.*|^[ \t]*//.*", re.MULTILINE)  # where ";" separates fields
 _EMPTY_ENDS = {
-    ",": re.compile(rb"(?:,[ \t\r]*)+$", re.MULTILINE),
-    ";": re.compile(rb"(?:;[ \t\r]*)+$", re.MULTILINE),
+    ",": re.compile(rb",[, \t\r]*$", re.MULTILINE),
+    ";": re.compile(rb";[; \t\r]*$", re.MULTILINE),
 }
-_DECIMAL_COMMA = re.compile(rb"(?<=\d),(?=\d)")
+# The search for a literal first byte is fast.
+_DECIMAL_COMMA = re.compile(rb",(?<=\d,)(?=\d)")
 _QUOTED = re.compile(rb"""(["'])([^\s"',;]*)\1""")
 
 
@@ -149,11 +150,19 @@ def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     at the end of a line, and quotes around a number. A decimal comma becomes a point where commas do
     not separate fields.
     """
-    lines = (_COMMENT_OR_FIELDS if delimiter == ";" else _COMMENT).sub(b"", lines)
+    lines = _without_comments(lines, delimiter)
     if delimiter != ",":
         lines = _DECIMAL_COMMA.sub(b".", lines)
-    lines = _QUOTED.sub(rb"\2", lines)
+    if b'"' in lines or b"'" in lines:
+        lines = _QUOTED.sub(rb"\2", lines)
     return _EMPTY_ENDS[delimiter].sub(b"", lines) if delimiter else lines
+
+
+def _without_comments(lines: bytes, delimiter: str | None) -> bytes:
+    """Return lines without comments. The search for them is slow, and few files have any."""
+    if b"#" in lines or b"//" in lines or (delimiter != ";" and b";" in lines):
+        return (_COMMENT_OR_FIELDS if delimiter == ";" else _COMMENT).sub(b"", lines)
+    return lines
 
 
 def is_number(field: str) -> bool:
@@ -211,14 +220,12 @@ def number_rows(
         try:
             rows = _parse(io.BytesIO(chunk), delimiter, max_rows=most, **options)
         except ValueError:
-            plain = _COMMENT_OR_FIELDS.sub(b"", chunk)
-            commas = commas or (delimiter != "," and b"," in plain)
-            points = points or b"." in plain
+            commas = commas or (delimiter != "," and b"," in _without_comments(chunk, delimiter))
             try:
                 rows = _parse(io.BytesIO(tidy_rows(chunk, delimiter)), delimiter, max_rows=most, **options)
             except ValueError as error:
                 raise _broken_row(path, line, chunk, columns, delimiter, limit, more) from error
-        points = points or b"." in _COMMENT_OR_FIELDS.sub(b"", chunk)
+        points = points or (b"." in chunk and b"." in _without_comments(chunk, delimiter))
         if commas and points:
             raise scan_error(
                 path,

@@ -19,6 +19,7 @@ from ....schemas.process.interrupts import check_interrupt
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, stack_channels, whole_bytes
 from ..common.scan import (
     BLOCK_BYTES,
+    BLOCK_POINTS,
     INTENSITY_NAMES,
     Scan,
     ScanBlock,
@@ -79,15 +80,25 @@ def length_name(name: str) -> str:
 class _Header(NamedTuple):
     """Description of a PLY file's vertices, from its header."""
 
-    vertex: _Element
+    elements: tuple[_Element, ...]
+    at: int  # number of the element of the vertices
     record: np.dtype[np.void]  # properties of a vertex up to its first list; all if it has none
-    before: tuple[_Element, ...]  # elements before the vertices
     start: int  # byte offset of the body
     lines: int  # number of header lines
     ascii: bool
     intensity: str | None  # the property's name
     rgb: tuple[str, ...]  # names of red, green and blue, or ()
     classification: str | None
+
+    @property
+    def vertex(self) -> _Element:
+        """Return the vertices."""
+        return self.elements[self.at]
+
+    @property
+    def before(self) -> tuple[_Element, ...]:
+        """Return the elements before the vertices."""
+        return self.elements[: self.at]
 
     @property
     def points(self) -> int:
@@ -130,14 +141,19 @@ class ListPly(Scan):
         header = self._header
         with self.path.open("rb") as file:
             file.seek(header.start)
-            for element in header.before:
-                if not element.has_lists:
-                    file.seek(element.records * element.least_bytes, 1)
-                    continue
-                for _ in _list_records(file, self.path, element, block_points):
-                    pass
+            _skip_elements(file, self.path, header.before)
             for record in _list_records(file, self.path, header.vertex, block_points):
                 yield _block(self, record, header)
+
+
+def _skip_elements(file: BufferedReader, path: Path, elements: Sequence[_Element]) -> None:
+    """Advance a binary file past elements. Raises ScanError."""
+    for element in elements:
+        if not element.has_lists:
+            file.seek(element.records * element.least_bytes, 1)
+            continue
+        for _ in _list_records(file, path, element, BLOCK_POINTS):
+            pass
 
 
 def _list_records(
@@ -161,7 +177,7 @@ def _list_records(
             data := file.read(most * record.itemsize), record, len(data) // record.itemsize
         )
         if not len(records):
-            raise _truncated(path, seen, element.records, element.name)
+            raise _truncated(path, seen, element.records, f"{element.name} records")
         alike = np.ones(len(records), bool)
         names = [length_name(each.name) for each in element.properties if each.length is not None]
         for name, length in zip(names, lengths, strict=True):
@@ -275,6 +291,46 @@ def open_ply(path: Path) -> list[Scan]:
         return [(ListPly if lists else BinaryPly)(path, header)]
 
 
+def ply_polygons(path: Path) -> list[NDArray[np.int64]]:
+    """Return the vertex numbers of the faces, (n, k) for each number of corners k; none without faces.
+
+    Raises ScanError.
+    """
+    header = _read_header(path)
+    at = next((k for k, each in enumerate(header.elements) if each.name == "face" and each.has_lists), None)
+    if at is None:
+        return []
+    face, before = header.elements[at], header.elements[:at]
+    lists = [each.name for each in face.properties if each.length is not None]
+    name = next((each for each in lists if each in ("vertex_indices", "vertex_index")), lists[0])
+    found: dict[int, list[NDArray[Any]]] = {}
+    with open_text_file(path) if header.ascii else path.open("rb") as file:
+        file.seek(header.start)
+        if header.ascii:
+            _skip_lines(file, sum(each.records for each in before))
+            runs = _text_lists(file, path, face, name)
+        else:
+            _skip_elements(file, path, before)
+            runs = (records[name] for records in _list_records(file, path, face, BLOCK_POINTS))
+        for run in runs:
+            found.setdefault(run.shape[1], []).append(run)
+    return [np.concatenate(found[corners]).astype(np.int64) for corners in sorted(found)]
+
+
+def _text_lists(file: BinaryIO, path: Path, element: _Element, name: str) -> Iterator[NDArray[np.int64]]:
+    """Yield a list of each record of an element in text, as (1, k). Raises ScanError."""
+    for number in range(element.records):
+        check_interrupt()
+        words = file.readline(LONGEST_LINE).split()
+        for each in element.properties:
+            size = 1 if each.length is None else 1 + int(words[0]) if words else 0
+            values, words = words[:size], words[size:]
+            if not values or len(values) < size:
+                raise _truncated(path, number, element.records, f"{element.name} records")
+            if each.name == name:
+                yield np.array([values[1:]], np.int64)
+
+
 def _truncated(path: Path, found: int, declared: int, what: str = "vertices") -> Exception:
     return scan_error(
         path,
@@ -284,7 +340,7 @@ def _truncated(path: Path, found: int, declared: int, what: str = "vertices") ->
     )
 
 
-def header_lines(path: Path) -> tuple[list[str], int]:
+def _header_lines(path: Path) -> tuple[list[str], int]:
     """Return the lines of a PLY file's header without comments, and the offset of its body.
 
     Raises ScanError.
@@ -309,7 +365,7 @@ def header_lines(path: Path) -> tuple[list[str], int]:
 
 def _read_header(path: Path) -> _Header:
     """Read and check the header. Raises ScanError."""
-    lines, start = header_lines(path)
+    lines, start = _header_lines(path)
     counts: list[int] = []
     for number, line in enumerate(lines):
         words = line.split()
@@ -348,7 +404,7 @@ def _read_header(path: Path) -> _Header:
     intensity = next((name for name in names if name.lower() in INTENSITY_NAMES), None)
     colours, of_class = find_columns(names)
     return _Header(
-        vertex, record, tuple(elements[:at]), start, len(lines), ply.text, intensity,
+        tuple(elements), at, record, start, len(lines), ply.text, intensity,
         tuple(names[each] for each in colours), None if of_class is None else names[of_class],
     )  # fmt: skip
 

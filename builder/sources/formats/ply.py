@@ -8,6 +8,7 @@ in elements before them, are skipped; in text, x, y, z and all columns in use co
 import io
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -166,11 +167,13 @@ def _list_records(
     Raises ScanError.
     """
     seen, step = 0, 1
+    names = [length_name(each.name) for each in element.properties if each.length is not None]
+    record_of = lru_cache(maxsize=64)(element.record)
     while seen < element.records:
         check_interrupt()
         begin = file.tell()
         lengths = _list_lengths(file, path, element)
-        record = element.record(lengths)
+        record = record_of(lengths)
         file.seek(begin)
         most = min(step, element.records - seen, block_points, BLOCK_BYTES // record.itemsize)
         records = np.frombuffer(
@@ -179,19 +182,18 @@ def _list_records(
         if not len(records):
             raise _truncated(path, seen, element.records, f"{element.name} records")
         alike = np.ones(len(records), bool)
-        names = [length_name(each.name) for each in element.properties if each.length is not None]
         for name, length in zip(names, lengths, strict=True):
             alike &= records[name] == length
-        unlike = np.flatnonzero(~alike)
-        good = int(unlike[0]) if len(unlike) else len(records)
+        good = len(records) if alike.all() else int(alike.argmin())
         yield records[:good]
         file.seek(begin + good * record.itemsize)
         seen, step = seen + good, 2 * step if good == most else 1
 
 
-def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> list[int]:
+def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> tuple[int, ...]:
     """Return the lengths of the lists of the record at the file's position. Raises ScanError."""
-    lengths, size = [], 0
+    lengths: list[int] = []
+    size = 0
     for _, kind, count in element.properties:
         if count is None:
             size += kind.itemsize
@@ -208,7 +210,7 @@ def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> list[i
             )
         lengths.append(length)
         file.seek(length * kind.itemsize, 1)
-    return lengths
+    return tuple(lengths)
 
 
 def _skip_lines(file: BinaryIO, lines: int) -> None:

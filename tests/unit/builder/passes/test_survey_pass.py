@@ -57,7 +57,7 @@ def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
     xyz[5, 1], xyz[6, 0], xyz[250, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
     good = np.delete(xyz, [5, 6, 250], axis=0)
     survey = survey_scan(listed(tmp_path, xyz))
-    assert (survey.count, survey.not_finite, survey.fault) == (297, 3, "")
+    assert (survey.count, survey.not_finite, survey.beyond, survey.fault) == (297, 2, 1, "")
     assert np.array_equal(survey.low, good.min(axis=0))
     assert np.array_equal(survey.high, good.max(axis=0))
 

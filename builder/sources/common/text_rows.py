@@ -116,6 +116,8 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
             raise scan_error(
                 path, f"line {at} holds a zero byte", "text", "fetch the file again, it is damaged"
             )
+        if UTF8_MARK in data:  # of files that were joined
+            data = data.replace(UTF8_MARK, b"")
         end = data.rfind(NEWLINE) + 1
         chunk, rest = line_ends(data[:end]), data[end:]
         if len(rest) > LONGEST_LINE:
@@ -289,7 +291,7 @@ def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[n
     Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored.
     Raises ScanError with the number of the first line whose three numbers cannot be read.
     """
-    lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE)
+    lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE | re.IGNORECASE)
     for line, chunk in text_chunks(file, path):
         found = lines_of.findall(chunk)
         try:

@@ -19,7 +19,8 @@ from ..common.text_rows import keyword_rows, open_text_file
 
 # A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
 STL_HEADER_BYTES = 84
-SOLID = re.compile(rb"(?:\xff\xfe|\xfe\xff)?\s*solid")
+SOLID = re.compile(rb"(?:\xff\xfe|\xfe\xff)?\s*solid", re.IGNORECASE)
+_FACET = re.compile(rb"facet|endsolid", re.IGNORECASE)
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -74,7 +75,7 @@ def open_stl(path: Path) -> list[Scan]:
         start = file.read(1024)
         # Many binary files begin with "solid" too: their first 80 bytes may hold anything.
         letters = start.replace(b"\0", b"") if is_utf16(start) else start.removeprefix(UTF8_MARK)
-        if SOLID.match(letters) and (b"facet" in letters or b"endsolid" in letters):
+        if SOLID.match(letters) and _FACET.search(letters):
             with open_text_file(path) as text:
                 _check_ascii_end(text, path)
             return [VertexLines(path, "vertex")]
@@ -91,7 +92,7 @@ def _check_ascii_end(file: BinaryIO, path: Path) -> None:
     """Check that an ASCII STL ends with the line that ends its last solid. Raises ScanError."""
     file.seek(max(0, file.seek(0, 2) - 1024))
     lines = file.read().strip().splitlines()
-    if not lines or not lines[-1].lstrip().startswith(b"endsolid"):
+    if not lines or not lines[-1].lstrip().lower().startswith(b"endsolid"):
         raise _truncated_stl(path, f"a last line {lines[-1][:60] if lines else b''!r}", "'endsolid'")
 
 

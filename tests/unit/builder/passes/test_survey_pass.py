@@ -129,7 +129,7 @@ def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path:
     path = listed(tmp_path, xyz).path
     survey = survey_scan(Dropping(path, xyz, 50))
     assert survey.dropped == {"not finite": 3, "invalid": 5}
-    assert survey.unclean == 3
+    assert survey.unclean == "3 points that are not finite"
     assert survey_scan(listed(tmp_path, xyz[1:])).dropped == {}
 
 

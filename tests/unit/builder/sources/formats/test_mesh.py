@@ -73,6 +73,16 @@ def test_an_stl_surface_is_sampled_too(tmp_path: Path) -> None:
     assert (xyz[:, :2].sum(axis=1) <= 2).all() and (xyz[:, 2] == 1).all()
 
 
+def test_an_stl_may_be_in_capitals(tmp_path: Path) -> None:
+    """Issue 35: it was taken for a truncated binary file."""
+    path = tmp_path / "a.stl"
+    path.write_text(
+        "SOLID A\nFACET NORMAL 0 0 1\nOUTER LOOP\nVERTEX 0 0 1\nVERTEX 2 0 1\nVERTEX 0 2 1\nENDLOOP\nENDFACET\n"
+        "ENDSOLID A\n"
+    )
+    assert read_all(path).tolist() == [[0, 0, 1], [2, 0, 1], [0, 2, 1]]
+
+
 def test_samples_fall_on_triangles_by_their_area(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text(

@@ -111,10 +111,6 @@ def mesh_triangles(vertices: Scan) -> NDArray[np.float64]:
     if suffix == ".stl":
         _check_size(path)
         corners = np.concatenate([np.empty((0, 3)), *(block.xyz for block in vertices.blocks())])
-        if len(corners) % 3:
-            raise scan_error(
-                path, f"{len(corners)} corners", "three a triangle", "fetch the file again, it is damaged"
-            )
         return corners.reshape(-1, 3, 3)
     with library_errors(path):
         if suffix == ".obj" and _has_faces(path):

@@ -34,7 +34,8 @@ _END_MARK = re.compile(rb"\x1a[\x1a\s]*\Z")
 _LINE_END = re.compile(rb"\r\n?|\n")
 
 # What rows may hold besides numbers and delimiters, and numpy.loadtxt does not accept.
-_COMMENT = re.compile(rb"#.*|^[ \t]*(?://|;).*", re.MULTILINE)
+# A number behind the ";" makes it a row: one wrong bit turns "3" into ";".
+_COMMENT = re.compile(rb"#.*|^[ \t]*(?://|;(?![ \t]*[-+.\d])).*", re.MULTILINE)
 _COMMENT_OR_FIELDS = re.compile(rb"#.*|^[ \t]*//.*", re.MULTILINE)  # where ";" separates fields
 _EMPTY_ENDS = {
     ",": re.compile(rb",[, \t\r]*$", re.MULTILINE),
@@ -148,9 +149,9 @@ def split_row(line: bytes, delimiter: str | None) -> list[str]:
 def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     """Return lines of rows as numpy.loadtxt accepts them, each at its place.
 
-    Comments are left out: what follows "#", and lines that begin with "//" or ";". So are delimiters
-    at the end of a line, and quotes around a number. A decimal comma becomes a point where commas do
-    not separate fields.
+    Comments are left out: what follows "#", and lines that begin with "//", or with ";" and no
+    number. So are delimiters at the end of a line, and quotes around a number. A decimal comma
+    becomes a point where commas do not separate fields.
     """
     lines = _without_comments(lines, delimiter)
     if delimiter != ",":

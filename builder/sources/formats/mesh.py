@@ -27,15 +27,19 @@ STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("att
 class VertexLines(Scan):
     """Vertices of an OBJ or ASCII STL file: three numbers after a keyword."""
 
-    def __init__(self, path: Path, keyword: str) -> None:
+    def __init__(self, path: Path, keyword: str, of_triangles: bool = False) -> None:
         super().__init__(path, "mesh")
-        self._keyword = keyword
+        self._keyword, self._of_triangles = keyword, of_triangles
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
+        seen = 0
         with open_text_file(self.path) as file:
             for rows in keyword_rows(file, self.path, self._keyword):
+                seen += len(rows)
                 for start in range(0, len(rows), block_points):
                     yield ScanBlock(rows[start : start + block_points], None)
+        if self._of_triangles and seen % 3:
+            raise _truncated_stl(self.path, f"{seen} corners", "three a triangle")
 
 
 class BinaryStl(SeekableScan):
@@ -78,7 +82,7 @@ def open_stl(path: Path) -> list[Scan]:
         if SOLID.match(letters) and _FACET.search(letters):
             with open_text_file(path) as text:
                 _check_ascii_end(text, path)
-            return [VertexLines(path, "vertex")]
+            return [VertexLines(path, "vertex", of_triangles=True)]
     if len(start) < STL_HEADER_BYTES:
         raise _truncated_stl(path, f"{size} bytes", f"a header of {STL_HEADER_BYTES}")
     (triangles,) = struct.unpack_from("<I", start, 80)

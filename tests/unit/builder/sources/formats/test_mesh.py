@@ -73,6 +73,14 @@ def test_an_stl_surface_is_sampled_too(tmp_path: Path) -> None:
     assert (xyz[:, :2].sum(axis=1) <= 2).all() and (xyz[:, 2] == 1).all()
 
 
+def test_an_stl_whose_keyword_is_damaged_is_refused(tmp_path: Path) -> None:
+    """Issue 35: its point was left out without a word."""
+    path = tmp_path / "a.stl"
+    path.write_text("solid a\nfacet\nvertex 0 0 1\nvertux 2 0 1\nvertex 0 2 1\nendsolid a\n")
+    with pytest.raises(ScanError, match="2 corners, expected three a triangle"):
+        read_all(path)
+
+
 def test_an_stl_may_be_in_capitals(tmp_path: Path) -> None:
     """Issue 35: it was taken for a truncated binary file."""
     path = tmp_path / "a.stl"

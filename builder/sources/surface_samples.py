@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .common.scan import NOT_FINITE, Scan, ScanBlock, library_errors, reader_library, scan_error
 from .common.text_rows import open_text_file, text_chunks
 from .formats.glb import GlbScan
-from .formats.ply import header_lines
+from .formats.ply import ply_polygons
 
 # Steps of the additive sequence in two dimensions with the plastic number 1.3247...: the known
 # sequence of this kind whose points keep farthest apart (Roberts 2018, "The unreasonable
@@ -31,13 +31,12 @@ SAMPLES_ANYWAY = 10**7
 # five times its file size.
 LARGEST_MESH = 512 << 20
 
-# A face in an OBJ file, and in the header of a PLY file.
+# A face in an OBJ file.
 _OBJ_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
 # A face in an OBJ file that does not name at least three vertices: trimesh leaves out most of these.
 _BROKEN_OBJ_FACE = re.compile(
     rb"^[ \t]*f(?=\s|\Z)(?!(?:[ \t]+-?0*[1-9]\d*(?:/-?\d*){0,2}){3,}[ \t\r]*(?:#.*)?$).*", re.MULTILINE
 )
-_PLY_FACE = re.compile(r"element[ \t]+face[ \t]+0*[1-9]")
 # Letters of names and comments, which trimesh would decode -> "?".
 _ASCII = bytes(range(128)) + b"?" * 128
 
@@ -106,7 +105,7 @@ class SurfaceSamples(Scan):
 def mesh_triangles(vertices: Scan) -> NDArray[np.float64]:
     """Return the corners (n, 3, 3) of all triangles of a file [m]; none if it holds only points.
 
-    vertices: the file as points. Only an OBJ or PLY file with faces needs the library trimesh.
+    vertices: the file as points. Only an OBJ file with faces needs the library trimesh.
     Raises ScanError.
     """
     path = vertices.path
@@ -116,26 +115,38 @@ def mesh_triangles(vertices: Scan) -> NDArray[np.float64]:
     if suffix == ".stl":
         _check_size(path)
         corners = np.concatenate([np.empty((0, 3)), *(block.xyz for block in vertices.blocks())])
-        if len(corners) % 3:
-            raise scan_error(
-                path, f"{len(corners)} corners", "three a triangle", "fetch the file again, it is damaged"
-            )
         return corners.reshape(-1, 3, 3)
-    if suffix in (".obj", ".ply") and _has_faces(path):
-        for _ in vertices.blocks():
-            pass  # checks that the file holds all its vertices, which trimesh does not
-        with library_errors(path):
+    with library_errors(path):
+        if suffix == ".obj" and _has_faces(path):
             return _by_trimesh(path)
+        if suffix == ".ply":
+            return _ply_triangles(vertices)
     return np.empty((0, 3, 3))
 
 
 def _has_faces(path: Path) -> bool:
-    """Return whether an OBJ or PLY file has faces. Raises ScanError."""
-    with library_errors(path):
-        if path.suffix.lower() == ".ply":
-            return any(map(_PLY_FACE.match, header_lines(path)[0]))
-        with open_text_file(path) as file:
-            return any(_OBJ_FACE.search(chunk) for _, chunk in text_chunks(file, path))
+    """Return whether an OBJ file has faces. Raises ScanError."""
+    with open_text_file(path) as file:
+        return any(_OBJ_FACE.search(chunk) for _, chunk in text_chunks(file, path))
+
+
+def _ply_triangles(vertices: Scan) -> NDArray[np.float64]:
+    """Return the corners (n, 3, 3) of the faces of a PLY file; polygons become fans. Raises ScanError.
+
+    Of faces with four corners the first triangles of all come before the second ones: so does
+    trimesh, and samples follow this order.
+    """
+    polygons = [each for each in ply_polygons(vertices.path) if each.shape[1] > 2]
+    if not polygons:
+        return np.empty((0, 3, 3))
+    _check_size(vertices.path)
+    faces = [
+        each[:, [k, k + 1, 0] if k > 1 else [0, 1, 2]]
+        for each in polygons
+        for k in range(1, each.shape[1] - 1)
+    ]
+    xyz = np.concatenate([np.empty((0, 3)), *(block.xyz for block in vertices.blocks())])
+    return _corners(vertices.path, xyz, np.concatenate(faces))
 
 
 def _check_size(path: Path) -> None:
@@ -151,14 +162,26 @@ def _check_size(path: Path) -> None:
 
 
 def _by_trimesh(path: Path) -> NDArray[np.float64]:
-    """Return the corners (n, 3, 3) of all triangles of an OBJ or PLY file. Raises ScanError."""
+    """Return the corners (n, 3, 3) of all triangles of an OBJ file. Raises ScanError."""
     _check_size(path)
     trimesh = reader_library("trimesh", path)
+    with open_text_file(path) as file:
+        text = file.read().translate(_ASCII)
+    if broken := _BROKEN_OBJ_FACE.search(text.replace(b"\\\r\n", b"").replace(b"\\\n", b"")):
+        raise scan_error(
+            path,
+            f"the face {broken[0].decode().strip()[:60]!r}",
+            "at least three vertices, counted from 1",
+            "fetch the file again, it is damaged",
+        )
     # With materials, trimesh would open any file that the OBJ names.
-    kind = path.suffix.lower().removeprefix(".")
-    mesh = trimesh.load_mesh(_plain_mesh(path), file_type=kind, process=False, skip_materials=True)
+    mesh = trimesh.load_mesh(io.BytesIO(text), file_type="obj", process=False, skip_materials=True)
     faces = np.asarray(mesh.faces) if hasattr(mesh, "faces") else np.empty((0, 3), np.int64)
-    vertices = np.asarray(mesh.vertices, np.float64)
+    return _corners(path, np.asarray(mesh.vertices, np.float64), faces)
+
+
+def _corners(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the corners (n, 3, 3) of faces (n, 3), by vertex numbers. Raises ScanError."""
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise scan_error(
             path,
@@ -167,28 +190,6 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
             "fetch the file again, it is truncated or damaged",
         )
     return np.asarray(vertices[faces], np.float64)
-
-
-def _plain_mesh(path: Path) -> io.BytesIO:
-    """Return an OBJ or PLY file without a byte order mark, and without letters that are not ASCII."""
-    if path.suffix.lower() == ".obj":
-        with open_text_file(path) as file:
-            text = file.read().translate(_ASCII)
-        if broken := _BROKEN_OBJ_FACE.search(text.replace(b"\\\r\n", b"").replace(b"\\\n", b"")):
-            raise scan_error(
-                path,
-                f"the face {broken[0].decode().strip()[:60]!r}",
-                "at least three vertices, counted from 1",
-                "fetch the file again, it is damaged",
-            )
-        return io.BytesIO(text)
-    lines, start = header_lines(path)
-    is_text = any(line.split()[:2] == ["format", "ascii"] for line in lines)
-    with open_text_file(path) if is_text else path.open("rb") as file:
-        file.seek(start)
-        # trimesh expects the format in the second line.
-        head = "".join(f"{line}\n" for line in lines if line != "comment")
-        return io.BytesIO(head.encode("ascii") + file.read())
 
 
 def _unit_triangle(u: Any, v: Any) -> tuple[Any, Any]:

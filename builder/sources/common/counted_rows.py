@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check_interrupt
+from ....schemas.process.text_encoding import UTF8_MARK
 from .colours import INTENSITY, RGB, whole_bytes
 from .scan import NO_RETURN, Scan, ScanBlock, apply_pose, scan_error
 from .text_rows import (
@@ -31,7 +32,7 @@ from .text_rows import (
 # against the bytes left in the file.
 MIN_ROW_BYTES = 6
 # The end of a line before a blank line or a comment, which is no row.
-_NO_ROW = re.compile(rb"\n(?=[ \t]*(?:\n|#|//|;))")
+_NO_ROW = re.compile(rb"\n(?=[ \t]*(?:\n|#|//|;(?![ \t]*[-+.\d])))")
 # Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
 # (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
 MAX_SCANS = 1 << 16
@@ -165,6 +166,7 @@ def next_line(file: BufferedReader, line: int) -> tuple[str, int]:
     line: number of the line at the current file position. At the end of the file the text is "".
     """
     while raw := file.readline(LONGEST_LINE):
+        raw = raw.removeprefix(UTF8_MARK)  # of files that were joined
         if split_row(raw, None):
             return raw.decode("latin-1").strip(), line
         line += 1

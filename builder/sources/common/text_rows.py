@@ -35,13 +35,15 @@ _END_MARK = re.compile(rb"\x1a[\x1a\s]*\Z")
 _LINE_END = re.compile(rb"\r\n?|\n")
 
 # What rows may hold besides numbers and delimiters, and numpy.loadtxt does not accept.
-_COMMENT = re.compile(rb"#.*|^[ \t]*(?://|;).*", re.MULTILINE)
+# A number behind the ";" makes it a row: one wrong bit turns "3" into ";".
+_COMMENT = re.compile(rb"#.*|^[ \t]*(?://|;(?![ \t]*[-+.\d])).*", re.MULTILINE)
 _COMMENT_OR_FIELDS = re.compile(rb"#.*|^[ \t]*//.*", re.MULTILINE)  # where ";" separates fields
 _EMPTY_ENDS = {
-    ",": re.compile(rb"(?:,[ \t\r]*)+$", re.MULTILINE),
-    ";": re.compile(rb"(?:;[ \t\r]*)+$", re.MULTILINE),
+    ",": re.compile(rb",[, \t\r]*$", re.MULTILINE),
+    ";": re.compile(rb";[; \t\r]*$", re.MULTILINE),
 }
-_DECIMAL_COMMA = re.compile(rb"(?<=\d),(?=\d)")
+# The search for a literal first byte is fast.
+_DECIMAL_COMMA = re.compile(rb",(?<=\d,)(?=\d)")
 _QUOTED = re.compile(rb"""(["'])([^\s"',;]*)\1""")
 
 
@@ -116,6 +118,8 @@ def text_chunks(file: BinaryIO, path: Path, first_line: int = 1) -> Iterator[tup
             raise scan_error(
                 path, f"line {at} holds a zero byte", "text", "fetch the file again, it is damaged"
             )
+        if UTF8_MARK in data:  # of files that were joined
+            data = data.replace(UTF8_MARK, b"")
         end = data.rfind(NEWLINE) + 1
         chunk, rest = line_ends(data[:end]), data[end:]
         if len(rest) > LONGEST_LINE:
@@ -146,15 +150,23 @@ def split_row(line: bytes, delimiter: str | None) -> list[str]:
 def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     """Return lines of rows as numpy.loadtxt accepts them, each at its place.
 
-    Comments are left out: what follows "#", and lines that begin with "//" or ";". So are delimiters
-    at the end of a line, and quotes around a number. A decimal comma becomes a point where commas do
-    not separate fields.
+    Comments are left out: what follows "#", and lines that begin with "//", or with ";" and no
+    number. So are delimiters at the end of a line, and quotes around a number. A decimal comma
+    becomes a point where commas do not separate fields.
     """
-    lines = (_COMMENT_OR_FIELDS if delimiter == ";" else _COMMENT).sub(b"", lines)
+    lines = _without_comments(lines, delimiter)
     if delimiter != ",":
         lines = _DECIMAL_COMMA.sub(b".", lines)
-    lines = _QUOTED.sub(rb"\2", lines)
+    if b'"' in lines or b"'" in lines:
+        lines = _QUOTED.sub(rb"\2", lines)
     return _EMPTY_ENDS[delimiter].sub(b"", lines) if delimiter else lines
+
+
+def _without_comments(lines: bytes, delimiter: str | None) -> bytes:
+    """Return lines without comments. The search for them is slow, and few files have any."""
+    if b"#" in lines or b"//" in lines or (delimiter != ";" and b";" in lines):
+        return (_COMMENT_OR_FIELDS if delimiter == ";" else _COMMENT).sub(b"", lines)
+    return lines
 
 
 def is_number(field: str) -> bool:
@@ -219,14 +231,12 @@ def number_rows(
         try:
             rows = _parse(io.BytesIO(chunk), delimiter, max_rows=most, **options)
         except ValueError:
-            plain = _COMMENT_OR_FIELDS.sub(b"", chunk)
-            commas = commas or (delimiter != "," and b"," in plain)
-            points = points or b"." in plain
+            commas = commas or (delimiter != "," and b"," in _without_comments(chunk, delimiter))
             try:
                 rows = _parse(io.BytesIO(tidy_rows(chunk, delimiter)), delimiter, max_rows=most, **options)
             except ValueError as error:
                 raise _broken_row(path, line, chunk, columns, delimiter, limit, more) from error
-        points = points or b"." in _COMMENT_OR_FIELDS.sub(b"", chunk)
+        points = points or (b"." in chunk and b"." in _without_comments(chunk, delimiter))
         if commas and points:
             raise scan_error(
                 path,
@@ -303,7 +313,7 @@ def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[n
     Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored.
     Raises ScanError with the number of the first line whose three numbers cannot be read.
     """
-    lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE)
+    lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE | re.IGNORECASE)
     for line, chunk in text_chunks(file, path):
         found = lines_of.findall(chunk)
         try:

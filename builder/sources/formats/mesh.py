@@ -27,22 +27,27 @@ from ..common.text_rows import keyword_rows, open_text_file
 
 # A binary STL: 80 bytes of anything, the number of triangles (uint32), then a record each.
 STL_HEADER_BYTES = 84
-SOLID = re.compile(rb"(?:\xff\xfe|\xfe\xff)?\s*solid")
+SOLID = re.compile(rb"(?:\xff\xfe|\xfe\xff)?\s*solid", re.IGNORECASE)
+_FACET = re.compile(rb"facet|endsolid", re.IGNORECASE)
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 class VertexLines(Scan):
     """Vertices of an OBJ or ASCII STL file: three numbers after a keyword."""
 
-    def __init__(self, path: Path, keyword: str) -> None:
+    def __init__(self, path: Path, keyword: str, of_triangles: bool = False) -> None:
         super().__init__(path, "mesh")
-        self._keyword = keyword
+        self._keyword, self._of_triangles = keyword, of_triangles
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
+        seen = 0
         with open_text_file(self.path) as file:
             for rows in keyword_rows(file, self.path, self._keyword):
+                seen += len(rows)
                 for start in range(0, len(rows), block_points):
                     yield ScanBlock(rows[start : start + block_points], None)
+        if self._of_triangles and seen % 3:
+            raise _truncated_stl(self.path, f"{seen} corners", "three a triangle")
 
 
 class BinaryStl(SeekableScan):
@@ -82,10 +87,10 @@ def open_stl(path: Path) -> list[Scan]:
         start = file.read(1024)
         # Many binary files begin with "solid" too: their first 80 bytes may hold anything.
         letters = start.replace(b"\0", b"") if is_utf16(start) else start.removeprefix(UTF8_MARK)
-        if SOLID.match(letters) and (b"facet" in letters or b"endsolid" in letters):
+        if SOLID.match(letters) and _FACET.search(letters):
             with open_text_file(path) as text:
                 _check_ascii_end(text, path)
-            return [VertexLines(path, "vertex")]
+            return [VertexLines(path, "vertex", of_triangles=True)]
     if len(start) < STL_HEADER_BYTES:
         raise _truncated_stl(path, f"{size} bytes", f"a header of {STL_HEADER_BYTES}")
     (triangles,) = struct.unpack_from("<I", start, 80)
@@ -102,7 +107,7 @@ def _check_ascii_end(file: BinaryIO, path: Path) -> None:
     """Check that an ASCII STL ends with the line that ends its last solid. Raises ScanError."""
     file.seek(max(0, file.seek(0, 2) - 1024))
     lines = file.read().strip().splitlines()
-    if not lines or not lines[-1].lstrip().startswith(b"endsolid"):
+    if not lines or not lines[-1].lstrip().lower().startswith(b"endsolid"):
         raise _truncated_stl(path, f"a last line {lines[-1][:60] if lines else b''!r}", "'endsolid'")
 
 

@@ -8,7 +8,7 @@ as NaN points in their grid; these are dropped as NO_RETURN.
 VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
 
 Missing lines of the header mean what they mean in that library: COLUMNS is an old name of FIELDS, COUNT
-and HEIGHT are 1, WIDTH is POINTS, and in text TYPE is F. Without WIDTH and POINTS the rest of the
+and HEIGHT are 1, WIDTH times HEIGHT is POINTS, and in text TYPE is F. Without WIDTH and POINTS the rest of the
 file is points.
 """
 
@@ -310,11 +310,12 @@ def _read_header(path: Path) -> _Header:
         raise refuse("COUNT", f"records of at most {BLOCK_BYTES} bytes")
     points, is_counted = 0, "POINTS" in entries or "WIDTH" in entries
     if is_counted:
-        (height,) = numbers("HEIGHT", 1, ["1"])
-        (width,) = numbers("WIDTH", 1, entries.get("POINTS") if height == 1 else None)
-        points = width * height
-        if numbers("POINTS", 1, [str(points)]) != [points]:
-            raise refuse("POINTS", f"WIDTH times HEIGHT, {points}")
+        (points,) = numbers("POINTS", 1, None if "POINTS" in entries else ["0"])
+        (width,), (height,) = numbers("WIDTH", 1, [str(points)]), numbers("HEIGHT", 1, ["1"])
+        grid = width * height if "WIDTH" in entries else points
+        if points != grid and "POINTS" in entries:
+            raise refuse("POINTS", f"WIDTH times HEIGHT, {grid}")
+        points = grid
     elif not is_text:
         points, rest = divmod(path.stat().st_size - start, record_bytes)
         if rest or kind == "binary_compressed":

@@ -8,6 +8,7 @@ in elements before them, are skipped; in text, x, y, z and all columns in use co
 import io
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -19,6 +20,7 @@ from ....schemas.process.interrupts import check_interrupt
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, stack_channels, whole_bytes
 from ..common.scan import (
     BLOCK_BYTES,
+    BLOCK_POINTS,
     INTENSITY_NAMES,
     Scan,
     ScanBlock,
@@ -82,16 +84,30 @@ def length_name(name: str) -> str:
 class _Header(NamedTuple):
     """Description of a PLY file's vertices, from its header."""
 
-    vertex: _Element
+    elements: tuple[_Element, ...]
+    at: int  # number of the element of the vertices
     record: np.dtype[np.void]  # properties of a vertex up to its first list; all if it has none
-    before: tuple[_Element, ...]  # elements before the vertices
-    after: tuple[_Element, ...]  # elements after the vertices
     start: int  # byte offset of the body
     lines: int  # number of header lines
     ascii: bool
     intensity: str | None  # the property's name
     rgb: tuple[str, ...]  # names of red, green and blue, or ()
     classification: str | None
+
+    @property
+    def vertex(self) -> _Element:
+        """Return the vertices."""
+        return self.elements[self.at]
+
+    @property
+    def after(self) -> tuple[_Element, ...]:
+        """Return the elements after the vertices."""
+        return self.elements[self.at + 1 :]
+
+    @property
+    def before(self) -> tuple[_Element, ...]:
+        """Return the elements before the vertices."""
+        return self.elements[: self.at]
 
     @property
     def points(self) -> int:
@@ -134,11 +150,16 @@ class ListPly(Scan):
         header = self._header
         with self.path.open("rb") as file:
             file.seek(header.start)
-            for element in header.before:
-                _skip_element(file, self.path, element)
+            _skip_elements(file, self.path, header.before)
             for record in _list_records(file, self.path, header.vertex, block_points):
                 yield _block(self, record, header)
             _check_rest(file, self.path, header)
+
+
+def _skip_elements(file: BufferedReader, path: Path, elements: Sequence[_Element]) -> None:
+    """Advance a binary file past elements. Raises ScanError."""
+    for element in elements:
+        _skip_element(file, path, element)
 
 
 def _list_records(
@@ -151,32 +172,33 @@ def _list_records(
     Raises ScanError.
     """
     seen, step = 0, 1
+    names = [length_name(each.name) for each in element.properties if each.length is not None]
+    record_of = lru_cache(maxsize=64)(element.record)
     while seen < element.records:
         check_interrupt()
         begin = file.tell()
         lengths = _list_lengths(file, path, element)
-        record = element.record(lengths)
+        record = record_of(lengths)
         file.seek(begin)
         most = min(step, element.records - seen, block_points, BLOCK_BYTES // record.itemsize)
         records = np.frombuffer(
             data := file.read(most * record.itemsize), record, len(data) // record.itemsize
         )
         if not len(records):
-            raise _truncated(path, seen, element.records, element.name)
+            raise _truncated(path, seen, element.records, f"{element.name} records")
         alike = np.ones(len(records), bool)
-        names = [length_name(each.name) for each in element.properties if each.length is not None]
         for name, length in zip(names, lengths, strict=True):
             alike &= records[name] == length
-        unlike = np.flatnonzero(~alike)
-        good = int(unlike[0]) if len(unlike) else len(records)
+        good = len(records) if alike.all() else int(alike.argmin())
         yield records[:good]
         file.seek(begin + good * record.itemsize)
         seen, step = seen + good, 2 * step if good == most else 1
 
 
-def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> list[int]:
+def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> tuple[int, ...]:
     """Return the lengths of the lists of the record at the file's position. Raises ScanError."""
-    lengths, size = [], 0
+    lengths: list[int] = []
+    size = 0
     for _, kind, count in element.properties:
         if count is None:
             size += kind.itemsize
@@ -188,7 +210,7 @@ def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> list[i
             raise _bad_list(path, element, length, f"in a record of at most {BLOCK_BYTES} bytes")
         lengths.append(length)
         file.seek(length * kind.itemsize, 1)
-    return lengths
+    return tuple(lengths)
 
 
 def _bad_list(path: Path, element: _Element, length: int, where: str) -> Exception:
@@ -289,8 +311,7 @@ def _check_rest(file: BufferedReader, path: Path, header: _Header) -> None:
     A vertex count that is too small makes vertices the first bytes of the next element, a face for
     instance, whose lists then end elsewhere. file: at the end of the vertices.
     """
-    for element in header.after:
-        _skip_element(file, path, element)
+    _skip_elements(file, path, header.after)
     check_end(file, path, "elements")
 
 
@@ -340,6 +361,46 @@ def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
     file.seek(at)
 
 
+def ply_polygons(path: Path) -> list[NDArray[np.int64]]:
+    """Return the vertex numbers of the faces, (n, k) for each number of corners k; none without faces.
+
+    Raises ScanError.
+    """
+    header = _read_header(path)
+    at = next((k for k, each in enumerate(header.elements) if each.name == "face" and each.has_lists), None)
+    if at is None:
+        return []
+    face, before = header.elements[at], header.elements[:at]
+    lists = [each.name for each in face.properties if each.length is not None]
+    name = next((each for each in lists if each in ("vertex_indices", "vertex_index")), lists[0])
+    found: dict[int, list[NDArray[Any]]] = {}
+    with open_text_file(path) if header.ascii else path.open("rb") as file:
+        file.seek(header.start)
+        if header.ascii:
+            _skip_lines(file, sum(each.records for each in before))
+            runs = _text_lists(file, path, face, name)
+        else:
+            _skip_elements(file, path, before)
+            runs = (records[name] for records in _list_records(file, path, face, BLOCK_POINTS))
+        for run in runs:
+            found.setdefault(run.shape[1], []).append(run)
+    return [np.concatenate(found[corners]).astype(np.int64) for corners in sorted(found)]
+
+
+def _text_lists(file: BinaryIO, path: Path, element: _Element, name: str) -> Iterator[NDArray[np.int64]]:
+    """Yield a list of each record of an element in text, as (1, k). Raises ScanError."""
+    for number in range(element.records):
+        check_interrupt()
+        words = file.readline(LONGEST_LINE).split()
+        for each in element.properties:
+            size = 1 if each.length is None else 1 + int(words[0]) if words else 0
+            values, words = words[:size], words[size:]
+            if not values or len(values) < size:
+                raise _truncated(path, number, element.records, f"{element.name} records")
+            if each.name == name:
+                yield np.array([values[1:]], np.int64)
+
+
 def _truncated(path: Path, found: int, declared: int, what: str = "vertices") -> Exception:
     return scan_error(
         path,
@@ -349,7 +410,7 @@ def _truncated(path: Path, found: int, declared: int, what: str = "vertices") ->
     )
 
 
-def header_lines(path: Path) -> tuple[list[str], int]:
+def _header_lines(path: Path) -> tuple[list[str], int]:
     """Return the lines of a PLY file's header without comments, and the offset of its body.
 
     Raises ScanError.
@@ -374,7 +435,7 @@ def header_lines(path: Path) -> tuple[list[str], int]:
 
 def _read_header(path: Path) -> _Header:
     """Read and check the header. Raises ScanError."""
-    lines, start = header_lines(path)
+    lines, start = _header_lines(path)
     counts: list[int] = []
     for number, line in enumerate(lines):
         words = line.split()
@@ -413,7 +474,7 @@ def _read_header(path: Path) -> _Header:
     intensity = next((name for name in names if name.lower() in INTENSITY_NAMES), None)
     colours, of_class = find_columns(names)
     return _Header(
-        vertex, record, tuple(elements[:at]), tuple(elements[at + 1 :]), start, len(lines), ply.text, intensity,
+        tuple(elements), at, record, start, len(lines), ply.text, intensity,
         tuple(names[each] for each in colours), None if of_class is None else names[of_class],
     )  # fmt: skip
 

@@ -129,7 +129,8 @@ def _find_layout(file: BinaryIO, path: Path) -> _Layout | None:
             return None
         text = raw.decode("utf-8", "replace").strip()
         # Several semicolons separate names, of which the first may be empty.
-        if text.startswith(("#", "//")) or (text.startswith(";") and text.count(";") == 1):
+        is_one = text.startswith(";") and text.count(";") == 1 and not split_row(raw, None)
+        if text.startswith(("#", "//")) or is_one:
             comment = text.lstrip("#/; \t")
             continue
         if not text or _SEPARATOR_LINE.fullmatch(text):

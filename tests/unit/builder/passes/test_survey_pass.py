@@ -57,7 +57,7 @@ def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
     xyz[5, 1], xyz[6, 0], xyz[250, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
     good = np.delete(xyz, [5, 6, 250], axis=0)
     survey = survey_scan(listed(tmp_path, xyz))
-    assert (survey.count, survey.not_finite, survey.fault) == (297, 3, "")
+    assert (survey.count, survey.not_finite, survey.beyond, survey.fault) == (297, 2, 1, "")
     assert np.array_equal(survey.low, good.min(axis=0))
     assert np.array_equal(survey.high, good.max(axis=0))
 
@@ -129,7 +129,7 @@ def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path:
     path = listed(tmp_path, xyz).path
     survey = survey_scan(Dropping(path, xyz, 50))
     assert survey.dropped == {"not finite": 3, "invalid": 5}
-    assert survey.unclean == 3
+    assert survey.unclean == "3 points that are not finite"
     assert survey_scan(listed(tmp_path, xyz[1:])).dropped == {}
 
 

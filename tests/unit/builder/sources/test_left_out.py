@@ -78,7 +78,7 @@ def test_a_vertex_count_before_faces_of_any_kind_is_checked(tmp_path: Path) -> N
     assert read(path) == 10
     for count in (0, 5, 9):
         path.write_bytes(head.format(count).encode() + rows + face + bytes(8))
-        with pytest.raises(ScanError, match="a count in its header is damaged|may be damaged"):
+        with pytest.raises(ScanError, match=r"a count in its header is damaged|may be damaged"):
             read(path)
 
 

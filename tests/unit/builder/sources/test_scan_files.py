@@ -16,6 +16,7 @@ import numpy as np
 import pye57
 import pytest
 from scan_cases import CASES, Case, Truth, rows_of, write_e57
+from scan_formats import ptx_scan
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit.edit_archive import add_scans
 from solidcloud.builder.pipeline import build_archive
@@ -137,6 +138,20 @@ def test_text_is_read_whatever_an_editor_made_of_it(
         assert len(xyz) and np.array_equal(other_xyz, xyz)
         assert (intensity is None) == (other_intensity is None)
         assert intensity is None or np.array_equal(other_intensity, intensity)
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.obj", "a.pts", "a.ptx"])
+def test_joined_files_with_byte_order_marks_are_read(name: str, tmp_path: Path) -> None:
+    """Issue 35: a mark before a vertex of an OBJ file would hide it."""
+    one = {
+        "a.obj": "v 1 2 3\nV 4 5 6\n",
+        "a.pts": "2\n1 2 3\n4 5 6\n",
+        "a.ptx": ptx_scan(np.array([[1.0, 2, 3], [4, 5, 6]]), np.zeros(2)),
+    }.get(name, "1 2 3\n4 5 6\n")
+    path = tmp_path / name
+    path.write_bytes(2 * one.encode("utf-8-sig"))
+    found = np.concatenate([read(scan)[0] for scan in open_scans(path)])
+    assert found.tolist() == 2 * [[1, 2, 3], [4, 5, 6]]
 
 
 @pytest.mark.parametrize("code", ["utf-16", "utf-16-le", "utf-16-be"])

@@ -3,8 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import plyfile
 import pytest
+import trimesh
 from solidcloud.builder.sources.scan_files import open_scans
+from solidcloud.builder.sources.surface_samples import mesh_triangles
 from solidcloud.schemas.errors import ScanError
 
 
@@ -70,6 +73,24 @@ def test_an_stl_surface_is_sampled_too(tmp_path: Path) -> None:
     assert (xyz[:, :2].sum(axis=1) <= 2).all() and (xyz[:, 2] == 1).all()
 
 
+def test_an_stl_whose_keyword_is_damaged_is_refused(tmp_path: Path) -> None:
+    """Issue 35: its point was left out without a word."""
+    path = tmp_path / "a.stl"
+    path.write_text("solid a\nfacet\nvertex 0 0 1\nvertux 2 0 1\nvertex 0 2 1\nendsolid a\n")
+    with pytest.raises(ScanError, match="2 corners, expected three a triangle"):
+        read_all(path)
+
+
+def test_an_stl_may_be_in_capitals(tmp_path: Path) -> None:
+    """Issue 35: it was taken for a truncated binary file."""
+    path = tmp_path / "a.stl"
+    path.write_text(
+        "SOLID A\nFACET NORMAL 0 0 1\nOUTER LOOP\nVERTEX 0 0 1\nVERTEX 2 0 1\nVERTEX 0 2 1\nENDLOOP\nENDFACET\n"
+        "ENDSOLID A\n"
+    )
+    assert read_all(path).tolist() == [[0, 0, 1], [2, 0, 1], [0, 2, 1]]
+
+
 def test_samples_fall_on_triangles_by_their_area(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text(
@@ -90,6 +111,44 @@ def test_spacing_samples_a_ply_with_faces_and_leaves_scans_alone(tmp_path: Path)
     scan = tmp_path / "a.xyz"
     scan.write_text("1 2 3\n")
     assert read_all(scan, spacing=0.1).tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+@pytest.mark.parametrize("text", [True, False])
+def test_faces_of_a_ply_are_in_the_order_of_trimesh(corners: int, text: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    vertex = np.array([tuple(row) for row in rng.normal(size=(50, 3))], [(axis, "f8") for axis in "xyz"])
+    face = np.empty(40, [("vertex_index", "i4", corners), ("flags", "u1")])
+    face["vertex_index"], face["flags"] = rng.integers(0, 50, (40, corners)), 7
+    elements = [plyfile.PlyElement.describe(vertex, "vertex"), plyfile.PlyElement.describe(face, "face")]
+    for order in (elements, elements[::-1]):
+        plyfile.PlyData(order, text=text).write(tmp_path / "a.ply")
+        (scan,) = open_scans(tmp_path / "a.ply")
+        expected = trimesh.load_mesh(tmp_path / "a.ply", process=False)
+        found = mesh_triangles(scan)
+        assert np.allclose(found, expected.vertices[expected.faces], rtol=0, atol=1e-9)
+        assert np.array_equal(found[:, 0], read_all(tmp_path / "a.ply")[expected.faces[:, 0]])
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_faces_of_a_ply_may_have_any_number_of_corners(text: bool, tmp_path: Path) -> None:
+    """Issue 35: trimesh refuses binary faces of three and four corners in one file, which Blender writes."""
+    corners = [(0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 2, 0), (0, 1, 0)]
+    vertex = np.array(corners, [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    face = np.empty(4, [("n", "O")])
+    face["n"] = [np.array(each, "i4") for each in ([0, 1, 2], [0, 1, 2, 4], [0, 1, 2, 3, 4], [0, 1])]
+    elements = [
+        plyfile.PlyElement.describe(vertex, "vertex"),
+        plyfile.PlyElement.describe(face, "face", val_types={"n": "i4"}),
+    ]
+    plyfile.PlyData(elements, text=text, byte_order="=" if text else "<").write(tmp_path / "a.ply")
+    found = mesh_triangles(*open_scans(tmp_path / "a.ply"))
+    area = np.linalg.norm(np.cross(found[:, 1] - found[:, 0], found[:, 2] - found[:, 0]), axis=1) / 2
+    assert len(found) == 6 and area.sum() == 1 + 2 + 3
+    whole = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(whole[:-5])
+    with pytest.raises(ScanError, match="ends after 3 face records at most, expected the 4"):
+        mesh_triangles(*open_scans(tmp_path / "a.ply"))
 
 
 def test_a_surface_too_large_for_its_file_is_refused(tmp_path: Path) -> None:

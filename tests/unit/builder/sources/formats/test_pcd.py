@@ -63,6 +63,7 @@ def test_whole_numbers_and_capitals_are_fields_too(tmp_path: Path) -> None:
         "VERSION .5\nCOLUMNS x y z\nDATA ascii\n",
         "# .PCD v.5\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n",
         "FIELDS x y z\nWIDTH 2\nDATA ASCII\n",
+        "FIELDS x y z\nHEIGHT 2\nPOINTS 2\nDATA ascii\n",
         "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nDATA binary\n",
         "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS 2\nDATA binary\n",
         "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nHEIGHT 2\nWIDTH 1\nDATA binary\n",

@@ -59,7 +59,7 @@ def intensities(path: Path) -> list[float] | None:
         ("a.csv", '"1,5";"2";"3"\n', [[1.5, 2, 3]], None),
         ("a.csv", 'x,y,z,"mean, of all"\n1,2,3,4\n', [[1, 2, 3]], None),
         ("a.txt", "X\tY\tZ\tScalar field\n1\t2\t3\t4\n", [[1, 2, 3]], None),
-        ("a.txt", "; by hand\n1 2 3\n// 9 9 9\n ; 9 9 9\n4 5 6 # c\n", [[1, 2, 3], [4, 5, 6]], None),
+        ("a.txt", "; by hand\n1 2 3\n// 9 9 9\n ; by hand\n4 5 6 # c\n", [[1, 2, 3], [4, 5, 6]], None),
         ("a.csv", "i;x;y;z\n0;1;2;3\n", [[1, 2, 3]], None),
         ("a.csv", ";x;y;z\n0;1;2;3\n", [[1, 2, 3]], None),
         ("a.csv", "// ok; 1,2.5\n1;2;3\n# 1.5, no\n4,5;6;7\n", [[1, 2, 3], [4.5, 6, 7]], None),
@@ -96,6 +96,8 @@ def test_text_layouts(
         ("1 2 3\n4, 5, 6\n", "line 2 is '4, 5, 6'"),
         ('"1,5","2,5","3,5"\n', "check that its numbers have decimal points"),
         ("1;2;3\n;5;6\n", "line 2 is ';5;6'"),  # no comment
+        ("1 2 3\n; 5 6\n", "line 2 is '; 5 6'"),
+        ("; 5 6\n1 2 3\n", "line 1"),
         ("1,2,3,4\n5,6,7,\n", "line 2 is '5,6,7,'"),
         ("1,2,3\n5,6,\n", "line 2 is '5,6,'"),
         ("1,2,3\n4,5,6,7,\n", "line 2 is '4,5,6,7,'"),

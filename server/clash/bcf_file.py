@@ -79,12 +79,17 @@ def _markup(
     _text(markup, "Index", str(topic.number))
     _text(markup, "CreationDate", date)
     _text(markup, "CreationAuthor", _AUTHOR)
-    times = f"{checked.times[clash.first]:.3f} to {checked.times[clash.last]:.3f} s"
+    first, last = checked.poses_of(clash.first, clash.last)
+    fraction, number = checked.fraction(clash), checked.track.number[clash.deepest]
+    times = f"{checked.track.times[clash.first]:.3f} to {checked.track.times[clash.last]:.3f} s"
+    where = f"Poses {first} to {last} ({times}) of {path} are"
+    if fraction is not None:
+        where = f"The motion between pose {first} and {last} ({times}) of {path} is, from {fraction:.3f} of it on,"
     _text(
         markup,
         "Description",
-        f"Poses {clash.first} to {clash.last} ({times}) of {path} are in contact with the scan {scene}. "
-        f"Greatest depth {clash.depth:.4f} m at pose {clash.deepest}; "
+        f"{where} in contact with the scan {scene}. "
+        f"Greatest depth {clash.depth:.4f} m at pose {number:.10g}; "
         f"up to {clash.contacts} pairs of points in contact at a pose; "
         f"clusters of contacts: {len(clash.clusters)}.",
     )

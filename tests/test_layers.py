@@ -72,7 +72,7 @@ ALLOWED = {
         "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes "
         "pictures"
     ),
-    "server/report/common": "cli/input avatars residency scene.py",
+    "server/report/common": "cli/input cli/output avatars residency scene.py",
     "server/cli/scene_files": "residency archives scenes scene.py",
     "server/report/accuracy/measurement": "avatars scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.process.visible_text import visible
 from .clash_check import CheckedPath
 from .clash_list import Clash
 from .clash_viewpoint import FIELD_OF_VIEW, Viewpoint
@@ -39,8 +40,10 @@ class Topic(NamedTuple):
 def bcf_bytes(checked: CheckedPath, topics: Iterable[Topic], scene: str, path: str, now: datetime) -> bytes:
     """Return clashes as a BCF file. The same input gives the same bytes.
 
-    scene, path: names that the descriptions mention.  now: date of the topics, with a time zone.
+    scene, path: names that the descriptions mention; characters that XML lacks become escapes.
+    now: date of the topics, with a time zone.
     """
+    scene, path = visible(scene), visible(path)
     content = io.BytesIO()
     stamp = now.astimezone(UTC).replace(microsecond=0)
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -120,9 +123,8 @@ def _vector(parent: ElementTree.Element, name: str, values: NDArray[np.float64])
 
 
 def _text(parent: ElementTree.Element, name: str, text: str) -> None:
-    """Add an element with a text. Characters that XML lacks become a question mark."""
-    kept = "".join(each if each >= " " or each in "\t\n" else "?" for each in text)
-    ElementTree.SubElement(parent, name).text = kept
+    """Add an element with a text."""
+    ElementTree.SubElement(parent, name).text = text
 
 
 def _xml(root: ElementTree.Element) -> bytes:

@@ -144,7 +144,7 @@ def check_order(element: ElementTree.Element) -> None:
 
 
 def test_bcf_has_the_structure_of_its_schemas(checked: CheckedPath) -> None:
-    content = bcf_bytes(checked, topics(checked), "hall <A&B>", "tour\x01.csv", NOW)
+    content = bcf_bytes(checked, topics(checked), "hall <A&B>", "tour\x01\ud83d\ufffe.csv", NOW)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert archive.testzip() is None
         files = {name: archive.read(name) for name in archive.namelist()}
@@ -176,7 +176,7 @@ def test_bcf_has_the_structure_of_its_schemas(checked: CheckedPath) -> None:
         assert f"{100 * clash.depth:.1f} cm" in topic.findtext("Title", "")
         description = topic.findtext("Description", "")
         assert f"Poses {clash.first} to {clash.last} " in description
-        assert "tour?.csv" in description
+        assert r"tour\x01\ud83d\ufffe.csv" in description
         assert "hall <A&B>" in description
         Image.open(io.BytesIO(files[f"{folder}/snapshot.png"])).verify()
     assert len(guids) == 6

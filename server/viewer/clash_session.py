@@ -24,8 +24,17 @@ from ..clash.clash_tables import clash_values, clashes_csv, clashes_json
 from ..clash.clash_viewpoint import Viewpoint, find_viewpoint
 from ..clash.path_motions import TOUCH_MARGIN
 from ..client import Client
+from ..runtime.threads import start_loop
 from .feeds.scene_link import OpenScene
-from .page.page_messages import ClashMessage, PathText, SaveClashes, ShowClash, binary_message, text_message
+from .page.page_messages import (
+    FAILED,
+    ClashMessage,
+    PathText,
+    SaveClashes,
+    ShowClash,
+    binary_message,
+    text_message,
+)
 from .page.view_frame import ViewFrame
 from .panels.path_source import GivenPath, PathParts
 from .users.browser_user import rounded
@@ -85,7 +94,7 @@ class ClashSession:
                 path = self._text.take(message)
             except SolidcloudError as error:
                 self._stop.set()
-                self._failed(message.name, error)
+                self._failed(message.name, str(error))
                 return
             if path is not None:
                 self._check(path)
@@ -104,6 +113,7 @@ class ClashSession:
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()
+        self._open.close()
 
     # --- jobs ------------------------------------------------------------------------------------
 
@@ -116,24 +126,22 @@ class ClashSession:
     def _run(self, job: Callable[[], None]) -> None:
         """Run a job in the thread."""
         if self._thread is None:
-            self._thread = threading.Thread(
-                target=self._work, name=f"viewer-{self._number}-clash", daemon=True
+            self._thread = start_loop(
+                f"viewer-{self._number}-clash", self._work, failed=partial(self._failed, "", FAILED)
             )
-            self._thread.start()
         self._jobs.put(job)
 
     def _work(self) -> None:
         """Run jobs until the session ends. Runs in a thread."""
-        with self._open:
-            while (job := self._jobs.get()) is not None:
-                try:
-                    job()
-                except SolidcloudError as error:
-                    self._failed("", error)
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except SolidcloudError as error:
+                self._failed("", str(error))
 
-    def _failed(self, name: str, error: SolidcloudError) -> None:
+    def _failed(self, name: str, message: str) -> None:
         """Tell the page why something was not done."""
-        self._send(text_message("check", state="failed", name=name, message=str(error)))
+        self._send(text_message("check", state="failed", name=name, message=message))
 
     def _check_path(self, path: GivenPath, stop: threading.Event) -> None:
         """Check a path, and send what is found as it is found."""

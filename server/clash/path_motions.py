@@ -54,8 +54,8 @@ def examine_motions(
 
     distance, verdict: (n + 1,), answers of `distance` within `reach` [m].
     A motion is swept with a margin below the distance at both ends, and if it is not clear, with
-    half of it, and so on to zero. The clearance of most motions is thus between 0.7 times the true
-    one and the true one.
+    half of it, and so on to zero. The clearance is thus at least half of the true one, and zero
+    below about `PRECISION`.
     """
     found = unknown_motions(len(poses) - 1)
     ends = np.stack([verdict[:-1], verdict[1:]])

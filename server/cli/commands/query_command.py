@@ -34,8 +34,8 @@ def query(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz. sweep and move examine the motion from each pose to the next, "
-            "the other queries only the poses."
+            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz. sweep and move examine the motions from each pose to the "
+            "next, the other queries only the poses."
         ),
     ] = None,
     rays: Annotated[Path | None, typer.Option(help="CSV file of rays: x,y,z,dx,dy,dz.")] = None,

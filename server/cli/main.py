@@ -152,12 +152,6 @@ def run(arguments: Sequence[str]) -> int:
         return 1
     except OSError as error:
         return print_error(os_error_line(error), 1)
-    except UnicodeEncodeError as error:
-        return print_error(
-            f"{error.object[:200]!r}: a name that is not UTF-8, which a text file or a message cannot hold: rename "
-            "the file or folder",
-            BadRequestError.exit_code,
-        )
     except MemoryError as error:
         return print_error(f"out of memory{f' ({error})' if str(error) else ''}: close other programs", 1)
 

@@ -176,10 +176,13 @@ def check_path(
     track = _track(times, poses, verdict, motions)
     clashes: list[Clash] = []
     at_poses = np.searchsorted(track.number, np.flatnonzero(contact))
-    for touching, margin in ((at_poses, 0.0), (np.flatnonzero(track.number % 1.0), TOUCH_MARGIN)):
+    between = np.flatnonzero(track.number % 1.0)
+    for touching, margin, share in (
+        (at_poses, 0.0, (0.6, 0.8)),
+        (between, TOUCH_MARGIN, (0.8, 1.0)),
+    ):
         parts = [
-            questions.contacts(track.poses[batch], margin)
-            for batch in _batches(touching, watcher, (0.6, 1.0))
+            questions.contacts(track.poses[batch], margin) for batch in _batches(touching, watcher, share)
         ]
         done = touching[: sum(map(len, parts))]
         clashes += list_clashes(done, join_answers(parts)) if parts else []

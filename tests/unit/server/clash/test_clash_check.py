@@ -222,6 +222,22 @@ def test_wall_between_two_poses_is_a_clash(case: archive_cases.Case, step: float
         assert clash.place[0] == pytest.approx(0.0, abs=1e-3)
 
 
+def test_clashes_at_and_between_poses_are_one_list(case: archive_cases.Case) -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = [-0.35, 0.0, 0.4, 1.6]
+    shares: list[float] = []
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        watcher = Watcher(progress=shares.append)
+        checked = check_path(scene, "body", np.arange(4.0), poses, watcher=watcher)
+    assert {checked.poses_of(each.first, each.last) for each in checked.clashes} == {(1, 1), (2, 3)}
+    assert [each.depth for each in checked.clashes] == sorted(
+        (each.depth for each in checked.clashes), reverse=True
+    )
+    assert checked.motions.verdict.tolist() == [Verdict.CONTACT] * 3
+    assert shares == sorted(shares)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_clearance_is_at_most_the_least_distance_on_the_motions(case: archive_cases.Case, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -294,7 +294,7 @@ class Client(QueryMethods):
         """Answer `op` (collide, distance, contacts, sweep) along up to 100,000 poses, in a request.
 
         name: of the avatar.  poses: (k, 4, 4) or (4, 4), avatar to world. A sweep has k - 1
-        motions, each from one pose to the next.
+        motions, each from one pose to the next; the others examine the poses only.
         parameters: of `op` besides the poses, including tolerance and budgets; `budget_ms` is for
         the whole path.
         Yield answers for items [first, first + n) of `total` as they arrive, in order and without

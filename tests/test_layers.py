@@ -46,7 +46,7 @@ ALLOWED = {
     "server/kernels/bodies": "kernels/core kernels/motion",
     "server/kernels/walk": "kernels/core kernels/bodies kernels/collide kernels/motion kernels/rays",
     "server/zenoh_common": "scene_interface.py",
-    "server/zenoh_client": "zenoh_common scene_interface.py",
+    "server/zenoh_client": "runtime zenoh_common scene_interface.py",
     "server/zenoh_server": "observability runtime scene_interface.py zenoh_common",
     "server/avatars": "kernels scene_interface.py",
     "server/client.py": "scene_interface.py zenoh_common zenoh_client avatars",
@@ -72,7 +72,7 @@ ALLOWED = {
         "observability runtime scene_interface.py avatars residency queries/context archives simulation scenes "
         "pictures"
     ),
-    "server/report/common": "cli/input avatars residency scene.py",
+    "server/report/common": "cli/input cli/output avatars residency scene.py",
     "server/cli/scene_files": "residency archives scenes scene.py",
     "server/report/accuracy/measurement": "avatars scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
@@ -83,10 +83,10 @@ ALLOWED = {
     "server/report/load": "avatars report/common report/load/page report/load/runs report/load/users",
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/clash": "scene_interface.py",
-    "server/viewer/feeds": "client.py viewer/page zenoh_client",
-    "server/viewer/users": "avatars cli/scene_files viewer/feeds viewer/page zenoh_client",
+    "server/viewer/feeds": "runtime client.py viewer/page zenoh_client",
+    "server/viewer/users": "runtime avatars cli/scene_files viewer/feeds viewer/page zenoh_client",
     "server/viewer/panels": "cli/input viewer/feeds viewer/page",
-    "server/viewer": "clash client.py viewer/feeds viewer/page viewer/panels viewer/users",
+    "server/viewer": "runtime clash client.py viewer/feeds viewer/page viewer/panels viewer/users",
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (

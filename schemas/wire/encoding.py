@@ -18,6 +18,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
+from msgspec import structs
 from msgspec.structs import asdict
 from numpy.typing import NDArray
 
@@ -57,8 +58,30 @@ def wire_encoding(stated: str | None) -> str:
 
 
 def encode(message: Any, encoding: str = MSGPACK) -> bytes:
-    """Encode one message. Arrays must already have the dtype of their field."""
-    return (_JSON_ENCODER if encoding == JSON else _MSGPACK_ENCODER).encode(message)
+    r"""Encode one message. Arrays must already have the dtype of their field.
+
+    A byte of a file's name that is not UTF-8 is written as an escape such as `\udcff`.
+    """
+    encoder = _JSON_ENCODER if encoding == JSON else _MSGPACK_ENCODER
+    try:
+        return encoder.encode(message)
+    except UnicodeEncodeError:
+        return encoder.encode(_valid_text(message))
+
+
+def _valid_text(value: Any) -> Any:
+    """Return a message, or a part of one, in which every text can be encoded."""
+    if isinstance(value, str):
+        return value.encode(errors="backslashreplace").decode()
+    if isinstance(value, msgspec.Struct):
+        fields = value.__struct_fields__
+        return structs.replace(value, **{name: _valid_text(getattr(value, name)) for name in fields})
+    if isinstance(value, dict):
+        return {_valid_text(name): _valid_text(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        # A tuple with names is encoded as its items.
+        return [_valid_text(each) for each in value]
+    return value
 
 
 def decode_request(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M:

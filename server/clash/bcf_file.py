@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.process.visible_text import visible
 from .clash_check import CheckedPath
 from .clash_list import Clash
 from .clash_viewpoint import FIELD_OF_VIEW, Viewpoint
@@ -39,8 +40,10 @@ class Topic(NamedTuple):
 def bcf_bytes(checked: CheckedPath, topics: Iterable[Topic], scene: str, path: str, now: datetime) -> bytes:
     """Return clashes as a BCF file. The same input gives the same bytes.
 
-    scene, path: names that the descriptions mention.  now: date of the topics, with a time zone.
+    scene, path: names that the descriptions mention; characters that XML lacks become escapes.
+    now: date of the topics, with a time zone.
     """
+    scene, path = visible(scene), visible(path)
     content = io.BytesIO()
     stamp = now.astimezone(UTC).replace(microsecond=0)
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -79,12 +82,17 @@ def _markup(
     _text(markup, "Index", str(topic.number))
     _text(markup, "CreationDate", date)
     _text(markup, "CreationAuthor", _AUTHOR)
-    times = f"{checked.times[clash.first]:.3f} to {checked.times[clash.last]:.3f} s"
+    first, last = checked.poses_of(clash.first, clash.last)
+    fraction, number = checked.fraction(clash), checked.track.number[clash.deepest]
+    times = f"{checked.track.times[clash.first]:.3f} to {checked.track.times[clash.last]:.3f} s"
+    where = f"Poses {first} to {last} ({times}) of {path} are"
+    if fraction is not None:
+        where = f"The motion between pose {first} and {last} ({times}) of {path} is, from {fraction:.3f} of it on,"
     _text(
         markup,
         "Description",
-        f"Poses {clash.first} to {clash.last} ({times}) of {path} are in contact with the scan {scene}. "
-        f"Greatest depth {clash.depth:.4f} m at pose {clash.deepest}; "
+        f"{where} in contact with the scan {scene}. "
+        f"Greatest depth {clash.depth:.4f} m at pose {number:.10g}; "
         f"up to {clash.contacts} pairs of points in contact at a pose; "
         f"clusters of contacts: {len(clash.clusters)}.",
     )
@@ -115,9 +123,8 @@ def _vector(parent: ElementTree.Element, name: str, values: NDArray[np.float64])
 
 
 def _text(parent: ElementTree.Element, name: str, text: str) -> None:
-    """Add an element with a text. Characters that XML lacks become a question mark."""
-    kept = "".join(each if each >= " " or each in "\t\n" else "?" for each in text)
-    ElementTree.SubElement(parent, name).text = kept
+    """Add an element with a text."""
+    ElementTree.SubElement(parent, name).text = text
 
 
 def _xml(root: ElementTree.Element) -> bytes:

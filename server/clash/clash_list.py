@@ -1,4 +1,8 @@
-"""Clashes: poses in contact that follow one another, and the clusters of their contacts."""
+"""Clashes: poses in contact that follow one another, and the clusters of their contacts.
+
+The poses are the places of a checked path's track, by their index: its poses, and further ones on
+motions that are in contact between two poses.
+"""
 
 from typing import NamedTuple
 

@@ -17,6 +17,7 @@ from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.process.interrupts import deferring_interrupts
 from ...schemas.process.os_errors import os_error_line
 from ...schemas.process.own_command import NAME, path_advice
+from ...schemas.process.visible_text import show_all_output
 from .commands import accuracy_command as accuracy
 from .commands import doctor_command as doctor
 from .commands import loadtest_command as loadtest
@@ -128,6 +129,7 @@ def run(arguments: Sequence[str]) -> int:
 
     An error is printed as one line, not as a traceback.
     """
+    show_all_output()
     try:
         command, name, rest = _find_verb(arguments or ["--help"])
         with contextlib.nullcontext() if name.split()[-1] in WAITING else deferring_interrupts():

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Self
 
-from ..runtime.threads import start_thread
+from ..runtime.threads import start_loop
 from .motion_prediction import User, UserTracks
 from .voxel_cache import VoxelCache
 from .voxel_states import BackgroundLoad
@@ -161,7 +161,7 @@ class Prefetcher:
     def _start(self) -> None:
         with self._lock:
             if self._thread is None and not self._stopped:
-                self._thread = start_thread("prefetch", self._run)
+                self._thread = start_loop("prefetch", self._run)
 
     def _run(self) -> None:
         """Prefetch until stopped. Runs in the thread."""

@@ -13,7 +13,7 @@ import weakref
 
 import numpy as np
 
-from .threads import start_thread
+from .threads import start_loop
 
 _PARTS = threading.Lock()
 # Interval at which a waiting request checks its stop flag [s].
@@ -140,7 +140,7 @@ class Deadlines:
     def _start(self) -> None:
         """Start the thread, unless it runs. If that raises, the next deadline tries again."""
         if self._thread is None:
-            self._thread = start_thread("deadlines", self._run)
+            self._thread = start_loop("deadlines", self._run)
 
     def _compact(self) -> None:
         """Drop the entries whose flag no longer exists or is set."""

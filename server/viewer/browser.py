@@ -12,9 +12,11 @@ import numpy as np
 
 from ...schemas.errors import BusyError, SolidcloudError
 from ...schemas.wire.motion_messages import FRAME_SECONDS, State
+from ..runtime.threads import start_loop
 from .clash_session import ClashSession
 from .feeds.scene_link import LinkStatus, OpenScene, may_enter, same_picture
 from .page.page_messages import (
+    FAILED,
     PAGE_VERSION,
     Around,
     Boom,
@@ -103,15 +105,13 @@ class Browser:
             return
         self._at = hello.at
         threads = [
-            threading.Thread(target=target, name=f"viewer-{self.number}-{name}", daemon=True)
+            start_loop(f"viewer-{self.number}-{name}", target, failed=self._failed)
             for name, target in (
                 ("commands", self._pace),
                 ("tiles", self._send_tiles),
                 ("panels", self._panels.run),
             )
         ]
-        for thread in threads:
-            thread.start()
         self._parts.residency.follow(self.number, self._changed)
         try:
             self._read(messages)
@@ -219,7 +219,7 @@ class Browser:
             self._problem(str(error))
         except Exception:  # the browser's thread must go on: its user would never enter, or never move
             log.exception("browser %d", self.number)
-            self._problem("The viewer failed at something: its log says at what.")
+            self._failed()
 
     def _deliver(self, state: State, frame: ViewFrame) -> None:
         """Send a state to the page, with the other users."""
@@ -310,12 +310,19 @@ class Browser:
             self._send(
                 text_message("missing", key=list(key[:4]), detail=key[4], again=False, message=str(error))
             )
+        except Exception:  # affects this tile only
+            log.exception("browser %d: tile %s", self.number, key)
+            self._send(text_message("missing", key=list(key[:4]), detail=key[4], again=False, message=FAILED))
         else:
             self._send(message)
             with self._work:
                 self._sent[key] = time.monotonic()
 
     # --- messages --------------------------------------------------------------------------------
+
+    def _failed(self) -> None:
+        """Tell the page of an error that is not expected."""
+        self._problem(FAILED)
 
     def _problem(self, message: str) -> None:
         """Show a sentence on the page."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import SolidcloudError
-from ...schemas.wire.answers import Verdict
+from ...schemas.wire.answers import ContactsAnswers, Verdict
 from ..clash.bcf_file import Topic, bcf_bytes
 from ..clash.clash_check import CheckedPath, Clearances, Watcher, check_path
 from ..clash.clash_list import Clash
@@ -22,9 +22,19 @@ from ..clash.clash_snapshot import draw, png_bytes
 from ..clash.clash_surroundings import surroundings
 from ..clash.clash_tables import clash_values, clashes_csv, clashes_json
 from ..clash.clash_viewpoint import Viewpoint, find_viewpoint
+from ..clash.path_motions import TOUCH_MARGIN
 from ..client import Client
+from ..runtime.threads import start_loop
 from .feeds.scene_link import OpenScene
-from .page.page_messages import ClashMessage, PathText, SaveClashes, ShowClash, binary_message, text_message
+from .page.page_messages import (
+    FAILED,
+    ClashMessage,
+    PathText,
+    SaveClashes,
+    ShowClash,
+    binary_message,
+    text_message,
+)
 from .page.view_frame import ViewFrame
 from .panels.path_source import GivenPath, PathParts
 from .users.browser_user import rounded
@@ -84,7 +94,7 @@ class ClashSession:
                 path = self._text.take(message)
             except SolidcloudError as error:
                 self._stop.set()
-                self._failed(message.name, error)
+                self._failed(message.name, str(error))
                 return
             if path is not None:
                 self._check(path)
@@ -103,6 +113,7 @@ class ClashSession:
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()
+        self._open.close()
 
     # --- jobs ------------------------------------------------------------------------------------
 
@@ -115,24 +126,22 @@ class ClashSession:
     def _run(self, job: Callable[[], None]) -> None:
         """Run a job in the thread."""
         if self._thread is None:
-            self._thread = threading.Thread(
-                target=self._work, name=f"viewer-{self._number}-clash", daemon=True
+            self._thread = start_loop(
+                f"viewer-{self._number}-clash", self._work, failed=partial(self._failed, "", FAILED)
             )
-            self._thread.start()
         self._jobs.put(job)
 
     def _work(self) -> None:
         """Run jobs until the session ends. Runs in a thread."""
-        with self._open:
-            while (job := self._jobs.get()) is not None:
-                try:
-                    job()
-                except SolidcloudError as error:
-                    self._failed("", error)
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except SolidcloudError as error:
+                self._failed("", str(error))
 
-    def _failed(self, name: str, error: SolidcloudError) -> None:
+    def _failed(self, name: str, message: str) -> None:
         """Tell the page why something was not done."""
-        self._send(text_message("check", state="failed", name=name, message=str(error)))
+        self._send(text_message("check", state="failed", name=name, message=message))
 
     def _check_path(self, path: GivenPath, stop: threading.Event) -> None:
         """Check a path, and send what is found as it is found."""
@@ -161,9 +170,14 @@ class ClashSession:
 
     def _clearances(self, found: Clearances) -> None:
         """Send the clearance of some poses."""
+        # No motion ends at the first pose of a path.
+        missing = (len(found.verdict) - len(found.motions.verdict), 0)
+        clearance = np.pad(found.motions.clearance, missing, constant_values=np.inf)
         arrays: dict[str, NDArray] = {
             "distance": found.signed_distance.astype(np.float32),
             "verdict": found.verdict,
+            "motion_clearance": clearance.astype(np.float32),
+            "motion_verdict": np.pad(found.motions.verdict, missing),
         }
         self._send(binary_message("clearances", arrays, first=found.first))
 
@@ -187,7 +201,7 @@ class ClashSession:
         return find_viewpoint(
             last.client,
             clash,
-            last.checked.poses,
+            last.checked.track.poses,
             (low + high) / 2,
             float(high[2] - low[2]),
             last.scene.info.up,
@@ -222,8 +236,8 @@ class ClashSession:
                 break
             self._progress("saving", len(topics) / len(listed))
             view = self._view(last, clash)
-            pose = last.checked.poses[clash.deepest]
-            pairs = last.client.contacts(last.avatar, pose, limit=_MOST_PAIRS)
+            pose = last.checked.track.poses[clash.deepest]
+            pairs = contacts_of(last, clash)
             up = np.asarray(last.scene.info.up, np.float64)
             clouds = surroundings(last.client, clash, pose, self._parts.avatar.points, pairs.cloud_point, up)
             topics.append(Topic(number, clash, view, png_bytes(draw(view, clouds))))
@@ -246,17 +260,26 @@ def clashes_message(last: CheckedScene) -> str:
         clearance=checked.clearance,
         faults=list(checked.faults),
         counts={verdict.name.lower(): checked.count(verdict) for verdict in Verdict},
+        motions={verdict.name.lower(): checked.count_motions(verdict) for verdict in Verdict},
         total=len(checked.clashes),
+        between=sum(checked.fraction(clash) is not None for clash in checked.clashes),
         topics=MOST_TOPICS,
         clashes=listed,
     )
 
 
+def contacts_of(last: CheckedScene, clash: Clash) -> ContactsAnswers:
+    """Return the pairs in contact at the deepest pose of a clash. Raise the server's errors."""
+    margin = 0.0 if last.checked.fraction(clash) is None else TOUCH_MARGIN
+    pose = last.checked.track.poses[clash.deepest]
+    return last.client.contacts(last.avatar, pose, limit=_MOST_PAIRS, margin=margin)
+
+
 def clash_message(last: CheckedScene, number: int, clash: Clash, view: Viewpoint) -> str:
     """Return a clash as a message: the pose, its contacts, and the viewpoint, in the page's frame."""
     frame: ViewFrame = last.scene.frame
-    pose = last.checked.poses[clash.deepest]
-    found = last.client.contacts(last.avatar, pose, limit=_MOST_PAIRS)
+    pose = last.checked.track.poses[clash.deepest]
+    found = contacts_of(last, clash)
     ways = found.cluster_avatar - found.cluster_cloud
     lengths = np.linalg.norm(ways, axis=1, keepdims=True)
     normals = np.divide(ways, lengths, out=np.zeros_like(ways), where=lengths > 0)

@@ -20,6 +20,7 @@ from ...schemas.errors import BadRequestError, BusyError, SolidcloudError, Unkno
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import MSGPACK, encode
 from ...schemas.wire.motion_messages import Late, State, Wish, motion_fields, object_poses
+from ..runtime.threads import start_loop
 from ..scene_interface import LatestState
 from ..zenoh_common.endpoints import zenoh_words
 from ..zenoh_common.zenoh_settings import FRAME_QOS
@@ -118,9 +119,6 @@ class ClientSession:
         return key_expressions.User(self._connection.client_id, self._avatar)
 
     def __enter__(self) -> Self:
-        thread = threading.Thread(
-            target=self._receive, name=f"solidcloud-session-{self._avatar}", daemon=True
-        )
         with ExitStack() as stack:
             try:
                 self._states.open()
@@ -132,7 +130,7 @@ class ClientSession:
                     f"session of avatar {self._avatar!r} in scene {self._scene!r}: {zenoh_words(error)}: expected "
                     "an open client: begin it inside `with Client(...) as scene`"
                 ) from None
-            thread.start()
+            thread = start_loop(f"session-{self._avatar}", self._receive)
             # The thread ends after it has taken everything that arrived before the end.
             stack.callback(thread.join)
             stack.callback(self._states.end)

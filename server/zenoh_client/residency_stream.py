@@ -14,6 +14,7 @@ from ...schemas.errors import BadRequestError, SolidcloudError
 from ...schemas.wire import key_expressions
 from ...schemas.wire.encoding import encode
 from ...schemas.wire.residency_messages import ResidencyChanges, ResidencyRequest
+from ..runtime.threads import start_loop
 from ..zenoh_common.endpoints import zenoh_words
 from .server_connection import ServerConnection
 from .state_query import StateQuery, decode_reply
@@ -54,8 +55,7 @@ class ResidencyStream:
                 f"changes of scene {self._scene!r}: {zenoh_words(error)}: expected an open client: begin them inside "
                 "`with Client(...) as scene`"
             ) from None
-        self._thread = threading.Thread(target=self._receive, name="solidcloud-residency", daemon=True)
-        self._thread.start()
+        self._thread = start_loop("residency", self._receive)
         return self
 
     def __exit__(self, *_: object) -> None:

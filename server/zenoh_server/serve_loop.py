@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 
 from ...schemas.wire.warming_parts import READY_LINE, SERVING_WORDS
 from ..runtime.process_heap import exempt_present_objects, give_back_large_blocks
-from ..runtime.threads import start_thread
+from ..runtime.threads import start_loop, start_thread
 from ..scene_interface import ServedScene
 from .request_dispatcher import RequestDispatcher
 from .server_config import ServerConfig
@@ -122,7 +122,7 @@ def _reloader(dispatcher: RequestDispatcher) -> Iterator[threading.Event]:
                 dispatcher.reload()
 
     # A reload that is running at the end is abandoned when its scene closes (`Scene.close` waits).
-    start_thread("reload", run)
+    start_loop("reload", run)
     try:
         yield wanted
     finally:

@@ -222,6 +222,31 @@ def test_path_of_the_command_line_is_checked_at_once(
         viewed.check_clean(url)
 
 
+def test_wall_between_two_poses_is_listed_and_shown(browser: Any, endpoint: str) -> None:
+    """Issue 35: the page said "No clash" of a path whose poses lie before and behind a wall."""
+    content = b"t,x,y,z,qw,qx,qy,qz\n0,2.6,-3,0.7,1,0,0,0\n2,2.6,3,0.7,1,0,0,0\n"
+    with viewing(endpoint) as url, viewed_page(browser, f"{url}?at={AT}") as viewed:
+        viewed.wait_complete()
+        clash = load(viewed, {"name": "wall.csv", "mimeType": "text/csv", "buffer": content})
+        result = clash["result"]
+        assert (result["counts"]["contact"], result["motions"]["contact"]) == (0, 1)
+        assert result["total"] == result["between"] >= 1
+        assert "between poses" in viewed.page.inner_text("#clash-message")
+        button = viewed.page.locator("#clash-list button").first
+        assert "between pose 0 and 1" in button.inner_text()
+        button.click()
+        shown = viewed.wait("s.watching && s.clash.shown")
+        fraction = result["clashes"][0]["pose_deepest"]
+        assert 0 < result["clashes"][0]["fraction"] <= fraction < 1
+        assert shown["pose"] != [[1, 0, 0, 2.6], [0, 1, 0, -3], [0, 0, 1, 0.7], [0, 0, 0, 1]]
+        assert viewed.read("s.clash.ghost.places") >= 1
+        _, content = saved(viewed, "BCF 2.1")
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            texts = [archive.read(name).decode() for name in archive.namelist() if name.endswith(".bcf")]
+        assert "between pose 0 and 1" in texts[0]
+        viewed.check_clean(url)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [

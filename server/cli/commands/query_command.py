@@ -34,7 +34,8 @@ def query(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz; sweep and move use each pose and the next as a motion."
+            help="CSV file of poses: t,x,y,z,qw,qx,qy,qz. sweep and move examine the motions from each pose to the "
+            "next, the other queries only the poses."
         ),
     ] = None,
     rays: Annotated[Path | None, typer.Option(help="CSV file of rays: x,y,z,dx,dy,dz.")] = None,
@@ -47,7 +48,7 @@ def query(
     along: Annotated[
         str | None,
         typer.Option(
-            help="Query along a path: collide (default), distance, contacts or sweep.",
+            help="Query along a path: collide (default), distance or contacts at its poses, or sweep between them.",
             autocompletion=among(*_ALONG),
         ),
     ] = None,

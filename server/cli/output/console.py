@@ -3,11 +3,10 @@
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from ....schemas.process.own_command import with_own_command
+from .terminal import Terminal
 
 if TYPE_CHECKING:
     # These modules load numba and HDF5; a table needs neither.
@@ -22,9 +21,8 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for name, value in facts:
-        # As Text: brackets in a path are not markup.
-        table.add_row(name, Text(with_own_command(value)))
-    Console().print(table)
+        table.add_row(name, with_own_command(value))
+    Terminal().print(table)
 
 
 def print_build(summary: "BuildSummary") -> None:

@@ -17,6 +17,8 @@ from rich.table import Column
 from rich.text import Text
 
 from ....schemas.process.interrupts import check_interrupt
+from ....schemas.process.visible_text import show_all_output
+from .terminal import Terminal
 
 # Rates average over this window: work completes in chunks of a second or two, and disk speed
 # varies.
@@ -199,13 +201,14 @@ class Bars(Listener):
             _Cell(_amount_text, 26),
             _Cell(lambda pace: _rate_text(pace, ""), 9),
             _Cell(_left_text, 12),
-            console=console or Console(stderr=True),
+            console=console or Terminal(stderr=True),
             refresh_per_second=4,
         )
         self._task: TaskID | None = None
 
     def __enter__(self) -> Self:
         self._bars.start()
+        show_all_output()  # the bars have replaced standard error, to print other output above them
         return self
 
     def __exit__(
@@ -334,7 +337,7 @@ class JsonLines(Listener):
 @contextmanager
 def progress_listener(log_json: bool = False) -> Iterator[Listener]:
     """Yield a progress display: JSON if `log_json`, bars on a terminal, else plain lines."""
-    console = Console(stderr=True)
+    console = Terminal(stderr=True)
     listener: Listener
     if log_json:
         listener = JsonLines()

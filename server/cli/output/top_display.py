@@ -10,8 +10,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from ....schemas.process.visible_text import visible
 from ....schemas.wire.stats import StatsAnswer, UserStats
 from .console import bytes_text
+from .terminal import Terminal
 
 # Maximum number of users shown, the most recently active.
 MAX_USERS_SHOWN = 16
@@ -82,18 +84,11 @@ def rate_text(value: float | None) -> str:
     return "" if value is None else f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 
-def printable(text: str) -> str:
-    """Replace unprintable characters in a name from a client, which could move the cursor."""
-    return "".join(c if c.isprintable() else "?" for c in text)
-
-
 def scene_view(before: Sample | None, now: Sample) -> RenderableType:
     """Return all tables of one scene. before: the previous sample, for rates."""
     stats = now.stats
     generation = f", generation {stats.generation}" if stats.generation else ""
-    facts = Text(
-        f"{printable(stats.scene)}{generation}, policy {printable(stats.policy) or '?'}", style="bold"
-    )
+    facts = Text(f"{visible(stats.scene)}{generation}, policy {visible(stats.policy) or '?'}", style="bold")
     voxels = f"{stats.resident:,} of {stats.voxels:,} voxels resident, {stats.kept:,} with users in them"
     right = Group(_bytes_table(before, now), Text(), _times_table(stats))
     tables = Columns([_counts_table(before, now), right], padding=(1, 3))
@@ -164,7 +159,7 @@ def _users_table(before: Sample | None, now: Sample) -> Table:
 
 def _user_row(user: UserStats, a_second: float | None) -> Iterable[RenderableType]:
     """Yield the cells of one user. A client is shown by the first characters of its random name."""
-    yield Text(f"{printable(user.client[:6]) or '-'} {printable(user.avatar)[:10] or '-'}")
+    yield Text(f"{visible(user.client[:6]) or '-'} {visible(user.avatar)[:10] or '-'}")
     yield f"{user.requests:,}"
     yield rate_text(a_second)
     for count in (user.misses, user.late, user.unknown, user.waited):
@@ -186,7 +181,7 @@ def watch(
 
     Raises the errors of `stats`.
     """
-    console = console or Console()
+    console = console or Terminal()
     before: list[Sample | None] = [None] * len(scenes)
 
     def look() -> RenderableType:

@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+from ....schemas.process.visible_text import visible
+from ...cli.output.terminal import Terminal
 
 # Mean number of other processes that wanted a core. Above it, long turns suffer more than short
 # ones, and ratios mean little.
@@ -181,7 +184,7 @@ def show(parts: list[Part], notes: dict[str, str], section: str = "Speed") -> No
 
     section: of scripts/FIGURES.md.
     """
-    console = Console(width=150)
+    console = Terminal(width=150)
     for part in parts:
         if part.figures:
             console.print(_figures_table(part))
@@ -194,9 +197,7 @@ def show(parts: list[Part], notes: dict[str, str], section: str = "Speed") -> No
             table.add_column(name, justify=justify)  # type: ignore[arg-type]
         for row in rows:
             style = {MET: "green", MISSED: "bold red", NOT_MEASURED: "yellow"}[row["verdict"]]
-            table.add_row(
-                row["goal"], number(row["measured"]), limit_text(row), f"[{style}]{row['verdict']}[/]"
-            )
+            table.add_row(row["goal"], number(row["measured"]), limit_text(row), Text(row["verdict"], style))
         console.print(table)
     if busy(parts):
         console.print(f"{busy(parts)}: not figures to quote", style="bold red")
@@ -239,7 +240,11 @@ def write(parts: list[Part], notes: dict[str, str], about: dict[str, Any], targe
         "sections": [dataclasses.asdict(part) for part in parts],
     }
     target.write_text(json.dumps(report, indent=1) + "\n")
-    with open(target.with_suffix(".csv"), "w", newline="") as file:
+    with open(target.with_suffix(".csv"), "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(Figure)])
         writer.writeheader()
-        writer.writerows(dataclasses.asdict(figure) for part in parts for figure in part.figures)
+        for figure in (figure for part in parts for figure in part.figures):
+            row = dataclasses.asdict(figure)
+            writer.writerow(
+                {name: visible(value) if isinstance(value, str) else value for name, value in row.items()}
+            )

@@ -5,6 +5,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Generic, Self, TypeVar
 
+from ...runtime.threads import start_loop
+
 Message = TypeVar("Message", str, bytes)
 
 
@@ -14,15 +16,17 @@ class BackgroundThread(ABC):
     def __init__(self, name: str) -> None:
         """Make a thread; entering the object starts it."""
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._name = name
+        self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self._thread = start_loop(self._name, self._run)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
 
     @abstractmethod
     def _run(self) -> None:

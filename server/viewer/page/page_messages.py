@@ -17,6 +17,8 @@ from ....schemas.wire.tile_messages import MAX_SPHERE_LEVEL
 
 # Version of these messages; a page of another version asks its user to reload it.
 PAGE_VERSION = 1
+# What a page shows of an error that is not expected.
+FAILED = "The viewer failed at something: its log says at what."
 # Arrays begin at multiples of this, as typed arrays of 8 bytes require [bytes].
 _ALIGNMENT = 8
 # Longest part of a file of poses [characters]: a character takes at most 6 bytes of a message.

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 
 from ....schemas.errors import BusyError, SolidcloudError
 from ....schemas.wire.motion_messages import State
+from ...runtime.threads import start_loop
 from ...zenoh_client.client_session import ClientSession
 from ..feeds.scene_link import OpenScene
-from ..page.page_messages import Intent
+from ..page.page_messages import FAILED, Intent
 from ..page.view_frame import ViewFrame
 from .user_avatar import UserAvatar
 from .user_motion import Easing, turn, velocity
@@ -76,10 +78,9 @@ class BrowserUser:
             session.close()
             raise
         self._session, self._frame = session, scene.frame
-        self._thread = threading.Thread(
-            target=self._receive, args=(session, scene.frame), name=f"viewer-{self._name}", daemon=True
+        self._thread = start_loop(
+            f"viewer-{self._name}", self._receive, session, scene.frame, failed=partial(self._report, FAILED)
         )
-        self._thread.start()
 
     def command(self, intent: Intent) -> None:
         """Send one motion command."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .....schemas.process.new_file import new_file
+from .....schemas.process.visible_text import visible
 from ..measurement.accuracy_results import Report
 from .accuracy_charts import length_name
 from .accuracy_texts import answer, choices, findings, size_name
@@ -82,7 +83,7 @@ def write_page(report: Report, charts: dict[str, Path], target: Path) -> None:
         f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
     with new_file(target) as file:
-        file.write(page.encode())
+        file.write(visible(page).encode())
 
 
 def _memory(report: Report, charts: dict[str, Path]) -> list[str]:

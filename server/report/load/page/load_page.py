@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .....schemas.process.new_file import new_file
+from .....schemas.process.visible_text import visible
 from ...common.bench_results import Part, busy, goal_rows, limit_text, number
 
 RELOAD_SECONDS = 10
@@ -71,8 +72,9 @@ def write_page(
     page = '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>solidcloud under load</title>'
     if running:
         page += f'<meta http-equiv="refresh" content="{RELOAD_SECONDS}">'
+    page += f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     with new_file(target) as file:
-        file.write(f"{page}<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n".encode())
+        file.write(visible(page).encode())
 
 
 def _goals(rows: list[dict[str, Any]]) -> str:

@@ -47,7 +47,7 @@ export class ClashCheck {
         this.changed();
       },
       clearances: ({ first, arrays }) => {
-        this.line.take(first, arrays.distance.array, arrays.verdict.array);
+        this.line.take(first, arrays);
         this.changed();
       },
       check: (message) => this.report(message),

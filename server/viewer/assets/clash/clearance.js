@@ -1,4 +1,4 @@
-// How a pose of a path is coloured: by its clearance.
+// How a pose of a path, or a motion between two poses, is coloured: by its clearance.
 
 export const REACH = 1;
 
@@ -12,7 +12,7 @@ export const CLASSES = [
 ];
 const [CONTACT, UNKNOWN, NEAR, CLEAR, PENDING] = CLASSES.keys();
 
-/** Return the class of a pose, a number in CLASSES. verdict: 255 before its answer.  near: [m]. */
+/** Return the class of a pose or a motion, a number in CLASSES. verdict: 255 before its answer.  near: [m]. */
 export function classOf(verdict, distance, near) {
   if (verdict === 255) return PENDING;
   if (verdict === 1) return CONTACT;

@@ -6,7 +6,7 @@ import {
 import { shared } from "../points_material.js";
 import { CLASSES, classOf } from "./clearance.js";
 
-// A longer path is drawn with this many pieces, each in the colour of its worst pose.
+// A longer path is drawn with this many pieces, each in the colour of its worst pose or motion.
 const MOST_PIECES = 3000;
 const RADIUS = 0.02;
 
@@ -70,6 +70,9 @@ export class PathLine {
     const total = places.length / 3;
     this.verdicts = new Uint8Array(total).fill(255);
     this.distances = new Float32Array(total).fill(Infinity);
+    // Of the motion that ends at each pose.
+    this.motionVerdicts = new Uint8Array(total).fill(255);
+    this.motionClearances = new Float32Array(total).fill(Infinity);
     const pieces = Math.max(1, Math.min(total - 1, MOST_PIECES));
     const node = (k) => Math.round((k * (total - 1)) / pieces);
     this.ends = Array.from({ length: pieces + 1 }, (_, k) => node(k));
@@ -99,11 +102,13 @@ export class PathLine {
     this.colour();
   }
 
-  /** Take the clearance of poses from `first` on. */
-  take(first, distances, verdicts) {
-    if (!this.meshes.length || first + verdicts.length > this.verdicts.length) return;
-    this.distances.set(distances, first);
-    this.verdicts.set(verdicts, first);
+  /** Take the clearance of poses from `first` on, and of the motions that end at them. */
+  take(first, { distance, verdict, motion_clearance: clearance, motion_verdict: motion }) {
+    if (!this.meshes.length || first + verdict.array.length > this.verdicts.length) return;
+    this.distances.set(distance.array, first);
+    this.verdicts.set(verdict.array, first);
+    this.motionClearances.set(clearance.array, first);
+    this.motionVerdicts.set(motion.array, first);
     this.colour();
   }
 
@@ -114,10 +119,13 @@ export class PathLine {
     const classes = Uint8Array.from(this.verdicts, (verdict, k) => classOf(verdict, this.distances[k], near));
     this.counts = CLASSES.map(() => 0);
     for (const each of classes) this.counts[each] += 1;
+    const motions = Uint8Array.from(this.motionVerdicts, (verdict, k) => classOf(verdict, this.motionClearances[k], near));
     const { tint } = this.meshes[0].geometry.attributes;
     for (let k = 0; k + 1 < this.ends.length; k += 1) {
       let worst = CLASSES.length - 1;
-      for (let pose = this.ends[k]; pose <= this.ends[k + 1]; pose += 1) worst = Math.min(worst, classes[pose]);
+      for (let pose = this.ends[k]; pose <= this.ends[k + 1]; pose += 1) {
+        worst = Math.min(worst, classes[pose], pose > this.ends[k] ? motions[pose] : worst);
+      }
       tint.array.set(CLASSES[worst].colour.map((part) => part / 255), 3 * k);
     }
     tint.needsUpdate = true;

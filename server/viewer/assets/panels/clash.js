@@ -17,7 +17,7 @@ function make(kind, properties = {}, ...children) {
 export function addClashPanel(app) {
   const { clash } = app;
   const section = panel("Clash check");
-  section.append(make("p", { textContent: "Finds where the avatar touches the scan along a path of poses. Depth is how far two of their spheres overlap." }));
+  section.append(make("p", { textContent: "Finds where the avatar touches the scan along a path, at its poses and on the motions between them. Depth is how far two of their spheres overlap." }));
   const input = make("input", { type: "file", accept: ".csv,.tum,.txt" });
   input.addEventListener("change", async () => {
     const [file] = input.files;
@@ -95,12 +95,14 @@ function text({ state, name, message, done, result, line }) {
   if (state === "running") return `${name}: ${Math.round(100 * done)} % checked`;
   if (state === "saving") return `BCF: ${Math.round(100 * done)} % of the pictures drawn`;
   if (!result) return "";
-  const { counts, poses, total, clearance, reach, complete, faults } = result;
+  const { counts, motions, between, poses, total, clearance, reach, complete, faults } = result;
   const parts = [total ? `${count(total, "clash").replace("clashs", "clashes")}.` : "No clash."];
   parts.push(`${counts.contact.toLocaleString("en")} of ${count(poses, "pose")} in contact`);
   if (counts.unknown) parts.push(`, ${counts.unknown.toLocaleString("en")} unknown`);
+  if (between) parts.push(`; ${count(between, "clash").replace("clashs", "clashes")} between poses`);
+  if (motions.unknown) parts.push(`; ${count(motions.unknown, "motion")} between poses unknown`);
   parts.push(".");
-  if (!total) parts.push(clearance === null ? ` Nothing within ${reach} m.` : ` Least clearance ${clearance.toFixed(3)} m.`);
+  if (!total) parts.push(clearance === null ? ` Nothing within ${reach} m.` : ` Clearance at least ${clearance.toFixed(3)} m.`);
   if (!complete) parts.push(" Cancelled: the rest was not examined.");
   if (faults.length) parts.push(` Unknown because: ${faults.join("; ")}`);
   return `${name}: ${parts[0]} ${parts.slice(1).join("")}`;
@@ -123,11 +125,12 @@ function drawList(list, clash) {
   const { result } = clash;
   list.replaceChildren(...(result?.clashes ?? []).map((each) => {
     const [from, to] = each.poses, [begin, end] = each.times;
+    const which = each.fraction !== null ? `between pose ${from} and ${to}` : from === to ? `pose ${from}` : `poses ${from} to ${to}`;
     const when = begin === null ? "" : ` · ${begin.toFixed(2)}${from === to ? "" : ` to ${end.toFixed(2)}`} s`;
     const button = make("button", { type: "button" },
       make("strong", { textContent: `${each.clash}. ${centimetres(each.depth)} deep` }),
       make("span", { textContent: count(each.contacts, "contact") }),
-      make("span", { textContent: `${from === to ? `pose ${from}` : `poses ${from} to ${to}`}${when}` }),
+      make("span", { textContent: `${which}${when}` }),
       make("span", { textContent: `at ${each.place.map(metres).join(" ")}` }));
     button.setAttribute("aria-current", "false");
     button.addEventListener("click", () => clash.show(each.clash));

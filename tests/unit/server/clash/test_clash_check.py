@@ -1,5 +1,6 @@
 """Test the check of a path on a small archive against brute force, and its end before time."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,6 +8,7 @@ import archive_cases
 import numpy as np
 import pytest
 from msgspec import structs
+from naive_sweep import pose_at
 from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.clash import clash_check
@@ -14,6 +16,7 @@ from solidcloud.server.clash.clash_check import Watcher, check_path
 from solidcloud.server.clash.clash_snapshot import draw
 from solidcloud.server.clash.clash_surroundings import surroundings
 from solidcloud.server.clash.clash_viewpoint import find_viewpoint
+from solidcloud.server.clash.path_motions import poses_between
 from solidcloud.server.scene import Scene
 
 RADIUS = 0.05
@@ -79,7 +82,9 @@ def test_clashes_are_those_of_brute_force(case: archive_cases.Case, monkeypatch:
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert checked.complete
-    assert checked.clearance == checked.signed_distance.min()
+    # Between poses it may be deeper, but two spheres overlap by no more than their radii.
+    assert checked.clearance is not None
+    assert -RADIUS - radius - 2e-6 <= checked.clearance <= checked.signed_distance.min()
     # The contact is drawn in red over everything, near the middle of the picture.
     for picture in pictures:
         red = np.argwhere((picture[..., 0] > 200) & (picture[..., 1] < 100))
@@ -88,7 +93,7 @@ def test_clashes_are_those_of_brute_force(case: archive_cases.Case, monkeypatch:
 
 
 class FakeScene:
-    """Scene in which every pose touches; it stops answering after some requests."""
+    """Scene in which everything is clear; it stops answering after some requests."""
 
     def __init__(self, answers: int) -> None:
         self.left, self.unanswered = answers, 0
@@ -97,10 +102,20 @@ class FakeScene:
         self.left -= 1
         if self.left < 0:
             self.unanswered += len(poses)
-        touching = np.full(len(poses), Verdict.CLEAR, np.uint8)
+        none = np.full((len(poses), 3), np.nan)
         return SimpleNamespace(
-            signed_distance=np.full(len(poses), 0.25), verdict=touching, stopped="", faults=()
+            signed_distance=np.full(len(poses), 0.25),
+            verdict=np.full(len(poses), Verdict.CLEAR, np.uint8),
+            witness_avatar=none,
+            witness_cloud=none,
+            stopped="",
+            faults=(),
         )
+
+    def sweep(self, name: str, first: np.ndarray, last: np.ndarray, margin: float) -> Any:
+        found = self.distance(name, first, 1.0)
+        found.upper = np.full(len(first), np.inf)
+        return found
 
     def silence(self, operation: str) -> str:
         return f"{operation}: no answer within 5 s"
@@ -114,8 +129,10 @@ def test_stopped_check_leaves_the_rest_unknown() -> None:
     examined = 2 * clash_check.BATCH_POSES
     assert not checked.complete
     assert checked.count(Verdict.UNKNOWN) == 1000 - examined
-    assert checked.unknown == [(examined, 999)]
-    assert checked.clearance == 0.25
+    assert checked.unknown == [(examined - 1, 999)]
+    assert checked.count_motions(Verdict.CLEAR) == examined - 1
+    assert checked.clearance is not None
+    assert 0.12 < checked.clearance <= 0.25
 
 
 def test_request_that_the_server_ends_is_asked_again_in_halves(case: archive_cases.Case) -> None:
@@ -146,8 +163,11 @@ class HastyScene:
     def distance(self, name: str, poses: np.ndarray, reach: float) -> Any:
         return self.limited(self.scene.distance(name, poses, reach))
 
-    def contacts(self, name: str, poses: np.ndarray, limit: int) -> Any:
-        return self.limited(self.scene.contacts(name, poses, limit))
+    def sweep(self, name: str, first: np.ndarray, last: np.ndarray, margin: float) -> Any:
+        return self.limited(self.scene.sweep(name, first, last, margin))
+
+    def contacts(self, name: str, poses: np.ndarray, limit: int, margin: float) -> Any:
+        return self.limited(self.scene.contacts(name, poses, limit, margin))
 
     def limited(self, answers: Any) -> Any:
         self.asked.append(len(answers))
@@ -163,3 +183,124 @@ def test_check_without_an_answer_fails() -> None:
         check_path(FakeScene(3), "body", times, poses)  # type: ignore[arg-type]
     with pytest.raises(BadRequestError, match="no poses"):
         check_path(FakeScene(3), "body", times[:0], poses[:0])  # type: ignore[arg-type]
+
+
+def ball_path(step: float) -> np.ndarray:
+    """Return poses of the way through the wall at x = 0, none of which touches it if `step` is large."""
+    places = np.arange(-0.35, 0.5, step)
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, 0, 3] = places
+    return poses
+
+
+@pytest.mark.parametrize("step", [0.7, 0.35, 0.1, 0.02])
+def test_wall_between_two_poses_is_a_clash(case: archive_cases.Case, step: float) -> None:
+    """Issue 35: a body before and behind a wall had no clash, and a clearance of 7 cm."""
+    poses = ball_path(step)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        checked = check_path(scene, "body", np.arange(len(poses)) * 2.0, poses)
+        at_poses = scene.collide("body", poses).verdict == Verdict.CONTACT
+        swept = scene.sweep("body", poses[:-1], poses[1:])
+        assert len(checked.clashes) == 1
+        (clash,), fraction = checked.clashes, checked.fraction(checked.clashes[0])
+        assert np.array_equal(checked.motions.verdict, swept.verdict)
+        assert checked.clearance is not None
+        assert checked.clearance <= -clash.depth
+        number = checked.track.number[clash.first]
+        deepest = scene.distance("body", checked.track.poses[clash.deepest])
+        assert clash.depth == pytest.approx(-float(deepest.signed_distance[0]), abs=1e-9)
+        if at_poses.any():
+            assert fraction is None
+            assert (clash.first, clash.last) == (at_poses.argmax(), len(poses) - 1 - at_poses[::-1].argmax())
+            return
+        motion = int((swept.verdict == Verdict.CONTACT).argmax())
+        assert fraction == pytest.approx(float(swept.upper[motion]), abs=1e-9)
+        assert checked.poses_of(clash.first, clash.last) == (motion, motion + 1)
+        assert checked.track.times[clash.first] == pytest.approx(2 * number)
+        assert clash.depth > 0.01
+        assert clash.place[0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_clashes_at_and_between_poses_are_one_list(case: archive_cases.Case) -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = [-0.35, 0.0, 0.4, 1.6]
+    shares: list[float] = []
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        watcher = Watcher(progress=shares.append)
+        checked = check_path(scene, "body", np.arange(4.0), poses, watcher=watcher)
+    assert {checked.poses_of(each.first, each.last) for each in checked.clashes} == {(1, 1), (2, 3)}
+    assert [each.depth for each in checked.clashes] == sorted(
+        (each.depth for each in checked.clashes), reverse=True
+    )
+    assert checked.motions.verdict.tolist() == [Verdict.CONTACT] * 3
+    assert shares == sorted(shares)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_clearance_is_at_most_the_least_distance_on_the_motions(case: archive_cases.Case, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = np.array([
+        archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform([0.3, -0.8, -0.5], [0.7, 0.8, 0.5]))
+        for _ in range(6)
+    ])  # fmt: skip
+    fractions = np.linspace(0, 1, 400)
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        checked = check_path(scene, "body", np.arange(6.0), poses)
+        dense = [np.array([pose_at(one, two, t) for t in fractions]) for one, two in pairwise(poses)]
+        least = [float(scene.distance("body", each).signed_distance.min()) for each in dense]
+    assert checked.clearance is not None
+    assert checked.clearance <= min(least)
+    if min(least) > 0:
+        # The dense poses are up to 2 mm apart.
+        assert checked.clearance > min(least) - 1e-3 - 2e-3
+    touches = np.array(least) <= 0
+    assert (checked.motions.verdict[touches] == Verdict.CONTACT).all()
+    clear = checked.motions.verdict == Verdict.CLEAR
+    assert (checked.motions.clearance[clear] <= np.array(least)[clear]).all()
+    assert (checked.motions.clearance[clear] > 0.3 * np.array(least)[clear] - 2e-3).all()
+
+
+def test_poses_on_a_motion_are_those_of_the_sweep() -> None:
+    rng = np.random.default_rng(3)
+    for case in range(200):
+        first, last = (
+            archive_cases.pose_of(archive_cases.random_rotation(rng), rng.normal(size=3)) for _ in range(2)
+        )
+        if case % 4 == 0:
+            last[:3, :3] = first[:3, :3]
+        elif case % 4 == 1:
+            # Half a turn about a random axis: rounding decides about which side it goes.
+            axis = rng.normal(size=3)
+            last[:3, :3] = (2 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)) @ first[:3, :3]
+        fractions = np.array([0.0, 1e-3, 0.4, 1.0])
+        found = poses_between(first[None], last[None], fractions[None])[0]
+        expected = np.array([pose_at(first, last, t) for t in fractions])
+        assert np.allclose(found, expected, atol=1e-12)
+
+
+def test_unknown_motion_makes_a_stretch_unknown(
+    case: archive_cases.Case,
+) -> None:
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = np.linspace(0.3, 0.6, 5)
+
+    class BlindScene:
+        """Scene in which the sweep of the motion from pose 2 is unknown."""
+
+        def __init__(self, scene: Scene) -> None:
+            self.distance, self.contacts, self.scene = scene.distance, scene.contacts, scene
+
+        def sweep(self, name: str, first: np.ndarray, last: np.ndarray, margin: float) -> Any:
+            answers = self.scene.sweep(name, first, last, margin)
+            verdict = np.where(first[:, 0, 3] == poses[2, 0, 3], Verdict.UNKNOWN, answers.verdict)
+            return structs.replace(answers, verdict=verdict.astype(np.uint8))
+
+    with Scene.open(case.archive) as scene:
+        scene.add_avatar("body", BODY, RADIUS)
+        checked = check_path(BlindScene(scene), "body", np.arange(5.0), poses)  # type: ignore[arg-type]
+    assert checked.count(Verdict.UNKNOWN) == 0
+    assert checked.unknown == [(2, 3)]
+    assert checked.count_motions(Verdict.UNKNOWN) == 1

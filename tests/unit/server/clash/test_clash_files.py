@@ -14,11 +14,12 @@ from clash_answers import answers_of, invented
 from PIL import Image
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.clash.bcf_file import Topic, bcf_bytes
-from solidcloud.server.clash.clash_check import CheckedPath
+from solidcloud.server.clash.clash_check import CheckedPath, Track
 from solidcloud.server.clash.clash_list import list_clashes
 from solidcloud.server.clash.clash_snapshot import Cloud, draw, png_bytes
 from solidcloud.server.clash.clash_tables import COLUMNS, clashes_csv, clashes_json
 from solidcloud.server.clash.clash_viewpoint import Viewpoint
+from solidcloud.server.clash.path_motions import unknown_motions
 
 NOW = datetime(2026, 3, 1, 12, 30, 15, 999, timezone(timedelta(hours=1)))
 GUID = re.compile(r"[a-f0-9]{8}(-[a-f0-9]{4}){3}-[a-f0-9]{12}")
@@ -52,7 +53,10 @@ def checked() -> CheckedPath:
     clashes = list_clashes(np.arange(30), answers_of(path))
     assert len(clashes) == 3
     poses = np.tile(np.eye(4), (30, 1, 1))
-    return CheckedPath(np.arange(30) / 7, poses, 1.0, distance, verdict, clashes, True)
+    times, motions = np.arange(30) / 7, unknown_motions(29)
+    motions.verdict[:] = np.maximum(verdict[:-1] == Verdict.CONTACT, verdict[1:] == Verdict.CONTACT)
+    track = Track(np.arange(30.0), times, poses)
+    return CheckedPath(times, poses, 1.0, distance, verdict, motions, track, clashes, True, -0.2)
 
 
 def test_csv_has_a_row_for_each_clash_in_full_precision(checked: CheckedPath) -> None:
@@ -60,7 +64,8 @@ def test_csv_has_a_row_for_each_clash_in_full_precision(checked: CheckedPath) ->
     assert tuple(header) == COLUMNS
     assert len(rows) == 3
     for number, (row, clash) in enumerate(zip(rows, checked.clashes, strict=True), 1):
-        values = dict(zip(header, map(float, row), strict=True))
+        assert row[-1] == ""
+        values = dict(zip(header[:-1], map(float, row[:-1]), strict=True))
         assert values["clash"] == number
         assert values["depth_m"] == clash.depth
         assert [values[axis] for axis in "xyz"] == clash.place.tolist()
@@ -89,8 +94,31 @@ def test_json_agrees_with_the_list(checked: CheckedPath) -> None:
 
 
 def test_times_that_json_lacks_are_null(checked: CheckedPath) -> None:
-    endless = checked._replace(times=np.full(30, np.nan))
+    endless = checked._replace(track=checked.track._replace(times=np.full(30, np.nan)))
     assert json.loads(clashes_json(endless))["clashes"][0]["times"] == [None, None]
+
+
+@pytest.fixture
+def between(checked: CheckedPath) -> CheckedPath:
+    """The same clashes, of which that at places 13 to 15 lies between pose 12 and pose 13."""
+    number = np.concatenate([np.arange(13.0), [12.25, 12.5, 12.75], np.arange(13.0, 27.0)])
+    return checked._replace(track=Track(number, number / 7, checked.track.poses))
+
+
+def test_clash_between_poses_is_named_by_them_everywhere(between: CheckedPath) -> None:
+    clash = next(each for each in between.clashes if each.first == 13)
+    number = between.clashes.index(clash)
+    deepest = 12 + (clash.deepest - 12) / 4
+    row = list(csv.DictReader(io.StringIO(clashes_csv(between))))[number]
+    assert (row["pose_from"], row["pose_to"], row["fraction"]) == ("12", "13", "0.25")
+    assert float(row["pose_deepest"]) == deepest
+    assert float(row["t_from"]) == 12.25 / 7
+    values = json.loads(clashes_json(between))["clashes"][number]
+    assert (values["poses"], values["fraction"], values["pose_deepest"]) == ([12, 13], 0.25, deepest)
+    with zipfile.ZipFile(io.BytesIO(bcf_bytes(between, topics(between), "hall", "t.csv", NOW))) as archive:
+        texts = [archive.read(name).decode() for name in archive.namelist() if name.endswith("markup.bcf")]
+    assert "The motion between pose 12 and 13" in texts[number]
+    assert f"at pose {deepest:g}" in texts[number]
 
 
 def topics(checked: CheckedPath) -> list[Topic]:
@@ -116,7 +144,7 @@ def check_order(element: ElementTree.Element) -> None:
 
 
 def test_bcf_has_the_structure_of_its_schemas(checked: CheckedPath) -> None:
-    content = bcf_bytes(checked, topics(checked), "hall <A&B>", "tour\x01.csv", NOW)
+    content = bcf_bytes(checked, topics(checked), "hall <A&B>", "tour\x01\ud83d\ufffe.csv", NOW)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         assert archive.testzip() is None
         files = {name: archive.read(name) for name in archive.namelist()}
@@ -148,7 +176,7 @@ def test_bcf_has_the_structure_of_its_schemas(checked: CheckedPath) -> None:
         assert f"{100 * clash.depth:.1f} cm" in topic.findtext("Title", "")
         description = topic.findtext("Description", "")
         assert f"Poses {clash.first} to {clash.last} " in description
-        assert "tour?.csv" in description
+        assert r"tour\x01\ud83d\ufffe.csv" in description
         assert "hall <A&B>" in description
         Image.open(io.BytesIO(files[f"{folder}/snapshot.png"])).verify()
     assert len(guids) == 6

@@ -72,7 +72,7 @@ def test_entries_of_requests_that_ended_do_not_pile_up():
 
 
 def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monkeypatch):
-    deadlines, start, failures = Deadlines(), stop_module.start_thread, [1]
+    deadlines, start, failures = Deadlines(), stop_module.start_loop, [1]
 
     def starting(*what):
         if failures:
@@ -80,7 +80,7 @@ def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monk
             raise RuntimeError("can't start new thread")
         return start(*what)
 
-    monkeypatch.setattr(stop_module, "start_thread", starting)
+    monkeypatch.setattr(stop_module, "start_loop", starting)
     first, second = StopFlag(), StopFlag()
     with pytest.raises(RuntimeError, match="can't start"):
         deadlines.add(first, time.perf_counter(), "first")

@@ -13,7 +13,6 @@ from solidcloud.server.cli.output.top_display import (
     MAX_USERS_SHOWN,
     Sample,
     budget_line,
-    printable,
     rate,
     rate_text,
     seconds_text,
@@ -167,9 +166,8 @@ def test_rates_for_a_reader() -> None:
 
 
 def test_names_cannot_move_the_cursor() -> None:
-    assert printable("al\x1b[2J\r\n\u202e\x07b") == "al?[2J????b"
     text = shown([hall(users=[UserStats("c\x1b[2J", "[red]x\x1b")])], once=True)
-    assert "\x1b" not in text and "c?[2J [red]x?" in text
+    assert "\x1b" not in text and r"c\x1b[2J [red]x\x1b" in text
 
 
 def test_a_scene_without_users_or_budget_is_shown_too() -> None:

@@ -138,8 +138,11 @@ def meet_points(body, points, reach, which, way, times, own):
 
 
 @nb.njit(nogil=True, cache=True)
-def find_held(body, points, held):
-    """Set held (n,) bool also for the points (n, 3), avatar frame, in the hull of the avatar's centres."""
+def find_held(body, points, reach, held):
+    """Set held (n,) bool also for points inside the hull of the avatar's spheres.
+
+    points, reach: as for `meet_points`. A point in a hollow between spheres is inside too.
+    """
     avatar = body.avatar
     outside = np.zeros(points.shape[0], np.bool_)
     for a in range(-HULL, HULL + 1):
@@ -154,8 +157,10 @@ def find_held(body, points, held):
                             avatar.points[block, 2, j],
                         )
                         most = max(most, (a * x + b * y) + c * z)
+                length = math.sqrt(np.float64(a * a + b * b + c * c))
                 for i in range(points.shape[0]):
-                    outside[i] |= (a * points[i, 0] + b * points[i, 1]) + c * points[i, 2] > most
+                    height = (a * points[i, 0] + b * points[i, 1]) + c * points[i, 2]
+                    outside[i] |= height > most + reach[i] * length
     for i in range(points.shape[0]):
         held[i] |= not outside[i]
 

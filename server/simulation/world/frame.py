@@ -16,6 +16,9 @@ from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 Vec = NDArray[np.float64]  # (3,) [m]
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
+# Limit of the obstacles that an answer lists.
+MAX_TOUCHED = 16
+
 
 class Hit(NamedTuple):
     """End of a motion.

@@ -55,7 +55,7 @@ class LeavingPose:
         self._lattice = points[:, kernel.LATTICE : kernel.DEFICIT]
         times, _ = self._meet(np.ones(len(points), bool), np.zeros(3))
         held = times == 0.0
-        self._body.call(kernel.find_held, self._body.reference, self._points, held)
+        self._body.call(kernel.find_held, self._body.reference, self._points, self._reach, held)
         self._held, self._of_held = held, np.flatnonzero(held)
         box = np.array([avatar.points.min(axis=0), avatar.points.max(axis=0)])
         planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))

@@ -22,8 +22,9 @@ PLACE, LATTICE, DEFICIT, GATHERED = 0, 3, 6, 7
 # Columns of a plane: unit normal away from the core, its offset, the nearest point's place and the core's
 # point nearest to that.
 NORMAL, OFFSET, NEAREST, CORE, PLANE = 0, 3, 4, 7, 10
-# Surfaces are planes within these distances of a point [m], as those of `slide`.
-REACHES = (0.08, 0.24)
+# The normal of a plane is that of the points within one of these distances [m], as for `slide`, and half of
+# it near an edge; the last is tried last, with the points that the best of the others leaves beyond.
+REACHES = (0.04, 0.08, 0.24, 0.24)
 # A plane lies up to this far before its nearest point [m], at most half the way to the core, so that the
 # bumps of a scanned wall make no planes of their own. With 0, noise of 2 mm closed every corner.
 MAX_BUMP = 0.02
@@ -72,7 +73,14 @@ def gather_points(held, voxel, box, pose, found, count):
             x = low[0] + ints[block_at] + np.int64(halves[lane_at + j])
             y = low[1] + ints[block_at + 1] + np.int64(halves[lane_at + LANES + j])
             z = low[2] + ints[block_at + 2] + np.int64(halves[lane_at + 2 * LANES + j])
-            if x < box[0, 0] or x > box[1, 0] or y < box[0, 1] or y > box[1, 1] or z < box[0, 2] or z > box[1, 2]:
+            if (
+                x < box[0, 0]
+                or x > box[1, 0]
+                or y < box[0, 1]
+                or y > box[1, 1]
+                or z < box[0, 2]
+                or z > box[1, 2]
+            ):
                 continue
             if count < found.shape[0]:
                 to = found[count]
@@ -121,7 +129,11 @@ def meet_points(body, points, reach, which, way, times, own):
                     depth += 1
                 continue
             for j in range(count):
-                ax, ay, az = avatar.points[~first, 0, j], avatar.points[~first, 1, j], avatar.points[~first, 2, j]
+                ax, ay, az = (
+                    avatar.points[~first, 0, j],
+                    avatar.points[~first, 1, j],
+                    avatar.points[~first, 2, j],
+                )
                 dx, dy, dz = x - ax, y - ay, z - az
                 beyond = dx * dx + dy * dy + dz * dz - most * most
                 time = np.inf
@@ -186,10 +198,12 @@ def _core(box, ends):
 
 
 @nb.njit(nogil=True, cache=True)
-def _surface(points, at, reach):
-    """Return the code of the normal of the points (n, 3) within reach of that of row `at`."""
+def _surface(points, which, at, reach):
+    """Return the code of the normal of those points (n, 3) within reach of that of row `at`. which: (n,) bool."""
     sums = np.zeros(SUMS, np.int64)
     for i in range(points.shape[0]):
+        if not which[i]:
+            continue
         x, y, z = points[i, 0] - points[at, 0], points[i, 1] - points[at, 1], points[i, 2] - points[at, 2]
         if x * x + y * y + z * z <= reach * reach:
             a, b, c = (
@@ -215,11 +229,13 @@ def separate_core(box, points, planes):
     """Find planes between the core and the points that an avatar holds; return their number.
 
     box: (2, 3) of the avatar's centres.  points: (n, 3), avatar frame.  planes: (MAX_PLANES, PLANE), written.
-    Each point lies beyond one of the planes, and the core before all of them: of the points left, the
-    nearest gives the next plane. Returns -1 if the core touches a point, or there are more planes.
+    Each point lies beyond one of the planes, and the core before all of them. The point nearest to the core
+    of those left gives the next plane: of several normals, the one with the most points beyond.
+    Returns -1 if the core touches a point, or there are more planes.
     """
     ends, left, distances = np.empty((2, 3)), np.ones(points.shape[0], np.bool_), np.empty(points.shape[0])
     core, normal, heights = np.empty((points.shape[0], 3)), np.empty(3), np.empty(points.shape[0])
+    toward, beyond = np.empty(3), np.empty(points.shape[0], np.bool_)
     _core(box, ends)
     length = 0.0
     for r in range(3):
@@ -243,34 +259,39 @@ def separate_core(box, points, planes):
             return count
         if distances[at] <= SLACK or count == MAX_PLANES:
             return -1
-        gap, height = -1.0, 0.0
-        for level in range(len(REACHES) + 1):
-            side = 1.0
+        best, most = planes[count], 0
+        for r in range(3):
+            best[NEAREST + r], best[CORE + r] = points[at, r], core[at, r]
+            toward[r] = (points[at, r] - core[at, r]) / distances[at]
+        for level in range(-1, len(REACHES)):
             for r in range(3):
-                normal[r] = (points[at, r] - core[at, r]) / distances[at]
-            if level < len(REACHES):
-                code = _surface(points, at, REACHES[level])
+                normal[r] = toward[r]
+            if level >= 0:
+                code = _surface(points, beyond if level == len(REACHES) - 1 else left, at, REACHES[level])
                 if code == NO_NORMAL:
                     continue
                 a, b, c = decode_normal(code)
-                side = -1.0 if a * normal[0] + b * normal[1] + c * normal[2] < 0.0 else 1.0
+                side = -1.0 if (a * toward[0] + b * toward[1]) + c * toward[2] < 0.0 else 1.0
                 normal[0], normal[1], normal[2] = side * a, side * b, side * c
-            height = (normal[0] * points[at, 0] + normal[1] * points[at, 1]) + normal[2] * points[at, 2]
             gap = np.inf
+            for i in range(points.shape[0]):
+                heights[i] = (normal[0] * points[i, 0] + normal[1] * points[i, 1]) + normal[2] * points[i, 2]
             for end in range(2):
                 own = (normal[0] * ends[end, 0] + normal[1] * ends[end, 1]) + normal[2] * ends[end, 2]
-                gap = min(gap, height - own)
-            if gap >= MIN_GAP * distances[at]:
-                break
-        least, offset = height - min(MAX_BUMP, 0.5 * gap), height
+                gap = min(gap, heights[at] - own)
+            if level >= 0 and gap < MIN_GAP * distances[at]:
+                continue
+            least, offset, found = heights[at] - min(MAX_BUMP, 0.5 * gap), heights[at], 0
+            for i in range(points.shape[0]):
+                if left[i] and heights[i] >= least:
+                    offset = min(offset, heights[i])
+                    found += 1
+            if found > most:
+                most, best[OFFSET] = found, offset
+                for r in range(3):
+                    best[NORMAL + r] = normal[r]
+                for i in range(points.shape[0]):
+                    beyond[i] = left[i] and heights[i] >= offset
         for i in range(points.shape[0]):
-            heights[i] = (normal[0] * points[i, 0] + normal[1] * points[i, 1]) + normal[2] * points[i, 2]
-            if left[i] and heights[i] >= least:
-                offset = min(offset, heights[i])
-        for i in range(points.shape[0]):
-            left[i] &= heights[i] < offset
-        for r in range(3):
-            planes[count, NORMAL + r] = normal[r]
-            planes[count, NEAREST + r], planes[count, CORE + r] = points[at, r], core[at, r]
-        planes[count, OFFSET] = offset
+            left[i] &= not beyond[i]
         count += 1

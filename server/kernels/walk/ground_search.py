@@ -11,7 +11,18 @@ from .slide_along import slide_along
 from .walk_motions import advance, move_to, settle_before
 from .walk_normals import hit_normal, scan_normal
 from .walk_queries import first_hit, nearest_point, pair_of
-from .walk_state import ARCHIVE, CONTACT, FRAME_VERDICT, HAS_NORMAL, HAS_PAIR, HITS, NORMAL, UNKNOWN, VERDICT, pose_now
+from .walk_state import (
+    ARCHIVE,
+    CONTACT,
+    FRAME_VERDICT,
+    HAS_NORMAL,
+    HAS_PAIR,
+    HITS,
+    NORMAL,
+    UNKNOWN,
+    VERDICT,
+    pose_now,
+)
 from .walk_vectors import copy_pose, divided, dot, minus, norm, place_of, plus, times, translated, vector
 
 # Distance past an edge at which the surface behind it is tested, and the radius of that test [m].

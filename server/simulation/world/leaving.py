@@ -63,9 +63,7 @@ class LeavingPose:
         self._planes = planes[: max(count, 0)]
         self._blocked = count < 0
 
-    def _meet(
-        self, which: NDArray[np.bool_], way: Vec
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _meet(self, which: NDArray[np.bool_], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return when a translation, avatar frame, meets points, and the avatar's touching centres."""
         times, own = np.empty(len(self._points)), np.zeros((len(self._points), 3))
         self._body.call(
@@ -117,7 +115,9 @@ class LeavingPose:
         number = int(self._archive[at])
         arrays = self._seen[number].data.arrays
         cloud = to_world(self._seen[number], self._lattice[at] * arrays.step + arrays.origin)
-        return Hit(fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end)
+        return Hit(
+            fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
+        )
 
     def _end(self, to: Pose, fraction: float, way: Vec, begin: Vec, skin: float) -> Pose:
         """Return the pose `skin` [m] before a contact. begin: from the touched to the touching centre."""

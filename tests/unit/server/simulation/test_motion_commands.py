@@ -75,7 +75,9 @@ def test_frames_last_as_the_clients_clock_says_within_bounds():
     assert durations(4.984375) == [0.015625]
     assert durations(5.0) == [0.0]
     assert durations(9.0) == [0.0], "a clock that went back"
-    assert durations(5.0 - LONGEST_FRAME * (1 + 1e-12)) == [LONGEST_FRAME], "no second frame for what a clock rounds"
+    assert durations(5.0 - LONGEST_FRAME * (1 + 1e-12)) == [LONGEST_FRAME], (
+        "no second frame for what a clock rounds"
+    )
     assert durations(4.75) == [0.25 / 3] * 3
     assert durations(5.0 - LONGEST_PAUSE) == [LONGEST_FRAME] * 5
     assert durations(1.0) == [LONGEST_FRAME]

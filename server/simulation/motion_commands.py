@@ -11,19 +11,25 @@ from ...schemas.wire.motion_messages import FRAME_SECONDS, Wish
 from .world.frame import Pose, Vec
 from .world.vectors import multiply, orthonormalize, rotation_matrix
 
-# Limit on the duration of a frame: after a longer pause, a viewer continues as after a short one
-# [s].
+# Limit on the duration of a frame [s]. A motion command that is due for longer takes several.
 LONGEST_FRAME = 0.1
+# After a pause of more than this, a viewer continues as after one of LONGEST_FRAME [s]: it stood still,
+# and did not send two motion commands a second.
+LONGEST_PAUSE = 0.5
 
 
-def frame_seconds(command: Wish, before: float | None) -> float:
-    """Return how long the frame of a motion command lasts [s].
+def frame_durations(command: Wish, before: float | None) -> list[float]:
+    """Return how long each of the frames of a motion command lasts [s]; there is at least one.
 
     before: time of the user's previous command, on its clock; None: it is the first.
     """
     if before is None:
-        return FRAME_SECONDS
-    return min(max(command.time - before, 0.0), LONGEST_FRAME)
+        return [FRAME_SECONDS]
+    seconds = max(command.time - before, 0.0)
+    if seconds > LONGEST_PAUSE:
+        seconds = LONGEST_FRAME
+    count = max(1, math.ceil(seconds / LONGEST_FRAME - 1e-9))  # times of clients are rounded
+    return [min(seconds / count, LONGEST_FRAME)] * count
 
 
 def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:

@@ -26,7 +26,7 @@ from ..bodies.avatar_patch import SUMS, lowest_heights
 from ..motion.sweep_resident import POINT
 from .walk_normals import hit_normal, scan_heights
 from .walk_queries import pair_of
-from .walk_state import ARCHIVE, HAS_PAIR, HAS_POINT, pose_now
+from .walk_state import ARCHIVE, HAS_NORMAL, HAS_PAIR, HAS_POINT, NORMAL, pose_now
 from .walk_vectors import divided, dot, minus, norm, rotate, rotate_back, times, vector
 
 # The avatar's patch may exceed the plane of the scan's normal by this share of the reach: by 1 cm
@@ -39,6 +39,8 @@ MAX_EXCESS_SHARE = 0.125
 def contact_normal(walk, hit):
     """Return whether the normal of a contact is known, and it: a unit vector towards the avatar."""
     result = walk.memory.tape[hit]
+    if result[HAS_NORMAL] != 0.0:
+        return True, vector(result[NORMAL : NORMAL + 3])  # of a body, or of a motion that began in contact
     known, smoothed = hit_normal(walk, hit, 0)
     if result[ARCHIVE] < 0.0 or result[HAS_PAIR] == 0.0 or result[HAS_POINT] == 0.0:
         return known, smoothed

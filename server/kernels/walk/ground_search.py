@@ -11,7 +11,18 @@ from .slide_along import slide_along
 from .walk_motions import advance, move_to, settle_before
 from .walk_normals import hit_normal, scan_normal
 from .walk_queries import first_hit, nearest_point, pair_of
-from .walk_state import ARCHIVE, HAS_NORMAL, HAS_PAIR, HITS, NORMAL, UNKNOWN, VERDICT, pose_now
+from .walk_state import (
+    ARCHIVE,
+    CONTACT,
+    FRAME_VERDICT,
+    HAS_NORMAL,
+    HAS_PAIR,
+    HITS,
+    NORMAL,
+    UNKNOWN,
+    VERDICT,
+    pose_now,
+)
 from .walk_vectors import copy_pose, divided, dot, minus, norm, place_of, plus, times, translated, vector
 
 # Distance past an edge at which the surface behind it is tested, and the radius of that test [m].
@@ -186,7 +197,8 @@ def lower_by(walk, below, way):
     if way <= 0.0:
         return
     up = vector(walk.settings.up)
-    if not below.aside and not walk.bodies:  # the search left out bodies beside the avatar
+    in_contact = walk.memory.numbers[FRAME_VERDICT] == CONTACT
+    if not below.aside and not walk.bodies and not in_contact:  # the search left out bodies beside the avatar
         down = translated(pose_now(walk), times(-below.reach, up))
         settle_before(walk, down, way / below.reach, below.free / below.reach if below.hit >= 0 else 1.0)
     else:

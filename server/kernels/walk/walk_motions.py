@@ -115,9 +115,10 @@ def _skin_share(walk, to, hit):
 @nb.njit(nogil=True, cache=True)
 def advance(walk, to):
     """Move towards a pose (4, 4) as far as nothing is touched; return the hit that ended the motion."""
-    if not walk.settings.continuous:
-        return _move_if_clear(walk, to)
     memory, hit = walk.memory, -1
+    leaves = memory.numbers[FRAME_VERDICT] == CONTACT  # the frame began in contact
+    if not (walk.settings.continuous or leaves):
+        return _move_if_clear(walk, to)
     for _ in range(MAX_PUSHES):
         if same_pose(pose_now(walk), to):
             return -1
@@ -126,8 +127,10 @@ def advance(walk, to):
             move_to(walk, to)
             return -1
         result = memory.tape[hit]
-        if result[HAS_END] != 0.0 and not walk.bodies:
-            move_to(walk, result[END:VERDICT].reshape(4, 4))
+        if result[HAS_END] != 0.0 and (leaves or not walk.bodies):
+            end = result[END:VERDICT].reshape(4, 4)
+            if not walk.bodies or is_clear(walk, end, True):
+                move_to(walk, end)
         else:
             keep_point(walk, to, hit)
             fraction = result[LOWER]
@@ -165,10 +168,31 @@ def follow_command(walk):
     """Move towards the commanded pose."""
     memory = walk.memory
     hit = advance(walk, memory.poses[TARGET])
+    if hit >= 0 and memory.numbers[FRAME_VERDICT] == CONTACT:
+        hit = _move_before_turn(walk, hit)
     memory.numbers[BLOCKED] = hit
     if hit >= 0:
         copy_pose(pose_now(walk), memory.poses[BLOCKED_POSE])
     keep_rest(walk, 0.0)
+
+
+@nb.njit(nogil=True, cache=True)
+def _move_before_turn(walk, hit):
+    """Follow a motion command of an avatar in contact, which does not turn there; return the hit that ends it.
+
+    hit: that of the whole motion.
+    """
+    target, moved = walk.memory.poses[TARGET], pose_now(walk).copy()
+    turns = False
+    for r in range(3):
+        moved[r, 3] = target[r, 3]
+        for c in range(3):
+            turns |= moved[r, c] != target[r, c]
+    if not turns:
+        return hit
+    walk.memory.numbers[HITS] -= 1
+    hit = advance(walk, moved)
+    return hit if hit >= 0 else advance(walk, target)
 
 
 @nb.njit(nogil=True, cache=True)

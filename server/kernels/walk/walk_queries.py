@@ -142,8 +142,8 @@ def _sweep(walk, to, tolerance, skin, row):
         pose, to, avatar.body, avatar.scratch, avatar.radius, walk.other_units, avatar.box, walk.held, walk.stop,
         walk.unknown, walk.unknown_everywhere, within, skin, memory.rows, result[:VERDICT],
     )  # fmt: skip
-    if needed < 0:
-        return False
+    if needed < 0 or (verdict == CONTACT and result[UPPER] == 0.0):
+        return False  # Python answers motions that begin in contact
     use_voxels(memory, needed)
     exact = True
     if verdict == CONTACT:

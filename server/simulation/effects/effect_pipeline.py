@@ -22,7 +22,7 @@ from ....schemas.wire.motion_messages import FRAME_SECONDS, Moved, Touched
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...runtime.stop_flag import NO_STOP, StoppedError
 from ..world.collision_world import World
-from ..world.frame import Body, Frame, Hit, Pose, Runner, Vec
+from ..world.frame import MAX_TOUCHED, Body, Frame, Hit, Pose, Runner, Vec
 from ..world.vectors import norm
 from .effect_times import EffectTimes
 
@@ -32,8 +32,6 @@ _SMOOTHING = 0.1
 # Otherwise it would be skipped forever after one slow run, for example because of compilation or a
 # disk. An effect that is always slow runs once in some dozens of frames.
 _DECAY = 0.02
-# Limit of the obstacles that an answer lists.
-_MAX_TOUCHED = 16
 
 
 class CostEstimate:
@@ -248,7 +246,7 @@ def _touched(hits: list[Hit], there: Vec) -> list[Touched]:
         normal = None if hit.normal is None else _vector(hit.normal)
         unknown = hit.verdict == Verdict.UNKNOWN
         found[hit.what, place] = Touched(place, normal, hit.what, unknown, hit.unloaded)
-    return list(found.values())[:_MAX_TOUCHED]
+    return list(found.values())[:MAX_TOUCHED]
 
 
 def _moved(frame: Frame, unknown: bool) -> Moved:

@@ -4,19 +4,21 @@ Alone it is discrete: the avatar takes the commanded pose if nothing is touched 
 stays. With `sweep`, it moves up to the first contact.
 
 An avatar that touches something before it moves (because it was placed there, or the archive was
-hot-reloaded) first escapes. The candidates are the displacement of the motion command, if it does
-not lead deeper into the deepest contact, and displacements of up to MAX_ESCAPE along the contact
-normal and upwards, shortest first. The first with a clear end is taken. The way to it is not
-tested, because an avatar in a wall has no clear side to stay on. If no end is clear, the avatar
-stays, and the verdict reports the contact. It also stays if its pose or a candidate is unknown
-because voxels are not in memory yet, for a frame that does not wait for them.
+hot-reloaded) first escapes. The candidates are the displacement of the motion command, and
+displacements of up to MAX_ESCAPE away from what is touched and upwards, shortest first. The first
+with a clear end is taken, if the rule for users in contact permits the way to it (schemas/SCENE.md).
+If there is none, the avatar moves by that rule as far as its motion command leads, also without
+`sweep`, and the verdict reports whether it is still in contact. It stays if its pose or a candidate is
+unknown because voxels are not in memory yet, for a frame that does not wait for them.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep
+from ....schemas.wire.answers import Verdict
 from ..world.collision_world import World
-from ..world.frame import Frame, Hit, Vec, find_touched, is_clear, record_hit, translated
+from ..world.frame import Frame, Vec, find_touched, is_clear, record_hit, translated
 from ..world.frame_walk import FOLLOW
-from ..world.vectors import dot, norm
+from ..world.leaving import leave, leaving_pose
+from ..world.vectors import norm
 
 # Longest displacement of an escape from contact [m], and the distances that are tried.
 MAX_ESCAPE = 0.5
@@ -50,9 +52,10 @@ def escape_contact(frame: Frame) -> None:
     if hit.unloaded:
         record_hit(frame, hit)  # it may be clear: nothing pushes it before that is known
         return
-    for way in _escape_displacements(frame, hit):
+    touches = hit.verdict == Verdict.CONTACT
+    for way in _escape_displacements(frame, touches=touches):
         pose, lacked = translated(frame.pose, way), frame.lacked
-        clear = is_clear(frame, pose)
+        clear = is_clear(frame, pose) and (not touches or leave(frame, pose) is None)
         if frame.lacked > lacked and not clear:
             break  # a frame that waits might take this one
         if clear:
@@ -61,19 +64,15 @@ def escape_contact(frame: Frame) -> None:
     frame.verdict = hit.verdict
 
 
-def _escape_displacements(frame: Frame, hit: Hit) -> list[Vec]:
+def _escape_displacements(frame: Frame, *, touches: bool) -> list[Vec]:
     """Return the displacements (3,) [m] to try, the commanded one first, then shortest first."""
     directions: list[Vec] = [frame.world.up]
-    commanded = frame.target[:3, 3] - frame.pose[:3, 3]
-    deeper = False
-    if hit.avatar is not None and hit.cloud is not None:
-        out = hit.avatar - hit.cloud
-        across = norm(out)
-        if across > 0.0:
-            directions.insert(0, out / across)
-            deeper = dot(commanded, out) < 0.0  # it might lead through the touched surface
+    out = leaving_pose(frame, MAX_ESCAPE).out if touches else None
+    if out is not None:
+        directions.insert(0, out)
     ways = [way * direction for way in _ESCAPE_DISTANCES for direction in directions]
-    if not deeper and 0.0 < norm(commanded) <= MAX_ESCAPE:
+    commanded = frame.target[:3, 3] - frame.pose[:3, 3]
+    if 0.0 < norm(commanded) <= MAX_ESCAPE:
         ways.insert(0, commanded)
     return ways
 

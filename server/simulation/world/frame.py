@@ -16,6 +16,9 @@ from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 Vec = NDArray[np.float64]  # (3,) [m]
 Pose = NDArray[np.float64]  # (4, 4) float64, avatar to world, rigid
 
+# Limit of the obstacles that an answer lists.
+MAX_TOUCHED = 16
+
 
 class Hit(NamedTuple):
     """End of a motion.
@@ -122,6 +125,7 @@ class Frame:
     apart: whether it is proved that no obstacle is touched at `pose`.
     walks, walk_hits: for walk_call.py: whether a part has run, and the hits that Python answered with, by
     their row.  visits: node visits of each part in its last call.
+    leaving: the last pose in contact from which a motion began (leaving.py), or None.
     """
 
     body: Body
@@ -146,6 +150,7 @@ class Frame:
     walks: bool = False
     walk_hits: dict[int, Hit] | None = None
     visits: list[int] = field(default_factory=list)
+    leaving: Any = None
 
     @property
     def lacked(self) -> int:
@@ -192,7 +197,12 @@ def find_first_hit(
     """
     found, lacked = None, frame.lacked
     swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
-    if swept.verdict != Verdict.CLEAR:
+    if begins_in_contact(swept) and is_translation(frame.pose, to):
+        # Imported here: few frames begin in contact.
+        from .leaving import leave
+
+        found = leave(frame, to, skin)
+    elif swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT
         if sure and not swept.exact:
             sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
@@ -205,6 +215,16 @@ def find_first_hit(
             found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
     until = math.inf if found is None else found.fraction
     return first_body_hit(frame, to, tolerance, until, below=below) or found
+
+
+def begins_in_contact(swept: Any) -> bool:
+    """Return whether a `SweepResult` says that the scan is touched where the motion begins."""
+    return bool(swept.verdict == Verdict.CONTACT and swept.upper == 0.0)
+
+
+def is_translation(pose: Pose, to: Pose) -> bool:
+    """Return whether two poses have the same orientation, bit for bit."""
+    return pose[:3, :3].tobytes() == to[:3, :3].tobytes()
 
 
 def first_body_hit(frame: Frame, to: Pose, tolerance: float, until: float, *, below: bool) -> Hit | None:
@@ -256,7 +276,7 @@ def max_displacement(frame: Frame, to: Pose) -> float:
     if not len(avatar.points):
         return 0.0
     way = to[:3, 3] - begin[:3, 3]
-    if to[:3, :3].tobytes() == begin[:3, :3].tobytes():
+    if is_translation(begin, to):
         return norm(way)
     turn = to[:3, :3] - begin[:3, :3]
     center = way + rotate(turn, avatar.arrays.center[0])

@@ -13,6 +13,7 @@ import numpy as np
 from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
 from ....schemas.scene.effect_table import Crowd, Ground, Slide, Step, Stop, Sweep
 from ....schemas.scene.scene_file import SceneFile, sweep_tolerance
+from ....schemas.wire.answers import Verdict
 from ...kernels.core.array_references import Held
 from ...kernels.walk import walk_state as state
 from ...kernels.walk.slide_along import FLAT_REACH_FACTOR
@@ -139,6 +140,9 @@ class Walker:
         frame.visits, frame.apart = log[state.VISITS :], own != state.ASKS and log[state.APART] != 0
         world.count(sum(frame.visits), log[state.MISSED])
         call.finish()
+        if frame.verdict == Verdict.CONTACT and not frame.clear:  # it began in contact
+            frame.verdict = world.collide(body.avatar, frame.pose, budget)
+            frame.clear = frame.verdict == Verdict.CLEAR
 
     def warm(self) -> None:
         """Compile the kernel before the first frame needs it."""

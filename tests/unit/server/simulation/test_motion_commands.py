@@ -10,8 +10,9 @@ from solidcloud.schemas.scene.scene_file import Spawn
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, MoveRequest, Wish
 from solidcloud.server.simulation.motion_commands import (
     LONGEST_FRAME,
+    LONGEST_PAUSE,
     first_pose,
-    frame_seconds,
+    frame_durations,
     spawn_pose,
     target_pose,
 )
@@ -66,12 +67,20 @@ def test_a_pose_turned_for_long_stays_rigid():
     assert np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-15
 
 
-def test_a_frame_lasts_as_the_clients_clock_says_within_bounds():
-    assert frame_seconds(wish(pose_at(0, 0, 0), time=5.0), None) == FRAME_SECONDS
-    assert frame_seconds(wish(pose_at(0, 0, 0), time=5.0), 4.984375) == 0.015625
-    assert frame_seconds(wish(pose_at(0, 0, 0), time=5.0), 5.0) == 0.0
-    assert frame_seconds(wish(pose_at(0, 0, 0), time=5.0), 9.0) == 0.0, "a clock that went back"
-    assert frame_seconds(wish(pose_at(0, 0, 0), time=5.0), 1.0) == LONGEST_FRAME
+def test_frames_last_as_the_clients_clock_says_within_bounds():
+    def durations(before):
+        return frame_durations(wish(pose_at(0, 0, 0), time=5.0), before)
+
+    assert durations(None) == [FRAME_SECONDS]
+    assert durations(4.984375) == [0.015625]
+    assert durations(5.0) == [0.0]
+    assert durations(9.0) == [0.0], "a clock that went back"
+    assert durations(5.0 - LONGEST_FRAME * (1 + 1e-12)) == [LONGEST_FRAME], (
+        "no second frame for what a clock rounds"
+    )
+    assert durations(4.75) == [0.25 / 3] * 3
+    assert durations(5.0 - LONGEST_PAUSE) == [LONGEST_FRAME] * 5
+    assert durations(1.0) == [LONGEST_FRAME]
 
 
 def test_users_begin_at_the_spawn_or_where_they_say():

@@ -70,6 +70,35 @@ def test_users_begin_at_the_spawn():
     assert np.array_equal(state.pose[0, :3, 3], [3.0 + 3.0 * FRAME_SECONDS, 4.0, 5.0])
 
 
+@pytest.mark.parametrize("rate", [2, 5, 7.5, 30, 90])
+def test_slow_clients_walk_as_far_as_fast_ones(floor, rate):
+    """Issue 35: frames were cut at 0.1 s, so that a client at 5 frames a second walked at half speed."""
+    floor.step([FrameCommand(AL, wish(1, 0.5, time=0.0))])
+    for n in range(1, round(2 * rate) + 1):
+        ((_, state, _),) = floor.step(
+            [FrameCommand(AL, wish(n + 1, velocity=(1.4, 0.0, -0.1), time=n / rate))]
+        )
+    assert np.allclose(state.pose[0, :3, 3], [2.8, 0.0, 0.3], atol=1e-12)
+    assert state.frame == round(2 * rate) + 1, "a motion command is one frame of the scene"
+
+
+def test_a_motion_command_that_fails_in_a_later_frame_changes_nothing(floor):
+    floor.step([FrameCommand(AL, wish(1, 0.5, time=0.0))])
+    run, calls = floor._pipeline.run, []
+
+    def fail(*rest, **more):
+        calls.append(1)
+        if len(calls) == 2:
+            raise BadRequestError("no")
+        return run(*rest, **more)
+
+    floor._pipeline.run = fail
+    ((_, state, _),) = floor.step([FrameCommand(AL, wish(2, velocity=(1.0, 0.0, 0.0), time=0.2))])
+    assert isinstance(state, BadRequestError) and len(calls) == 2
+    ((_, state, _),) = floor.step([FrameCommand(AL, wish(3, velocity=(0.0, 0.0, 0.0), time=0.01))])
+    assert np.array_equal(state.pose, pose_at(0.5))
+
+
 def test_everybody_who_wished_has_one_frame_in_the_order_given(floor):
     order = []
     run = floor._pipeline.run

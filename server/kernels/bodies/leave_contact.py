@@ -1,0 +1,297 @@
+"""Motions that begin in contact: which scan points an avatar holds, and the planes it may not cross.
+
+The rule, its proof and its limits are in schemas/SCENE.md, "A user in contact". Sums are float64 in a
+fixed order, so that every machine finds the same motions; distances below `SLACK` count as contact.
+"""
+
+import math
+
+import numpy as np
+
+from ....schemas.kernels import compiling as nb
+from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
+from ..core.kernel_decorators import njit_no_refcount
+from ..core.node_overlap import STACK
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class
+from .avatar_patch import PATCH_STEPS, SUMS
+
+# More than float64 loses at 10^7 m from the origin, and less than any skin [m].
+SLACK = 1e-7
+# Columns of a gathered point: place in the avatar's frame [m], lattice coordinates, radius deficit.
+PLACE, LATTICE, DEFICIT, GATHERED = 0, 3, 6, 7
+# Columns of a plane: unit normal away from the core, its offset, the nearest point's place and the core's
+# point nearest to that.
+NORMAL, OFFSET, NEAREST, CORE, PLANE = 0, 3, 4, 7, 10
+# The normal of a plane is that of the points within one of these distances [m], as for `slide`, and half of
+# it near an edge; the last is tried last, with the points that the best of the others leaves beyond.
+REACHES = (0.04, 0.08, 0.24, 0.24)
+# A plane lies up to this far before its nearest point [m], at most half the way to the core, so that the
+# bumps of a scanned wall make no planes of their own. With 0, noise of 2 mm closed every corner.
+MAX_BUMP = 0.02
+# A plane that is nearer to the core than this share of its point's distance is not taken.
+MIN_GAP = 0.25
+MAX_PLANES = 256
+# Directions of the half-spaces around the avatar: whole numbers up to this. The farthest is 9 degrees
+# from one of them, so that the hull is a hundredth too large.
+HULL = 3
+
+
+@nb.njit(nogil=True, cache=True)
+def gather_points(held, voxel, box, pose, found, count):
+    """Append the points of a resident voxel in a box to found (capacity, GATHERED); return their number.
+
+    box: (2, 3) int64, inclusive, lattice.  pose: (4, 4), avatar to archive.  count: number of points so far.
+    Points beyond the capacity are counted and not written.
+    """
+    scene = held.scene
+    words, ints, halves = scene.words, scene.ints, scene.halves
+    mask = np.uint64(scene.radius_deficit.shape[0] - 1)
+    low, shift = np.empty(3, np.int64), np.empty(3)
+    for r in range(3):
+        low[r] = scene.coordinates[voxel, r] * scene.voxel_steps
+        shift[r] = scene.origin[r] - pose[r, 3]
+    base = scene.where[voxel, 0]
+    rows, depth = np.empty(STACK, np.int64), 1
+    rows[0] = base
+    while depth > 0:
+        depth -= 1
+        row, near = rows[depth], True
+        for r in range(3):
+            middle, radius = low[r] + np.float64(words[row + r]), np.float64(words[row + 3])
+            near &= middle + radius >= box[0, r] and middle - radius <= box[1, r]
+        if not near:
+            continue
+        first, points = np.int64(ints[row + FIRST]), np.int64(ints[row + COUNT] & COUNTED)
+        if first >= 0:
+            for child in range(first, first + points):
+                rows[depth] = base + child * ROW_WORDS
+                depth += 1
+            continue
+        block_at = scene.where[voxel, 1] + ~first * scene.block_words
+        lane_at = scene.where[voxel, 2] + ~first * 3 * LANES
+        for j in range(points):
+            x = low[0] + ints[block_at] + np.int64(halves[lane_at + j])
+            y = low[1] + ints[block_at + 1] + np.int64(halves[lane_at + LANES + j])
+            z = low[2] + ints[block_at + 2] + np.int64(halves[lane_at + 2 * LANES + j])
+            if (
+                x < box[0, 0]
+                or x > box[1, 0]
+                or y < box[0, 1]
+                or y > box[1, 1]
+                or z < box[0, 2]
+                or z > box[1, 2]
+            ):
+                continue
+            if count < found.shape[0]:
+                to = found[count]
+                a, b, c = x * scene.step + shift[0], y * scene.step + shift[1], z * scene.step + shift[2]
+                for k in range(3):
+                    to[PLACE + k] = pose[0, k] * a + pose[1, k] * b + pose[2, k] * c
+                to[LATTICE], to[LATTICE + 1], to[LATTICE + 2] = x, y, z
+                to[DEFICIT] = scene.radius_deficit[point_class(ints, block_at, j, mask)]
+            count += 1
+    return count
+
+
+@nb.njit(nogil=True, cache=True)
+def meet_points(body, points, reach, which, way, times, own):
+    """Find when a translated avatar first meets each of some points.
+
+    body: reference to the avatar's arrays, not empty.  points: (n, 3), avatar frame.  reach: (n,) between
+    the centres of two touching spheres [m].  which: (n,) bool, points to examine.  way: (3,) translation.
+    times: (n,), set to the fraction of the way, 0 where they touch, inf for never.  own: (n, 3), set to
+    the centre of the avatar's sphere that touches.
+    """
+    avatar = body.avatar
+    square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+    rows = np.empty(STACK, np.int64)
+    for i in range(points.shape[0]):
+        times[i] = np.inf
+        if not which[i]:
+            continue
+        x, y, z, most = points[i, 0], points[i, 1], points[i, 2], reach[i] + SLACK
+        rows[0], depth = 0, 1
+        while depth > 0:
+            depth -= 1
+            row = rows[depth]
+            dx, dy, dz = x - avatar.center[row, 0], y - avatar.center[row, 1], z - avatar.center[row, 2]
+            t = 0.0
+            if square > 0.0:
+                t = min(max((dx * way[0] + dy * way[1] + dz * way[2]) / square, 0.0), 1.0)
+            dx, dy, dz = dx - t * way[0], dy - t * way[1], dz - t * way[2]
+            both = (most + avatar.radius[row]) * (1.0 + 1e-9)
+            if dx * dx + dy * dy + dz * dz > both * both:
+                continue
+            first, count = np.int64(avatar.first[row]), np.int64(avatar.count[row])
+            if first >= 0:
+                for child in range(first, first + count):
+                    rows[depth] = child
+                    depth += 1
+                continue
+            for j in range(count):
+                ax, ay, az = (
+                    avatar.points[~first, 0, j],
+                    avatar.points[~first, 1, j],
+                    avatar.points[~first, 2, j],
+                )
+                dx, dy, dz = x - ax, y - ay, z - az
+                beyond = dx * dx + dy * dy + dz * dz - most * most
+                time = np.inf
+                if beyond <= 0.0:
+                    time = 0.0
+                else:
+                    along = dx * way[0] + dy * way[1] + dz * way[2]
+                    root = along * along - square * beyond
+                    if along > 0.0 and root >= 0.0 and along - math.sqrt(root) <= square:
+                        time = max(0.0, (along - math.sqrt(root)) / square)
+                if time < times[i]:
+                    times[i] = time
+                    own[i, 0], own[i, 1], own[i, 2] = ax, ay, az
+
+
+@nb.njit(nogil=True, cache=True)
+def find_held(body, points, reach, held):
+    """Set held (n,) bool also for points inside the hull of the avatar's spheres.
+
+    points, reach: as for `meet_points`. A point in a hollow between spheres is inside too.
+    """
+    avatar = body.avatar
+    outside = np.zeros(points.shape[0], np.bool_)
+    for a in range(-HULL, HULL + 1):
+        for b in range(-HULL, HULL + 1):
+            for c in range(-HULL, HULL + 1):
+                most = -np.inf
+                for block in range(avatar.points.shape[0]):
+                    for j in range(LANES):
+                        x, y, z = (
+                            avatar.points[block, 0, j],
+                            avatar.points[block, 1, j],
+                            avatar.points[block, 2, j],
+                        )
+                        most = max(most, (a * x + b * y) + c * z)
+                length = math.sqrt(np.float64(a * a + b * b + c * c))
+                for i in range(points.shape[0]):
+                    height = (a * points[i, 0] + b * points[i, 1]) + c * points[i, 2]
+                    outside[i] |= height > most + reach[i] * length
+    for i in range(points.shape[0]):
+        held[i] |= not outside[i]
+
+
+@njit_no_refcount
+def _core(box, ends):
+    """Write the ends (2, 3) of the core of an avatar with a box (2, 3) of its centres.
+
+    It is the segment through the middle of the box along its longest axis, shorter by the second extent.
+    """
+    longest = 0
+    for r in range(1, 3):
+        if box[1, r] - box[0, r] > box[1, longest] - box[0, longest]:
+            longest = r
+    second = 0.0
+    for r in range(3):
+        ends[0, r] = ends[1, r] = 0.5 * (box[0, r] + box[1, r])
+        if r != longest:
+            second = max(second, box[1, r] - box[0, r])
+    half = 0.5 * (box[1, longest] - box[0, longest] - second)
+    ends[0, longest] -= half
+    ends[1, longest] += half
+
+
+@nb.njit(nogil=True, cache=True)
+def _surface(points, which, at, reach):
+    """Return the code of the normal of those points (n, 3) within reach of that of row `at`. which: (n,) bool."""
+    sums = np.zeros(SUMS, np.int64)
+    for i in range(points.shape[0]):
+        if not which[i]:
+            continue
+        x, y, z = points[i, 0] - points[at, 0], points[i, 1] - points[at, 1], points[i, 2] - points[at, 2]
+        if x * x + y * y + z * z <= reach * reach:
+            a, b, c = (
+                np.int64(np.rint(x * PATCH_STEPS)),
+                np.int64(np.rint(y * PATCH_STEPS)),
+                np.int64(np.rint(z * PATCH_STEPS)),
+            )
+            sums[0] += 1
+            sums[1] += a
+            sums[2] += b
+            sums[3] += c
+            sums[4] += a * a
+            sums[5] += b * b
+            sums[6] += c * c
+            sums[7] += b * c
+            sums[8] += c * a
+            sums[9] += a * b
+    return normal_code(sums)
+
+
+@nb.njit(nogil=True, cache=True)
+def separate_core(box, points, planes):
+    """Find planes between the core and the points that an avatar holds; return their number.
+
+    box: (2, 3) of the avatar's centres.  points: (n, 3), avatar frame.  planes: (MAX_PLANES, PLANE), written.
+    Each point lies beyond one of the planes, and the core before all of them. The point nearest to the core
+    of those left gives the next plane: of several normals, the one with the most points beyond.
+    Returns -1 if the core touches a point, or there are more planes.
+    """
+    ends, left, distances = np.empty((2, 3)), np.ones(points.shape[0], np.bool_), np.empty(points.shape[0])
+    core, normal, heights = np.empty((points.shape[0], 3)), np.empty(3), np.empty(points.shape[0])
+    toward, beyond = np.empty(3), np.empty(points.shape[0], np.bool_)
+    _core(box, ends)
+    length = 0.0
+    for r in range(3):
+        length += (ends[1, r] - ends[0, r]) ** 2
+    for i in range(points.shape[0]):
+        along, square = 0.0, 0.0
+        for r in range(3):
+            along += (points[i, r] - ends[0, r]) * (ends[1, r] - ends[0, r])
+        along = min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
+        for r in range(3):
+            core[i, r] = ends[0, r] + along * (ends[1, r] - ends[0, r])
+            square += (points[i, r] - core[i, r]) ** 2
+        distances[i] = math.sqrt(square)
+    count = 0
+    while True:
+        at = -1
+        for i in range(points.shape[0]):
+            if left[i] and (at < 0 or distances[i] < distances[at]):
+                at = i
+        if at < 0:
+            return count
+        if distances[at] <= SLACK or count == MAX_PLANES:
+            return -1
+        best, most = planes[count], 0
+        for r in range(3):
+            best[NEAREST + r], best[CORE + r] = points[at, r], core[at, r]
+            toward[r] = (points[at, r] - core[at, r]) / distances[at]
+        for level in range(-1, len(REACHES)):
+            for r in range(3):
+                normal[r] = toward[r]
+            if level >= 0:
+                code = _surface(points, beyond if level == len(REACHES) - 1 else left, at, REACHES[level])
+                if code == NO_NORMAL:
+                    continue
+                a, b, c = decode_normal(code)
+                side = -1.0 if (a * toward[0] + b * toward[1]) + c * toward[2] < 0.0 else 1.0
+                normal[0], normal[1], normal[2] = side * a, side * b, side * c
+            gap = np.inf
+            for i in range(points.shape[0]):
+                heights[i] = (normal[0] * points[i, 0] + normal[1] * points[i, 1]) + normal[2] * points[i, 2]
+            for end in range(2):
+                own = (normal[0] * ends[end, 0] + normal[1] * ends[end, 1]) + normal[2] * ends[end, 2]
+                gap = min(gap, heights[at] - own)
+            if level >= 0 and gap < MIN_GAP * distances[at]:
+                continue
+            least, offset, found = heights[at] - min(MAX_BUMP, 0.5 * gap), heights[at], 0
+            for i in range(points.shape[0]):
+                if left[i] and heights[i] >= least:
+                    offset = min(offset, heights[i])
+                    found += 1
+            if found > most:
+                most, best[OFFSET] = found, offset
+                for r in range(3):
+                    best[NORMAL + r] = normal[r]
+                for i in range(points.shape[0]):
+                    beyond[i] = left[i] and heights[i] >= offset
+        for i in range(points.shape[0]):
+            left[i] &= not beyond[i]
+        count += 1

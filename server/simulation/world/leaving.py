@@ -1,0 +1,181 @@
+"""Motions of an avatar that begin in contact with the scan (schemas/SCENE.md, "A user in contact")."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.archive.units import UNITS_PER_METRE
+from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_model import AvatarModel
+from ...kernels.bodies import leave_contact as kernel
+from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MIN_MOTION
+from ...queries.context.query_budget import QueryBudget
+from ...queries.context.query_context import parts_that_fit
+from .frame import Frame, Hit, Pose, Vec, translated
+from .held_archive import HeldArchive, to_archive, to_world
+from .vectors import dot, norm, rotate, rotate_back
+
+# Points this much farther than a motion reaches are gathered with it, for the next motions [m].
+_MORE = 0.25
+# A motion may lead over a plane by this share of its length, which is rounding.
+_ROUNDING = 1e-8
+
+
+class _Gathered(NamedTuple):
+    """Points of an archive: see `gather_points`. lacks: voxels that were not available; late: not in memory."""
+
+    points: NDArray[np.float64]
+    lacks: bool = False
+    late: int = 0
+
+
+class LeavingPose:
+    """Pose in contact with the scan, and the motions that may leave it.
+
+    Scan points that the avatar holds, by touching them or inside, bound these motions by planes
+    between them and its core. All other points stop a motion at their first contact.
+    """
+
+    def __init__(self, frame: Frame, reach: float) -> None:
+        """Gather the points that translations of frame.pose by up to `reach` [m] may meet."""
+        self.pose, self.reach = frame.pose, reach
+        world, avatar, budget = frame.world, frame.body.avatar, frame.budget
+        self._body = world.probe(avatar).body
+        with world as seen:
+            self._seen = list(seen)
+            found = [_gather(each, avatar, to_archive(each, frame.pose), reach, budget) for each in seen]
+        budget.lacked(sum(each.late for each in found))
+        self.lacks, self.late = any(each.lacks for each in found), any(each.late for each in found)
+        points = np.concatenate([each.points for each in found])
+        self._archive = np.repeat(np.arange(len(found)), [len(each.points) for each in found])
+        units = np.array([each.data.radius_units for each in self._seen])[self._archive]
+        self._reach = avatar.radius + (units - points[:, kernel.DEFICIT]) / UNITS_PER_METRE
+        self._points = np.ascontiguousarray(points[:, : kernel.LATTICE])
+        self._lattice = points[:, kernel.LATTICE : kernel.DEFICIT]
+        times, _ = self._meet(np.ones(len(points), bool), np.zeros(3))
+        held = times == 0.0
+        self._body.call(kernel.find_held, self._body.reference, self._points, self._reach, held)
+        self._held, self._of_held = held, np.flatnonzero(held)
+        box = np.array([avatar.points.min(axis=0), avatar.points.max(axis=0)])
+        planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))
+        count = kernel.separate_core(box, self._points[held], planes)
+        self._planes = planes[: max(count, 0)]
+        self._blocked = count < 0
+
+    def _meet(self, which: NDArray[np.bool_], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return when a translation, avatar frame, meets points, and the avatar's touching centres."""
+        times, own = np.empty(len(self._points)), np.zeros((len(self._points), 3))
+        self._body.call(
+            kernel.meet_points, self._body.reference, self._points, self._reach, which, way, times, own
+        )
+        return times, own
+
+    def _in_world(self, place: Vec) -> Vec:
+        """Return a place (3,) of the avatar's frame in the world."""
+        return rotate(self.pose, place) + self.pose[:3, 3]
+
+    @property
+    def out(self) -> Vec | None:
+        """Return the unit direction (3,) away from all planes together; None if there is none."""
+        total = np.zeros(3)
+        for plane in self._planes:
+            total -= plane[: kernel.OFFSET]
+        length = norm(total)
+        return rotate(self.pose, total / length) if length > _ROUNDING else None
+
+    def sweep(self, to: Pose, skin: float) -> Hit | None:
+        """Return the hit that ends the translation to a pose, as `find_first_hit`, or None."""
+        if self.lacks:
+            return Hit(0.0, Verdict.UNKNOWN, None, None, unloaded=self.late)
+        way = to[:3, 3] - self.pose[:3, 3]
+        local, length = rotate_back(self.pose, way), norm(way)
+        if self._blocked:
+            return Hit(0.0, Verdict.CONTACT, None, None, end=self.pose)
+        deepest, hit = _ROUNDING * length, None
+        for plane in self._planes:
+            into = dot(plane[: kernel.OFFSET], local)
+            if into > deepest:
+                deepest = into
+                nearest, core = plane[kernel.NEAREST : kernel.CORE], plane[kernel.CORE :]
+                hit = Hit(
+                    0.0, Verdict.CONTACT, self._in_world(core), self._in_world(nearest),
+                    normal=-rotate(self.pose, plane[: kernel.OFFSET]), end=self.pose,
+                )  # fmt: skip
+                at = int(np.flatnonzero((self._points == nearest).all(axis=1))[0])
+                hit = hit._replace(archive=int(self._archive[at]))
+        if hit is not None:
+            return hit
+        times, own = self._meet(~self._held, local)
+        at = int(times.argmin()) if len(times) else -1
+        if at < 0 or times[at] == np.inf:
+            return None
+        fraction, avatar = float(times[at]), self._in_world(own[at])
+        end = self._end(to, fraction, local, own[at] - self._points[at], skin) if skin >= 0.0 else None
+        number = int(self._archive[at])
+        arrays = self._seen[number].data.arrays
+        cloud = to_world(self._seen[number], self._lattice[at] * arrays.step + arrays.origin)
+        return Hit(
+            fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
+        )
+
+    def _end(self, to: Pose, fraction: float, way: Vec, begin: Vec, skin: float) -> Pose:
+        """Return the pose `skin` [m] before a contact. begin: from the touched to the touching centre."""
+        out, length = begin + fraction * way, norm(way)
+        into = -dot(way, out) / norm(out) if norm(out) > 0.0 else length
+        fraction -= skin / max(into, length / MAX_SKIN_FACTOR)
+        if not fraction * length >= MIN_MOTION:
+            return self.pose
+        return translated(self.pose, fraction * (to[:3, 3] - self.pose[:3, 3]))
+
+
+def _gather(
+    seen: HeldArchive, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget
+) -> _Gathered:
+    """Return the points of an archive that an avatar at a pose, archive frame, may meet within `reach` [m]."""
+    data, residency = seen.data, seen.data.residency
+    arrays, broad = data.arrays, data.broad
+    more = reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
+    places = avatar.points @ pose[:3, :3].T + (pose[:3, 3] - arrays.origin)
+    low, high = places.min(axis=0) - more, places.max(axis=0) + more
+    box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
+    nothing = np.empty((0, kernel.GATHERED))
+    if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
+        return _Gathered(nothing, True)
+    rows = np.flatnonzero(_meets(box, broad.low, broad.high)).tolist()
+    held = data.references.to(arrays, broad)
+    found, count = np.empty((4096, kernel.GATHERED)), 0
+    for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
+        with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:
+            if loaded.late or loaded.faults:
+                return _Gathered(nothing, True, len(loaded.late))
+            for row in part:
+                while True:
+                    with residency.frozen():
+                        now = held.call(kernel.gather_points, held.reference, row, box, pose, found, count)
+                    if now <= len(found):
+                        break
+                    found = np.concatenate([found[:count], np.empty((now, kernel.GATHERED))])
+                count = now
+    return _Gathered(found[:count])
+
+
+def _meets(box: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[Any]:
+    """Return which of the boxes low, high (k, 3) meet a box (2, 3)."""
+    return ((low <= box[1]) & (high >= box[0])).all(axis=1)
+
+
+def leaving_pose(frame: Frame, far: float) -> LeavingPose:
+    """Return frame.pose, in contact, for translations of up to `far` [m]."""
+    known: LeavingPose | None = frame.leaving
+    if known is None or far > known.reach or known.pose.tobytes() != frame.pose.tobytes():
+        known = frame.leaving = LeavingPose(frame, far + _MORE)
+    return known
+
+
+def leave(frame: Frame, to: Pose, skin: float = -1.0) -> Hit | None:
+    """Return the hit that ends the translation from frame.pose, in contact, to a pose; or None.
+
+    skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
+    """
+    return leaving_pose(frame, norm(to[:3, 3] - frame.pose[:3, 3])).sweep(to, skin)

@@ -207,18 +207,18 @@ def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> tuple[
         length = int(np.frombuffer(file.read(count.itemsize).ljust(count.itemsize, b"\0"), count)[0])
         size += count.itemsize + length * kind.itemsize
         if length < 0 or size > BLOCK_BYTES:
-            raise _bad_list(path, element, length, f"in a record of at most {BLOCK_BYTES} bytes")
+            raise _bad_list(path, element, length)
         lengths.append(length)
         file.seek(length * kind.itemsize, 1)
     return tuple(lengths)
 
 
-def _bad_list(path: Path, element: _Element, length: int, where: str) -> Exception:
+def _bad_list(path: Path, element: _Element, length: int) -> Exception:
     return scan_error(
         path,
         f"a list of {length} values in element {element.name!r}",
-        f"0 or more, {where}",
-        "fetch the file again: it is truncated, or a count in its header is damaged",
+        f"0 or more, in a record of at most {BLOCK_BYTES} bytes",
+        "fetch the file again, it is truncated, or a count in its header is damaged",
     )
 
 
@@ -346,18 +346,13 @@ def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
             # A byte is the usual type of a length; its conversion would take most of the time.
             held = data[past - 1] if is_byte else int(np.frombuffer(data, length, 1, at - begin)[0])
             at += length.itemsize + held * width
-            if held < 0 or at > size:
-                raise _bad_list(path, element, held, f"within the file of {size} bytes")
+            if held < 0 or held * width > BLOCK_BYTES:
+                raise _bad_list(path, element, held)
         at += fixed
         if at > size:
-            break
+            raise _truncated(path, number, element.records, f"{element.name} records")
     if at > size:
-        raise scan_error(
-            path,
-            f"a file of {size} bytes that ends within its element {element.name!r}",
-            "all elements that its header declares",
-            "fetch the file again: it is truncated, or a count in its header is damaged",
-        )
+        raise _truncated(path, 0, element.records, f"{element.name} records")
     file.seek(at)
 
 
@@ -406,7 +401,7 @@ def _truncated(path: Path, found: int, declared: int, what: str = "vertices") ->
         path,
         f"the file ends after {found} {what} at most",
         f"the {declared} its header declares",
-        "fetch the file again, it is truncated",
+        "fetch the file again, it is truncated, or a count in its header is damaged",
     )
 
 

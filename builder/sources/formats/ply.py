@@ -352,7 +352,7 @@ def _header_lines(path: Path) -> tuple[list[str], int]:
         while not lines or lines[-1] != "end_header":
             raw = file.readline(LONGEST_HEADER)
             # Letters that are not ASCII occur in comments, and in names that nothing here reads. Some
-            # writers leave blanks at the ends of lines ("ply "), which plyfile refuses.
+            # writers leave blanks at the ends of lines ("ply "), or blank lines; plyfile refuses both.
             line = raw.decode("ascii", "backslashreplace").strip()
             if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
                 raise scan_error(
@@ -361,7 +361,7 @@ def _header_lines(path: Path) -> tuple[list[str], int]:
                     "a PLY header, from 'ply' to 'end_header'",
                     "check that this is a PLY file",
                 )
-            lines.append("comment" if line.startswith(("comment", "obj_info")) else line)
+            lines.append("comment" if not line or line.startswith(("comment", "obj_info")) else line)
         return lines, file.tell()
 
 

@@ -203,11 +203,9 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
         )
     beyond = sum(part.beyond for part in parts)
     if not count and beyond:
-        text = beyond_text(scan.units, max(part.farthest for part in parts))
         others = f" and {not_finite:,} that are not finite" if not_finite else ""
-        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}".replace(
-            ", expected", f"{others}, expected", 1
-        )
+        text = beyond_text(scan.units, max(part.farthest for part in parts), others)
+        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}"
     elif not count:
         fault = f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     nothing_lost = count == 0 and not_finite == 0 and beyond == 0

@@ -13,6 +13,7 @@ from ...schemas.errors import BadRequestError, ScanError
 from ..resume.build_identity import changed_inputs, describe_build
 from ..run.executor import Progress
 from ..sources.scan_files import open_input_files
+from ..sources.scan_warnings import unit_warnings
 from ..spool.spool import Spool
 from .added_scans import AddOptions, box_of, no_longer_unknown, source_of, spool_added, survey_added
 from .archive_change import changing, scan_name
@@ -78,7 +79,10 @@ def add_scans(
         counts = dict(zip(new.keys.tolist(), new.counts.tolist(), strict=True))
         boxes = {key: box_of(key, new) for key in counts}
         names = tuple(scan_name(source) for source in added)
-        return rebuild(change, ChangeSpec(header, names, boxes, places=places, added=counts), check_unchanged)
+        spec = ChangeSpec(header, names, boxes, places=places, added=counts)
+        summary = rebuild(change, spec, check_unchanged)
+        units = unit_warnings([survey.scan for survey in surveys if survey.scan is not None])
+        return summary._replace(warnings=(*(each.text for each in units), *summary.warnings))
 
 
 def remove_scans(

@@ -7,7 +7,6 @@ spacing of the points. The checks use the bounds of headers, and read a few poin
 these do not suffice. A warning is one line and never an error.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -175,7 +174,7 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
     found = [
         *(ScanWarning(number, note) for number, each in used for note in each.scan.notes),
         *_beyond_limit(used),
-        *_stated_units(used),
+        *unit_warnings([each.scan for each in facts]),
         *_wrong_units(used),
         *_gaps(used),
         *_avatars(used),
@@ -187,21 +186,19 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
 _Numbered = Sequence[tuple[int, ScanFacts]]
 
 
-def _stated_units(facts: _Numbered) -> list[ScanWarning]:
+def unit_warnings(scans: Sequence[Scan]) -> list[ScanWarning]:
     """Tell which units other than the metre the files state, once for all scans of one statement."""
-    first: dict[str, tuple[int, ScanFacts]] = {}
-    counts = Counter(each.scan.units_note for _, each in facts)
-    for number, each in facts:
-        first.setdefault(each.scan.units_note, (number, each))
-    return [
-        ScanWarning(
-            number,
-            f"{each.name}{f' and {counts[note] - 1} more' if counts[note] > 1 else ''}: {note}"
-            f"{'' if each.scan.units == 'm' else ': converted to metres'}",
-        )
-        for note, (number, each) in first.items()
-        if note
-    ]
+    alike: dict[str, list[int]] = {}
+    for number, scan in enumerate(scans):
+        if scan.units_note:
+            alike.setdefault(scan.units_note, []).append(number)
+    found = []
+    for note, numbers in alike.items():
+        scan = scans[numbers[0]]
+        more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+        end = "" if scan.units == "m" else ": converted to metres"
+        found.append(ScanWarning(numbers[0], f"{scan.path}{more}: {note}{end}"))
+    return found
 
 
 def _wrong_units(facts: _Numbered) -> list[ScanWarning]:

@@ -137,7 +137,7 @@ DOORS = {
     "laspy": ("builder/synthetic/write.py", "builder/export/las_export.py"),
     "lazrs": ("builder/sources/formats/las.py",),
     "pye57": ("builder/sources/formats/e57.py", "builder/synthetic/write.py"),
-    "plyfile": ("builder/sources/formats/ply.py",),
+    "plyfile": ("builder/sources/formats/ply_header.py",),
     "tomli_w": ("builder/sources/scan_list.py",),
     "trimesh": ("builder/sources/surface_samples.py", "builder/synthetic/"),
     "embreex": ("builder/synthetic/scanner.py",),

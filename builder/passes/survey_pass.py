@@ -205,11 +205,9 @@ def join_ranges(scan: Scan, parts: Sequence[Part], sha256: tuple[str, str]) -> S
     chosen = any(reason.startswith((WITHHELD, SYNTHETIC, CLASS)) for part in parts for reason in part.dropped)
     beyond = sum(part.beyond for part in parts)
     if not count and beyond:
-        text = beyond_text(scan.units, max(part.farthest for part in parts))
         others = f" and {not_finite:,} that are not finite" if not_finite else ""
-        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}".replace(
-            ", expected", f"{others}, expected", 1
-        )
+        text = beyond_text(scan.units, max(part.farthest for part in parts), others)
+        fault = f"{scan.path}: scan {scan.index} holds {beyond:,} {text}"
     elif not count and not chosen:
         fault = f"{scan.path}: scan {scan.index} holds no usable point, expected at least one: leave it out"
     lost = not_finite + beyond + sum(part.dropped.get(NOT_FINITE, 0) for part in parts)

@@ -7,7 +7,6 @@ spacing of the points. The checks use the bounds of headers, and read a few poin
 these do not suffice. A warning is one line and never an error.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas.archive.units import MAX_COORDINATE
 from ...schemas.errors import ScanError
-from .common.scan import Scan
+from .common.scan import BEYOND, Scan
 from .placed_scan import METRES
 
 # Points that are read of a scan without known bounds; and points whose closest points are searched.
@@ -124,35 +123,31 @@ class ScanFacts:
     @cached_property
     def _first(self) -> NDArray[np.float64]:
         """Return the first points of the scan (n, 3) [m]; none if it cannot be read."""
-        return _usable(_points(self.scan, 0, FIRST_POINTS))
+        return _points(self.scan, 0, FIRST_POINTS)
 
     @property
     def _middle(self) -> NDArray[np.float64]:
         """Return points (n, 3) [m] that follow one another, from the middle of the scan if it can seek."""
         declared = self.scan.declared_count
         if self.scan.seekable and declared and declared > SAMPLE_POINTS:
-            return _usable(_points(self.scan, (declared - SAMPLE_POINTS) // 2, SAMPLE_POINTS))
+            return _points(self.scan, (declared - SAMPLE_POINTS) // 2, SAMPLE_POINTS)
         return self._first[-SAMPLE_POINTS:]
 
 
-def _points(scan: Scan, start: int, count: int) -> NDArray[np.float64]:
-    """Return up to `count` finite points of a scan; none if it cannot be read."""
+def _points(scan: Scan, start: int, count: int, limit: float = MAX_COORDINATE) -> NDArray[np.float64]:
+    """Return up to `count` points of a scan with coordinates within a limit; none if it cannot be read."""
     found, left = [np.empty((0, 3))], count
     stop = min(start + count, scan.declared_count) if scan.seekable and scan.declared_count else None
     try:
         for block in scan.blocks(count, start if stop else 0, stop):
-            found.append(block.xyz[np.isfinite(block.xyz).all(axis=1)][:left])
+            xyz = block.xyz[(np.abs(block.xyz) <= limit).all(axis=1)]
+            found.append(xyz[:left])
             left -= len(found[-1])
             if left <= 0:
                 break
     except ScanError:
         pass  # the build reports it
     return np.concatenate(found)
-
-
-def _usable(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the points of (n, 3) that an archive can hold."""
-    return xyz[(np.abs(xyz) <= MAX_COORDINATE).all(axis=1)]
 
 
 def closest_distances(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -179,7 +174,7 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
     found = [
         *(ScanWarning(number, note) for number, each in used for note in each.scan.notes),
         *_beyond_limit(used),
-        *_stated_units(used),
+        *unit_warnings([each.scan for each in facts]),
         *_wrong_units(used),
         *_gaps(used),
         *_avatars(used),
@@ -191,21 +186,19 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
 _Numbered = Sequence[tuple[int, ScanFacts]]
 
 
-def _stated_units(facts: _Numbered) -> list[ScanWarning]:
+def unit_warnings(scans: Sequence[Scan]) -> list[ScanWarning]:
     """Tell which units other than the metre the files state, once for all scans of one statement."""
-    first: dict[str, tuple[int, ScanFacts]] = {}
-    counts = Counter(each.scan.units_note for _, each in facts)
-    for number, each in facts:
-        first.setdefault(each.scan.units_note, (number, each))
-    return [
-        ScanWarning(
-            number,
-            f"{each.name}{f' and {counts[note] - 1} more' if counts[note] > 1 else ''}: {note}"
-            f"{'' if each.scan.units == 'm' else ': converted to metres'}",
-        )
-        for note, (number, each) in first.items()
-        if note
-    ]
+    alike: dict[str, list[int]] = {}
+    for number, scan in enumerate(scans):
+        if scan.units_note:
+            alike.setdefault(scan.units_note, []).append(number)
+    found = []
+    for note, numbers in alike.items():
+        scan = scans[numbers[0]]
+        more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+        end = "" if scan.units == "m" else ": converted to metres"
+        found.append(ScanWarning(numbers[0], f"{scan.path}{more}: {note}{end}"))
+    return found
 
 
 def _wrong_units(facts: _Numbered) -> list[ScanWarning]:
@@ -238,27 +231,25 @@ def _beyond_limit(facts: _Numbered) -> list[ScanWarning]:
     """Warn of scans without bounds whose first points are all beyond the limit of coordinates."""
     found = []
     for number, each in facts:
-        if each.box is None and len(points := _points(each.scan, 0, SAMPLE_POINTS)):
-            found.append(
-                ScanWarning(
-                    number, f"{each.name}: {beyond_text(each.scan.units, float(np.abs(points).max()))}"
-                )
-            )
+        if each.box is None and len(points := _points(each.scan, 0, SAMPLE_POINTS, np.finfo(float).max)):
+            text = beyond_text(each.scan.units, float(np.abs(points).max()))
+            found.append(ScanWarning(number, f"{each.name}: {text}"))
     return found
 
 
-def beyond_text(units: str, farthest: float) -> str:
+def beyond_text(units: str, farthest: float, others: str = "") -> str:
     """Return what is wrong with points beyond the limit of coordinates, and the likely unit.
 
     units: read as.  farthest: greatest of their coordinates [m], taken from these units.
+    others: what else was found.
     """
-    where = f"points beyond {MAX_COORDINATE:.0e} m".replace("e+0", "e")
+    what = f"points {BEYOND}{others}, expected all within it"
     if units == "m" and farthest * METRES["mm"] <= MAX_COORDINATE:
         return (
-            f"{where}, expected all within it: the coordinates are probably in millimetres: write a list with "
-            '`solidcloud inspect`, set units = "mm" in it, and build the list'
+            f"{what}: the coordinates are probably in millimetres: write a list with `solidcloud inspect`, set "
+            'units = "mm" in it, and build the list'
         )
-    return f"{where}, expected all within it: check its coordinates and their unit ({units})"
+    return f"{what}: check its coordinates and their unit ({units})"
 
 
 def _gaps(facts: _Numbered) -> list[ScanWarning]:

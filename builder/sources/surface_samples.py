@@ -51,7 +51,7 @@ class SurfaceSamples(Scan):
         spacing: side of the square that one point represents [m].
         """
         super().__init__(vertices.path, "mesh")
-        self.up = vertices.up
+        self.up, self.notes = vertices.up, vertices.notes
         self._vertices = vertices
         self._spacing = spacing
 

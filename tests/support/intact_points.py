@@ -10,6 +10,7 @@ import json
 import re
 import struct
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,12 +50,18 @@ class Whole(NamedTuple):
     boxes: list[Field]
 
 
+def las_boxes(points: np.ndarray) -> list[float]:
+    """Return the bounds of points (n, 3) in the order of a LAS header."""
+    low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return [value for pair in zip(high, low, strict=True) for value in pair]
+
+
 def _lines(data: bytes) -> list[Span]:
     """Return the span of each line, with the line end before it."""
     ends = [-1, *(m.start() for m in re.finditer(rb"\n", data))]
     if not data.endswith(b"\n"):
         ends.append(len(data) - 1)
-    return [(max(0, a), b + 1) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [(max(0, a), b + 1) for a, b in pairwise(ends)]
 
 
 def _found(pattern: bytes, data: bytes) -> list[Span]:
@@ -139,7 +146,7 @@ def describe(name: str, path: Path) -> Whole:
         counts = [[legacy, wide], [wide], [legacy]] if data[25] >= 4 else [[legacy]]
         boxes = [Field((at, at + 8), "<d") for at in range(179, 227, 8)]
     elif suffix == ".e57":
-        offset, length = struct.unpack_from("<QQ", data, 24)
+        (offset,) = struct.unpack_from("<Q", data, 24)
         header = (offset, len(data))
         xml = data[offset:]
         sections = [int(x) for x in re.findall(rb'fileOffset="(\d+)"', xml)]

@@ -44,6 +44,8 @@ _EMPTY_ENDS = {
 }
 # The search for a literal first byte is fast.
 _DECIMAL_COMMA = re.compile(rb",(?<=\d,)(?=\d)")
+# What C programs on Windows print for NaN and infinities; the "#" would begin a comment.
+_WINDOWS_NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:QNAN|SNAN|IND|INF)\d*)", re.IGNORECASE)
 _QUOTED = re.compile(rb"""(["'])([^\s"',;]*)\1""")
 
 
@@ -154,12 +156,17 @@ def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     number. So are delimiters at the end of a line, and quotes around a number. A decimal comma
     becomes a point where commas do not separate fields.
     """
-    lines = _without_comments(lines, delimiter)
+    lines = _without_comments(_plain_nan(lines), delimiter)
     if delimiter != ",":
         lines = _DECIMAL_COMMA.sub(b".", lines)
     if b'"' in lines or b"'" in lines:
         lines = _QUOTED.sub(rb"\2", lines)
     return _EMPTY_ENDS[delimiter].sub(b"", lines) if delimiter else lines
+
+
+def _plain_nan(lines: bytes) -> bytes:
+    """Return lines with "nan" for what means that, or infinity, to C programs on Windows."""
+    return _WINDOWS_NAN.sub(b"nan", lines) if b".#" in lines or b"(" in lines else lines
 
 
 def _without_comments(lines: bytes, delimiter: str | None) -> bytes:
@@ -220,7 +227,7 @@ def number_rows(
         if limit == 0:
             following += _count_rows(chunk)
             continue
-        most = None
+        chunk, most = _plain_nan(chunk), None
         if limit is not None:
             # loadtxt allocates max_rows rows at once, with as many columns as the first row has.
             # Bound both by what these bytes can hold.

@@ -115,12 +115,13 @@ def with_plain_letters(path: Path) -> Iterator[Path | None]:
         first, at = divmod(offset, PAGE_BYTES)
         count = -(-(at + length) // (PAGE_BYTES - 4))
         file.seek(first * PAGE_BYTES)
-        pages = np.frombuffer(bytearray(file.read(count * PAGE_BYTES)), np.uint8).reshape(-1, PAGE_BYTES)
+        data = bytearray(file.read(count * PAGE_BYTES))
     try:
         check_xml(plain)
     except (XmlLimitError, expat.ExpatError):
         plain = raw
-    if plain == raw or not np.array_equal(pages[:, -4:], _checksums(pages)):
+    pages = np.frombuffer(data[: len(data) // PAGE_BYTES * PAGE_BYTES], np.uint8).reshape(-1, PAGE_BYTES)
+    if plain == raw or len(pages) < count or not np.array_equal(pages[:, -4:], _checksums(pages)):
         yield None
         return
     section = pages[:, :-4].reshape(-1)

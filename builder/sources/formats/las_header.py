@@ -15,7 +15,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.scan import SourceLattice, checked_bounds, scan_error
+from ..common.scan import BLOCK_POINTS, SourceLattice, checked_bounds, scan_error
 from .las_crs import WKT
 from .laz_chunks import chunk_bytes
 
@@ -211,10 +211,9 @@ def check_count(file: BinaryIO, path: Path, header: LasHeader, size: int) -> Non
         if points and more:
             behind = read_points(file, header, start, min(more, RECORDS_BEHIND))
             blank = (behind == header.offset).all(axis=1)  # bytes of 0 that fill a block
-            # Bounds that do not hold the declared points say nothing about those behind them.
-            first = read_points(file, header, header.offset_to_points, min(points, RECORDS_BEHIND))
-            found = ~blank & (header.holds(behind) | ~header.holds(first).all())
-            more = more if found.any() else 0
+            found = header.holds(behind) & ~blank
+            # Other bounds than those of the declared points say nothing about what is behind.
+            more = more if found.any() or ((~blank).any() and not _fills_bounds(file, header)) else 0
     if more:
         raise scan_error(
             path,
@@ -222,6 +221,17 @@ def check_count(file: BinaryIO, path: Path, header: LasHeader, size: int) -> Non
             "the number of all points",
             "the header is damaged, or was not finished: repair or export the file again",
         )
+
+
+def _fills_bounds(file: BinaryIO, header: LasHeader) -> bool:
+    """Return whether the bounds are those of the declared points, up to a step."""
+    low, high, at, left = np.full(3, np.inf), np.full(3, -np.inf), header.offset_to_points, header.points
+    while left and len(xyz := read_points(file, header, at, min(left, BLOCK_POINTS))):
+        low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+        at, left = at + len(xyz) * header.record_bytes, left - len(xyz)
+    return header.bounds is not None and bool(
+        (np.abs(np.stack([low, high]) - header.bounds) <= np.abs(header.scale)).all()
+    )
 
 
 def points_end(header: LasHeader, size: int) -> int:

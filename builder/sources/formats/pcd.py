@@ -2,14 +2,14 @@
 
 Only the fields x, y, z and intensity are read, and colour (rgb or rgba) and class (label,
 classification) if they are wanted. A colour is one number, 0xRRGGBB in an integer or in the bits of
-a float. Organised clouds store directions without a return
-as NaN points in their grid; these are dropped as NO_RETURN.
+a float. Organised clouds store directions without a return as NaN points in their grid; these are
+dropped as NO_RETURN.
 
 VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
 
-Missing lines of the header mean what they mean in that library: COLUMNS is an old name of FIELDS, COUNT
-and HEIGHT are 1, WIDTH times HEIGHT is POINTS, and in text TYPE is F. Without WIDTH and POINTS the rest of the
-file is points.
+Missing lines of the header mean what they mean in that library: COLUMNS is an old name of FIELDS,
+COUNT and HEIGHT are 1, WIDTH times HEIGHT is POINTS, and in text TYPE is F. Without WIDTH and POINTS
+the rest of the file is points.
 """
 
 import struct

@@ -1,130 +1,43 @@
 """PLY reader: the vertices of one file, ASCII or binary of either byte order.
 
-plyfile reads the header. This module reads the body in blocks, because plyfile reads faces one by
-one and ASCII vertices into one array of the size that the header claims. Lists, in the vertices or
+ply_header.py reads the header. This module reads the body in blocks, because plyfile reads faces one
+by one and ASCII vertices into one array of the size that the header claims. Lists, in the vertices or
 in elements before them, are skipped; in text, x, y, z and all columns in use come before a list.
 """
 
-import io
-import itertools
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check_interrupt
-from ..common.colours import CLASSIFICATION, INTENSITY, RGB, find_columns, stack_channels, whole_bytes
+from ..common.colours import CLASSIFICATION, RGB, stack_channels, whole_bytes
 from ..common.scan import (
     BLOCK_BYTES,
     BLOCK_POINTS,
-    INTENSITY_NAMES,
     Scan,
     ScanBlock,
     SeekableScan,
     check_end,
     library_errors,
     read_records,
-    reader_library,
     scan_error,
 )
 from ..common.text_rows import LONGEST_LINE, number_rows, open_text_file
+from .ply_header import PlyElement, PlyHeader, length_name, read_ply_header
 
-# Maximum bytes of a header. A real one has a few hundred bytes.
-LONGEST_HEADER = 1 << 20
 # Bytes of elements with lists read at a time.
 LISTS_BYTES = 1 << 16
-
-
-class _Property(NamedTuple):
-    """Property of an element. length: type of the number before a list; None: a single value."""
-
-    name: str
-    type: np.dtype[Any]
-    length: np.dtype[Any] | None
-
-
-class _Element(NamedTuple):
-    """Element of a PLY file: so many records of some properties."""
-
-    name: str
-    records: int
-    properties: tuple[_Property, ...]
-
-    @property
-    def has_lists(self) -> bool:
-        """Return whether records differ in size."""
-        return any(each.length is not None for each in self.properties)
-
-    @property
-    def least_bytes(self) -> int:
-        """Return the least size of a record of a binary file."""
-        return sum((each.length or each.type).itemsize for each in self.properties)
-
-    def record(self, lengths: Sequence[int] = ()) -> np.dtype[np.void]:
-        """Return the layout of a record. lengths: of its lists, in order; see `length_name`."""
-        fields: list[Any] = []
-        left = iter(lengths)
-        for name, kind, length in self.properties:
-            if length is None:
-                fields.append((name, kind))
-            else:
-                fields += [(length_name(name), length), (name, kind, (next(left, 0),))]
-        return np.dtype(fields)
-
-
-def length_name(name: str) -> str:
-    """Return the name of the field with a list's length; no property has it, because names have no blank."""
-    return f"{name} length"
-
-
-class _Header(NamedTuple):
-    """Description of a PLY file's vertices, from its header."""
-
-    elements: tuple[_Element, ...]
-    at: int  # number of the element of the vertices
-    record: np.dtype[np.void]  # properties of a vertex up to its first list; all if it has none
-    start: int  # byte offset of the body
-    lines: int  # number of header lines
-    ascii: bool
-    intensity: str | None  # the property's name
-    rgb: tuple[str, ...]  # names of red, green and blue, or ()
-    classification: str | None
-
-    @property
-    def vertex(self) -> _Element:
-        """Return the vertices."""
-        return self.elements[self.at]
-
-    @property
-    def after(self) -> tuple[_Element, ...]:
-        """Return the elements after the vertices."""
-        return self.elements[self.at + 1 :]
-
-    @property
-    def before(self) -> tuple[_Element, ...]:
-        """Return the elements before the vertices."""
-        return self.elements[: self.at]
-
-    @property
-    def points(self) -> int:
-        """Return the number of vertices."""
-        return self.vertex.records
-
-    @property
-    def columns(self) -> frozenset[str]:
-        """Return `Scan.columns`."""
-        held = {INTENSITY: self.intensity, RGB: self.rgb, CLASSIFICATION: self.classification}
-        return frozenset(name for name, here in held.items() if here)
 
 
 class BinaryPly(SeekableScan):
     """Vertices of one binary PLY file."""
 
-    def __init__(self, path: Path, header: _Header) -> None:
+    def __init__(self, path: Path, header: PlyHeader) -> None:
         super().__init__(path, "ply", declared_count=header.points)
         self._header, self.columns = header, header.columns
 
@@ -142,7 +55,7 @@ class BinaryPly(SeekableScan):
 class ListPly(Scan):
     """Vertices of one binary PLY file with lists in or before its vertices, hence read from the start."""
 
-    def __init__(self, path: Path, header: _Header) -> None:
+    def __init__(self, path: Path, header: PlyHeader) -> None:
         super().__init__(path, "ply", declared_count=header.points)
         self._header, self.columns = header, header.columns
 
@@ -156,14 +69,14 @@ class ListPly(Scan):
             _check_rest(file, self.path, header)
 
 
-def _skip_elements(file: BufferedReader, path: Path, elements: Sequence[_Element]) -> None:
+def _skip_elements(file: BufferedReader, path: Path, elements: Sequence[PlyElement]) -> None:
     """Advance a binary file past elements. Raises ScanError."""
     for element in elements:
         _skip_element(file, path, element)
 
 
 def _list_records(
-    file: BufferedReader, path: Path, element: _Element, block_points: int
+    file: BufferedReader, path: Path, element: PlyElement, block_points: int
 ) -> Iterator[NDArray[np.void]]:
     """Read the records of an element with lists from the current position, in blocks.
 
@@ -195,7 +108,7 @@ def _list_records(
         seen, step = seen + good, 2 * step if good == most else 1
 
 
-def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> tuple[int, ...]:
+def _list_lengths(file: BufferedReader, path: Path, element: PlyElement) -> tuple[int, ...]:
     """Return the lengths of the lists of the record at the file's position. Raises ScanError."""
     lengths: list[int] = []
     size = 0
@@ -207,18 +120,18 @@ def _list_lengths(file: BufferedReader, path: Path, element: _Element) -> tuple[
         length = int(np.frombuffer(file.read(count.itemsize).ljust(count.itemsize, b"\0"), count)[0])
         size += count.itemsize + length * kind.itemsize
         if length < 0 or size > BLOCK_BYTES:
-            raise _bad_list(path, element, length, f"in a record of at most {BLOCK_BYTES} bytes")
+            raise _bad_list(path, element, length)
         lengths.append(length)
         file.seek(length * kind.itemsize, 1)
     return tuple(lengths)
 
 
-def _bad_list(path: Path, element: _Element, length: int, where: str) -> Exception:
+def _bad_list(path: Path, element: PlyElement, length: int) -> Exception:
     return scan_error(
         path,
         f"a list of {length} values in element {element.name!r}",
-        f"0 or more, {where}",
-        "fetch the file again: it is truncated, or a count in its header is damaged",
+        f"0 or more, in a record of at most {BLOCK_BYTES} bytes",
+        "fetch the file again, it is truncated, or a count in its header is damaged",
     )
 
 
@@ -231,7 +144,7 @@ def _skip_lines(file: BinaryIO, lines: int) -> None:
 class AsciiPly(Scan):
     """Vertices of one PLY file in text."""
 
-    def __init__(self, path: Path, header: _Header) -> None:
+    def __init__(self, path: Path, header: PlyHeader) -> None:
         super().__init__(path, "ply", declared_count=header.points)
         self._header, self.columns = header, header.columns
 
@@ -263,7 +176,7 @@ class AsciiPly(Scan):
             raise _truncated(self.path, seen, header.points)
 
 
-def _block(scan: Scan, record: NDArray[np.void], header: _Header) -> ScanBlock:
+def _block(scan: Scan, record: NDArray[np.void], header: PlyHeader) -> ScanBlock:
     """Convert vertex records to a block."""
     xyz = np.empty((len(record), 3))
     for axis, name in enumerate("xyz"):
@@ -288,7 +201,7 @@ def _as_declared(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
 def open_ply(path: Path) -> list[Scan]:
     """Return the one scan of a PLY file; reads its header only. Raises ScanError."""
     with library_errors(path):
-        header = _read_header(path)
+        header = read_ply_header(path)
         skip = 0 if header.ascii else sum(each.records * each.least_bytes for each in header.before)
         least = 2 * len(header.vertex.properties) if header.ascii else header.vertex.least_bytes
         left = path.stat().st_size - header.start - skip
@@ -305,7 +218,7 @@ def open_ply(path: Path) -> list[Scan]:
         return [BinaryPly(path, header)]
 
 
-def _check_rest(file: BufferedReader, path: Path, header: _Header) -> None:
+def _check_rest(file: BufferedReader, path: Path, header: PlyHeader) -> None:
     """Check that the elements after the vertices of a binary file end with it. Raises ScanError.
 
     A vertex count that is too small makes vertices the first bytes of the next element, a face for
@@ -315,7 +228,7 @@ def _check_rest(file: BufferedReader, path: Path, header: _Header) -> None:
     check_end(file, path, "elements")
 
 
-def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
+def _skip_element(file: BufferedReader, path: Path, element: PlyElement) -> None:
     """Advance a binary file past an element. Raises ScanError where the file is shorter."""
     at, size = file.tell(), file.seek(0, 2)
     # Of each list: bytes before its length, type of the length, whether it is an unsigned byte, and
@@ -346,18 +259,13 @@ def _skip_element(file: BufferedReader, path: Path, element: _Element) -> None:
             # A byte is the usual type of a length; its conversion would take most of the time.
             held = data[past - 1] if is_byte else int(np.frombuffer(data, length, 1, at - begin)[0])
             at += length.itemsize + held * width
-            if held < 0 or at > size:
-                raise _bad_list(path, element, held, f"within the file of {size} bytes")
+            if held < 0 or held * width > BLOCK_BYTES:
+                raise _bad_list(path, element, held)
         at += fixed
         if at > size:
-            break
+            raise _truncated(path, number, element.records, f"{element.name} records")
     if at > size:
-        raise scan_error(
-            path,
-            f"a file of {size} bytes that ends within its element {element.name!r}",
-            "all elements that its header declares",
-            "fetch the file again: it is truncated, or a count in its header is damaged",
-        )
+        raise _truncated(path, 0, element.records, f"{element.name} records")
     file.seek(at)
 
 
@@ -366,7 +274,7 @@ def ply_polygons(path: Path) -> list[NDArray[np.int64]]:
 
     Raises ScanError.
     """
-    header = _read_header(path)
+    header = read_ply_header(path)
     at = next((k for k, each in enumerate(header.elements) if each.name == "face" and each.has_lists), None)
     if at is None:
         return []
@@ -387,7 +295,7 @@ def ply_polygons(path: Path) -> list[NDArray[np.int64]]:
     return [np.concatenate(found[corners]).astype(np.int64) for corners in sorted(found)]
 
 
-def _text_lists(file: BinaryIO, path: Path, element: _Element, name: str) -> Iterator[NDArray[np.int64]]:
+def _text_lists(file: BinaryIO, path: Path, element: PlyElement, name: str) -> Iterator[NDArray[np.int64]]:
     """Yield a list of each record of an element in text, as (1, k). Raises ScanError."""
     for number in range(element.records):
         check_interrupt()
@@ -406,89 +314,5 @@ def _truncated(path: Path, found: int, declared: int, what: str = "vertices") ->
         path,
         f"the file ends after {found} {what} at most",
         f"the {declared} its header declares",
-        "fetch the file again, it is truncated",
+        "fetch the file again, it is truncated, or a count in its header is damaged",
     )
-
-
-def _header_lines(path: Path) -> tuple[list[str], int]:
-    """Return the lines of a PLY file's header without comments, and the offset of its body.
-
-    Raises ScanError.
-    """
-    lines: list[str] = []
-    with open_text_file(path) as file:
-        while not lines or lines[-1] != "end_header":
-            raw = file.readline(LONGEST_HEADER)
-            # Letters that are not ASCII occur in comments, and in names that nothing here reads. Some
-            # writers leave blanks at the ends of lines ("ply "), which plyfile refuses.
-            line = raw.decode("ascii", "backslashreplace").strip()
-            if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
-                raise scan_error(
-                    path,
-                    f"line {len(lines) + 1} is {line[:60]!r}",
-                    "a PLY header, from 'ply' to 'end_header'",
-                    "check that this is a PLY file",
-                )
-            lines.append("comment" if line.startswith(("comment", "obj_info")) else line)
-        return lines, file.tell()
-
-
-def _read_header(path: Path) -> _Header:
-    """Read and check the header. Raises ScanError."""
-    lines, start = _header_lines(path)
-    counts: list[int] = []
-    for number, line in enumerate(lines):
-        words = line.split()
-        if len(words) == 3 and words[0] == "element" and words[2].isdecimal():
-            counts.append(int(words[2]))
-            # plyfile reads the declared number of records. Declare none: only the header is needed.
-            lines[number] = f"element {words[1]} 0"
-    plyfile = reader_library("plyfile", path)
-    ply = plyfile.PlyData.read(io.BytesIO(("\n".join(lines) + "\n").encode("ascii")))
-    order = "=" if ply.text else ply.byte_order
-    elements = [
-        _Element(element.name, count, tuple(_property(path, each, order) for each in element.properties))
-        for element, count in zip(ply, counts, strict=True)
-    ]
-    at = next((k for k, element in enumerate(elements) if element.name == "vertex"), None)
-    if at is None:
-        found = ", ".join(element.name for element in elements) or "none"
-        raise scan_error(
-            path, f"elements: {found}", "an element 'vertex'", "check that this is a PLY of points"
-        )
-    vertex = elements[at]
-    # Where rows of text have lists, only the columns before the first one have a fixed place.
-    used = list(itertools.takewhile(lambda each: each.length is None, vertex.properties))
-    known = tuple(used) if ply.text else tuple(each for each in vertex.properties if each.length is None)
-    record = vertex._replace(properties=known).record()
-    names = record.names or ()
-    missing = [name for name in "xyz" if name not in names]
-    if missing:
-        raise scan_error(
-            path,
-            f"vertices without {', '.join(missing)}"
-            + (" before their first list" if len(known) < len(vertex.properties) else ""),
-            "properties x, y and z",
-            "check the program that wrote this file",
-        )
-    intensity = next((name for name in names if name.lower() in INTENSITY_NAMES), None)
-    colours, of_class = find_columns(names)
-    return _Header(
-        tuple(elements), at, record, start, len(lines), ply.text, intensity,
-        tuple(names[each] for each in colours), None if of_class is None else names[of_class],
-    )  # fmt: skip
-
-
-def _property(path: Path, given: Any, order: str) -> _Property:
-    """Return a property of plyfile with its types in this byte order. Raises ScanError."""
-    if not hasattr(given, "len_dtype"):
-        return _Property(given.name, np.dtype(given.dtype(order)), None)
-    count, kind = (np.dtype(each) for each in given.list_dtype(order))
-    if count.kind not in "iu":
-        raise scan_error(
-            path,
-            f"the list {given.name!r} with lengths of type {count.name}",
-            "whole numbers",
-            "check the program that wrote this file",
-        )
-    return _Property(given.name, kind, count)

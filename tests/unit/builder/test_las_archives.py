@@ -74,6 +74,9 @@ def test_a_room_in_feet_is_built_in_metres_on_its_own_lattice(
         assert np.abs(size - np.ptp(ROOM, axis=0) * 0.001 * FOOT).max() < 1e-9
         assert header.lattice_source == "sources" and header.moved_max < 1e-9
         assert header.sources[0].units == "us-ft"
+    write(tmp_path / "b.las", ROOM + 1, US_FEET)
+    (warning,) = add_scans(tmp_path / "archive", [tmp_path / "b.las"], jobs=1).warnings
+    assert "US survey feet" in warning
     edit_list(tmp_path / "scans.toml", {"units": "m"})
     header = built(tmp_path, tmp_path / "scans.toml")
     assert np.array_equal(header.high - header.low, np.ptp(ROOM, axis=0))

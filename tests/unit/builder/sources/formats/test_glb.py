@@ -53,6 +53,7 @@ def test_letters_of_names_and_a_rotation_of_zeros_are_read(tmp_path: Path) -> No
     path.write_bytes(path.read_bytes().replace(b"SuedX", "S\xfcd\x1b\x9b".encode("latin-1")))
     assert np.array_equal(read_all(path), SQUARE + np.array([1, 2, 3]))
     (note,) = open_scans(path)[0].notes
+    assert open_scans(path, spacing=0.5)[0].notes == (note,)
     assert note == f"{path}: scan 0 has a rotation of zeros, read as no rotation: check how the scan lies"
     document = json.dumps(glb_document(4, 6)).encode()
     path.write_bytes(_glb_of(b"\xef\xbb\xbf" + document))

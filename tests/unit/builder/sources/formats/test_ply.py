@@ -137,6 +137,22 @@ def test_a_list_of_no_length_is_refused(tmp_path: Path) -> None:
         read_all(path)
 
 
+def test_letters_of_ply_names_stop_nothing(tmp_path: Path) -> None:
+    """Issue 35: names of properties and elements too, and blank lines."""
+    path = tmp_path / "a.ply"
+    head = (
+        PLY.format(1) + "property float gr\xf6\xdfe\x1b\n\nelement s\xfcd 0\nproperty int \xe4\nend_header\n"
+    )
+    path.write_bytes((head + "1 2 3 4\n").encode("latin-1"))
+    assert read_all(path).tolist() == [[1, 2, 3]]
+    path.write_bytes(head.replace("double x", "double u").encode("latin-1") + b"1 2 3 4\n")
+    with pytest.raises(ScanError, match="vertices without x"):
+        read_all(path)
+    path.write_bytes(head.replace("element vertex", "element vert\x1bx").encode("latin-1"))
+    with pytest.raises(ScanError, match=r"elements: vert\\x1bx, s\\xfcd, expected"):
+        read_all(path)
+
+
 def test_a_ply_may_have_blanks_and_crlf_at_its_line_ends_and_no_vertices(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes((PLY.format(2) + "end_header\n1 2 3\n4 5 6").replace("\n", " \r\n").encode())

@@ -48,6 +48,8 @@ def intensities(path: Path) -> list[float] | None:
         ("a.txt", "nan 1e999 -3\n", [[np.nan, np.inf, -3]], None),  # counted by the caller
         ("a.txt", "# nothing\n\n", [], None),
         # Issue 35: what other programs write and read.
+        ("a.txt", "1 2 1.#QNAN\n-1.#IND00 5 -nan(ind)\n", [[1, 2, np.nan], [np.nan, 5, np.nan]], None),
+        ("a.txt", "1 2 3\n4 5 1.#INF # 3\n7 8 9 # (nan)\n", [[1, 2, 3], [4, 5, np.nan], [7, 8, 9]], None),
         ("a.csv", "1,2,3,\n4,5,6,\n", [[1, 2, 3], [4, 5, 6]], None),
         ("a.csv", "x,y,z,\n1,2,3\n4,5,6,,\n", [[1, 2, 3], [4, 5, 6]], None),
         ("a.csv", "X;Y;Z\n1,5;2;-3,25\n4;5,5;6e-1\n", [[1.5, 2, -3.25], [4, 5.5, 0.6]], None),

@@ -121,13 +121,18 @@ class ResidencyStreams:
                     if user in self._streams.users()
                 }
                 if open_queries:
-                    watch = self._dispatcher.watch(self._scene) if watch is None else watch
-                    self._send(watch, open_queries, new)
+                    try:
+                        watch = self._dispatcher.watch(self._scene) if watch is None else watch
+                        self._send(watch, open_queries, new)
+                    except BadRequestError:
+                        raise
+                    except Exception:  # affects these changes only, and the next message says so
+                        log.exception("changes of scene %s are lost", self._scene)
+                        with self._lock:
+                            self._new = open_queries | self._new
                     self._closed.wait(CHANGES_SECONDS)
         except BadRequestError as error:  # the scene is closed
             log.debug("changes end: %s", error)
-        except Exception:  # affects these queries only
-            log.exception("changes of %s end", self._scene)
         finally:
             self._streams.close()
             if watch is not None:

@@ -13,6 +13,7 @@ from ...schemas.errors import BadRequestError, ScanError
 from ..resume.build_identity import changed_inputs, describe_build
 from ..run.executor import Progress
 from ..sources.scan_files import open_input_files
+from ..sources.scan_warnings import step_warning
 from ..spool.spool import Spool
 from .added_scans import AddOptions, box_of, no_longer_unknown, source_of, spool_added, survey_added
 from .archive_change import changing, scan_name
@@ -76,7 +77,11 @@ def add_scans(
         counts = dict(zip(new.keys.tolist(), new.counts.tolist(), strict=True))
         boxes = {key: box_of(key, new) for key in counts}
         names = tuple(scan_name(source) for source in added)
-        return rebuild(change, ChangeSpec(header, names, boxes, places=places, added=counts), check_unchanged)
+        summary = rebuild(
+            change, ChangeSpec(header, names, boxes, places=places, added=counts), check_unchanged
+        )
+        coarse = step_warning([survey.facts for survey in surveys], header.lattice.step)
+        return summary._replace(warnings=(*summary.warnings, *coarse))
 
 
 def remove_scans(

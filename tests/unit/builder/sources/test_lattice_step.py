@@ -141,7 +141,6 @@ def test_the_step_is_that_of_the_densest_scan_however_the_work_is_cut(
     before = build(files, tmp_path / "a")
     assert before.lattice_step == 2e-6
     monkeypatch.setattr(survey_pass, "RANGE_POINTS", (300, 300))
-    monkeypatch.setattr(survey_pass, "PROBES", 20)
     for number, paths in enumerate((files, files[::-1])):
         assert build(paths, tmp_path / f"b{number}").lattice_step == before.lattice_step
 

@@ -113,7 +113,7 @@ def check_normals(counts: NDArray[np.int64], config: BuildConfig) -> None:
     most = int(counts.max(initial=0))
     if "normal" in config.keep and is_dense(most, config):
         raise BadRequestError(
-            f"--keep normal: a voxel of {config.voxel:g} m holds {most} points, too many to be held in memory: give a "
+            f"--keep normal: a voxel holds {most} points, too many to be held in memory: give a "
             "smaller --voxel, or build without `--keep normal`: a server estimates normals"
         )
 
@@ -166,7 +166,7 @@ def readers_that_fit(
         fewer = next((n for n in range(jobs - 1, 0, -1) if most <= _room_of_one(n, config)), 0)
         fewer_too = f"{option}{fewer} or " if fewer else ""
         raise SolidcloudError(
-            f"a voxel of {config.voxel:g} m holds {int(largest[0])} points, and to read its record back takes "
+            f"a voxel holds {int(largest[0])} points, and to read its record back takes "
             f"{most >> 20} MB: give {fewer_too}--memory {_memory_for(most, jobs, config) >> 20}MB{otherwise}"
         )
     fits = int(np.searchsorted(needed, _room(jobs, config), "right"))

@@ -11,7 +11,6 @@ from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError
 
-DEFAULT_STEP = 1e-4
 DEFAULT_VOXEL = 8.0
 DEFAULT_CELL_POINTS = 1024
 # A cell is built at once: with more points, one part of a dense voxel would exceed --memory.
@@ -70,10 +69,10 @@ def _is_rule(rule: tuple[float, int] | None) -> bool:
 class BuildConfig:
     """Options of a build.
 
-    voxel: edge of a voxel [m]. With 8 m, a few to a few hundred voxels of a few MB each are in
-    reach of a walk.
-    resolution: lattice step [m]; None: the sources' common step if they share one, otherwise 0.1
-    mm, a twentieth of a terrestrial scanner's range noise. 1 mm saves a third of the archive and no
+    voxel: edge of a voxel [m], at most 2^21 steps, to which it shrinks. With 8 m, a few to a few
+    hundred voxels of a few MB each are in reach of a walk.
+    resolution: lattice step [m]; None: the sources' common step if they share one, otherwise 0.1 mm
+    or less, by the distance between points (sources/lattice_step.py). 1 mm saves a third of the archive and no
     time, and moves distances by up to 0.7 mm (measured with `solidcloud accuracy`, as are the next
     two).
     degree: children per node, 2 to 16 ([Fig12] table 1 tries 4 to 16). All values from 4 to 16 take

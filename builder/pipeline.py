@@ -128,7 +128,7 @@ def build_archive(
             with Archive(target) as archive:
                 header, voxels, shards = archive.header, len(archive.voxels), archive.shard_count()
             facts = [ScanFacts(scan) for item in inputs for scan in item.scans]
-            found = _warn(inputs, facts, config, warn)
+            found = _warn(inputs, facts, config, header.lattice.step, warn)
             return _summary(build, header, inputs, voxels, shards, begin, found, already=True)
         check_target(target, config.overwrite)
         with build_directory(target, what, fresh=config.fresh) as build_dir:
@@ -152,9 +152,9 @@ def _build(
     with build.workers(about):
         build_dir.staffed = True
         surveys, faulty = survey_scans(inputs, about, build_dir, build)
-        facts = [ScanFacts(s.scan, np.stack([s.low, s.high]), s.count) for s in surveys if s.scan is not None]
-        found = _warn(inputs, facts, config, warn)
-        lattice, lattice_source = choose_lattice(surveys, config)
+        facts = [s.facts for s in surveys]
+        lattice, lattice_source = choose_lattice(surveys, facts, config)
+        found = _warn(inputs, facts, config, lattice.step, warn)
         _check_request(surveys, lattice, config)
         build_dir.surveyed = True
         points = sum(s.count for s in surveys)
@@ -178,7 +178,7 @@ def _build(
         final -= (points - int(spool.counts.sum())) * (spool.dtype.itemsize + ARCHIVE_BYTES_A_POINT)
         dense = np.sort(spool.counts[spool.counts > DENSE_POINTS])[-build.executor.jobs :]
         build.check_space(final + int(dense.sum()) * SCRATCH_BYTES_A_POINT, build_dir.folder)
-        _check_voxels(spool, config)
+        _check_voxels(spool)
         if config.leaf_cells is not None:
             from .passes.cell_size import choose_cell_points  # most builds do not need its kernel
 
@@ -200,11 +200,12 @@ def _warn(
     inputs: Sequence[InputFile],
     facts: Sequence[ScanFacts],
     config: BuildConfig,
+    step: float,
     warn: Callable[[str], None] | None,
 ) -> tuple[str, ...]:
-    """Return the warnings about the scans, each of which is also passed to `warn`."""
+    """Return the warnings about the scans, each of which is also passed to `warn`. step: of the lattice."""
     notes = [item.note for item in inputs if item.note]
-    found = (*notes, *(warning.text for warning in find_warnings(facts, config.radius)))
+    found = (*notes, *(warning.text for warning in find_warnings(facts, config.radius, step)))
     if warn is not None:
         for text in found:
             warn(text)
@@ -244,13 +245,13 @@ def _check_request(surveys: Sequence[Survey], lattice: Lattice, config: BuildCon
         raise ScanError(coincident_text(where, first.scan.index if first.scan else 0, count))
 
 
-def _check_voxels(spool: Spool, config: BuildConfig) -> None:
+def _check_voxels(spool: Spool) -> None:
     """Refuse a voxel with more points than a record can hold, before hours of work on it."""
     most = int(spool.counts.max())
     if most > MAX_RECORD_POINTS:
         raise SolidcloudError(
-            f"a voxel of {config.voxel:g} m holds {most} points, expected at most {MAX_RECORD_POINTS}: give a smaller "
-            "--voxel and --fresh"
+            f"a voxel of {spool.lattice.voxel_size:g} m holds {most} points, expected at most {MAX_RECORD_POINTS}: "
+            "give a smaller --voxel and --fresh"
         )
 
 

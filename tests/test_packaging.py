@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from importlib import metadata
 from pathlib import Path
 
@@ -82,3 +83,10 @@ def test_every_requirement_of_every_extra_is_pinned_to_a_version_it_allows() -> 
     for requirement in wanted:
         if requirement.name != "solidcloud":
             assert requirement.specifier.contains(pinned[normalised(requirement.name)]), requirement
+
+
+def test_laspy_2_6_0_which_does_not_import_is_not_allowed() -> None:
+    """Issue 35: it was withdrawn, but pip takes it where a lower bound names it."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (laspy,) = (wanted for wanted in map(Requirement, extras["readers"]) if wanted.name == "laspy")
+    assert not laspy.specifier.contains("2.6.0") and laspy.specifier.contains("2.6.1")

@@ -13,7 +13,7 @@ from ...schemas.errors import BadRequestError, ScanError
 from ..resume.build_identity import changed_inputs, describe_build
 from ..run.executor import Progress
 from ..sources.scan_files import open_input_files
-from ..sources.scan_warnings import unit_warnings
+from ..sources.scan_warnings import step_warning, unit_warnings
 from ..spool.spool import Spool
 from .added_scans import AddOptions, box_of, no_longer_unknown, source_of, spool_added, survey_added
 from .archive_change import changing, scan_name
@@ -85,7 +85,8 @@ def add_scans(
         notes += [note for survey in surveys if survey.scan is not None for note in survey.scan.notes]
         units = unit_warnings([survey.scan for survey in surveys if survey.scan is not None])
         notes += [each.text for each in units]
-        return summary._replace(warnings=(*notes, *summary.warnings))
+        coarse = step_warning([survey.facts for survey in surveys], header.lattice.step)
+        return summary._replace(warnings=(*notes, *summary.warnings, *coarse))
 
 
 def remove_scans(

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ...schemas.archive.voxel_grid import KEY_BIAS, MAX_VOXEL_STEPS
+from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_edge
 from ..build_limits import (
     DENSE_POINTS,
     MAX_PREVIEW_POINTS,
@@ -31,9 +31,10 @@ from ..build_limits import (
     memory_share,
     shard_points,
 )
-from ..config import DEFAULT_STEP, BuildConfig
+from ..config import BuildConfig
 from ..passes.spool_pass import run_points
 from ..run.executor import worker_count
+from ..sources.lattice_step import STEPS
 from ..spool.run_files import spool_dtype
 from .rates import Rates
 
@@ -66,7 +67,7 @@ class SceneStats:
 
     points, scans: their numbers.  largest: points of the largest scan.  input_bytes: of the files;
     None: not known.
-    formats: format -> points.  step: lattice step that all scans share [m], or None.  area: of the
+    formats: format -> points.  step: lattice step [m]; None: the default.  area: of the
     surfaces [m^2].
     voxels: (edge [m], number of voxels with points) if sampled; otherwise the number follows from
     the area.
@@ -177,9 +178,9 @@ def estimate(scene: SceneStats, config: BuildConfig, rates: Rates, target: Path 
 
     target: location of the archive, to check free space; None: no check.
     """
-    step = config.resolution or scene.step or DEFAULT_STEP
+    step = config.resolution or scene.step or STEPS[0]
     pitch = math.sqrt(scene.area / scene.points)
-    voxels = _voxels(scene, config.voxel, rates)
+    voxels = _voxels(scene, voxel_edge(config.voxel, step), rates)
     jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
     bytes_of = {"scan": 0.2, "intensity": 2.0, "normal": 1.2, "rgb": 2.5, "classification": 0.2}
     measured = set() if scene.packed is None else {"scan", "intensity"}
@@ -309,12 +310,13 @@ def _limits(
     plan: BuildPlan, scene: SceneStats, config: BuildConfig, directories: float, target: Path | None
 ) -> tuple[Limit, ...]:
     """Return the limits of the build. Some grow with it although --memory is kept."""
-    dense = plan.points_a_voxel * DENSEST * plan.bytes_a_point
+    dense, edge = (
+        plan.points_a_voxel * DENSEST * plan.bytes_a_point,
+        voxel_edge(config.voxel, plan.lattice_step),
+    )
     found = [
-        Limit("voxels along an axis", (scene.extent or math.sqrt(scene.area)) / config.voxel, KEY_BIAS, "voxels",
+        Limit("voxels along an axis", (scene.extent or math.sqrt(scene.area)) / edge, KEY_BIAS, "voxels",
               "give a larger --voxel, or build in parts"),
-        Limit("lattice steps a voxel", config.voxel / plan.lattice_step, MAX_VOXEL_STEPS, "steps",
-              "give a smaller --voxel or a coarser --resolution"),
         Limit("the densest voxel, compressed", dense, MAX_FRAME, "bytes", "give a smaller --voxel"),
         Limit("index, held by build and server", plan.index_bytes, config.memory_bytes, "bytes",
               "give a larger --voxel: the index takes 100 bytes a voxel"),

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, make_lattice
+from ...schemas.archive.voxel_grid import MAX_COORDINATE, MIN_STEP, make_lattice, voxel_edge
 from ...schemas.errors import ScanError
-from ..config import DEFAULT_STEP, BuildConfig
-from ..passes.survey_pass import shared_step
+from ..config import BuildConfig
 from ..sources.common.scan import Scan
+from ..sources.lattice_step import choose_step
 from ..sources.scan_files import InputFile, open_input_files
 from ..sources.scan_warnings import ScanFacts, find_warnings
 from .build_plan import BuildPlan, SceneStats, estimate
@@ -148,10 +148,13 @@ def sample_scene(
     scans = [scan for each in inputs for scan in each.scans]
     if lost and not config.skip_bad:
         raise ScanError(f"{lost[0]} (--skip-bad leaves such scans out)")
+    facts = [ScanFacts(scan) for scan in scans]
+    step, _ = choose_step([each for each in facts if not each.scan.fault], config.resolution, config.voxel)
+    voxel = voxel_edge(config.voxel, step)
     bounds = _bounds(scans)
     # Without bounds in the headers, the origin of the lattice is not known, and the voxel borders
     # differ from those of the build.
-    grid = _Grid(config.voxel, np.zeros(3) if bounds is None else bounds[0])
+    grid = _Grid(voxel, np.zeros(3) if bounds is None else bounds[0])
     begin, blind = time.perf_counter(), 0
     seen: list[_ScanSample] = []
     for scan in scans:
@@ -172,14 +175,14 @@ def sample_scene(
         if quick:
             break
         try:
-            packed = _packed(scans, seen, bounds, points / area, config, rates or load_rates())
+            packed = _packed(scans, seen, bounds, points / area, step, config, rates or load_rates())
             break
         except BrokenScanError as error:
             if not config.skip_bad:
                 raise
             lost.append(str(error))
             seen[[scan is error.scan for scan in scans].index(True)] = _UNREADABLE
-    voxels = _total(seen, config.voxel)
+    voxels = _total(seen, voxel)
     looked = sum(look.points for each in seen for look in each.looks)
     formats: Counter[str] = Counter()
     for scan, each in zip(scans, seen, strict=True):
@@ -204,15 +207,15 @@ def sample_scene(
         largest=max(each.points for each in seen),
         input_bytes=sum(path.stat().st_size for path in {scan.path for scan in scans}),
         formats=formats,
-        step=_shared_step(scans, config.voxel),
+        step=step,
         area=area,
-        voxels=(config.voxel, max(1.0, min(voxels, points))),
+        voxels=(voxel, max(1.0, min(voxels, points))),
         extent=None if bounds is None else float((bounds[1] - bounds[0]).max()),
         assumed=tuple(assumed),
         packed=None if packed is None else packed.bytes_a_point,
         warnings=(
             *(item.note for item in inputs if item.note),
-            *(w.text for w in find_warnings([ScanFacts(scan) for scan in scans], config.radius)),
+            *(warning.text for warning in find_warnings(facts, config.radius, step)),
         ),
     )
 
@@ -237,6 +240,7 @@ def _packed(
     seen: Sequence[_ScanSample],
     bounds: NDArray[np.float64] | None,
     density: float,
+    step: float,
     config: BuildConfig,
     rates: Rates,
 ) -> Packed | None:
@@ -244,8 +248,7 @@ def _packed(
     some = [look.some for each in seen for look in each.looks]
     if not any(map(len, some)):
         return None
-    step = config.resolution or _shared_step(scans, config.voxel) or DEFAULT_STEP
-    if not (step >= MIN_STEP and 1 <= round(config.voxel / step) <= MAX_VOXEL_STEPS):
+    if not (step >= MIN_STEP and round(config.voxel / step) >= 1):
         return None
     low = np.min(np.concatenate(some), axis=0) if bounds is None else bounds[0]
     # A scan that was not sampled, or is broken, is not read.
@@ -276,15 +279,6 @@ def _total(seen: Sequence[_ScanSample], edge: float) -> float:
             found += own * each.points / max(1, sum(look.points for look in each.looks))
     looked = sum(each.points for each in seen if each.looks)
     return found * sum(each.points for each in seen) / max(1, looked)
-
-
-def _shared_step(scans: Sequence[Scan], voxel: float) -> float | None:
-    """Return the lattice step that all scans share by their headers, or None.
-
-    survey_pass.py makes the same choice.
-    """
-    step = shared_step([scan.lattice for scan in scans])
-    return step if step and max(MIN_STEP, voxel / MAX_VOXEL_STEPS) <= step <= voxel else None
 
 
 def _bounds(scans: Sequence[Scan]) -> NDArray[np.float64] | None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...schemas.archive.units import MAX_COORDINATE
+from ...schemas.archive.units import MAX_COORDINATE, MIN_STEP
 from ...schemas.errors import ScanError
 from .common.scan import BEYOND, Scan
 from .placed_scan import METRES
@@ -46,7 +46,10 @@ AVATAR_LENGTH = 6.0
 TOO_DENSE, TOO_SPARSE = 1 / 20, 40.0
 # Two scans whose spacings differ by more than this factor do not fit one radius.
 UNLIKE = 20.0
-# Most scans whose spacing is measured.
+# A lattice is too coarse for points that are closer together than this many steps. Rounding moves a
+# point by up to 0.87 steps, and the radius is half of the distance: four steps are 0.43 of it.
+FEW_STEPS = 4
+# Most scans whose spacing is estimated.
 MEASURED_SCANS = 32
 
 
@@ -60,15 +63,22 @@ class ScanWarning(NamedTuple):
 class ScanFacts:
     """Properties of a placed scan; its points are read when a property needs them."""
 
-    def __init__(self, scan: Scan, box: NDArray[np.float64] | None = None, count: int | None = None) -> None:
+    def __init__(
+        self,
+        scan: Scan,
+        box: NDArray[np.float64] | None = None,
+        count: int | None = None,
+        spacing: float | None = None,
+    ) -> None:
         """Describe a scan in metres with z up.
 
         box: (2, 3), the bounds of its points [m], if known better than by its header.
-        count: number of its points, likewise.
+        count: number of its points, likewise.  spacing: see the property; None: not measured.
         """
         self.scan = scan
         self._box = scan.bounds if box is None else box
         self._count = scan.declared_count if count is None else count
+        self._spacing = spacing
 
     @property
     def name(self) -> str:
@@ -79,6 +89,11 @@ class ScanFacts:
     def is_mesh(self) -> bool:
         """Return whether the file is a mesh and not a scan."""
         return self.scan.format in ("mesh", "glb")
+
+    @property
+    def is_measured(self) -> bool:
+        """Return whether `spacing` was measured, and is not an estimate."""
+        return self._spacing is not None
 
     @property
     def whole(self) -> bool:
@@ -108,10 +123,12 @@ class ScanFacts:
     def spacing(self) -> float | None:
         """Return the approximate distance between neighbouring points [m]; None if it is not known.
 
-        It is the lesser of two estimates, each of which may be too large: the median distance of a
-        point to its closest one among points that follow one another in the file, and that of
-        points spread over the surface of the box.
+        Unless it is measured, it is the lesser of two estimates, each of which may be too large: the
+        median distance of a point to its closest one among points that follow one another in the
+        file, and that of points spread over the surface of the box.
         """
+        if self._spacing is not None:
+            return self._spacing
         if self.box is None or self.count < FEW_POINTS:
             return None
         x, y, z = (self.box[1] - self.box[0]).tolist()
@@ -165,10 +182,13 @@ def closest_distances(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
-def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> list[ScanWarning]:
+def find_warnings(
+    facts: Sequence[ScanFacts], radius: float | None = None, step: float | None = None
+) -> list[ScanWarning]:
     """Return the warnings about scans that are built together, in order of the scans.
 
     radius: given for all points [m]; None: it is measured.
+    step: of the lattice [m]; None: a build will choose it, and each scan's own is checked.
     """
     used = [(number, each) for number, each in enumerate(facts) if not each.scan.fault]
     found = [
@@ -179,6 +199,7 @@ def find_warnings(facts: Sequence[ScanFacts], radius: float | None = None) -> li
         *_gaps(used),
         *_avatars(used),
         *(_unlike_spacings(used) if radius is None else _radius_of_scans(used, radius)),
+        *_coarse_steps(used, step),
     ]
     return sorted(found, key=lambda warning: warning.number)
 
@@ -313,14 +334,20 @@ def _is_figure(facts: ScanFacts) -> bool:
     return bool((facts.box[0] <= slack).all() and (facts.box[1] >= -slack).all())
 
 
-def _measured(facts: _Numbered) -> list[tuple[int, ScanFacts, float]]:
-    """Return scans with their spacing: of some, if there are many."""
-    chosen = [facts[k] for k in np.unique(np.linspace(0, len(facts) - 1, MEASURED_SCANS).astype(int))]
+def _measured(facts: _Numbered, *, meshes: bool = False) -> list[tuple[int, ScanFacts, float]]:
+    """Return scans, and meshes too if asked, with their spacing: of some, if there are many."""
+    chosen = [facts[k] for k in spread(len(facts), MEASURED_SCANS)]
     return [
         (number, each, spacing)
         for number, each in chosen
-        if not each.is_mesh and (spacing := each.spacing) is not None
+        if (meshes or not each.is_mesh) and (spacing := each.spacing) is not None
     ]
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return up to `most` of the numbers below `count`, spread over them."""
+    found: list[int] = np.unique(np.linspace(0, count - 1, most).astype(int)).tolist() if count else []
+    return found
 
 
 def _unlike_spacings(facts: _Numbered) -> list[ScanWarning]:
@@ -345,12 +372,45 @@ def _unlike_spacings(facts: _Numbered) -> list[ScanWarning]:
 
 def _radius_of_scans(facts: _Numbered, radius: float) -> list[ScanWarning]:
     """Warn of a given radius that does not fit the scans."""
-    measured = _measured(facts) if facts else []
+    measured = _measured(facts)
     if not measured:
         return []
     number, each, spacing = sorted(measured, key=lambda found: found[2])[len(measured) // 2]
     text = radius_warning(radius, spacing)
     return [ScanWarning(number, f"{each.name}: {text}")] if text else []
+
+
+def step_warning(facts: Sequence[ScanFacts], step: float) -> tuple[str, ...]:
+    """Return the warning that a lattice step [m] is too coarse for scans, if it is."""
+    return tuple(text for _, text in _coarse_steps(list(enumerate(facts)), step))
+
+
+def _coarse_steps(facts: _Numbered, step: float | None) -> list[ScanWarning]:
+    """Warn of the scan for whose points its lattice step, or that of all scans, is the most too coarse."""
+    checked = [each for each in facts if step is not None or each[1].scan.lattice is not None]
+    found = []
+    for number, each, spacing in _measured(checked, meshes=True):
+        own = max(each.scan.lattice.scale) if each.scan.lattice is not None else 0.0
+        coarse = own if step is None else step
+        if spacing and spacing < FEW_STEPS * coarse:
+            found.append((spacing / coarse, number, each, spacing, own, coarse))
+    if not found:
+        return []
+    _, number, each, spacing, own, coarse = min(found, key=lambda one: one[:2])
+    advice = f"build all scans with --resolution {max(spacing / 10, MIN_STEP):.1g}"
+    if own >= coarse:
+        advice = "export the scan with a finer scale"
+    elif coarse <= MIN_STEP:
+        advice = (
+            "no step is finer: write a list with `solidcloud inspect` and enlarge all scans by scale = 1000.0"
+        )
+    return [
+        ScanWarning(
+            number,
+            f"{each.name}: points about {length_text(spacing)} apart, in steps of {length_text(coarse)}: rounding "
+            f"moves their surface by up to {length_text(0.87 * coarse)}: {advice}",
+        )
+    ]
 
 
 def radius_warning(radius: float, spacing: float) -> str:

@@ -17,14 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import BadRequestError
 from ..kernels.morton import morton_decode, morton_encode
 from .units import MAX_COORDINATE as MAX_COORDINATE
+from .units import MIN_STEP as MIN_STEP
 from .units import UNITS_PER_METRE
 
 # Offset added to voxel coordinates before they are interleaved, 21 bits per axis, into a uint64
 # key.
 KEY_BIAS = 1 << 20
-
-# A step below 1 micrometre would span fewer than 67 exact units, and no scanner resolves it.
-MIN_STEP = 1e-6
 
 # Morton codes hold 21 bits per axis, so the octree of a larger voxel would map distinct points to
 # the same code. Node centres, in voxel steps, must also be exact in float32 for the fast pass of
@@ -67,11 +65,16 @@ class Lattice(NamedTuple):
         return np.asarray(lattice, np.int64) // self.voxel_steps
 
 
+def voxel_edge(voxel_size: float, step: float) -> float:
+    """Return the edge of a voxel [m]: `voxel_size`, but at most MAX_VOXEL_STEPS steps [m]."""
+    return min(voxel_size, MAX_VOXEL_STEPS * step)
+
+
 def make_lattice(origin: ArrayLike, step: float, voxel_size: float) -> Lattice:
     """Make the lattice whose voxels are `voxel_size` [m], rounded to a whole number of steps.
 
-    origin: (3,), world [m].  step: [m]. Raises BadRequestError if the format cannot represent step
-    or voxel size.
+    A larger voxel than the format can hold shrinks, see `voxel_edge`. origin: (3,), world [m].
+    step: [m]. Raises BadRequestError if the format cannot represent step or voxel size.
     """
     if not (np.isfinite(step) and step >= MIN_STEP):
         raise BadRequestError(
@@ -81,11 +84,11 @@ def make_lattice(origin: ArrayLike, step: float, voxel_size: float) -> Lattice:
         raise BadRequestError(
             f"voxel size {voxel_size!r} m: expected a positive length: give another --voxel"
         )
-    voxel_steps = round(voxel_size / step)
-    if not 1 <= voxel_steps <= MAX_VOXEL_STEPS:
+    voxel_steps = round(voxel_edge(voxel_size, step) / step)
+    if voxel_steps < 1:
         raise BadRequestError(
-            f"a voxel of {voxel_size} m is {voxel_steps} lattice steps of {step} m: expected 1 to "
-            f"{MAX_VOXEL_STEPS}: give a smaller --voxel or a coarser --resolution"
+            f"a voxel of {voxel_size} m is less than a lattice step of {step} m: give a larger --voxel or a finer "
+            "--resolution"
         )
     x, y, z = (float(v) + 0.0 for v in np.asarray(origin, np.float64))  # + 0.0: never store -0.0
     return Lattice((x, y, z), float(step), int(voxel_steps))

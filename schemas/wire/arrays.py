@@ -20,10 +20,22 @@ class ArrayType(NamedTuple):
     row_bytes: int
 
 
+def without_alias(hint: Any) -> Any:
+    """Return the type that an annotation stands for if it is a type alias, else the annotation.
+
+    `NDArray` is an alias of `np.ndarray` from numpy 2.5 on.
+    """
+    alias = get_origin(hint) or hint
+    if not hasattr(alias, "__value__"):
+        return hint
+    value, given = alias.__value__, dict(zip(alias.__type_params__, get_args(hint), strict=False))
+    return without_alias(value[tuple(given[of] for of in value.__parameters__)] if given else value)
+
+
 @cache
 def array_type(hint: Any) -> ArrayType:
     """Parse the dtype and the fixed axis lengths from an array's type annotation."""
-    shape, of = get_args(hint)
+    shape, of = get_args(without_alias(hint))
     tail = tuple(get_args(axis)[0] for axis in get_args(shape)[1:] if get_origin(axis) is Literal)
     dtype = np.dtype(get_args(of)[0]).newbyteorder("<")
     return ArrayType(dtype, tail, dtype.itemsize * math.prod(tail))
@@ -35,5 +47,5 @@ def array_fields(kind: type) -> dict[str, ArrayType]:
     return {
         name: array_type(hint)
         for name, hint in get_type_hints(kind).items()
-        if get_origin(hint) is np.ndarray
+        if get_origin(without_alias(hint)) is np.ndarray
     }

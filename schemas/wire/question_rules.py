@@ -368,7 +368,7 @@ def _conversions(kind: type[QuestionRequest]) -> tuple[tuple[str, Callable[[Any,
             continue
         elif hint == Length:
             found.append((name, lambda value, _: float(value)))
-        elif str(hint).startswith("numpy.ndarray"):
+        elif name in array_fields(kind):
             found.append((name, make_vectors))
     return tuple(found)
 

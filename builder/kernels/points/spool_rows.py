@@ -37,6 +37,22 @@ def usable_bounds(xyz, farthest, low, high):
 
 
 @nb.njit(nogil=True, cache=True)
+def closest_to(xyz, probes, least, best):
+    """Lower best (p,) to the squared distances [m^2] of probes (3, p) to the closest of points (n, 3).
+
+    All are float64. Distances below `least` [m] are not counted: the probe is a point itself, and
+    may have twins. A point or probe that is not finite changes nothing.
+    """
+    for i in range(xyz.shape[0]):
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        for k in range(best.shape[0]):
+            dx, dy, dz = x - probes[0, k], y - probes[1, k], z - probes[2, k]
+            square = dx * dx + dy * dy + dz * dz
+            # No branch: the loop is vectorised, 8 ns a point for 32 probes.
+            best[k] = square if (square >= least * least) & (square < best[k]) else best[k]
+
+
+@nb.njit(nogil=True, cache=True)
 def _to_lattice(xyz, axis, origin, step, steps):
     """Quantise one axis of points (n, 3), half to even, into steps (n,) int64.
 

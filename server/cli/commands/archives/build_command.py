@@ -30,7 +30,9 @@ def build(
     voxel: Annotated[float, typer.Option(help="Edge of a voxel [m].")] = 8.0,
     resolution: Annotated[
         float | None,
-        typer.Option(help="Lattice step [m]; default: the step that all scans share, else 0.0001."),
+        typer.Option(
+            help="Lattice step [m]; default: that of all scans, else 0.0001 or a tenth of their spacing."
+        ),
     ] = None,
     degree: Annotated[int, typer.Option(help="Maximum number of children of a node.")] = 8,
     leaf: Annotated[int, typer.Option(help="Maximum number of points of a leaf node.")] = 32,

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .....builder.config import DEFAULT_STEP, BuildConfig
+from .....builder.config import BuildConfig
 from .....builder.pipeline import build_archive
+from .....builder.sources.lattice_step import STEPS
 from .....builder.synthetic.facade import build_facade
 from .....builder.synthetic.figure import figure_points
 from .....builder.synthetic.scenes import make_facade
@@ -78,8 +79,8 @@ def generated_scene(
     body = figure_points() if avatar is None else read_avatar(avatar)
     _, walk = walk_poses(build_facade().truth, plan.frames)
     # These archives usually have one shard: more processes would only load numba several times.
-    plain = BuildConfig(resolution=DEFAULT_STEP, overwrite=True, jobs=1)
-    config = BuildConfig(resolution=DEFAULT_STEP, overwrite=True, jobs=1, models=models)
+    plain = BuildConfig(resolution=STEPS[0], overwrite=True, jobs=1)
+    config = BuildConfig(resolution=STEPS[0], overwrite=True, jobs=1, models=models)
     for name, chosen in (("plain", plain), ("modelled", config)):
         build_archive([scan], folder / name, chosen)
     return MeasuredScene(

@@ -79,7 +79,7 @@ def test_a_voxel_that_gets_too_large_is_refused_as_in_a_build(
         refused(
             target,
             SolidcloudError,
-            rf"^a voxel of 0\.5 m holds {most} points, and to read its record back takes \d+ MB: {ADVICE}",
+            rf"^a voxel holds {most} points, and to read its record back takes \d+ MB: {ADVICE}",
             lambda: add_scans(target, [more], jobs=1, memory_bytes=LEAST),
         )
         with pytest.raises(SolidcloudError) as error:

@@ -186,7 +186,7 @@ CHOICES = {
     "none with": ([None], {}, 1e-4, "default"),
     "given": ([grid(0.01)], {"resolution": 0.005}, 0.005, "given"),
     "too fine to store": ([grid(1e-7)], {}, 1e-4, "default"),
-    "too fine for the voxel": ([grid(2e-6)], {"voxel": 80.0}, 1e-4, "default"),
+    "too fine for the voxel": ([grid(2e-6)], {"voxel": 80.0}, 2e-6, "sources"),
     "coarser than a voxel": ([grid(10.0)], {}, 1e-4, "default"),
     "no number": ([grid(0.01), grid(0.01, float("nan"))], {}, 1e-4, "default"),
 }
@@ -196,7 +196,7 @@ CHOICES = {
 def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: Path) -> None:
     lattices, options, step, source = CHOICES[name]
     surveys = [survey_on(tmp_path, lattice, low=7.0 - i) for i, lattice in enumerate(lattices)]
-    lattice, found = choose_lattice(surveys, BuildConfig(**options))
+    lattice, found = choose_lattice(surveys, [s.facts for s in surveys], BuildConfig(**options))
     assert (lattice.step, found) == (step, source)
     assert lattice.origin == (7.0 - (len(lattices) - 1),) * 3
 
@@ -204,7 +204,7 @@ def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: 
 def test_an_impossible_resolution_is_refused(tmp_path: Path) -> None:
     for resolution in (1e-7, 100.0):
         with pytest.raises(BadRequestError):
-            choose_lattice([survey_on(tmp_path, None)], BuildConfig(resolution=resolution))
+            choose_lattice([survey_on(tmp_path, None)], [], BuildConfig(resolution=resolution))
 
 
 def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:

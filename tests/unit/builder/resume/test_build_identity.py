@@ -208,7 +208,7 @@ def command(capsys: pytest.CaptureFixture[str], scan: Path, target: Path, *optio
 
 # Options and points of a request that is refused when all is read, and what its error says to give.
 LATE_REFUSALS: dict[str, tuple[list[str], np.ndarray, str, list[str]]] = {
-    "one point": ([], np.array([[0, 0, 0], [1e-6, 0, 0]]), "give --radius", ["--radius", "0.01"]),
+    "one point": ([], np.array([[0, 0, 0], [1e-7, 0, 0]]), "give --radius", ["--radius", "0.01"]),
     "no point": (
         ["--outliers", "0.001,5"],
         make_scan("noise", 3, 100),

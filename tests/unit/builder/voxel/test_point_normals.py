@@ -220,7 +220,7 @@ def test_a_normal_that_is_another_is_found(tmp_path: Path) -> None:
 def test_voxels_built_in_parts_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = build(tmp_path)
     monkeypatch.setattr(build_limits, "DENSE_POINTS", 20)
-    with pytest.raises(BadRequestError, match="--keep normal: a voxel of"):
+    with pytest.raises(BadRequestError, match="--keep normal: a voxel holds"):
         build(tmp_path, name="dense")
     assert not (tmp_path / "dense.scd").exists()
     more = synthetic_scans.write_ply(tmp_path / "more.ply", synthetic_scans.make_scan("corner", 9, 200))

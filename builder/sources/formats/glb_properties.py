@@ -47,7 +47,7 @@ def used_bytes(
             continue
         free.discard(accessor["bufferView"])
         view = views[accessor["bufferView"]]
-        width = SIZES.get(accessor.get("componentType"), 1) * WIDTHS.get(accessor.get("type"), 1)
+        width = SIZES.get(accessor.get("componentType", 0), 1) * WIDTHS.get(accessor.get("type", ""), 1)
         begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         if count := accessor.get("count", 0):
             used.append((begin, begin + (count - 1) * (view.get("byteStride", 0) or width) + width))

@@ -14,10 +14,9 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from io import BufferedReader
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +34,8 @@ BLOCK_POINTS = 1 << 18
 # (LAS) or a thousand properties (PLY); without this bound a block of them would take gigabytes.
 BLOCK_BYTES = 64 << 20
 
-# Bytes of a file hashed per read; and searched for data behind the last record.
+# Bytes of a file hashed per read.
 HASHED_BYTES = 1 << 20
-SEARCHED_BYTES = 1 << 16
-
-# Bytes that may follow the last record of a binary file: zeros, blanks, and the end of a text in DOS.
-BLANKS = b"\0 \t\r\n\x1a"
 
 # Drop reasons of points that are not finite, and of those that lie beyond MAX_COORDINATE.
 NOT_FINITE = "not finite"
@@ -241,54 +236,6 @@ class BrokenScan(Scan):
 
     def _read(self, block_points: int) -> Iterator[ScanBlock]:
         raise ScanError(self.fault)
-
-
-def read_records(
-    file: BufferedReader, path: Path, record: np.dtype[Any], count: int, block_points: int, what: str
-) -> Iterator[NDArray[Any]]:
-    """Read `count` records of one size from the current file position, in blocks of bounded memory.
-
-    what: plural noun for the records, used in the error message.
-    Yields (n,) of `record`, n > 0; the next block overwrites it. Raises ScanError where the file
-    ends early.
-    """
-    step = max(1, min(block_points, count, BLOCK_BYTES // record.itemsize))
-    # One buffer serves all blocks: page faults of fresh memory per block cost as much as the copy
-    # into it.
-    buffer = np.empty(step, record)
-    raw = buffer.view(np.uint8).data
-    for seen in range(0, count, step):
-        wanted = min(step, count - seen)
-        # readinto() of a buffered file returns less than requested only at the end of the file.
-        got = file.readinto(raw[: wanted * record.itemsize]) // record.itemsize
-        if got < wanted:
-            raise scan_error(
-                path,
-                f"the file ends {count - seen - got} {what} too soon",
-                "as many as its header declares",
-                "fetch the file again, it is truncated",
-            )
-        yield buffer[:wanted]
-
-
-def check_end(file: BinaryIO, path: Path, what: str) -> None:
-    """Refuse a file that continues after the records that its header declares.
-
-    A count that is too small, or 0, would leave out the points behind it without notice. Zeros and
-    blanks may follow: some writers fill the last page with zeros, others end it as a text.
-
-    file: at the end of the declared records.  what: plural noun for these, used in the message.
-    Raises ScanError.
-    """
-    while data := file.read(SEARCHED_BYTES):
-        check_interrupt()
-        if data.strip(BLANKS):
-            raise scan_error(
-                path,
-                f"data behind the {what} that its header declares",
-                "the end of the file",
-                "fetch the file again, the count in its header may be damaged",
-            )
 
 
 def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanError:

@@ -6,12 +6,10 @@ with y up [glTF 2.0, 3.4]; this reader does not convert coordinates.
 """
 
 import json
-import re
 import struct
 from bisect import bisect_left
 from collections.abc import Iterator
 from io import BufferedReader
-from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +27,7 @@ from ..common.scan import (
     scan_error,
     zero_rotation_note,
 )
+from .glb_properties import ATTRIBUTE, PROPERTIES, used_bytes
 
 # Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
 # takes thirty times that.
@@ -45,34 +44,8 @@ MAX_TRIANGLES = 1 << 24
 # instancing, compression.
 HARMLESS = ("KHR_lights_", "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
 
-# Properties of the objects that place vertices [glTF 2.0, 5]. Any other, beside "extensions" and
-# "extras", may be one of these whose name is damaged; to ignore it would move or lose vertices.
-PROPERTIES = {
-    "glTF": {
-        *("accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensionsUsed"),
-        *("extensionsRequired", "images", "materials", "meshes", "nodes", "samplers", "scene", "scenes"),
-        *("skins", "textures"),
-    },
-    "scenes": {"nodes", "name"},
-    "nodes": {
-        *("camera", "children", "skin", "matrix", "mesh", "rotation", "scale", "translation", "weights"),
-        "name",
-    },
-    "meshes": {"primitives", "weights", "name"},
-    "primitives": {"attributes", "indices", "material", "mode", "targets"},
-    "accessors": {
-        *("bufferView", "byteOffset", "componentType", "normalized", "count", "type", "max", "min", "sparse"),
-        "name",
-    },
-    "bufferViews": {"buffer", "byteOffset", "byteLength", "byteStride", "target", "name"},
-}
-ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|_.*")
-
 FLOAT = 5126
 INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
-# Bytes of a value by its type, and values in a row by its shape; some matrices have padding more.
-SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, FLOAT: 4}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
@@ -285,25 +258,8 @@ class _Document:
 
         A count that is too small would leave these out. Raises ScanError.
         """
-        used: list[tuple[int, int]] = []  # first byte, and first byte behind
-        free = set(range(len(self.document.get("bufferViews", []))))
-        for accessor in self.document.get("accessors", []):
-            if "bufferView" not in accessor:
-                continue
-            free.discard(accessor["bufferView"])
-            view = self._at("bufferViews", accessor["bufferView"])
-            width = SIZES.get(accessor.get("componentType"), 1) * WIDTHS.get(accessor.get("type"), 1)
-            begin = self._whole(view.get("byteOffset", 0)) + self._whole(accessor.get("byteOffset", 0))
-            stride = self._whole(view.get("byteStride", width)) or width
-            if count := self._whole(accessor.get("count", 0)):
-                used.append((begin, begin + (count - 1) * stride + width))
-        for number in free:  # pictures, and what extensions use
-            view = self._at("bufferViews", number)
-            begin = self._whole(view.get("byteOffset", 0))
-            used.append((begin, begin + self._whole(view["byteLength"])))
-        used.sort()
-        begins = [begin for begin, _ in used]
-        ends = list(accumulate((end for _, end in used), max))
+        views = [self._at("bufferViews", k) for k in range(len(self.document.get("bufferViews", [])))]
+        begins, ends = used_bytes(self.document.get("accessors", []), views)
         for accessor in positions:
             row = np.dtype(accessor.type).itemsize * accessor.width
             at = accessor.start - self.start + accessor.rows * accessor.stride

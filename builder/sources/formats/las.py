@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
 from ..common.colours import CLASSIFICATION, INTENSITY, RGB, SYNTHETIC, WITHHELD, class_counts
+from ..common.records import read_records
 from ..common.scan import (
     BLOCK_BYTES,
     BLOCK_POINTS,
@@ -26,7 +27,6 @@ from ..common.scan import (
     ScanBlock,
     SeekableScan,
     library_errors,
-    read_records,
     reader_library,
     scan_error,
 )
@@ -250,7 +250,8 @@ def _readable_points(
     if header.compressed:
         # The first point is raw, behind the place of the chunk table.
         yield read_points(file, header, at + 8, 1)
-        for record in readable_records(file, path, laszip, at, header.record_bytes):
+        lazrs = reader_library("lazrs", path)
+        for record in readable_records(lazrs, file, path, laszip, at, header.record_bytes):
             yield header.xyz(np.frombuffer(record, header.layout()))
         return
     left = (points_end(header, path.stat().st_size) - at) // header.record_bytes

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 from ....schemas.errors import ScanError
 from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
-from ..common.scan import library_errors, reader_library, scan_error
+from ..common.scan import library_errors, scan_error
 
 CHUNKED = 2  # the compressor of point formats 0 to 5
 VARIABLE = 0xFFFFFFFF  # special value of points per chunk: each chunk has its own point count
@@ -195,14 +195,13 @@ class _WholeChunks(LazTail):
 
 
 def readable_records(
-    file: BinaryIO, path: Path, laszip: bytes, start: int, record_bytes: int
+    lazrs: Any, file: BinaryIO, path: Path, laszip: bytes, start: int, record_bytes: int
 ) -> Iterator[bytearray]:
     """Yield the records of a damaged LAZ file that can be decompressed, each overwritten by the next.
 
     Of layered chunks those that lie whole in the file are read, of others all up to the first
     fault. Parameters as for `check_chunks`. Raises ScanError.
     """
-    lazrs = reader_library("lazrs", path)
     items = _items(path, laszip)
     compressor, chunk_points = struct.unpack_from("<H10xI", laszip)
     if compressor not in (CHUNKED, LAYERED) or sum(length for _, length in items) != record_bytes:

@@ -14,13 +14,12 @@ from typing import BinaryIO
 import numpy as np
 
 from ....schemas.process.text_encoding import UTF8_MARK, is_utf16
+from ..common.records import check_end, read_records
 from ..common.scan import (
     Scan,
     ScanBlock,
     SeekableScan,
-    check_end,
     library_errors,
-    read_records,
     scan_error,
 )
 from ..common.text_rows import keyword_rows, open_text_file

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.colours import CLASS_NAMES, CLASSIFICATION, INTENSITY, RGB, whole_bytes
+from ..common.records import check_end, read_records
 from ..common.scan import (
     BLOCK_BYTES,
     INTENSITY_NAMES,
@@ -29,10 +30,8 @@ from ..common.scan import (
     ScanBlock,
     SeekableScan,
     apply_pose,
-    check_end,
     library_errors,
     quaternion_pose,
-    read_records,
     scan_error,
     zero_rotation_note,
 )

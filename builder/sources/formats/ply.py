@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check_interrupt
 from ..common.colours import CLASSIFICATION, RGB, stack_channels, whole_bytes
+from ..common.records import check_end, read_records
 from ..common.scan import (
     BLOCK_BYTES,
     BLOCK_POINTS,
     Scan,
     ScanBlock,
     SeekableScan,
-    check_end,
     library_errors,
-    read_records,
     scan_error,
 )
 from ..common.text_rows import LONGEST_LINE, number_rows, open_text_file

@@ -1,0 +1,59 @@
+"""Properties of glTF objects, and the bytes that a document uses: what a damaged one would hide."""
+
+import re
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+# Properties of the objects that place vertices [glTF 2.0, 5]. Any other, beside "extensions" and
+# "extras", may be one of these whose name is damaged; to ignore it would move or lose vertices.
+PROPERTIES = {
+    "glTF": {
+        *("accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensionsUsed"),
+        *("extensionsRequired", "images", "materials", "meshes", "nodes", "samplers", "scene", "scenes"),
+        *("skins", "textures"),
+    },
+    "scenes": {"nodes", "name"},
+    "nodes": {
+        *("camera", "children", "skin", "matrix", "mesh", "rotation", "scale", "translation", "weights"),
+        "name",
+    },
+    "meshes": {"primitives", "weights", "name"},
+    "primitives": {"attributes", "indices", "material", "mode", "targets"},
+    "accessors": {
+        *("bufferView", "byteOffset", "componentType", "normalized", "count", "type", "max", "min", "sparse"),
+        "name",
+    },
+    "bufferViews": {"buffer", "byteOffset", "byteLength", "byteStride", "target", "name"},
+}
+ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|_.*")
+# Bytes of a value by its type, and values in a row by its shape; some matrices have padding more.
+SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+def used_bytes(
+    accessors: Sequence[dict[str, Any]], views: Sequence[dict[str, Any]]
+) -> tuple[list[int], list[int]]:
+    """Return the spans of the binary chunk that accessors use, and views without accessors.
+
+    accessors, views: of a document. Returns the first byte of each span, ascending, and the greatest
+    end, exclusive, of it and all before it. May raise anything for an invalid document.
+    """
+    used: list[tuple[int, int]] = []
+    free = set(range(len(views)))
+    for accessor in accessors:
+        if "bufferView" not in accessor:
+            continue
+        free.discard(accessor["bufferView"])
+        view = views[accessor["bufferView"]]
+        width = SIZES.get(accessor.get("componentType", 0), 1) * WIDTHS.get(accessor.get("type", ""), 1)
+        begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        if count := accessor.get("count", 0):
+            used.append((begin, begin + (count - 1) * (view.get("byteStride", 0) or width) + width))
+    # Pictures, and what extensions use.
+    used += [
+        (views[k].get("byteOffset", 0), views[k].get("byteOffset", 0) + views[k]["byteLength"]) for k in free
+    ]
+    used.sort()
+    return [begin for begin, _ in used], list(accumulate((end for _, end in used), max))

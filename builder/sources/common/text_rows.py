@@ -36,8 +36,10 @@ _LINE_END = re.compile(rb"\r\n?|\n")
 
 # What rows may hold besides numbers and delimiters, and numpy.loadtxt does not accept.
 # A number behind the ";" makes it a row: one wrong bit turns "3" into ";".
-_COMMENT = re.compile(rb"#.*|^[ \t]*(?://|;(?![ \t]*[-+.\d])).*", re.MULTILINE)
-_COMMENT_OR_FIELDS = re.compile(rb"#.*|^[ \t]*//.*", re.MULTILINE)  # where ";" separates fields
+# So does a number before the "#": one wrong byte joins two rows by it.
+_COMMENT = re.compile(rb"(?<!\S)#.*|^[ \t]*(?://|;(?![ \t]*[-+.\d])).*", re.MULTILINE)
+_HASH_COMMENT = re.compile(rb"#(?<!\S#).*")
+_COMMENT_OR_FIELDS = re.compile(rb"(?<!\S)#.*|^[ \t]*//.*", re.MULTILINE)  # where ";" separates fields
 _EMPTY_ENDS = {
     ",": re.compile(rb",[, \t\r]*$", re.MULTILINE),
     ";": re.compile(rb";[; \t\r]*$", re.MULTILINE),
@@ -46,6 +48,8 @@ _EMPTY_ENDS = {
 _DECIMAL_COMMA = re.compile(rb",(?<=\d,)(?=\d)")
 # What C programs on Windows print for NaN and infinities; the "#" would begin a comment.
 _WINDOWS_NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:QNAN|SNAN|IND|INF)\d*)", re.IGNORECASE)
+# Numbers of an OBJ file with a vertex in the same line: one wrong byte joins two lines.
+_JOINED_OBJ = re.compile(rb"^[ \t]*(?:v[ntp]?|[flp])[ \t][^\n]*[v#]", re.MULTILINE | re.IGNORECASE)
 _QUOTED = re.compile(rb"""(["'])([^\s"',;]*)\1""")
 
 
@@ -152,7 +156,7 @@ def split_row(line: bytes, delimiter: str | None) -> list[str]:
 def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     """Return lines of rows as numpy.loadtxt accepts them, each at its place.
 
-    Comments are left out: what follows "#", and lines that begin with "//", or with ";" and no
+    Comments are left out: what follows "#" behind a blank, and lines that begin with "//", or with ";" and no
     number. So are delimiters at the end of a line, and quotes around a number. A decimal comma
     becomes a point where commas do not separate fields.
     """
@@ -191,7 +195,7 @@ def _parse(lines: io.BytesIO | list[bytes], delimiter: str | None, **options: ob
         warnings.simplefilter("ignore", UserWarning)  # "input contained no data": blank lines are valid
         # Latin-1 decodes any byte: a stray byte is reported as a broken line and not as a codec
         # error.
-        return np.loadtxt(lines, delimiter=delimiter, encoding="latin-1", ndmin=2, **options)  # type: ignore[call-overload, no-any-return]
+        return np.loadtxt(lines, delimiter=delimiter, comments=None, encoding="latin-1", ndmin=2, **options)  # type: ignore[call-overload, no-any-return]
 
 
 def number_rows(
@@ -227,7 +231,7 @@ def number_rows(
         if limit == 0:
             following += _count_rows(chunk)
             continue
-        chunk, most = _plain_nan(chunk), None
+        chunk, most = _without_comments(_plain_nan(chunk), delimiter), None
         if limit is not None:
             # loadtxt allocates max_rows rows at once, with as many columns as the first row has.
             # Bound both by what these bytes can hold.
@@ -238,12 +242,12 @@ def number_rows(
         try:
             rows = _parse(io.BytesIO(chunk), delimiter, max_rows=most, **options)
         except ValueError:
-            commas = commas or (delimiter != "," and b"," in _without_comments(chunk, delimiter))
+            commas = commas or (delimiter != "," and b"," in chunk)
             try:
                 rows = _parse(io.BytesIO(tidy_rows(chunk, delimiter)), delimiter, max_rows=most, **options)
             except ValueError as error:
                 raise _broken_row(path, line, chunk, columns, delimiter, limit, more) from error
-        points = points or (b"." in chunk and b"." in _without_comments(chunk, delimiter))
+        points = points or b"." in chunk
         if commas and points:
             raise scan_error(
                 path,
@@ -322,10 +326,12 @@ def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[n
     """
     lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE | re.IGNORECASE)
     for line, chunk in text_chunks(file, path):
-        found = lines_of.findall(chunk)
+        plain = _HASH_COMMENT.sub(b"", chunk)
+        found = lines_of.findall(plain)
         try:
             rows = _parse(found, None, usecols=(0, 1, 2)) if found else np.empty((0, 3))
-            broken = len(rows) != len(found)  # loadtxt skips a keyword with nothing after it
+            # loadtxt skips a keyword with nothing after it.
+            broken = len(rows) != len(found) or (keyword == "v" and _JOINED_OBJ.search(plain) is not None)
         except ValueError:
             broken = True
         if broken:
@@ -340,8 +346,10 @@ def _broken_keyword(
     """Build the error for the first line of a chunk whose keyword lacks three numbers after it."""
     expected = f"{keyword!r} and three numbers"
     for number, raw in enumerate(io.BytesIO(chunk), first_line):
-        match = lines_of.match(raw.rstrip(b"\r\n"))
-        if match:
+        plain = _HASH_COMMENT.sub(b"", raw.rstrip(b"\r\n"))
+        if keyword == "v" and _JOINED_OBJ.match(plain):
+            return _broken_line(path, number, raw, "numbers only")
+        if match := lines_of.match(plain):
             fields = split_row(match[1] or b"", None)
             if len(fields) < 3 or not all(map(is_number, fields[:3])):
                 return _broken_line(path, number, raw, expected)

@@ -73,6 +73,17 @@ def test_an_stl_surface_is_sampled_too(tmp_path: Path) -> None:
     assert (xyz[:, :2].sum(axis=1) <= 2).all() and (xyz[:, 2] == 1).all()
 
 
+@pytest.mark.parametrize(
+    "line", ["v 4 5 6\x0ev 7 8 9", "vn 0 0 1 v 7 8 9", "v 4 5 6#v 7 8 9", "f 1 2 3\x85v 7 8 9"]
+)
+def test_vertices_that_one_wrong_byte_joins_to_a_line_are_not_lost(line: str, tmp_path: Path) -> None:
+    """Issue 35."""
+    path = tmp_path / "a.obj"
+    path.write_text(f"# v 1\no v 2 3\nv 1 2 3 # v 1\n{line}\n", encoding="latin-1")
+    with pytest.raises(ScanError, match=r"line 4 is .*, expected numbers only"):
+        read_all(path)
+
+
 def test_an_stl_whose_keyword_is_damaged_is_refused(tmp_path: Path) -> None:
     """Issue 35: its point was left out without a word."""
     path = tmp_path / "a.stl"

@@ -105,6 +105,7 @@ def test_text_layouts(
         ("1,2,3\n4,5,6,7,\n", "line 2 is '4,5,6,7,'"),
         ("1 2 3\n4 5\x1a6\n7 8 9\n", "line 2 is"),
         ("1 2 3\n\x1a\n7 8 9\n", "line 2 is"),
+        ("1 2 3\n4 5 6#7 8 9\n", "line 2 is '4 5 6#7 8 9'"),  # a damaged line end is no comment
         ("1 2 3 wall\n", "expected at least three numbers .*, and nothing else: .* remove columns"),
         ("1 2\n3 4\n", "line 1 is '1 2', expected at least three numbers"),
         ("1 2 z\n", "line 1"),

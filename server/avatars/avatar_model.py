@@ -5,10 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...builder.voxel.point_hierarchy import build_local, mean_closest_distance
+from ...builder.voxel.point_hierarchy import LocalHierarchy, build_local, mean_closest_distance
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_positions
+from ...schemas.wire.scene_messages import AvatarInfo
 from ..kernels.core.placed_avatar import MAX_FRONT, Avatar
 from ..kernels.core.scene_arrays import LANES
 
@@ -23,6 +24,9 @@ class AvatarModel(NamedTuple):
     arrays: arrays that the kernels read.
     rows: (b, LANES) int32, the row of `points` in each lane of a block.
     bounding_radius: of a sphere that encloses all spheres of the avatar [m].
+    surface: arrays of the points of its surface alone, from which normals are estimated; `arrays`
+    where no point is inside.
+    inner_points: number of the points inside, the last ones.
     digest: `avatar_digest` of an avatar that a client added; empty for an avatar of the scene file.
     """
 
@@ -31,11 +35,22 @@ class AvatarModel(NamedTuple):
     arrays: Avatar
     rows: NDArray[np.int32]
     bounding_radius: float
+    surface: Avatar
+    inner_points: int = 0
     digest: bytes = b""
 
 
-def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
+def describe_avatar(name: str, model: AvatarModel, description: str = "") -> AvatarInfo:
+    """Return the description of an avatar. description: of its source, see `AvatarInfo`."""
+    return AvatarInfo(
+        name, len(model.points), model.radius, model.bounding_radius, model.inner_points, description
+    )
+
+
+def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: int = 0) -> AvatarModel:
     """Build an avatar from points (n, 3), avatar frame [m]. One without points touches nothing.
+
+    inner_points: number of them inside, the last ones; fewer than n.
 
     radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance
     ([Fig12] section 7) of the distinct points, rounded to a lattice of 2^-20 m. A single distinct
@@ -58,7 +73,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
             np.empty((4, 0)),
             0,
         )
-        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0)
+        return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0, empty)
     local = build_local(array, leaf=LANES, degree=DEGREE)
     if radius is None:
         radius = mean_closest_distance(local) / 2
@@ -66,6 +81,17 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
             raise BadRequestError(
                 "avatar of a single distinct point has no closest-point distance: give a radius"
             )
+    arrays, rows = _arrays(local, array)
+    surface = arrays
+    if inner_points:
+        outer = np.ascontiguousarray(array[: len(array) - inner_points])
+        surface, _ = _arrays(build_local(outer, leaf=LANES, degree=DEGREE), outer)
+    bounding_radius = float(arrays.radius[0]) + float(radius)
+    return AvatarModel(array, float(radius), arrays, rows, bounding_radius, surface, inner_points)
+
+
+def _arrays(local: LocalHierarchy, points: NDArray[np.float64]) -> tuple[Avatar, NDArray[np.int32]]:
+    """Return the arrays of a hierarchy of points (n, 3), and the row of the point in each lane."""
     tree, bounds = local.hierarchy.tree, local.hierarchy.bounds
     leaves = int(tree.levels[-2])
     first = np.empty(len(tree.begin), np.int32)
@@ -76,7 +102,7 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
     # Unused lanes of a block repeat its last point.
     last = tree.end[leaves:, None] - 1
     rows = tree.order[np.minimum(tree.begin[leaves:, None] + np.arange(LANES), last)]
-    lanes = array[rows].transpose(0, 2, 1)
+    lanes = points[rows].transpose(0, 2, 1)
     # Rounding moves a point by less than sqrt(3) lattice steps. Two more steps in the radius
     # therefore enclose the given points, including the rounding of these sums.
     center = np.asarray(local.low + bounds.center * local.step)
@@ -96,5 +122,4 @@ def make_avatar(points: ArrayLike, radius: float | None = None) -> AvatarModel:
         np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
     )
-    bounding_radius = float(node_radius[0]) + float(radius)
-    return AvatarModel(array, float(radius), arrays, np.ascontiguousarray(rows, np.int32), bounding_radius)
+    return arrays, np.ascontiguousarray(rows, np.int32)

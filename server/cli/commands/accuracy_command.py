@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import interruptible, needs_extra
+from .command_options import AvatarUnits, AvatarUp, interruptible, needs_extra
 
 
 def accuracy(
@@ -15,6 +15,8 @@ def accuracy(
     avatar: Annotated[
         Path | None, typer.Option(help="Points of the avatar; default: a generated human figure.")
     ] = None,
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")] = Path("report"),
     full: Annotated[bool, typer.Option("--full", help="More settings, poses and repetitions.")] = False,
 ) -> None:
@@ -28,6 +30,7 @@ def accuracy(
 
     with needs_extra("made"):
         from ...report.accuracy.accuracy_report import run as measure
+    from ...avatars.avatar_file import read_avatar
     from ...report.accuracy.measurement.measurement_plan import BRIEF, FULL
     from ...report.accuracy.page.accuracy_texts import findings
     from ..output.progress_display import progress_listener
@@ -38,7 +41,8 @@ def accuracy(
         tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch,
         progress_listener() as bars,
     ):
-        report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
+        body = None if avatar is None else read_avatar(avatar, avatar_up, avatar_units)
+        report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, body)
     for line in (
         *report.facts["warnings"],
         *findings(report),

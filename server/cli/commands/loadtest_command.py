@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, needs_extra
+from .command_options import ArchivePath, AvatarUnits, AvatarUp, needs_extra
 
 
 def loadtest(
@@ -30,6 +30,8 @@ def loadtest(
     avatar: Annotated[
         Path | None, typer.Option(help="Points of the avatar; default: a generated human figure.")
     ] = None,
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder of load.html, load.json and load.csv.")
     ] = Path("load"),
@@ -83,6 +85,7 @@ def loadtest(
 
         load_pyplot()  # fails now if matplotlib is missing, not after minutes of measuring
         from ...report.load.load_test import ALL_KINDS, SECTIONS, LoadOptions, run_load_test
+    from ...avatars.avatar_file import read_avatar
     from ...report.common.bench_results import show
     from ...report.load.runs.load_cases import NOTES
     from ...report.load.runs.load_run import cores
@@ -96,7 +99,7 @@ def loadtest(
         kinds=_names(kinds, "--kinds", ALL_KINDS),
         walks=tuple(walks or ()),
         truth=truth,
-        avatar=avatar,
+        avatar=None if avatar is None else read_avatar(avatar, avatar_up, avatar_units),
         users=users,
         seconds=seconds,
         budget=budget,

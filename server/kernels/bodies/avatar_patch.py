@@ -23,7 +23,8 @@ _ROUNDED = 1.0 + 1e-9
 def lowest_heights(body, point, reach, directions, heights, sums):
     """Find how low an avatar's points near one of them lie along directions.
 
-    body: reference to the avatar's arrays.  point: (3,) a place on it, avatar frame [m].  reach: inclusive [m].
+    body: reference to the arrays of the avatar's surface.  point: (3,) a place on it, avatar frame
+    [m].  reach: inclusive [m].
     directions: (k, 3) unit, avatar frame.  heights: (k,), set to the least height over the points
     within reach, relative to `point` [m]; 0 if there are none.
     sums: (10,) int64, set to the sums for `normal_code` (schemas/kernels/normal_codes.py), in

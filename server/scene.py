@@ -297,13 +297,11 @@ class Scene(SceneTiles, SceneQuestions):
         is `clear`.
         radius: of each point's sphere [m]; None: half the mean closest-point distance of the
         points, for a mesh a hundredth of the square root of its area.
-        up, units: of a file: its axis that points up, "x", "y" or "z", and its unit of length, such
-        as "mm", with the words of scan lists (`solidcloud inspect`). None: as its format states,
-        otherwise "z" and "m"; glTF states "y". Points and mesh objects are in metres, z up.
+        up, units: of a file: its axis that points up and its unit, in the words of scan lists, such
+        as "y" and "mm"; None: as its format states (glTF: "y"), otherwise "z" and "m".
         hollow: leave the inside of a closed mesh empty.
         client: owner; clients may use the same names for different avatars. Adding the same avatar
-        again changes nothing.
-        The answer's `description` says what was taken.
+        again changes nothing. The answer's `description` says what was taken.
         Raise BadRequestError for an avatar without points, or if the name belongs to a different
         one, ScanError if the file cannot be read, TooLargeError beyond the limits.
         """

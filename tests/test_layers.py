@@ -85,7 +85,7 @@ ALLOWED = {
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/clash": "scene_interface.py",
     "server/viewer/feeds": "client.py viewer/page zenoh_client",
-    "server/viewer/users": "scene_interface.py avatars cli/scene_files viewer/feeds viewer/page zenoh_client",
+    "server/viewer/users": "scene_interface.py cli/scene_files viewer/feeds viewer/page zenoh_client",
     "server/viewer/panels": "cli/input viewer/feeds viewer/page",
     "server/viewer": "scene_interface.py clash client.py viewer/feeds viewer/page viewer/panels viewer/users",
     "server/cli/doctor": "cli/output scene.py",

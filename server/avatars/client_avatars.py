@@ -45,11 +45,10 @@ class _Entry:
 
     __slots__ = ("asked", "bytes", "model", "used")
 
-    def __init__(self, count: int, surface: int, asked: float | None) -> None:
-        """count: of its points.  surface: number of those that have a second tree, of the surface."""
+    def __init__(self, count: int, asked: float | None) -> None:
         self.model: AvatarModel | None = None
         self.asked = asked
-        self.bytes = (_LEAST_BYTES << (surface > 0)) + _BYTES_A_POINT * (count + surface)
+        self.bytes = _LEAST_BYTES + _BYTES_A_POINT * count
         self.used = time.monotonic()
 
 
@@ -112,8 +111,7 @@ class Avatars:
         shared = None if client == EVERYBODY else self._scene_avatar(name)
         if shared is not None:
             self._check_same(name, shared, array, radius, inner_points)
-        surface = len(array) - inner_points if inner_points else 0
-        entry = _Entry(len(array), surface, radius) if shared is None else _Entry(0, 0, radius)
+        entry = _Entry(len(array) if shared is None else 0, radius)
         with self._reserved(name, client, len(array), entry) as entry:
             if entry.model is None:
                 model = _built(self._large, array, radius, inner_points) if shared is None else shared.model
@@ -275,6 +273,5 @@ def _built(
 
 def bytes_of(model: AvatarModel) -> int:
     """Return the memory of an avatar's arrays [bytes]."""
-    trees = model.arrays if model.surface is model.arrays else (*model.arrays, *model.surface)
-    arrays = [model.points, model.rows, *(each for each in trees if isinstance(each, np.ndarray))]
+    arrays = [model.points, model.rows, *(each for each in model.arrays if isinstance(each, np.ndarray))]
     return sum(array.nbytes for array in arrays)

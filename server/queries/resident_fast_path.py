@@ -273,7 +273,8 @@ class ResidentQueries:
             points = np.ascontiguousarray(self.avatar.points)
             self._walking = make_walk_avatar(
                 self.body.reference,
-                refer_to_avatar(self.avatar.surface),
+                self.avatar.rows,
+                len(self.avatar.points) - self.avatar.inner_points,
                 scratch,
                 self._box,
                 points,

@@ -19,7 +19,7 @@ from .panels.effect_switch import EffectSwitch, NoSwitch
 from .panels.path_source import read_given_path
 from .panels.voxel_spheres import SphereSource
 from .users.starting_place import StartingPlaces
-from .users.user_avatar import load_avatar
+from .users.user_avatar import figure_avatar
 from .viewer_parts import Users, ViewerParts
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def viewing(
     poses: file of a path whose clashes the page shows.
     Raise SolidcloudError if the port is in use, and the errors of `read_path`.
     """
-    shape = load_avatar(None) if avatar is None else avatar
+    shape = figure_avatar() if avatar is None else avatar
     path = None if poses is None else read_given_path(poses)
     with (
         SceneLink(endpoint, scene, key_file) as link,

@@ -73,9 +73,9 @@ def view(
     from contextlib import ExitStack
 
     with needs_extra("view"):
-        from ...viewer.users.user_avatar import load_avatar
         from ...viewer.viewer import viewing
     from ....schemas.errors import BadRequestError
+    from ...avatars.avatar_shape import avatar_shape
     from ..scene_files.viewed_scene import viewed_scene
     from .viewed_server import ViewedServer
 
@@ -88,8 +88,9 @@ def view(
             "--cache and --up belong to a server that this command starts: name an archive or a scene file"
         )
 
-    shape = load_avatar(avatar, **avatar_options(avatar_up, avatar_units, avatar_hollow))
+    shape = None
     if avatar is not None:
+        shape = avatar_shape(avatar, **avatar_options(avatar_up, avatar_units, avatar_hollow))
         print_avatar(avatar, shape)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     server: ViewedServer | None = None

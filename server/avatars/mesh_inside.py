@@ -43,8 +43,8 @@ class ClosedParts(NamedTuple):
 
     parts, open_parts: number of parts of the mesh, and of those that are not closed.
     closed: (m,) bool, triangles of closed parts.
-    corners: (c, 3, 3) int64, even: triangles of closed parts that are not points or lines, oriented
-    alike in each part.  part: (c,) of each.  hole: (parts,) bool, whether a part is oriented against
+    corners: (c, 3, 3) int64, even: triangles of closed parts, oriented alike in each; without those
+    of two equal corners.  part: (c,) of each.  hole: (parts,) bool, whether a part is oriented against
     the largest one and may be a cavity.
     low, step: a corner is at low + corners * step / 2 [m].
     """

@@ -199,8 +199,8 @@ def test_a_filled_mesh_touches_what_its_spheres_touch(
     rng = np.random.default_rng(seed)
     shape = avatar_shape(trimesh.creation.icosphere(2, 0.3), radius)
     avatar = np.asarray(shape.points)
-    points = np.concatenate([cloud(rng, kind, 60), rng.uniform(-1, 1, (100, 3))])
-    poses = archive_cases.near_poses(rng, points, avatar, 40, 0.5)
+    points = np.concatenate([cloud(rng, kind, 9), rng.uniform(-2, 2, (3, 3))])
+    poses = archive_cases.near_poses(rng, points, avatar, 100, 0.5)
     with TemporaryDirectory() as folder:
         case = build(points, folder, radius=0.005, **tree)
         with Scene.open(case.archive) as scene:

@@ -27,14 +27,22 @@ class ReadAvatar(NamedTuple):
     axes: str
 
 
-def read_avatar(path: Path, up: str | None = None, units: str | None = None) -> NDArray[np.float64]:
+def read_avatar(path: Path) -> NDArray[np.float64]:
     """Read the points (n, 3) of an avatar from a scan, or the vertices from a mesh, float64 [m].
 
-    up, units: as for `read_triangles_or_points`.
-    Raise ScanError if the file cannot be read, contains no point or one that is not finite,
-    TooLargeError if it has more than MAX_AVATAR_POINTS points.
+    Raise the errors of `read_vertices`.
     """
-    return _points(path, _place(open_scans(path), up, units))
+    return read_vertices(path).points
+
+
+def read_vertices(path: Path, up: str | None = None, units: str | None = None) -> ReadAvatar:
+    """Read the points of a scan, or the vertices of a mesh; up, units: as for `read_triangles_or_points`.
+
+    Raise ScanError if the file cannot be read, contains no point or one that is not finite,
+    TooLargeError if it has more than MAX_AVATAR_POINTS points, BadRequestError for another axis or unit.
+    """
+    scans, placed = _open(path, up, units)
+    return ReadAvatar(np.empty((0, 3, 3)), _points(path, placed), _axes(scans[0], placed[0], up, units))
 
 
 def read_triangles_or_points(path: Path, up: str | None = None, units: str | None = None) -> ReadAvatar:
@@ -42,23 +50,26 @@ def read_triangles_or_points(path: Path, up: str | None = None, units: str | Non
 
     up: a key of TURNS, the file's axis that points up.  units: a key of METRES, its unit of length.
     None: what its format states, otherwise z and metres; glTF states y.
-    Raise BadRequestError for another word, and the errors of `read_avatar`.
+    Raise the errors of `read_vertices`.
     """
+    scans, placed = _open(path, up, units)
+    triangles = mesh_triangles(scans[0]) if len(scans) == 1 else np.empty((0, 3, 3))
+    if not len(triangles):
+        return ReadAvatar(triangles, _points(path, placed), _axes(scans[0], placed[0], up, units))
+    if isinstance(placed[0], PlacedScan):
+        triangles = placed[0].place(triangles.reshape(-1, 3)).reshape(-1, 3, 3)
+    return ReadAvatar(triangles, np.empty((0, 3)), _axes(scans[0], placed[0], up, units))
+
+
+def _open(path: Path, up: str | None, units: str | None) -> tuple[list[Scan], list[Scan]]:
+    """Open the scans of a file; return them as they are, and in metres with z up."""
     for name, word, known in (("up", up, TURNS), ("units", units, METRES)):
         if word is not None and word not in known:
             raise BadRequestError(f"{name} {word!r} of avatar {path}: expected one of {', '.join(known)}")
     scans = open_scans(path)
-    placed = _place(scans, up, units)
-    triangles = mesh_triangles(scans[0]) if len(scans) == 1 else np.empty((0, 3, 3))
-    if len(triangles) and isinstance(placed[0], PlacedScan):
-        triangles = placed[0].place(triangles.reshape(-1, 3)).reshape(-1, 3, 3)
-    points = np.empty((0, 3)) if len(triangles) else _points(path, placed)
-    return ReadAvatar(triangles, points, _axes(scans[0], placed[0], up, units))
-
-
-def _place(scans: Sequence[Scan], up: str | None, units: str | None) -> list[Scan]:
-    """Return scans in metres with z up."""
-    return [place_scan(scan, up=up, units=units) for scan in scans]
+    if not scans:
+        raise ScanError(f"{path}: contains no point: expected at least one: choose another file")
+    return scans, [place_scan(scan, up=up, units=units) for scan in scans]
 
 
 def _axes(scan: Scan, placed: Scan, up: str | None, units: str | None) -> str:

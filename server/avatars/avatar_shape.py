@@ -87,14 +87,11 @@ def _mesh_shape(
 ) -> AvatarShape:
     """Return the shape of a mesh (m, 3, 3). axes: description of a file's axes and unit."""
     cover = cover_surface(triangles, radius, what)
-    found = closed_parts(triangles)
-    closed = found.parts - found.open_parts
-    points, inner = cover.points, 0
+    points, inner, text = cover.points, 0, f"open mesh: {_SURFACE}"
+    found = None if hollow or cover.radius is None else closed_parts(triangles)
     if hollow:
         text = f"mesh, hollow: {_SURFACE}"
-    elif not closed or cover.radius is None:
-        text = f"open mesh: {_SURFACE}"
-    else:
+    elif found is not None and found.parts > found.open_parts:
         small = cover.triangles
         if found.open_parts:
             small = cover_surface(triangles[found.closed], cover.radius, what).triangles
@@ -102,5 +99,6 @@ def _mesh_shape(
         points, inner = np.concatenate([points, inside]), len(inside)
         text = "closed mesh, filled"
         if found.open_parts:
+            closed = found.parts - found.open_parts
             text = f"mesh: {closed} of {found.parts} parts closed and filled, the others {_SURFACE}"
     return AvatarShape(points, cover.radius, inner, f"{text}; {axes}" if axes else text)

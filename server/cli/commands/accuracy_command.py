@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import AvatarUnits, AvatarUp, interruptible, needs_extra
+from .command_options import AvatarUnits, AvatarUp, interruptible, needs_extra, read_avatar_points
 
 
 def accuracy(
@@ -30,7 +30,6 @@ def accuracy(
 
     with needs_extra("made"):
         from ...report.accuracy.accuracy_report import run as measure
-    from ...avatars.avatar_file import read_avatar
     from ...report.accuracy.measurement.measurement_plan import BRIEF, FULL
     from ...report.accuracy.page.accuracy_texts import findings
     from ..output.progress_display import progress_listener
@@ -41,7 +40,7 @@ def accuracy(
         tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch,
         progress_listener() as bars,
     ):
-        body = None if avatar is None else read_avatar(avatar, avatar_up, avatar_units)
+        body = None if avatar is None else read_avatar_points(avatar, avatar_up, avatar_units)
         report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, body)
     for line in (
         *report.facts["warnings"],

@@ -21,6 +21,9 @@ from ....schemas.process.interrupts import (
 from ....schemas.process.own_command import with_own_command
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ...scene_interface import AvatarShape
 
 ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
@@ -124,6 +127,16 @@ def avatar_options(
     """Return the options of an avatar's file that were given, as `avatar_shape` takes them."""
     given = {"up": avatar_up, "units": avatar_units, "hollow": avatar_hollow}
     return {name: value for name, value in given.items() if value is not None}
+
+
+def read_avatar_points(file: Path, avatar_up: str | None, avatar_units: str | None) -> "NDArray[np.float64]":
+    """Read the points (n, 3) of an avatar's file or the vertices of a mesh [m]; print what was taken."""
+    from ...avatars.avatar_file import read_vertices
+    from ...scene_interface import AvatarShape
+
+    read = read_vertices(file, avatar_up, avatar_units)
+    print_avatar(file, AvatarShape(read.points, None, 0, f"points or vertices: a surface; {read.axes}"))
+    return read.points
 
 
 def print_avatar(file: Path, shape: "AvatarShape") -> None:

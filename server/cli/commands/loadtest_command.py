@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, AvatarUnits, AvatarUp, needs_extra
+from .command_options import ArchivePath, AvatarUnits, AvatarUp, needs_extra, read_avatar_points
 
 
 def loadtest(
@@ -85,7 +85,6 @@ def loadtest(
 
         load_pyplot()  # fails now if matplotlib is missing, not after minutes of measuring
         from ...report.load.load_test import ALL_KINDS, SECTIONS, LoadOptions, run_load_test
-    from ...avatars.avatar_file import read_avatar
     from ...report.common.bench_results import show
     from ...report.load.runs.load_cases import NOTES
     from ...report.load.runs.load_run import cores
@@ -99,7 +98,7 @@ def loadtest(
         kinds=_names(kinds, "--kinds", ALL_KINDS),
         walks=tuple(walks or ()),
         truth=truth,
-        avatar=None if avatar is None else read_avatar(avatar, avatar_up, avatar_units),
+        avatar=None if avatar is None else read_avatar_points(avatar, avatar_up, avatar_units),
         users=users,
         seconds=seconds,
         budget=budget,

@@ -88,10 +88,9 @@ def _mesh_shape(
     """Return the shape of a mesh (m, 3, 3). axes: description of a file's axes and unit."""
     cover = cover_surface(triangles, radius, what)
     points, inner, text = cover.points, 0, f"open mesh: {_SURFACE}"
-    found = None if hollow or cover.radius is None else closed_parts(triangles)
     if hollow:
         text = f"mesh, hollow: {_SURFACE}"
-    elif found is not None and found.parts > found.open_parts:
+    elif cover.radius is not None and (found := closed_parts(triangles)).parts > found.open_parts:
         small = cover.triangles
         if found.open_parts:
             small = cover_surface(triangles[found.closed], cover.radius, what).triangles

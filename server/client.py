@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import ArrayLike
 
 from ..schemas.archive.pose_arrays import make_poses, one_pose
@@ -32,7 +33,7 @@ from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
 from .avatars.avatar_shape import MeshLike, avatar_shape
-from .scene_interface import QueryMethods, list_avatars
+from .scene_interface import AvatarShape, QueryMethods, list_avatars
 from .zenoh_client.client_identity import AddedAvatar
 from .zenoh_client.client_session import ClientSession, CommandNumbers
 from .zenoh_client.residency_stream import ResidencyStream
@@ -169,20 +170,24 @@ class Client(QueryMethods):
     def add_avatar(
         self,
         name: str,
-        points: "ArrayLike | str | os.PathLike[str] | MeshLike",
+        points: "ArrayLike | str | os.PathLike[str] | MeshLike | AvatarShape",
         radius: float | None = None,
+        *,
+        up: str | None = None,
+        units: str | None = None,
+        hollow: bool = False,
     ) -> AvatarInfo:
         """Add an avatar of this client: points (n, 3), the path of a file, or a mesh object.
 
-        name, points, radius: as in `Scene.add_avatar`. This process reads the file, and needs the
+        Arguments are as in `Scene.add_avatar`. This process reads the file, and needs the
         extra `readers` for some formats.
         If no server answers, the avatar is remembered and added later; the answer then has `radius`
         as given here and no `bounding_radius`. Raise BadRequestError if another avatar has the name
         or this one is invalid or without points, ScanError if the file cannot be read,
         TooLargeError beyond the server's limits.
         """
-        shape = avatar_shape(points, radius)
-        avatar = AddedAvatar(make_positions(shape.points).copy(), shape.radius)
+        shape = avatar_shape(points, radius, up=up, units=units, hollow=hollow)
+        avatar = AddedAvatar(make_positions(shape.points).copy(), shape.radius, shape.inner_points)
         request = avatar.request(name)
         avatars = self._connection.avatars
         new = avatars.add(name, avatar)
@@ -195,8 +200,10 @@ class Client(QueryMethods):
                 avatars.remove(name)
             raise
         if payload is None:
-            return AvatarInfo(name, len(avatar.points), avatar.radius)
-        return avatars.accepted(name, payload)
+            info = AvatarInfo(name, len(avatar.points), avatar.radius, None, avatar.inner_points)
+        else:
+            info = avatars.accepted(name, payload)
+        return structs.replace(info, description=shape.description)
 
     def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A:
         """Answer a question, in several requests if it has many items.

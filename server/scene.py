@@ -23,6 +23,7 @@ from ..schemas.wire.warming_parts import MOTION, PARTS
 from .archives.archive_info import describe_scene
 from .archives.placed_archive import PlacedArchive
 from .archives.scene_info import join_infos, make_stats
+from .avatars.avatar_model import describe_avatar
 from .avatars.avatar_shape import MeshLike, avatar_shape
 from .avatars.client_avatars import check_owner
 from .observability.request_stats import RequestStats
@@ -31,7 +32,7 @@ from .residency.voxel_cache import VoxelCache
 from .residency.voxel_store import OpenStore
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag
-from .scene_interface import EVERYBODY, AvatarLimits, list_avatars
+from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, list_avatars
 from .scenes.scene_archives import (
     ReadPoints,
     error_location,
@@ -63,13 +64,13 @@ class Scene(SceneTiles, SceneQuestions):
         name: str,
         metrics: RequestStats | None = None,
         file: SceneFile | None = None,
-        avatars: Mapping[str, tuple[ArrayLike, float | None]] | None = None,
+        avatars: Mapping[str, AvatarShape] | None = None,
     ) -> None:
         """Serve archives, which this scene closes with itself; callers use `Scene.open`.
 
         metrics: statistics of answers, and of the loads of these archives; None: new ones.
         file: declares effects, objects and limits; None: the effect `stop` alone.
-        avatars: avatars that every client may use, by name: points (n, 3) [m] and radius [m].
+        avatars: avatars that every client may use, by name.
         Raise BadRequestError if there is no archive, or an avatar is invalid.
         """
         if not archives:
@@ -79,8 +80,7 @@ class Scene(SceneTiles, SceneQuestions):
         self._simulation: Simulation | None = None
         self._making = threading.Lock()
         self._own = [
-            self.add_avatar(each, points, radius, client=EVERYBODY)
-            for each, (points, radius) in (avatars or {}).items()
+            self.add_avatar(each, shape, client=EVERYBODY) for each, shape in (avatars or {}).items()
         ]
 
     @classmethod
@@ -152,7 +152,7 @@ class Scene(SceneTiles, SceneQuestions):
         name = name or scene_name(file, path)
         found = find_archives(file, path, key)
         avatars = read_avatars(file, path, read_points)
-        own = {each.info.name: (each.points, each.info.radius) for each in avatars}
+        own = {each.info.name: each.shape for each in avatars}
         metrics = RequestStats()
         with ExitStack() as stack:
             archives = open_archives(
@@ -279,28 +279,36 @@ class Scene(SceneTiles, SceneQuestions):
     def add_avatar(
         self,
         name: str,
-        points: "ArrayLike | str | os.PathLike[str] | MeshLike",
+        points: "ArrayLike | str | os.PathLike[str] | MeshLike | AvatarShape",
         radius: float | None = None,
         *,
         client: str = "",
+        up: str | None = None,
+        units: str | None = None,
+        hollow: bool = False,
     ) -> AvatarInfo:
         """Add an avatar: points (n, 3), the path of a scan or mesh file, or a mesh object.
 
         name: 1 to 64 characters.
         points: in the avatar's frame [m]. A file has any format that `solidcloud build` reads. A
         mesh object has `vertices` and `faces`, such as a `trimesh.Trimesh`. The surface of a mesh
-        is covered with points, so that no part of it is farther than the radius from one.
+        is covered with points, so that no part of it is farther than the radius from one. So is the
+        inside of a closed mesh. An open mesh and points are surfaces: what they surround untouched
+        is `clear`.
         radius: of each point's sphere [m]; None: half the mean closest-point distance of the
         points, for a mesh a hundredth of the square root of its area.
+        up, units: of a file: its axis that points up and its unit, in the words of scan lists, such
+        as "y" and "mm"; None: as its format states (glTF: "y"), otherwise "z" and "m".
+        hollow: leave the inside of a closed mesh empty.
         client: owner; clients may use the same names for different avatars. Adding the same avatar
-        again changes nothing.
+        again changes nothing. The answer's `description` says what was taken.
         Raise BadRequestError for an avatar without points, or if the name belongs to a different
         one, ScanError if the file cannot be read, TooLargeError beyond the limits.
         """
-        shape = avatar_shape(points, radius)
-        request = AddAvatarRequest(name, make_positions(shape.points), shape.radius)
-        model = self._avatars.add(name, request.points, request.radius, client)
-        return AvatarInfo(name, len(model.points), model.radius, model.bounding_radius)
+        shape = avatar_shape(points, radius, up=up, units=units, hollow=hollow)
+        request = AddAvatarRequest(name, make_positions(shape.points), shape.radius, shape.inner_points)
+        model = self._avatars.add(name, request.points, request.radius, client, request.inner_points)
+        return describe_avatar(name, model, shape.description)
 
     @property
     def simulation(self) -> Simulation:

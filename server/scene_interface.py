@@ -11,7 +11,9 @@ from contextlib import contextmanager
 from enum import Enum
 from typing import Any, NamedTuple, NoReturn, Protocol, Self, TypeVar, Unpack
 
+import numpy as np
 from msgspec import structs
+from numpy.typing import ArrayLike, NDArray
 
 from ..schemas.errors import SolidcloudError
 from ..schemas.wire.answers import (
@@ -257,6 +259,27 @@ class ServedWatch(Protocol):
 
     def take(self, *, always: bool = False) -> ResidencyChanges | None: ...
     def close(self) -> None: ...
+
+
+class AvatarShape(NamedTuple):
+    """Shape of an avatar.
+
+    points: (n, 3) in the avatar's frame [m].  radius: of each point's sphere [m]; None: half the
+    mean closest-point distance of the points.
+    inner_points: number of points that fill the inside of a mesh; they are the last ones.
+    description: of what was taken from a file or mesh, and how; empty for points.
+    """
+
+    points: ArrayLike
+    radius: float | None = None
+    inner_points: int = 0
+    description: str = ""
+
+    @property
+    def surface(self) -> NDArray[np.float64]:
+        """Return the points (n, 3) of the surface [m]."""
+        points = np.asarray(self.points, np.float64)
+        return points[: len(points) - self.inner_points]
 
 
 class ServedScene(Protocol):

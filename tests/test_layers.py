@@ -73,7 +73,8 @@ ALLOWED = {
         "pictures"
     ),
     "server/report/common": "cli/input cli/output avatars residency scene.py",
-    "server/cli/scene_files": "residency archives scenes scene.py",
+    "server/cli/input": "scene_interface.py",
+    "server/cli/scene_files": "scene_interface.py residency archives scenes scene.py",
     "server/report/accuracy/measurement": "avatars scene.py report/common",
     "server/report/accuracy/page": "report/common report/accuracy/measurement",
     "server/report/accuracy": "scene.py report/common report/accuracy/measurement report/accuracy/page",
@@ -84,15 +85,19 @@ ALLOWED = {
     "server/report/walk": "cli/input client.py cli/output scene.py report/common",
     "server/clash": "scene_interface.py",
     "server/viewer/feeds": "runtime client.py viewer/page zenoh_client",
-    "server/viewer/users": "runtime avatars cli/scene_files viewer/feeds viewer/page zenoh_client",
+    "server/viewer/users": (
+        "runtime scene_interface.py cli/scene_files viewer/feeds viewer/page zenoh_client"
+    ),
     "server/viewer/panels": "cli/input viewer/feeds viewer/page",
-    "server/viewer": "runtime clash client.py viewer/feeds viewer/page viewer/panels viewer/users",
+    "server/viewer": (
+        "runtime scene_interface.py clash client.py viewer/feeds viewer/page viewer/panels viewer/users"
+    ),
     "server/cli/doctor": "cli/output scene.py",
     "server/cli/warming": "scene.py",
     "server/cli/commands": (
         "cli/doctor cli/warming cli/input zenoh_common zenoh_server zenoh_client client.py avatars "
-        "cli/output simulation scene.py cli/scene_files report/accuracy/measurement report/accuracy/page "
-        "report/accuracy report/common report/load/runs report/load report/walk viewer"
+        "scene_interface.py cli/output simulation scene.py cli/scene_files report/accuracy/measurement "
+        "report/accuracy/page report/accuracy report/common report/load/runs report/load report/walk viewer"
     ),
     "server/cli/commands/archives": "archives cli/commands cli/input cli/output client.py residency",
     "server/cli": "cli/commands cli/commands/archives cli/output",
@@ -109,6 +114,7 @@ CROSSING = {
     "server/avatars": (
         "builder/voxel/point_hierarchy",
         "builder/sources/common/scan",
+        "builder/sources/placed_scan",
         "builder/sources/scan_files",
         "builder/sources/surface_samples",
     ),

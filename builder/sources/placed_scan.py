@@ -106,8 +106,12 @@ class PlacedScan(Scan):
         self._inner.wanted, self._inner.drop_classes = self.wanted, self.drop_classes
         for block in self._inner.blocks(block_points, start, stop):
             self.dropped = self._inner.dropped
-            yield block._replace(xyz=apply_pose(self._given, self._turned(block.xyz)))
+            yield block._replace(xyz=self.place(block.xyz))
         self.dropped = self._inner.dropped
+
+    def place(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (n, 3) of the file, its own pose applied, in the world [m]."""
+        return apply_pose(self._given, self._turned(xyz))
 
     def _turned(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the points in metres with z up, (n, 3); changing a sign is exact, hence one rounding."""
@@ -131,7 +135,7 @@ class PlacedScan(Scan):
         corners = np.array(
             [[bounds[k, 0], bounds[m, 1], bounds[n, 2]] for k in (0, 1) for m in (0, 1) for n in (0, 1)]
         )
-        moved = apply_pose(self._given, self._turned(corners))
+        moved = self.place(corners)
         return checked_bounds(
             np.stack([moved.min(axis=0) - BOUNDS_MARGIN, moved.max(axis=0) + BOUNDS_MARGIN])
         )

@@ -64,12 +64,19 @@ class AvatarItem(_Part, frozen=True):
     """Avatar that every user may use.
 
     file: a scan or mesh of it.
-    radius: of its points [m]; omitted: half the mean closest-point distance.
+    radius: of its points [m]; omitted: half the mean closest-point distance, of a mesh a hundredth of
+    the square root of its area.
+    up, units: the axis of the file that points up, and its unit of length; omitted: as its format
+    states, otherwise z and m.
+    hollow: leave the inside of a closed mesh empty.
     """
 
     name: SceneName
     file: PathText
     radius: Annotated[float, msgspec.Meta(ge=0, le=8)] | None = None
+    up: Literal["x", "y", "z"] | None = None
+    units: Literal["m", "mm", "cm", "dm", "km", "in", "ft", "us-ft", "yd"] | None = None
+    hollow: bool = False
 
 
 class ObjectItem(_Part, frozen=True):

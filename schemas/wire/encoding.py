@@ -36,7 +36,7 @@ _LARGE_BIN = 1 << 18
 _LARGE_JSON, _JSON_PIECE = 1 << 17, 1 << 16
 _LISTED = 1 << 13
 
-_RADIUS = struct.Struct("<d")
+_RADIUS_AND_COUNT = struct.Struct("<2d")
 
 _M = TypeVar("_M")
 
@@ -108,15 +108,15 @@ def decode_answer(kind: type[_M], payload: bytes, encoding: str = MSGPACK) -> _M
         ) from None
 
 
-def avatar_digest(points: NDArray[np.float64], radius: float) -> bytes:
+def avatar_digest(points: NDArray[np.float64], radius: float, inner_points: int = 0) -> bytes:
     """Return the SHA-256 that identifies an avatar by its content.
 
-    points: (n, 3) [m].  radius: of each point's sphere [m].
-    The hash covers the points, row by row, and the radius, each number as a little-endian float64;
-    -0.0 counts as 0.0.
+    points: (n, 3) [m].  radius: of each point's sphere [m].  inner_points: number of inner ones.
+    The hash covers the points, row by row, the radius, and the number of inner points, each number
+    as a little-endian float64; -0.0 counts as 0.0.
     """
     found = hashlib.sha256(np.asarray(points + 0.0, "<f8").tobytes())
-    found.update(_RADIUS.pack(radius + 0.0))
+    found.update(_RADIUS_AND_COUNT.pack(radius + 0.0, inner_points))
     return found.digest()
 
 

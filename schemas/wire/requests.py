@@ -52,11 +52,15 @@ class AddAvatarRequest(Request, frozen=True):
     name: 1 to 64 characters.  points: (n, 3) float64, n >= 1, in the avatar's frame [m].
     radius: of every point [m], finite and >= 0; null: half the mean closest-point distance of
     `points`.
+    inner_points: number of points, the last ones, that fill the inside of a mesh, less than n.
+    They count for every answer, but are not part of the avatar's surface, from which contact
+    normals are estimated.
     """
 
     name: Name
     points: Positions
     radius: Length | None = None
+    inner_points: Count = 0
 
     def __post_init__(self) -> None:
         Request.__post_init__(self)
@@ -64,6 +68,11 @@ class AddAvatarRequest(Request, frozen=True):
             raise BadRequestError(
                 f"avatar {self.name!r} has no points: expected at least one, because an avatar without points touches "
                 "nothing: check where its points come from"
+            )
+        if self.inner_points >= len(self.points):
+            raise BadRequestError(
+                f"avatar {self.name!r}: {self.inner_points} inner points of {len(self.points)}: expected fewer than "
+                "all, because the first ones are its surface"
             )
 
 

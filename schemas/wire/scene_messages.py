@@ -22,6 +22,10 @@ class AvatarInfo(msgspec.Struct, frozen=True):
 
     points: number of points.  radius: of every point [m].
     bounding_radius: radius of a sphere around the avatar's points and their radii [m].
+    inner_points: number of points that fill the inside of a mesh, the last ones.
+    description: what was taken of the avatar's file or mesh, and how: whether it is filled or only
+    a surface, the file's up axis and unit. The process that reads the file fills it in: a server
+    for the scene's own avatars, `add_avatar` for others; empty for points.
     If no server has answered yet, `Client` returns a `bounding_radius` of null, and the `radius`
     that was requested.
     """
@@ -30,6 +34,8 @@ class AvatarInfo(msgspec.Struct, frozen=True):
     points: int
     radius: float | None = None
     bounding_radius: float | None = None
+    inner_points: int = 0
+    description: str = ""
 
 
 class SourceInfo(msgspec.Struct, frozen=True):

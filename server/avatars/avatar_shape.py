@@ -5,14 +5,18 @@ This module imports neither numba nor h5py, and the readers of files only when a
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_vectors
+from ..scene_interface import AvatarShape
+from .mesh_inside import closed_parts, fill_inside
 from .surface_points import cover_surface
+
+_SURFACE = "a surface, with nothing inside"
 
 
 class MeshLike(Protocol):
@@ -22,36 +26,42 @@ class MeshLike(Protocol):
     def vertices(self) -> Any: ...
 
 
-class AvatarShape(NamedTuple):
-    """Shape of an avatar.
-
-    points: (n, 3) in the avatar's frame [m].  radius: of each point's sphere [m]; None: half the
-    mean closest-point distance of the points.
-    """
-
-    points: ArrayLike
-    radius: float | None
-
-
-def avatar_shape(source: Any, radius: float | None = None) -> AvatarShape:
+def avatar_shape(
+    source: Any,
+    radius: float | None = None,
+    *,
+    up: str | None = None,
+    units: str | None = None,
+    hollow: bool = False,
+) -> AvatarShape:
     """Return the shape of an avatar from any source that `add_avatar` accepts.
 
     source: points (n, 3) [m], the path of a scan or mesh file, or a mesh object with `vertices` and
-    `faces`, such as a `trimesh.Trimesh` or a `trimesh.Scene`.
+    `faces`, such as a `trimesh.Trimesh` or a `trimesh.Scene`. A shape is returned as it is.
     radius: of each point's sphere [m]. The surface of a mesh is covered with points such that no
     part of it is farther than the radius from one; None: see `cover_surface`. Points without faces
     are taken as they are.
+    up, units: the axis of a file that points up, "x", "y" or "z", and its unit of length, a key of
+    METRES (placed_scan.py); None: what its format states, otherwise "z" and "m". A point is scaled
+    to metres and turned to z up.
+    hollow: leave the inside of closed meshes empty; see `fill_inside`.
     Raise BadRequestError for an invalid mesh, ScanError for a file that cannot be read or whose
     reader is not installed, TooLargeError for more than MAX_AVATAR_POINTS points.
     """
+    if isinstance(source, AvatarShape):
+        return source
     radius = None if radius is None else float(radius)
     if isinstance(source, str | os.PathLike):
         from .avatar_file import read_triangles_or_points
 
-        triangles, points = read_triangles_or_points(Path(source))
-        if len(triangles):
-            return AvatarShape(*cover_surface(triangles, radius, str(source)))
-        return AvatarShape(points, radius)
+        read = read_triangles_or_points(Path(source), up, units)
+        if len(read.triangles):
+            return _mesh_shape(read.triangles, radius, str(source), hollow, read.axes)
+        return AvatarShape(read.points, radius, 0, f"points: {_SURFACE}; {read.axes}")
+    if up is not None or units is not None:
+        raise BadRequestError(
+            "up and units for an avatar that is no file: expected the path of one: turn and scale the points instead"
+        )
     if hasattr(source, "to_mesh") and not hasattr(source, "faces"):
         source = source.to_mesh()  # a trimesh.Scene holds several meshes, each at a pose
     if not hasattr(source, "vertices"):
@@ -69,4 +79,25 @@ def avatar_shape(source: Any, radius: float | None = None) -> AvatarShape:
             f"mesh with a face of vertex {faces.max() if faces.min() >= 0 else faces.min()}: expected rows of its "
             f"{len(vertices)} vertices, counted from 0"
         )
-    return AvatarShape(*cover_surface(vertices[faces], radius, "mesh"))
+    return _mesh_shape(vertices[faces], radius, "mesh", hollow)
+
+
+def _mesh_shape(
+    triangles: NDArray[np.float64], radius: float | None, what: str, hollow: bool, axes: str = ""
+) -> AvatarShape:
+    """Return the shape of a mesh (m, 3, 3). axes: description of a file's axes and unit."""
+    cover = cover_surface(triangles, radius, what)
+    points, inner, text = cover.points, 0, f"open mesh: {_SURFACE}"
+    if hollow:
+        text = f"mesh, hollow: {_SURFACE}"
+    elif cover.radius is not None and (found := closed_parts(triangles)).parts > found.open_parts:
+        small = cover.triangles
+        if found.open_parts:
+            small = cover_surface(triangles[found.closed], cover.radius, what).triangles
+        inside = fill_inside(found, small, points, cover.radius, what)
+        points, inner = np.concatenate([points, inside]), len(inside)
+        text = "closed mesh, filled"
+        if found.open_parts:
+            closed = found.parts - found.open_parts
+            text = f"mesh: {closed} of {found.parts} parts closed and filled, the others {_SURFACE}"
+    return AvatarShape(points, cover.radius, inner, f"{text}; {axes}" if axes else text)

@@ -96,10 +96,12 @@ class Avatars:
         check_owner(client)
         raise UnknownAvatarError(f"avatar {name!r} is not known: add it with add_avatar first")
 
-    def add(self, name: str, points: ArrayLike, radius: float | None, client: str) -> AvatarModel:
+    def add(
+        self, name: str, points: ArrayLike, radius: float | None, client: str, inner_points: int = 0
+    ) -> AvatarModel:
         """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
 
-        radius: as for `make_avatar`. An avatar with the name of a scene avatar must equal it, and
+        radius, inner_points: as for `make_avatar`. An avatar with the name of a scene avatar must equal it, and
         shares its arrays. Raise BadRequestError if a name is invalid or belongs to a different avatar,
         TooLargeError beyond the limits.
         """
@@ -108,19 +110,19 @@ class Avatars:
         array = make_positions(points)
         shared = None if client == EVERYBODY else self._scene_avatar(name)
         if shared is not None:
-            self._check_same(name, shared, array, radius)
+            self._check_same(name, shared, array, radius, inner_points)
         entry = _Entry(len(array) if shared is None else 0, radius)
         with self._reserved(name, client, len(array), entry) as entry:
             if entry.model is None:
-                model = _built(self._large, array, radius) if shared is None else shared.model
+                model = _built(self._large, array, radius, inner_points) if shared is None else shared.model
                 assert model is not None, "the scene's own avatars are complete"
-                digest = b"" if client == EVERYBODY else avatar_digest(model.points, model.radius)
+                digest = b"" if client == EVERYBODY else _digest(model)
                 with self._changed:
                     entry.model, entry.used = model._replace(digest=digest), time.monotonic()
                     if shared is None:
                         entry.bytes = bytes_of(model)
             known = entry.model
-        self._check_same(name, entry, array, radius)
+        self._check_same(name, entry, array, radius, inner_points)
         return known
 
     def _scene_avatar(self, name: str) -> _Entry | None:
@@ -130,12 +132,17 @@ class Avatars:
             return None if entry is None or entry.model is None else entry
 
     def _check_same(
-        self, name: str, entry: _Entry, points: NDArray[np.float64], radius: float | None
+        self,
+        name: str,
+        entry: _Entry,
+        points: NDArray[np.float64],
+        radius: float | None,
+        inner_points: int,
     ) -> None:
         """Raise BadRequestError unless a known avatar has these points and this radius."""
         known = entry.model
         assert known is not None
-        same = np.array_equal(known.points, points)
+        same = known.inner_points == inner_points and np.array_equal(known.points, points)
         if same and radius is None and entry.asked is not None:
             # One radius is given and one is the default of the points, which only building yields.
             radius = _built(self._large, points, None).radius
@@ -252,10 +259,16 @@ class Avatars:
                 )
 
 
-def _built(large: threading.Lock, points: NDArray[np.float64], radius: float | None) -> AvatarModel:
+def _digest(model: AvatarModel) -> bytes:
+    return avatar_digest(model.points, model.radius, model.inner_points)
+
+
+def _built(
+    large: threading.Lock, points: NDArray[np.float64], radius: float | None, inner_points: int = 0
+) -> AvatarModel:
     """Build an avatar. large: lock that is held while an avatar of over _LARGE points is built."""
     with large if len(points) > _LARGE else nullcontext():
-        return make_avatar(points, radius)
+        return make_avatar(points, radius, inner_points)
 
 
 def bytes_of(model: AvatarModel) -> int:

@@ -1,6 +1,7 @@
 """Points that cover the surface of a mesh: the avatar's spheres around them leave no hole."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,23 @@ _MAX_RADIUS = 8.0
 _MAX_TRIANGLES = 3 * MAX_AVATAR_POINTS
 
 
-def cover_surface(
-    triangles: _Triangles, radius: float | None, what: str
-) -> tuple[NDArray[np.float64], float | None]:
-    """Return points (n, 3) such that no part of a surface is farther than a radius from one.
+class SurfaceCover(NamedTuple):
+    """Cover of a surface.
+
+    points: (n, 3) [m].  radius: used [m]; None if none was given and the surface has no area.
+    triangles: (k, 3, 3), of the surface, after halving [m].
+    """
+
+    points: NDArray[np.float64]
+    radius: float | None
+    triangles: _Triangles
+
+
+def cover_surface(triangles: _Triangles, radius: float | None, what: str) -> SurfaceCover:
+    """Cover a surface with points: no part of it is farther than a radius from one.
 
     triangles: (m, 3, 3), the corners of each [m].  what: name of the mesh, for messages.
-    radius: above 0 [m]; None: a hundredth of the square root of the area. Returned with the points;
-    None if it was and the surface has no area.
+    radius: above 0 [m]; None: a hundredth of the square root of the area.
     Triangles with an edge longer than sqrt(3) radii are halved at their longest edge until none is
     left. The points are the corners of all triangles, each once, sorted: they depend neither on a
     random number nor on the order of vertices.
@@ -47,7 +57,7 @@ def cover_surface(
     area = _area(triangles)
     if radius is None:
         if area == 0.0:
-            return _distinct(triangles.reshape(-1, 3)), None
+            return SurfaceCover(_distinct(triangles.reshape(-1, 3)), None, triangles)
         radius = max(1, round(math.sqrt(area) / _RADII / _STEP)) * _STEP
         if radius > _MAX_RADIUS:
             raise BadRequestError(
@@ -63,7 +73,7 @@ def cover_surface(
     # An equilateral triangle has the largest area for its longest edge.
     if len(triangles) > _MAX_TRIANGLES or area > _MAX_TRIANGLES * math.sqrt(3) / 4 * longest**2:
         raise _too_large(what, area, radius)
-    corners = [triangles.reshape(-1, 3)]
+    corners, small = [triangles.reshape(-1, 3)], []
     count = 0
     while len(triangles):
         # Of equally long edges, that of the least corners is halved, whatever the order of the corners.
@@ -73,6 +83,7 @@ def cover_surface(
         begin = edges.argmax(axis=1)
         long = edges.max(axis=1) > longest
         count += len(triangles) - int(long.sum())
+        small.append(triangles[~long])
         triangles, begin = triangles[long], begin[long]
         rows = np.arange(len(triangles))
         first, second = triangles[rows, begin], triangles[rows, (begin + 1) % 3]
@@ -86,7 +97,7 @@ def cover_surface(
     points = _distinct(np.concatenate(corners))
     if len(points) > MAX_AVATAR_POINTS:
         raise _too_large(what, area, radius)
-    return points, radius
+    return SurfaceCover(points, radius, np.concatenate(small))
 
 
 def _halves(

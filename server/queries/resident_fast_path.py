@@ -272,7 +272,13 @@ class ResidentQueries:
                 scratch = make_scratch(make_avatar([[0.0, 0.0, 0.0]], 0.1).arrays)
             points = np.ascontiguousarray(self.avatar.points)
             self._walking = make_walk_avatar(
-                self.body.reference, scratch, self._box, points, float(self.avatar.radius)
+                self.body.reference,
+                self.avatar.rows,
+                len(self.avatar.points) - self.avatar.inner_points,
+                scratch,
+                self._box,
+                points,
+                float(self.avatar.radius),
             )
         return self._walking
 

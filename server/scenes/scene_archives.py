@@ -25,11 +25,12 @@ from ...schemas.wire.requests import make_positions
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ..archives.archive_info import describe
 from ..archives.placed_archive import PlacedArchive
-from ..avatars.avatar_model import make_avatar
+from ..avatars.avatar_model import describe_avatar, make_avatar
 from ..avatars.avatar_shape import avatar_shape
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..residency.arena import ArenaBuffer
 from ..residency.voxel_store import OpenStore, VoxelStore
+from ..scene_interface import AvatarShape
 
 # Maximum radius of avatars that may collide with one another [m]: two of them and a margin stay
 # within the reach of a pair (simulation/world/bodies.py).
@@ -54,10 +55,10 @@ class FoundArchive(NamedTuple):
 
 
 class FoundAvatar(NamedTuple):
-    """Avatar that a scene file names. points: (n, 3), of its file, avatar frame [m]."""
+    """Avatar that a scene file names. shape: of its file, with its final radius."""
 
     file: Path
-    points: NDArray[np.float64]
+    shape: AvatarShape
     info: AvatarInfo
 
 
@@ -104,17 +105,17 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints | None) ->
         avatar_file = _resolve_relative(path, item.file)
         with error_location(path, f"$.avatars[{number}].file"):
             source = avatar_file if read_points is None else read_points(avatar_file)
-            shape = avatar_shape(source, item.radius)
-            points = make_positions(shape.points)
+            given = {} if read_points else {"up": item.up, "units": item.units}
+            shape = avatar_shape(source, item.radius, hollow=item.hollow, **given)
         with error_location(path, f"$.avatars[{number}]"):
-            model = make_avatar(points, shape.radius)
+            model = make_avatar(make_positions(shape.points), shape.radius, shape.inner_points)
             if meet and model.radius > MAX_BODY_RADIUS:
                 raise BadRequestError(
                     f"avatar radius {model.radius:g} m: expected at most {MAX_BODY_RADIUS:g} m with the effect "
                     "`objects` or `crowd`, under which avatars collide with others"
                 )
-        info = AvatarInfo(item.name, len(points), model.radius, model.bounding_radius)
-        found.append(FoundAvatar(avatar_file, points, info))
+        shape = shape._replace(points=model.points, radius=model.radius)
+        found.append(FoundAvatar(avatar_file, shape, describe_avatar(item.name, model, shape.description)))
     return found
 
 

@@ -19,7 +19,7 @@ from ...schemas.wire.encoding import decode_request
 from ...schemas.wire.key_expressions import User
 from ...schemas.wire.motion_messages import Wish
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from ..scene_interface import FrameCommand, ServedScene
+from ..scene_interface import AvatarShape, FrameCommand, ServedScene
 from .replay_log import (
     AvatarPoints,
     Begin,
@@ -154,7 +154,8 @@ class _LoggedAvatars:
                 )
             points = np.frombuffer(record.points, "<f8").reshape(-1, 3)
             try:
-                self._simulation.scene.add_avatar(user.avatar, points, record.radius, client=user.client)
+                shape = AvatarShape(points, record.radius, record.inner_points)
+                self._simulation.scene.add_avatar(user.avatar, shape, client=user.client)
             except SolidcloudError as error:
                 raise BadRequestError(f"the log is of another scene: {error}") from None
             self._added[user] = entered.digest

@@ -8,7 +8,6 @@ body. The body is MessagePack. Each record is written by one unbuffered call. Af
 killed, all records but the last are therefore complete.
 """
 
-import hashlib
 import logging
 import struct
 import zlib
@@ -21,7 +20,7 @@ import numpy as np
 
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ...schemas.process.os_errors import write_error_words
-from ...schemas.wire.encoding import encode
+from ...schemas.wire.encoding import avatar_digest, encode
 from ...schemas.wire.key_expressions import User
 from ..avatars.avatar_model import AvatarModel
 from ..scene_interface import FrameCommand, FrameResult
@@ -51,11 +50,16 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
 
 
 class AvatarPoints(msgspec.Struct, frozen=True, tag="points"):
-    """Content of an avatar. points: (n, 3) float64, little-endian [m].  radius: of each [m]."""
+    """Content of an avatar.
+
+    points: (n, 3) float64, little-endian [m].  radius: of each [m].  inner_points: number of them
+    inside, the last ones.
+    """
 
     digest: bytes
     points: bytes
     radius: float
+    inner_points: int = 0
 
 
 class Entered(msgspec.Struct, frozen=True, tag="entered"):
@@ -162,10 +166,10 @@ class FrameLog:
     def entered(self, user: User, avatar: AvatarModel) -> None:
         """Record that a user enters with its next turn."""
         points = np.ascontiguousarray(avatar.points, "<f8").tobytes()
-        digest = hashlib.sha256(struct.pack("<d", avatar.radius) + points).digest()
+        digest = avatar_digest(avatar.points, avatar.radius, avatar.inner_points)
         if digest not in self._known:
             self._known.add(digest)
-            self._write(AvatarPoints(digest, points, avatar.radius))
+            self._write(AvatarPoints(digest, points, avatar.radius, avatar.inner_points))
         self._write(Entered(user, digest))
 
     def ended(self, users: list[User]) -> None:

@@ -388,6 +388,6 @@ def welcome_message(scene: OpenScene, number: int) -> str:
 
 
 def avatar_message(parts: ViewerParts) -> bytes:
-    """Return the avatar's points as a message."""
+    """Return the points of the avatar's surface as a message."""
     avatar = parts.avatar
-    return binary_message("avatar", {"points": avatar.points.astype("f4")}, radius=avatar.radius or 0.0)
+    return binary_message("avatar", {"points": avatar.surface.astype("f4")}, radius=avatar.radius or 0.0)

@@ -158,8 +158,8 @@ class ClashSession:
             client = self._open.enter_context(self._parts.link.another_client(scene.info.scene))
             self._client = client
         name = f"clash-{self._number}"
-        client.add_avatar(name, avatar.points, avatar.radius)
-        middle = (avatar.points.min(axis=0) + avatar.points.max(axis=0)) / 2
+        client.add_avatar(name, avatar)
+        middle = (avatar.surface.min(axis=0) + avatar.surface.max(axis=0)) / 2
         places = path.poses[:, :3, :3] @ middle + path.poses[:, :3, 3]
         arrays = {"places": scene.frame.points(places).astype(np.float32).reshape(-1, 3)}
         self._send(binary_message("path", arrays, name=path.name, total=len(path.poses)))
@@ -196,7 +196,7 @@ class ClashSession:
 
     def _view(self, last: CheckedScene, clash: Clash) -> Viewpoint:
         """Return from where a clash is seen."""
-        points = self._parts.avatar.points
+        points = self._parts.avatar.surface
         low, high = points.min(axis=0), points.max(axis=0)
         return find_viewpoint(
             last.client,
@@ -239,7 +239,7 @@ class ClashSession:
             pose = last.checked.track.poses[clash.deepest]
             pairs = contacts_of(last, clash)
             up = np.asarray(last.scene.info.up, np.float64)
-            clouds = surroundings(last.client, clash, pose, self._parts.avatar.points, pairs.cloud_point, up)
+            clouds = surroundings(last.client, clash, pose, self._parts.avatar.surface, pairs.cloud_point, up)
             topics.append(Topic(number, clash, view, png_bytes(draw(view, clouds))))
         return topics
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ..scene_interface import AvatarShape
 from .browser import Browser
 from .feeds.residency_feed import ResidencyFeed
 from .feeds.scene_link import SceneLink
@@ -18,7 +19,7 @@ from .panels.effect_switch import EffectSwitch, NoSwitch
 from .panels.path_source import read_given_path
 from .panels.voxel_spheres import SphereSource
 from .users.starting_place import StartingPlaces
-from .users.user_avatar import load_avatar
+from .users.user_avatar import figure_avatar
 from .viewer_parts import Users, ViewerParts
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ def viewing(
     scene: str | None = None,
     *,
     port: int = 0,
-    avatar: Path | None = None,
+    avatar: AvatarShape | None = None,
     key_file: Path | None = None,
     switch: EffectSwitch | None = None,
     poses: Path | None = None,
@@ -38,13 +39,12 @@ def viewing(
     """Serve the viewer during the block; yield the address of its page.
 
     endpoint: of the server; it need not run yet.  scene: its name; None: the only one there.
-    port: of the page; 0: a free one.  avatar: file of the users' avatar; None: a figure.
+    port: of the page; 0: a free one.  avatar: of the users; None: a figure.
     switch: changes the effects of the server; None: they are shown only.
     poses: file of a path whose clashes the page shows.
-    Raise SolidcloudError if the port is in use, ScanError for an invalid avatar, and the errors of
-    `read_path`.
+    Raise SolidcloudError if the port is in use, and the errors of `read_path`.
     """
-    shape = load_avatar(avatar)
+    shape = figure_avatar() if avatar is None else avatar
     path = None if poses is None else read_given_path(poses)
     with (
         SceneLink(endpoint, scene, key_file) as link,

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene_interface import AvatarShape
 from .feeds.residency_feed import ResidencyFeed
 from .feeds.scene_link import SceneLink
 from .feeds.statistics_feed import StatisticsFeed
@@ -15,7 +16,6 @@ from .panels.effect_switch import EffectSwitch
 from .panels.path_source import GivenPath
 from .panels.voxel_spheres import SphereSource
 from .users.starting_place import StartingPlaces
-from .users.user_avatar import UserAvatar
 
 
 class UserPlace(NamedTuple):
@@ -86,7 +86,7 @@ class ViewerParts(NamedTuple):
     """
 
     link: SceneLink
-    avatar: UserAvatar
+    avatar: AvatarShape
     places: StartingPlaces
     tiles: TileSource
     users: Users

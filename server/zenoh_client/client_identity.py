@@ -65,18 +65,25 @@ class AddedAvatar(NamedTuple):
     """Avatar as it was added.
 
     points: (n, 3) [m].  radius: as requested [m]; None: the server derives it from the points.
+    inner_points: number of them inside, the last ones.
     """
 
     points: Positions
     radius: float | None
+    inner_points: int = 0
 
     def request(self, name: str) -> bytes:
         """Return the request that adds the avatar."""
-        return encode(AddAvatarRequest(name, self.points, self.radius))
+        return encode(AddAvatarRequest(name, self.points, self.radius, self.inner_points))
 
     def is_same(self, other: "AddedAvatar") -> bool:
         """Return whether two avatars are equal."""
-        return self.radius == other.radius and np.array_equal(self.points, other.points)
+        same = (self.radius, self.inner_points) == (other.radius, other.inner_points)
+        return same and np.array_equal(self.points, other.points)
+
+    def digest(self, radius: float) -> bytes:
+        """Return its digest with a radius [m]."""
+        return avatar_digest(self.points, radius, self.inner_points)
 
 
 class AddedAvatars:
@@ -93,7 +100,7 @@ class AddedAvatars:
 
         Raise BadRequestError if another avatar has the name.
         """
-        digest = None if avatar.radius is None else avatar_digest(avatar.points, avatar.radius)
+        digest = None if avatar.radius is None else avatar.digest(avatar.radius)
         with self._lock:
             known = self._avatars.setdefault(name, avatar)
             if known is avatar and digest is not None:
@@ -120,7 +127,7 @@ class AddedAvatars:
         info = decode_answer(AvatarInfo, answer)
         avatar = self._avatars.get(name)
         if avatar is not None and name not in self._digests and info.radius is not None:
-            self._digests[name] = avatar_digest(avatar.points, info.radius)
+            self._digests[name] = avatar.digest(info.radius)
         return info
 
     def known(self, names: Sequence[str]) -> dict[str, AddedAvatar]:

@@ -31,7 +31,14 @@ from ...schemas.wire.stats import StatsRequest
 from ...schemas.wire.tile_messages import TileRequest, VoxelsRequest
 from ...schemas.wire.warming_parts import MOTION, needed_parts
 from ..runtime.stop_flag import NO_STOP, StopFlag
-from ..scene_interface import EncodedReply, LimitReached, ServedScene, ServedWatch, recording_avatars
+from ..scene_interface import (
+    AvatarShape,
+    EncodedReply,
+    LimitReached,
+    ServedScene,
+    ServedWatch,
+    recording_avatars,
+)
 from .command_mailboxes import FrameLoop
 from .server_config import ServerConfig
 from .warming import Warming
@@ -56,7 +63,9 @@ class _Operation(NamedTuple):
 # Operations with a payload that are not questions.
 _OTHERS = {
     "add_avatar": _Operation(
-        AddAvatarRequest, "", lambda s, r, c, stop: s.add_avatar(r.name, r.points, r.radius, client=c)
+        AddAvatarRequest,
+        "",
+        lambda s, r, c, stop: s.add_avatar(r.name, AvatarShape(r.points, r.radius, r.inner_points), client=c),
     ),
     "move": _Operation(
         MoveRequest,

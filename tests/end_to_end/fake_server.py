@@ -38,7 +38,7 @@ from solidcloud.schemas.wire.stats import StatsAnswer
 from solidcloud.schemas.wire.warming_parts import MOTION
 from solidcloud.server.archives.archive_info import describe_scene
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.scene_interface import record_avatar
+from solidcloud.server.scene_interface import AvatarShape, record_avatar
 from solidcloud.server.scenes.scene_tiles import SceneTiles
 from solidcloud.server.simulation.local_session import LocalSession
 from solidcloud.server.simulation.replay_log import Begin, FrameLog
@@ -159,6 +159,8 @@ class FloorScene(SceneTiles):
         return StatsAnswer(scene=self.name, hits=len(self.asked), keys=[3, 5] if keys else None)
 
     def add_avatar(self, name, points, radius=None, *, client=""):
+        if isinstance(points, AvatarShape):
+            points, radius = points.points, points.radius
         known = self.avatars.get((client, name)) or self.avatars.get(("*", name))
         if known is not None and not np.array_equal(known[0], points):
             raise BadRequestError(f"avatar {name!r} has other points")

@@ -25,7 +25,7 @@ from solidcloud.schemas.wire.warming_parts import READY_LINE
 from solidcloud.server.cli.input.pose_file import read_path
 from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
 from solidcloud.server.client import Client
-from solidcloud.server.viewer.users.user_avatar import load_avatar
+from solidcloud.server.viewer.users.user_avatar import figure_avatar
 from solidcloud.server.viewer.viewer import viewing
 from viewed_page import CHROMIUM, DEADLINE, ViewedPage, browsing, viewed_page
 
@@ -81,7 +81,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def expected(endpoint: str, path_file: Path) -> list[tuple[float, int, int, int]]:
     """Return depth, first and last pose, and contacts of each clash, as `contacts` of every pose finds them."""
-    avatar = load_avatar(None)
+    avatar = figure_avatar()
     _, poses = read_path(path_file)
     with Client(endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
@@ -176,7 +176,7 @@ def test_list_jumps_and_files_are_the_clashes_that_contacts_finds(
 
 def expected_pairs(endpoint: str, path_file: Path, clash: dict[str, Any]) -> int:
     """Return how many pairs are in contact at the deepest pose of a clash."""
-    avatar = load_avatar(None)
+    avatar = figure_avatar()
     pose = read_path(path_file)[1][clash["pose_deepest"]]
     with Client(endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)

@@ -13,6 +13,7 @@ import naive
 import numpy as np
 import pytest
 import synthetic_scans
+import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from point_clouds import (
     signed_permutations,
 )
 from sample_sizes import sample
+from solidcloud.server.avatars.avatar_shape import avatar_shape
 from solidcloud.server.scene import Scene
 
 
@@ -181,3 +183,31 @@ def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Genera
     expected = case.judge(avatar, 0.05, poses, 0.02)
     assert archive_cases.ask(case, avatar, 0.05, poses, 0.02).tolist() == expected.astype(int).tolist()
     assert expected.any() and not expected.all()
+
+
+@settings(max_examples=sample(6, 20), deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(KINDS),
+    radius=st.sampled_from([0.02, 0.04]),
+    tree=TREES,
+)
+def test_a_filled_mesh_touches_what_its_spheres_touch(
+    seed: int, kind: str, radius: float, tree: dict[str, Any]
+) -> None:
+    """Scattered points in and around a ball, issue 35: most leaf nodes of the scan hold its inside."""
+    rng = np.random.default_rng(seed)
+    shape = avatar_shape(trimesh.creation.icosphere(2, 0.3), radius)
+    avatar = np.asarray(shape.points)
+    points = np.concatenate([cloud(rng, kind, 9), rng.uniform(-2, 2, (3, 3))])
+    poses = archive_cases.near_poses(rng, points, avatar, 100, 0.5)
+    with TemporaryDirectory() as folder:
+        case = build(points, folder, radius=0.005, **tree)
+        with Scene.open(case.archive) as scene:
+            scene.add_avatar("filled", shape)
+            for margin in (0.0, 0.03):
+                expected = case.judge(avatar, radius, poses, margin)
+                assert scene.collide("filled", poses, margin).verdict.tolist() == expected.tolist()
+            early = scene.collide("filled", poses, tolerance=0.03).verdict
+            assert (early >= case.judge(avatar, radius, poses)).all() and (early <= expected).all()
+            assert (scene.distance("filled", poses, 0.0).verdict == case.judge(avatar, radius, poses)).all()

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import interruptible, needs_extra
+from .command_options import AvatarUnits, AvatarUp, interruptible, needs_extra, read_avatar_points
 
 
 def accuracy(
@@ -15,6 +15,8 @@ def accuracy(
     avatar: Annotated[
         Path | None, typer.Option(help="Points of the avatar; default: a generated human figure.")
     ] = None,
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")] = Path("report"),
     full: Annotated[bool, typer.Option("--full", help="More settings, poses and repetitions.")] = False,
 ) -> None:
@@ -38,7 +40,8 @@ def accuracy(
         tempfile.TemporaryDirectory(prefix="solidcloud-accuracy-") as scratch,
         progress_listener() as bars,
     ):
-        report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, avatar)
+        body = None if avatar is None else read_avatar_points(avatar, avatar_up, avatar_units)
+        report = measure(output, Path(scratch), FULL if full else BRIEF, bars, archive, body)
     for line in (
         *report.facts["warnings"],
         *findings(report),

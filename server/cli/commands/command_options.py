@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,10 +20,30 @@ from ....schemas.process.interrupts import (
 )
 from ....schemas.process.own_command import with_own_command
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ...scene_interface import AvatarShape
+
 ArchivePath = Annotated[Path, typer.Argument(help="Folder of an archive.")]
 KeyFile = Annotated[
     Path | None,
     typer.Option(help="File with the server's key; default: the key that a server of this user has stored."),
+]
+AvatarUp = Annotated[
+    str | None,
+    typer.Option(help="Axis of the avatar's file that points up: x, y or z; default: z, of glTF y."),
+]
+AvatarUnits = Annotated[
+    str | None,
+    typer.Option(
+        help="Unit of the avatar's file: m, mm, cm, dm, km, in, ft, us-ft or yd; default: the file's, or m."
+    ),
+]
+AvatarHollow = Annotated[
+    bool | None,
+    typer.Option("--avatar-hollow", help="Leave the inside of a closed mesh empty, instead of filling it."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
@@ -99,3 +119,27 @@ def interruptible(describe_remains: Callable[[], str] | None = None) -> Iterator
                 raise
             stop_insisting()
             raise Interrupted(describe_remains() if describe_remains else "") from None
+
+
+def avatar_options(
+    avatar_up: str | None, avatar_units: str | None, avatar_hollow: bool | None = None
+) -> dict[str, Any]:
+    """Return the options of an avatar's file that were given, as `avatar_shape` takes them."""
+    given = {"up": avatar_up, "units": avatar_units, "hollow": avatar_hollow}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def read_avatar_points(file: Path, avatar_up: str | None, avatar_units: str | None) -> "NDArray[np.float64]":
+    """Read the points (n, 3) of an avatar's file or the vertices of a mesh [m]; print what was taken."""
+    from ...avatars.avatar_file import read_vertices
+    from ...scene_interface import AvatarShape
+
+    read = read_vertices(file, avatar_up, avatar_units)
+    print_avatar(file, AvatarShape(read.points, None, 0, f"points or vertices: a surface; {read.axes}"))
+    return read.points
+
+
+def print_avatar(file: Path, shape: "AvatarShape") -> None:
+    """Print on standard error what was taken of an avatar's file."""
+    count = len(shape.surface) + shape.inner_points
+    print(f"avatar {file.name}: {count:,} points, {shape.description}", file=sys.stderr)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import ArchivePath, needs_extra
+from .command_options import ArchivePath, AvatarUnits, AvatarUp, needs_extra, read_avatar_points
 
 
 def loadtest(
@@ -30,6 +30,8 @@ def loadtest(
     avatar: Annotated[
         Path | None, typer.Option(help="Points of the avatar; default: a generated human figure.")
     ] = None,
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder of load.html, load.json and load.csv.")
     ] = Path("load"),
@@ -96,7 +98,7 @@ def loadtest(
         kinds=_names(kinds, "--kinds", ALL_KINDS),
         walks=tuple(walks or ()),
         truth=truth,
-        avatar=avatar,
+        avatar=None if avatar is None else read_avatar_points(avatar, avatar_up, avatar_units),
         users=users,
         seconds=seconds,
         budget=budget,

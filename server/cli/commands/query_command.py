@@ -9,10 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .command_options import AsJson, KeyFile, among, print_error, print_json, print_warning
+from .command_options import (
+    AsJson,
+    AvatarHollow,
+    AvatarUnits,
+    AvatarUp,
+    KeyFile,
+    among,
+    avatar_options,
+    print_avatar,
+    print_error,
+    print_json,
+    print_warning,
+)
 
 if TYPE_CHECKING:
     from ...client import Client
+    from ...scene_interface import AvatarShape
 
 # Options that are not parameters of the query.
 _NOT_OF_THE_QUESTION = ("scene", "op", "connect", "key_file", "as_json")
@@ -95,6 +108,9 @@ def query(
             "in local:0.8, or fixed:METRES; default: the one radius stored with the scene."
         ),
     ] = None,
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
+    avatar_hollow: AvatarHollow = None,
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> int:
@@ -110,17 +126,17 @@ def query(
     """
     options = {name: value for name, value in locals().items() if name not in _NOT_OF_THE_QUESTION}
     from ...avatars.avatar_file import read_avatar
-    from ...avatars.avatar_shape import avatar_shape
     from ...client import Client
     from ..input.query_input import ask, check_query, joined
     from ..output.answer_text import answer_lines, answers_json, summary_line, unknown_line, word_of
 
     question = check_query(op, options)
+    avatars = _Avatars(avatar_options(avatar_up, avatar_units, avatar_hollow))
     if op == "move":
-        return _ask_moves(connect, scene, question, as_json, key_file)
+        return _ask_moves(connect, scene, question, avatars, as_json, key_file)
     found, asked, printed = [], 0, 0
     with Client(connect, scene=scene, key_file=key_file) as client:
-        for part in ask(client, question, read_avatar, avatar_shape):
+        for part in ask(client, question, read_avatar, avatars.read):
             found.append(part)
             asked += len(part.labels)
             if as_json or client.unanswered == asked:
@@ -130,6 +146,7 @@ def query(
                     print(line, flush=op == "path")
             printed = len(found)
         _check_answered(client, asked, op)
+        avatars.show()
         whole = joined(found)
         said: Any = whole.answers  # every answer type has verdict and outside
         outside = _warn_outside(client, whole.places, said.outside, said.verdict, word_of(said))
@@ -138,6 +155,26 @@ def query(
     else:
         print(summary_line(said, outside))
     return _report_unknown(client, op, word_of(said), asked, unknown_line(said, client.unanswered))
+
+
+class _Avatars:
+    """Avatars of a query. options: of their files."""
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self._options = options
+        self._read: dict[Path, AvatarShape] = {}
+
+    def read(self, file: Path, radius: float | None) -> "AvatarShape":
+        """Return the shape of a file."""
+        from ...avatars.avatar_shape import avatar_shape
+
+        self._read[file] = avatar_shape(file, radius, **self._options)
+        return self._read[file]
+
+    def show(self) -> None:
+        """Print what was taken of each file."""
+        for file, shape in self._read.items():
+            print_avatar(file, shape)
 
 
 def _check_answered(client: "Client", asked: int, op: str) -> None:
@@ -182,12 +219,13 @@ def _warn_outside(client: "Client", places: Any, leaves: Any, verdicts: Any, wor
     return outside
 
 
-def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file: Path | None) -> int:
+def _ask_moves(
+    connect: str, scene: str, question: Any, avatars: _Avatars, as_json: bool, key_file: Path | None
+) -> int:
     """Send one move per frame and print one line each, or all as JSON; return the exit code."""
     import numpy as np
 
     from ....schemas.wire.answers import Verdict
-    from ...avatars.avatar_shape import avatar_shape
     from ...client import Client
     from ..input.query_input import ask_moves
     from ..output.answer_text import move_line
@@ -195,7 +233,7 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
     found: list[dict[str, Any]] = []
     waiting: list[str] = []
     with Client(connect, scene=scene, key_file=key_file) as client:
-        places, frames = ask_moves(client, question, avatar_shape)
+        places, frames = ask_moves(client, question, avatars.read)
         for label, moved in frames:
             found.append(moved.to_dict())
             waiting.append(move_line(label, moved))
@@ -203,6 +241,7 @@ def _ask_moves(connect: str, scene: str, question: Any, as_json: bool, key_file:
                 print("\n".join(waiting))
                 waiting.clear()
         _check_answered(client, len(found), "move")
+        avatars.show()
         verdicts = np.array([moved.get("verdict", 0) for moved in found])
         outside = _warn_outside(client, places, np.ones(len(found), bool), verdicts, "motions")
     if as_json:

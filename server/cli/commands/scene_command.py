@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from .command_options import AsJson, print_json
+from .command_options import AsJson, AvatarHollow, AvatarUnits, AvatarUp, avatar_options, print_json
 
 
 def new(
@@ -17,12 +17,15 @@ def new(
     avatar: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Points of an avatar that all users may use; its name derives from the file name; may be repeated."
+            help="Points or mesh of an avatar that all users may use; its name is that of the file; may be repeated."
         ),
     ] = None,
     effects: Annotated[
         str, typer.Option(help="Effects to enable, separated by commas; the others are commented out.")
     ] = "stop",
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
+    avatar_hollow: AvatarHollow = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a scene file, every field explained.
@@ -43,6 +46,7 @@ def new(
         effects=wanted,
         name=name,
         overwrite=overwrite,
+        avatar_options=avatar_options(avatar_up, avatar_units, avatar_hollow),
     )
     if spawn is None:
         print(f"{output}: no place to stand was found: see [spawn] in it", file=sys.stderr)

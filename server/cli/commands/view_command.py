@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from .command_options import KeyFile, among, needs_extra, parse_bytes
+from .command_options import (
+    AvatarHollow,
+    AvatarUnits,
+    AvatarUp,
+    KeyFile,
+    among,
+    avatar_options,
+    needs_extra,
+    parse_bytes,
+    print_avatar,
+)
 
 
 def view(
@@ -24,7 +34,7 @@ def view(
     avatar: Annotated[
         Path | None,
         typer.Option(
-            help="Points or mesh of the users' avatar, z up, facing +y; default: a figure of 1.75 m."
+            help="Points or mesh of the users' avatar, facing +y once its z is up; default: a figure of 1.75 m."
         ),
     ] = None,
     poses: Annotated[
@@ -44,6 +54,9 @@ def view(
             autocompletion=among("x", "y", "z"),
         ),
     ] = None,
+    avatar_up: AvatarUp = None,
+    avatar_units: AvatarUnits = None,
+    avatar_hollow: AvatarHollow = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     key_file: KeyFile = None,
 ) -> None:
@@ -62,6 +75,7 @@ def view(
     with needs_extra("view"):
         from ...viewer.viewer import viewing
     from ....schemas.errors import BadRequestError
+    from ...avatars.avatar_shape import avatar_shape
     from ..scene_files.viewed_scene import viewed_scene
     from .viewed_server import ViewedServer
 
@@ -74,6 +88,10 @@ def view(
             "--cache and --up belong to a server that this command starts: name an archive or a scene file"
         )
 
+    shape = None
+    if avatar is not None:
+        shape = avatar_shape(avatar, **avatar_options(avatar_up, avatar_units, avatar_hollow))
+        print_avatar(avatar, shape)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     server: ViewedServer | None = None
     with ExitStack() as stack:
@@ -84,7 +102,7 @@ def view(
             server = stack.enter_context(ViewedServer(file, *options))
             connect = server.endpoint
         url = stack.enter_context(
-            viewing(connect, scene, port=port, avatar=avatar, key_file=key_file, switch=server, poses=poses)
+            viewing(connect, scene, port=port, avatar=shape, key_file=key_file, switch=server, poses=poses)
         )
         print(f"viewer: {url}  (Ctrl-C ends it)", flush=True)
         if server is not None:

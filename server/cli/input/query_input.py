@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
@@ -16,6 +16,7 @@ from ....schemas.wire.question_rules import Question
 from ....schemas.wire.question_table import OBJECTS, QUESTIONS, join_answers, path_questions
 from ....schemas.wire.request_limits import MAX_FRAME_SECONDS
 from ....schemas.wire.requests import QuestionRequest, make_positions
+from ...scene_interface import AvatarShape
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import BodyPlaces, Places, PointPlaces, RayPlaces, box_of
 
@@ -30,19 +31,21 @@ _FILES = {
     "points": "points",
     "objects": "objects",
 }
+# Options of the files of avatars, besides the radius.
+AVATAR_OPTIONS = ("avatar_up", "avatar_units", "avatar_hollow")
 # Options that are not sent as parameters.
-_NOT_SENT = frozenset({*_FILES.values(), "radius", "along"})
+_NOT_SENT = frozenset({*_FILES.values(), *AVATAR_OPTIONS, "radius", "along"})
 _COMMON_OPTIONS = QuestionRequest.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
-# Returns the points and the radius of an avatar's file for the radius that was given.
-ReadAvatar = Callable[[Path, float | None], tuple[ArrayLike, float | None]]
+# Returns the shape of an avatar's file for the radius that was given.
+ReadAvatar = Callable[[Path, float | None], AvatarShape]
 
 
 class QueryTarget(Protocol):
     """A `Client` or a `Scene`."""
 
-    def add_avatar(self, *what: Any) -> Any: ...
+    def add_avatar(self, name: str, points: Any, /) -> Any: ...
     def ask(self, question: Question[Any], *what: Any, **parameters: Any) -> Any: ...
     def path(self, *what: Any, **parameters: Any) -> Any: ...
     def move(self, *what: Any, **parameters: Any) -> Moved: ...
@@ -88,7 +91,7 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
     needed: tuple[str, ...]
     others: tuple[str, ...]
     if op == "move":  # the budget of a frame is set by the scene, not by the request
-        needed, others = ("avatar", "poses"), ("radius",)
+        needed, others = ("avatar", "poses"), ("radius", *AVATAR_OPTIONS)
     elif op == "path":
         if along not in path_questions():
             raise BadRequestError(f"--along {along}: expected one of {', '.join(path_questions())}")
@@ -110,10 +113,10 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
 def _options(question: Question[Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the required and the optional options of a question, besides those common to all."""
     files = dict.fromkeys(_FILES[name] for name in question.arguments if name in _FILES)
-    radius = ("radius",) if question.about_avatars else ()
+    of_avatar = ("radius", *AVATAR_OPTIONS) if question.about_avatars else ()
     parameters = question.parameters
     needed = (*files, *(name for name in parameters if name in question.required))
-    return needed, (*radius, *(name for name in parameters if name not in question.required))
+    return needed, (*of_avatar, *(name for name in parameters if name not in question.required))
 
 
 def ask(
@@ -181,11 +184,11 @@ def _add_body(
     scene: QueryTarget, query: Query, read_avatar: ReadAvatar, poses: NDArray[np.float64], *, moving: bool
 ) -> BodyPlaces:
     """Add the avatar of a query; return its positions at the poses, or on motions between them."""
-    found, radius = read_avatar(query.given["avatar"], query.given.get("radius"))
-    points = make_positions(found)
-    radius = scene.add_avatar("avatar", points, radius).radius
+    shape = read_avatar(query.given["avatar"], query.given.get("radius"))
+    box = box_of(make_positions(shape.points))
+    radius = scene.add_avatar("avatar", shape).radius
     ends = (poses[:-1], poses[1:]) if moving else (poses, poses)
-    return BodyPlaces(box_of(points)[None], np.array([radius or 0.0]), _around(query), *ends)
+    return BodyPlaces(box[None], np.array([radius or 0.0]), _around(query), *ends)
 
 
 def _around(query: Query) -> float:
@@ -208,9 +211,8 @@ def _ask_objects(
     }
     bodies = {}
     for avatar, name in names.items():
-        found, own = read_avatar(avatar, radius)
-        points = make_positions(found)
-        bodies[avatar] = box_of(points), scene.add_avatar(name, points, own).radius or 0.0
+        shape = read_avatar(avatar, radius)
+        bodies[avatar] = box_of(make_positions(shape.points)), scene.add_avatar(name, shape).radius or 0.0
     listed = [(names[row.avatar], row.pose, row.group, row.mask) for row in rows]
     answers = scene.ask(OBJECTS, listed, **parameters)
     boxes = np.array([bodies[row.avatar][0] for row in rows]).reshape(-1, 2, 3)

@@ -71,7 +71,10 @@ def scene_facts(checked: Checked) -> Iterator[tuple[str, str]]:
     yield "radius model", file.radius_model or "the radius stored in each archive"
     for avatar in checked.avatars:
         made = avatar.info
-        yield f"avatar {made.name}", f"{avatar.file}: {made.points:,} points of {made.radius:.4g} m radius"
+        yield (
+            f"avatar {made.name}",
+            f"{avatar.file}: {made.points:,} points of {made.radius:.4g} m radius, {made.description}",
+        )
     for thing in file.objects:
         x, y, z = (row[3] for row in thing.pose[:3])
         yield f"object {thing.name}", f"{thing.kind}, avatar {thing.avatar}, at {_numbers((x, y, z))} m"

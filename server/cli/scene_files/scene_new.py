@@ -3,12 +3,13 @@
 import errno
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ....builder.synthetic.figure import HEIGHT, figure_points
 from ....schemas.archive.radius_model import STORED_MODELS
@@ -20,6 +21,7 @@ from ....schemas.wire.key_expressions import check_name
 from ...archives.archive_info import describe
 from ...residency.voxel_store import VoxelStore
 from ...scene import DEFAULT_BUDGET, Scene
+from ...scene_interface import AvatarShape
 from ...scenes.scene_archives import ReadPoints, find_archives, open_archives, read_avatars
 from .scene_text import SceneContent, scene_text
 from .spawn_search import CLEARANCE, add_body, find_spawn
@@ -41,11 +43,13 @@ def new_scene(
     name: str | None = None,
     overwrite: bool = False,
     read_points: ReadPoints | None = None,
+    avatar_options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Sequence[float] | None:
     """Write a scene file with archives, avatars named after their files, effects, and a spawn.
 
     Returns the position of the spawn, None if no place for it was found.
     overwrite: replace an existing file.  read_points: as for `Scene.open`.
+    avatar_options: fields of all avatars, besides name and file.
     Raises BadRequestError for content that a scene file must not have and for an existing file,
     FormatError or CorruptError for an invalid archive, ScanError for an invalid avatar.
     """
@@ -64,7 +68,10 @@ def new_scene(
     bounds = np.array([info.bounds for info in infos])
     begin = SceneContent(
         [_relative(folder, out) for folder in archives],
-        [(called, _relative(file, out)) for called, file in _avatar_names(avatars).items()],
+        [
+            {"name": called, "file": _relative(file, out), **avatar_options}
+            for called, file in _avatar_names(avatars).items()
+        ],
         effects,
         name,
         [model for model in STORED_MODELS if all(model in info.radius_models for info in infos)],
@@ -97,13 +104,10 @@ def _find_spawn(
     Without avatars, a generated figure takes their place.
     """
     found = find_archives(file, out)
-    avatars = {
-        each.info.name: (each.points, each.info.radius) for each in read_avatars(file, out, read_points)
-    }
-    given: dict[str, tuple[NDArray[np.float64], float | None]] = {**avatars}
-    who = ", ".join(avatars)
-    if not avatars:
-        given, who = {"figure": (figure_points(_FIGURE_POINTS), None)}, f"a figure of {HEIGHT:g} m"
+    given = {each.info.name: each.shape for each in read_avatars(file, out, read_points)}
+    who = ", ".join(given)
+    if not given:
+        given, who = {"figure": AvatarShape(figure_points(_FIGURE_POINTS))}, f"a figure of {HEIGHT:g} m"
     try:
         archives = open_archives(file, out, name, found, DEFAULT_BUDGET, "lru", lambda _: None)
         with Scene(archives, name) as scene:

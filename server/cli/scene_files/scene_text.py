@@ -9,7 +9,7 @@ import inspect
 import json
 import re
 import textwrap
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, get_args
 
 import msgspec
@@ -25,7 +25,7 @@ _WIDTH = 100
 class SceneContent(NamedTuple):
     """Content of a new scene file.
 
-    archives: paths, relative to the file.  avatars: (name, path).
+    archives: paths, relative to the file.  avatars: the fields of each.
     effects: names of the effects to enable.  models: radius models that all archives store.
     low, high: bounds of the archives, world frame [m].
     spawn: position of users at their start, world frame [m]; None: an example, commented out.
@@ -33,7 +33,7 @@ class SceneContent(NamedTuple):
     """
 
     archives: Sequence[str]
-    avatars: Sequence[tuple[str, str]]
+    avatars: Sequence[Mapping[str, Any]]
     effects: Collection[str]
     name: str | None
     models: Sequence[str]
@@ -130,23 +130,24 @@ def _places(begin: SceneContent) -> Iterator[str]:
     yield ""
     yield from _comment(
         "Avatars that all users may use: points of a scan or mesh, in its own frame. radius: of each point's sphere; "
-        "default: half the mean closest-point distance."
+        "default: half the mean closest-point distance, of a mesh a hundredth of the square root of its area. up, "
+        "units: of the file; default: as its format states, otherwise z and m. hollow: whether the inside of a closed "
+        "mesh stays empty."
     )
-    for name, file in begin.avatars:
-        yield from (
-            "[[avatars]]",
-            f"name = {toml_value(name)}",
-            f"file = {toml_value(file)}",
-            "#radius = 0.01",
-            "",
-        )
-    if not begin.avatars:
-        yield from ("#[[avatars]]", '#name = "visitor"', '#file = "visitor.ply"', "#radius = 0.01", "")
+    examples = {"radius": 0.01, "up": "y", "units": "mm", "hollow": True}
+    for avatar in begin.avatars or [{}]:
+        off = "" if avatar else "#"
+        fields = avatar or {"name": "visitor", "file": "visitor.ply"}
+        yield f"{off}[[avatars]]"
+        yield from (f"{off}{field} = {toml_value(value)}" for field, value in fields.items())
+        left = {field: value for field, value in examples.items() if field not in fields}
+        yield from (f"#{field} = {toml_value(value)}" for field, value in left.items())
+        yield ""
     yield from _comment(
         "Dynamic objects, in the shape of an avatar; they need the effect `objects`. kind: kinematic, at the pose that "
         "is set for it, or pushed, moved by users who touch it."
     )
-    shape = begin.avatars[0][0] if begin.avatars else "visitor"
+    shape = begin.avatars[0]["name"] if begin.avatars else "visitor"
     yield from (
         "#[[objects]]",
         '#name = "door"',

@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.scene_messages import AvatarInfo, SceneInfo
+from ...scene_interface import AvatarShape
 
 _Floats = NDArray[np.float64]
 
@@ -61,12 +62,12 @@ class Body(NamedTuple):
     wide: float
 
 
-def add_body(scene: SearchedScene, avatars: Mapping[str, tuple[ArrayLike, float | None]]) -> Body:
-    """Add avatars to a scene, points (n, 3) and radius [m] by name, and return them as one body."""
+def add_body(scene: SearchedScene, avatars: Mapping[str, AvatarShape]) -> Body:
+    """Add avatars to a scene, by name, and return them as one body."""
     foot, top, wide = np.inf, -np.inf, 0.0
-    for name, (points, radius) in avatars.items():
-        array = np.asarray(points, np.float64)
-        made = scene.add_avatar(name, array, radius).radius or 0.0
+    for name, shape in avatars.items():
+        array = shape.surface
+        made = scene.add_avatar(name, shape).radius or 0.0
         foot = min(foot, float(array[:, 2].min()) - made)
         top = max(top, float(array[:, 2].max()) + made)
         wide = max(wide, float(np.hypot(array[:, 0], array[:, 1]).max()))

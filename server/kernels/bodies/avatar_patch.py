@@ -20,10 +20,13 @@ _ROUNDED = 1.0 + 1e-9
 
 
 @nb.njit(nogil=True, cache=True)
-def lowest_heights(body, point, reach, directions, heights, sums):
+def lowest_heights(body, order, surface, point, reach, directions, heights, sums):
     """Find how low an avatar's points near one of them lie along directions.
 
-    body: reference to the avatar's arrays.  point: (3,) a place on it, avatar frame [m].  reach: inclusive [m].
+    body: reference to the avatar's arrays.
+    order: (b, LANES) int32, number of the point in each lane of a block.  surface: number of the
+    points of its surface; those after them are inside, and left out.
+    point: (3,) a place on it, avatar frame [m].  reach: inclusive [m].
     directions: (k, 3) unit, avatar frame.  heights: (k,), set to the least height over the points
     within reach, relative to `point` [m]; 0 if there are none.
     sums: (10,) int64, set to the sums for `normal_code` (schemas/kernels/normal_codes.py), in
@@ -53,7 +56,7 @@ def lowest_heights(body, point, reach, directions, heights, sums):
             px = avatar.points[~first, 0, j] - x
             py = avatar.points[~first, 1, j] - y
             pz = avatar.points[~first, 2, j] - z
-            if px * px + py * py + pz * pz > square:
+            if px * px + py * py + pz * pz > square or order[~first, j] >= surface:
                 continue
             for k in range(directions.shape[0]):
                 height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]

@@ -322,6 +322,23 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
 
 
 @njit_no_refcount
+def sphere_is_near(halves, lane_at, low_x, low_y, low_z, x, y, z, reach):
+    """Return whether a point of a scene block may be within `reach` of a place.
+
+    lane_at, low: as for `next_near`.  x, y, z: from the frame [steps].  reach: includes their error.
+    """
+    h, near, square = U(lane_at), False, reach * reach * ONE_SLACK
+    x, y, z = x - low_x, y - low_y, z - low_z
+    for j in range(LANES):
+        i = h + U(j)
+        dx = np.float32(halves[i]) - x
+        dy = np.float32(halves[i + U(LANES)]) - y
+        dz = np.float32(halves[i + U(2 * LANES)]) - z
+        near |= dx * dx + dy * dy + dz * dz <= square
+    return near
+
+
+@njit_no_refcount
 def locate_voxel(scene, voxel, placed):
     """Locate a resident voxel in the arena and relative to the frame."""
     coordinates, where, frame = scene.coordinates, scene.where, placed.frame

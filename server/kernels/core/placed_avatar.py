@@ -52,6 +52,7 @@ class Avatar(NamedTuple):
     points: (b, 3, LANES) float64 [m], as the client sent them, the last one repeated.
     front: (4, f) float64, x[], y[], z[], radius[] of one level of the tree, see placed_avatar.py.
     front_first: its first node.
+    inner_points: number of the points that fill a mesh.
     """
 
     center: NDArray[np.float64]
@@ -61,6 +62,7 @@ class Avatar(NamedTuple):
     points: NDArray[np.float64]
     front: NDArray[np.float64]
     front_first: int
+    inner_points: int
 
 
 class PlacedAvatar(NamedTuple):

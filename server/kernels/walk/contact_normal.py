@@ -6,7 +6,7 @@ of points, it is still the sheet's, and an avatar would press against the edge f
 
 The normal of a contact separates the two bodies: near the touched point, the avatar lies on one
 side of the plane, and the scan on the other. The smoothed normal of the scan is therefore taken if
-its plane separates the avatar's patch, which is its points within reach of the touched one.
+its plane separates the avatar's patch, which is the points of its surface within reach of the touched one.
 Otherwise the contact is at an edge, and three directions are compared: the smoothed normal of the
 scan, that of the avatar, and the direction from the touched sphere to the touching one. The one
 whose plane the points of both patches exceed least is taken. Where a smooth body touches an edge,
@@ -94,6 +94,7 @@ def _lowest(walk, hit, out, apart, normals, lowest, sums):
     for n in range(normals.shape[0]):
         _put(directions, n, rotate_back(pose, vector(normals[n])))
     point = walk.memory.tape[hit, POINT : POINT + 3]
-    lowest_heights(walk.avatar.body, point, walk.settings.normal_reach, directions, lowest, sums)
+    avatar, reach = walk.avatar, walk.settings.normal_reach
+    lowest_heights(avatar.body, avatar.rows, avatar.surface, point, reach, directions, lowest, sums)
     for n in range(normals.shape[0]):
         lowest[n] = lowest[n] + dot(out, vector(normals[n])) - apart

@@ -74,7 +74,7 @@ _SETTINGS = [
     "up", "continuous", "skin", "tolerance", "slides", "surfaces", "normal_reach", "lift", "walkable_slide",
     "step", "clearance", "near_reach", "down", "gravity", "max_speed", "walkable",
 ]  # fmt: skip
-_AVATAR = ["body", "scratch", "box", "points", "radius"]
+_AVATAR = ["body", "rows", "surface", "scratch", "box", "points", "radius"]
 _WALK = [
     "settings", "avatar", "memory", "held", "stop", "unknown", "unknown_everywhere", "alone", "native", "bodies",
     "other_units", "least_tolerance", "tolerance_units", "squares", "standing", "own",
@@ -137,6 +137,8 @@ if nb.config.DISABLE_JIT:
         """Arrays of an avatar, see `make_walk_avatar`."""
 
         body: AvatarReference
+        rows: NDArray[np.int32]
+        surface: int
         scratch: MotionScratch
         box: NDArray[np.float64]
         points: NDArray[np.float64]
@@ -222,12 +224,13 @@ def make_settings(
 
 
 @nb.njit(nogil=True, cache=True)
-def make_walk_avatar(body, scratch, box, points, radius):
+def make_walk_avatar(body, rows, surface, scratch, box, points, radius):
     """Return the arrays of an avatar. body: reference.  scratch: of motions.  box: `box_of` it.
 
+    rows, surface: see `lowest_heights`.
     points: (n, 3) float64, avatar frame [m].  radius: of its spheres [m].
     """
-    return WalkAvatar(body, scratch, box, points, radius)
+    return WalkAvatar(body, rows, surface, scratch, box, points, radius)
 
 
 def make_arrays(rows: int, voxels: int) -> WalkArrays:

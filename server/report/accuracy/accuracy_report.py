@@ -21,6 +21,7 @@ from ....schemas.process.os_errors import check_writable
 from ....schemas.wire.answers import Verdict
 from ...scene import Scene
 from ..common.machine import BUSY, cores, cpu_name
+from ..common.paired_times import Floats
 from ..common.sphere_pictures import load_pyplot
 from .measurement.accuracy_results import RadiusRow, Report
 from .measurement.cold_curve import along, can_drop, cold_curve
@@ -41,13 +42,13 @@ def run(
     plan: MeasurementPlan,
     progress: Progress,
     archive: Path | None = None,
-    avatar: Path | None = None,
+    avatar: Floats | None = None,
 ) -> Report:
     """Measure everything and write it into the folder `out`.
 
     scratch: a folder for scans and archives, which the caller removes.
     archive: folder of an archive to measure; None: one built from a generated façade.
-    avatar: a file of points; None: the generated figure.
+    avatar: points (n, 3) [m]; None: the generated figure.
     Raises SolidcloudError if matplotlib is missing.
     """
     from .page.accuracy_charts import draw_charts
@@ -73,7 +74,7 @@ def measure(
     plan: MeasurementPlan,
     progress: Progress,
     archive: Path | None = None,
-    avatar: Path | None = None,
+    avatar: Floats | None = None,
 ) -> Report:
     """Measure everything and return the report without writing it."""
     begin = time.perf_counter()

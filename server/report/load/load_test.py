@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....builder.run.executor import Progress
 from ....builder.synthetic.figure import figure_points
@@ -22,7 +23,6 @@ from ....builder.synthetic.truth import SceneTruth, read_truth
 from ....schemas.errors import SolidcloudError
 from ....schemas.process.interrupts import check_interrupt
 from ....schemas.process.os_errors import check_writable
-from ...avatars.avatar_file import read_avatar
 from ...avatars.avatar_model import make_avatar
 from ..common.bench_results import Part, write
 from ..common.machine import Clock, cpu_name
@@ -50,7 +50,7 @@ class LoadOptions:
     """Options of a load test.
 
     walks: files of poses; empty: made walks.  truth: of a generated town, whose users know its doors.
-    avatar: a file of points; None: the generated figure.
+    avatar: points (n, 3) [m]; None: the generated figure.
     budget, budgets: shares of the decoded bytes; None: the usual ones that the archive allows.
     speeds: [m/s].  crowds: numbers of users of section `users`.
     budget_ms: time budget of each request; None: an answer waits for its voxels.
@@ -61,7 +61,7 @@ class LoadOptions:
     kinds: tuple[str, ...] = ALL_KINDS
     walks: tuple[Path, ...] = ()
     truth: Path | None = None
-    avatar: Path | None = None
+    avatar: NDArray[np.float64] | None = None
     users: int = 8
     seconds: float = 30.0
     budget: float | None = None
@@ -115,7 +115,7 @@ class LoadTest:
     ) -> None:
         """Read the archive and check the options."""
         self.options, self.progress, self.out = options, progress, out
-        avatar = figure_points() if options.avatar is None else read_avatar(options.avatar)
+        avatar = figure_points() if options.avatar is None else options.avatar
         self.voxels: Voxels = read_voxels(archive)
         self.setup = load_run.Setup(archive, scratch, avatar, options.processes, options.budget_ms)
         one, said = cache_budgets.checked_shares(

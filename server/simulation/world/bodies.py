@@ -62,7 +62,7 @@ class Shape(NamedTuple):
         """
         if point not in self.normals:
             points = self.model.points
-            apart = points - points[point]
+            apart = points[: len(points) - self.model.inner_points] - points[point]
             near = np.rint(apart[(apart * apart).sum(axis=1) <= _SURFACE**2] * UNITS_PER_METRE).astype(
                 np.int64
             )

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from ....schemas.errors import BusyError, SolidcloudError
 from ....schemas.wire.motion_messages import State
 from ...runtime.threads import start_loop
+from ...scene_interface import AvatarShape
 from ...zenoh_client.client_session import ClientSession
 from ..feeds.scene_link import OpenScene
 from ..page.page_messages import FAILED, Intent
 from ..page.view_frame import ViewFrame
-from .user_avatar import UserAvatar
 from .user_motion import Easing, turn, velocity
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class BrowserUser:
     def __init__(
         self,
         name: str,
-        avatar: UserAvatar,
+        avatar: AvatarShape,
         deliver: Callable[[State, ViewFrame], None],
         report: Callable[[str], None],
     ) -> None:
@@ -69,7 +69,7 @@ class BrowserUser:
 
     def begin(self, scene: OpenScene, pose: Floats) -> None:
         """Enter the scene at a pose (4, 4). Raise the server's errors, BusyError without a server."""
-        scene.client.add_avatar(self._name, self._avatar.points, self._avatar.radius)
+        scene.client.add_avatar(self._name, self._avatar)
         session = scene.client.session(self._name, late="bounds")
         session.__enter__()
         try:

@@ -13,8 +13,9 @@ from ....schemas.errors import SolidcloudError
 from ....schemas.wire.answers import CollideAnswers, Verdict
 from ....schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ...cli.scene_files.spawn_search import Body, add_body, find_spawn
+from ...scene_interface import AvatarShape
 from ..feeds.scene_link import OpenScene
-from .user_avatar import UserAvatar
+from .user_avatar import height_of
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +55,7 @@ class _UprightScene:
 class StartingPlaces:
     """Places where users begin. Thread-safe; a search is done once for each avatar and scene."""
 
-    def __init__(self, avatar: UserAvatar) -> None:
+    def __init__(self, avatar: AvatarShape) -> None:
         """Make places for an avatar."""
         self._avatar = avatar
         self._lock = threading.Lock()
@@ -83,7 +84,7 @@ class StartingPlaces:
         """Return a place to stand near the middle of the scene, or above it if none is found."""
         if self._found is not None and self._found[0] == scene.info.generation:
             return self._found[1]
-        body = add_body(scene.client, {_PROBE: (self._avatar.points, self._avatar.radius)})
+        body = add_body(scene.client, {_PROBE: self._avatar})
         found = find_spawn(_UprightScene(scene), body)
         place = scene.frame.to_world(found) if found is not None else _above(scene, body)
         self._found = (scene.info.generation, place)
@@ -108,7 +109,7 @@ class StartingPlaces:
         angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
         ways = np.column_stack([np.cos(angles), np.sin(angles), np.full(_DIRECTIONS, 0.05)])
         ways /= np.linalg.norm(ways, axis=1)[:, None]
-        eyes = scene.frame.directions_to_world([0.0, 0.0, _EYES * self._avatar.height])
+        eyes = scene.frame.directions_to_world([0.0, 0.0, _EYES * height_of(self._avatar)])
         try:
             hits = scene.client.raycast(
                 np.tile(place + eyes, (_DIRECTIONS, 1)), scene.frame.directions_to_world(ways), _SIGHT

@@ -17,7 +17,6 @@ from .....builder.voxel.record_points import voxel_points
 from .....schemas.archive.archive import Archive
 from .....schemas.archive.index import Header
 from .....schemas.wire.answers import Verdict
-from ....avatars.avatar_file import read_avatar
 from ....avatars.avatar_model import make_avatar
 from ....scene import Scene
 from ...common.floor_walk import floor_walk
@@ -68,7 +67,7 @@ class MeasuredScene(NamedTuple):
 
 
 def generated_scene(
-    plan: MeasurementPlan, avatar: Path | None, models: frozenset[str], folder: Path
+    plan: MeasurementPlan, avatar: Floats | None, models: frozenset[str], folder: Path
 ) -> MeasuredScene:
     """Generate the façade's scan in `folder`, build it, and return it with the walk through it.
 
@@ -76,7 +75,7 @@ def generated_scene(
     """
     scan = folder / "facade.laz"
     made = make_facade(scan, points=plan.points)
-    body = figure_points() if avatar is None else read_avatar(avatar)
+    body = figure_points() if avatar is None else avatar
     _, walk = walk_poses(build_facade().truth, plan.frames)
     # These archives usually have one shard: more processes would only load numba several times.
     plain = BuildConfig(resolution=STEPS[0], overwrite=True, jobs=1)
@@ -89,7 +88,7 @@ def generated_scene(
     )  # fmt: skip
 
 
-def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Path | None) -> MeasuredScene:
+def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Floats | None) -> MeasuredScene:
     """Return an archive with a straight walk over its floor, through the voxels around its middle.
 
     Of walks along LINES, it is the one with the most clear poses.
@@ -99,7 +98,7 @@ def archive_scene(archive: Path, plan: MeasurementPlan, avatar: Path | None) -> 
     with Archive(archive) as opened:
         points = middle_points(opened)
         header, warnings = opened.header, unknown_regions(opened.header)
-    body = figure_points() if avatar is None else read_avatar(avatar)
+    body = figure_points() if avatar is None else avatar
     walks = [floor_walk(points, quantile)[1] for quantile in LINES]
     for walk in walks:
         # The walk places avatar points on scan points. Raise it by both radii: the spheres would else

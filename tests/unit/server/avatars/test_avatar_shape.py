@@ -2,6 +2,7 @@
 
 import struct
 import sys
+import typing
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 import synthetic_scans
 import trimesh
+from msgspec import structs
+from solidcloud.builder.sources.placed_scan import METRES, TURNS
 from solidcloud.builder.synthetic.figure import figure_points, write_figure
 from solidcloud.schemas.errors import BadRequestError, ScanError, TooLargeError
+from solidcloud.schemas.scene.scene_file import AvatarItem
 from solidcloud.server.avatars.avatar_shape import avatar_shape
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
@@ -44,7 +48,11 @@ def at(x: float) -> np.ndarray:
 
 def test_an_array_is_taken_as_it_is() -> None:
     assert avatar_shape(POINTS, 0.1).points is POINTS
-    assert avatar_shape(POINTS.tolist()) == (POINTS.tolist(), None)
+    assert avatar_shape(POINTS.tolist()) == (POINTS.tolist(), None, 0, "")
+    shape = avatar_shape(BOX, 0.1)
+    assert avatar_shape(shape) is shape
+    with pytest.raises(BadRequestError, match="up and units for an avatar that is no file"):
+        avatar_shape(BOX, 0.1, up="y")
 
 
 @pytest.mark.parametrize("kind", ["stl", "ascii.stl", "obj", "ply", "glb"])
@@ -57,7 +65,10 @@ def test_a_mesh_file_is_solid(scene: Scene, tmp_path: Path, kind: str) -> None:
         assert info.points > 5_000 and info.radius == pytest.approx(np.sqrt(1.5) / 100, abs=1e-6)
         # The scan's point lies on the middle of a side, far from any corner of the box.
         verdicts = scene.collide(name, np.concatenate([at(0.25), at(0.25 + 0.03), at(0.0)])).verdict
-        assert verdicts.tolist() == [1, 0, 0], "a surface, and nothing inside"
+        assert verdicts.tolist() == [1, 0, 1], "the box, and what is inside"
+        hollow = scene.add_avatar(f"hollow {name}", given, hollow=True)
+        assert scene.collide(hollow.name, at(0.0)).verdict.tolist() == [0], "a surface, and nothing inside"
+        assert hollow.points == info.points - info.inner_points and hollow.inner_points == 0
     assert np.array_equal(avatar_shape(file, 0.1).points, avatar_shape(BOX, 0.1).points)
 
 
@@ -73,13 +84,48 @@ def test_points_of_a_file_are_taken_as_they_are(tmp_path: Path) -> None:
     assert np.array_equal(avatar_shape(tmp_path / "body.xyz").points, [[0, 0, 0], [1, 2, 3]])
 
 
+def lying(kind: str, folder: Path) -> Path:
+    """A file of a person of 1.75 m who lies along y, in millimetres."""
+    person = trimesh.creation.box((500.0, 1750.0, 300.0)).apply_translation([0.0, 875.0, 0.0])
+    file = folder / f"person.{kind}"
+    corners = np.asarray(person.vertices)
+    if kind in ("stl", "obj", "ply", "glb"):
+        person.export(file)
+    elif kind == "laz":
+        synthetic_scans.write_las(file, np.rint(corners * 1000).astype(np.int32))
+    else:
+        np.savetxt(file, corners)
+    return file
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj", "ply", "glb", "xyz", "laz"])
+def test_the_up_axis_and_unit_of_any_file_are_taken_issue_35(tmp_path: Path, kind: str) -> None:
+    file = lying(kind, tmp_path)
+    shape = avatar_shape(file, 0.05, up="y", units="mm")
+    assert np.allclose(np.ptp(shape.surface, axis=0), [0.5, 0.3, 1.75], atol=1e-6)
+    assert np.allclose(shape.surface.min(axis=0), [-0.25, -0.15, 0.0], atol=1e-6)
+    assert shape.description.endswith("; y up, unit mm")
+    plain = avatar_shape(file, 50.0)
+    assert np.argmax(np.ptp(plain.surface, axis=0)) == (2 if kind == "glb" else 1)
+    assert plain.description.endswith("; y up (glTF), unit m" if kind == "glb" else "; z up, unit m")
+    if kind == "glb":
+        assert np.argmax(np.ptp(avatar_shape(file, 50.0, up="z").surface, axis=0)) == 1
+    for word in ({"up": "w"}, {"units": "feet"}):
+        with pytest.raises(
+            BadRequestError, match=r"person.* expected one of (z, y, x|m, mm, cm, dm, km, in, ft)"
+        ):
+            avatar_shape(file, **word)
+
+
 def test_a_trimesh_object_or_anything_like_it_is_solid(scene: Scene) -> None:
     info = scene.add_avatar("box", BOX, 0.02)
     assert info.radius == 0.02 and info.points > 1_000
     assert scene.add_avatar("box", Mesh(BOX.vertices.tolist(), BOX.faces.tolist()), 0.02) == info
     assert scene.add_avatar("box", trimesh.Scene(BOX), 0.02) == info
     both = trimesh.Scene([BOX, BOX.copy().apply_translation([3.0, 0, 0])])
-    assert scene.add_avatar("two", both, 0.02).points == 2 * info.points
+    two = scene.add_avatar("two", both, 0.02)
+    assert two.points - two.inner_points == 2 * (info.points - info.inner_points)
+    assert two.inner_points == pytest.approx(2 * info.inner_points, rel=0.02), "each on a common lattice"
     assert scene.add_avatar("cloud", trimesh.PointCloud(POINTS), 0.02).points == len(POINTS)
     assert scene.add_avatar("vertices", Mesh(POINTS), 0.02).points == len(POINTS)
 
@@ -147,6 +193,13 @@ def test_stl_glb_and_points_need_no_extra(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(np.asarray(avatar_shape(tmp_path / "figure.obj").points)) == 3
 
 
+def test_a_scene_file_takes_the_words_of_scan_lists() -> None:
+    hints = typing.get_type_hints(AvatarItem)
+    for field, known in (("up", TURNS), ("units", METRES)):
+        words = next(each for each in typing.get_args(hints[field]) if each is not type(None))
+        assert set(typing.get_args(words)) == set(known)
+
+
 def refusals(add: Any) -> list[str]:
     """The messages with which invalid avatars are refused."""
     found = []
@@ -185,8 +238,16 @@ def test_a_mesh_of_a_scene_file_is_solid(scene: Scene, tmp_path: Path) -> None:
     top = f'format = 1\n[[archives]]\npath = "{archive}"\n'
     file.write_text(top + '[[avatars]]\nname = "al"\nfile = "box.stl"\nradius = 0.02\n')
     with Scene.open(file) as opened:
-        assert opened.info().avatars[0] == scene.add_avatar("al", BOX, 0.02)
-        assert opened.collide("al", np.concatenate([at(0.25), at(0.0)])).verdict.tolist() == [1, 0]
+        found = opened.info().avatars[0]
+        assert found.description == "closed mesh, filled; z up, unit m"
+        assert structs.replace(found, description="") == structs.replace(
+            scene.add_avatar("al", BOX, 0.02), description=""
+        )
+        assert opened.collide("al", np.concatenate([at(0.25), at(0.0)])).verdict.tolist() == [1, 1]
+    file.write_text(file.read_text() + 'hollow = true\nup = "y"\nunits = "cm"\n')
+    with Scene.open(file) as opened:
+        assert opened.info().avatars[0].description.startswith("mesh, hollow: a surface")
+        assert opened.info().avatars[0].description.endswith("; y up, unit cm")
     with Scene.open(file, read_points=lambda _: POINTS) as opened:
         assert opened.info().avatars[0].points == len(POINTS)
 

@@ -120,7 +120,7 @@ def test_only_a_radius_that_is_not_given_is_made_again_and_in_its_turn(monkeypat
     avatars, made = Avatars(LIMITS), []
     first = avatars.add("al", BODY, 0.01, "a")
 
-    def making(points, radius):
+    def making(points, radius, inner_points=0):
         made.append((radius, avatars._large.locked()))
         return make_avatar(points, radius)
 
@@ -164,7 +164,7 @@ def test_a_client_may_add_one_of_the_scenes_own_avatars_as_it_is():
 def test_what_is_being_built_counts_and_is_waited_for(monkeypatch):
     avatars, begun, go = Avatars(LIMITS), threading.Event(), threading.Event()
 
-    def slowly(points, radius):
+    def slowly(points, radius, inner_points=0):
         begun.set()
         assert go.wait(20)
         return make_avatar(points, radius)

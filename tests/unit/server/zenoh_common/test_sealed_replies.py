@@ -57,12 +57,13 @@ def test_a_seal_says_which_avatars_a_reply_is_about():
 
 
 def test_an_avatars_digest_is_of_its_numbers():
-    numbers = struct.pack("<7d", 0, 0, 0, 0, 0, 1.75, 0.875)
+    numbers = struct.pack("<8d", 0, 0, 0, 0, 0, 1.75, 0.875, 0)
     assert hashlib.sha256(numbers).digest() == ABOUT
     assert avatar_digest(np.asfortranarray(-POINTS * -1.0), 0.875) == ABOUT
     assert avatar_digest(POINTS * [1.0, -1.0, 1.0], 0.875) == ABOUT, "a zero has no sign"
-    assert avatar_digest(np.empty((0, 3)), -0.0) == hashlib.sha256(bytes(8)).digest()
+    assert avatar_digest(np.empty((0, 3)), -0.0) == hashlib.sha256(bytes(16)).digest()
     assert ABOUT not in (avatar_digest(POINTS[::-1], 0.875), avatar_digest(POINTS, np.nextafter(0.875, 1)))
+    assert avatar_digest(POINTS, 0.875, 1) != ABOUT, "a point inside is no part of the surface"
 
 
 @pytest.mark.parametrize(

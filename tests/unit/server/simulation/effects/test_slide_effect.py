@@ -6,10 +6,12 @@ import archive_cases
 import effect_rooms
 import numpy as np
 import pytest
+import trimesh
 from effect_rooms import INTERPRETED, RADIUS, at, play
 from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.avatars.avatar_shape import avatar_shape
 from solidcloud.server.kernels.walk.slide_planes import clip_displacement
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
@@ -166,3 +168,22 @@ def test_points_too_few_for_a_surface_stop_however_far_their_neighbours_may_be(t
         body = game.body(make_avatar([[0.0, 0, 0]], 0.2), at(0.01, 0.02, 0.5))
         moved = game.go(body, (0.05, 0, -0.5))
         assert moved.touched and not game.touches(body)
+
+
+def test_a_filled_mesh_passes_a_free_edge_as_a_hollow_one_does_issue_35(tmp_path: Path) -> None:
+    """The jamb of a wall of one sheet: there the normal is that of the body's surface."""
+    jamb = effect_rooms.build(tmp_path, effect_rooms.plane((0, -1.4, -0.8), (0, 0, 0.8)))
+    column, ends = trimesh.creation.cylinder(0.25, 0.6), []
+    for hollow in (False, True):
+        shape = avatar_shape(column, 0.03, hollow=hollow)
+        with play(jamb.archive, Stop(), Sweep(), Slide()) as game:
+            body = game.body(make_avatar(*shape[:3]), at(-0.5, 0.1, 0))
+            normals = []
+            for _ in range(60):
+                moved = game.go(body, (0.03, 0.0, 0))
+                normals += [touched.normal for touched in moved.touched[:1] if touched.normal is not None]
+                assert not game.touches(body)
+        ends.append(body.pose[:3, 3])
+        assert body.pose[0, 3] > 0.3, "around the edge"
+        assert normals and all(np.dot(normal, (0.0, 0.0, 1.0)) < 0.2 for normal in normals)
+    assert ends[0] == pytest.approx(ends[1], abs=0.02)

@@ -64,9 +64,7 @@ class Judged:
         scan = synthetic_scans.write_ply(folder / "hall.ply", self.points)
         self.folder = folder / "hall"
         build_archive([scan], self.folder, BuildConfig(voxel=1.0, resolution=1e-3, jobs=1))
-        avatar = folder / "figure.ply"
-        synthetic_scans.write_ply(avatar, figure_points(200))
-        self.measured: MeasuredScene = archive_scene(self.folder, PLAN, avatar)
+        self.measured: MeasuredScene = archive_scene(self.folder, PLAN, figure_points(200))
         self._stack = ExitStack()
         self.scene = self._stack.enter_context(Scene.open(self.folder))
         self.scene.add_avatar(AVATAR, self.measured.avatar)

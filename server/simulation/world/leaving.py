@@ -18,6 +18,8 @@ from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
 _MORE = 0.25
+# Name under which `Body.effect_state` keeps the half-spaces around the avatar.
+_HULL = "hull"
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
 
@@ -55,8 +57,11 @@ class LeavingPose:
         self._lattice = points[:, kernel.LATTICE : kernel.DEFICIT]
         times, _ = self._meet(np.ones(len(points), bool), np.zeros(3))
         held = times == 0.0
-        self._body.call(kernel.find_held, self._body.reference, self._points, self._reach, held)
-        self._held, self._of_held = held, np.flatnonzero(held)
+        hull = frame.body.effect_state.get(_HULL)
+        if hull is None:
+            hull = frame.body.effect_state[_HULL] = kernel.hull_of(self._body.reference)
+        kernel.find_held(hull, self._points, self._reach, held)
+        self._held = held
         box = np.array([avatar.points.min(axis=0), avatar.points.max(axis=0)])
         planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))
         count = kernel.separate_core(box, self._points[held], planes)

@@ -20,6 +20,10 @@ from .vectors import dot, norm, rotate, rotate_back
 _MORE = 0.25
 # Name under which `Body.effect_state` keeps the half-spaces around the avatar.
 _HULL = "hull"
+# A motion leaves a surface if its direction has at least this part away from the plane. The points up to
+# _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its radius deep
+# touches new points of both walls on every way out, although it leaves both.
+_LEAVES, _THICK = 0.2, 0.05
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
 
@@ -111,7 +115,7 @@ class LeavingPose:
                 hit = hit._replace(archive=int(self._archive[at]))
         if hit is not None:
             return hit
-        times, own = self._meet(~self._held, local)
+        times, own = self._meet(~(self._held | self._left_behind(local, length)), local)
         at = int(times.argmin()) if len(times) else -1
         if at < 0 or times[at] == np.inf:
             return None
@@ -123,6 +127,17 @@ class LeavingPose:
         return Hit(
             fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
         )
+
+    def _left_behind(self, way: Vec, length: float) -> NDArray[np.bool_]:
+        """Return which points belong to a surface that a translation, avatar frame, leads away from."""
+        found = np.zeros(len(self._points), bool)
+        x, y, z = self._points.T
+        for plane in self._planes:
+            if dot(plane[: kernel.OFFSET], way) <= -_LEAVES * length:
+                a, b, c, offset = plane[: kernel.NEAREST].tolist()
+                beyond = a * x + b * y + c * z - offset
+                found |= (beyond >= 0.0) & (beyond <= _THICK)
+        return found
 
     def _end(self, to: Pose, fraction: float, way: Vec, begin: Vec, skin: float) -> Pose:
         """Return the pose `skin` [m] before a contact. begin: from the touched to the touching centre."""

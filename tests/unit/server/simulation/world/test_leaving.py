@@ -103,10 +103,12 @@ def test_a_motion_in_contact_obeys_the_rule_by_its_definition(
             allowed += bool(moved.any())
             touched = [_touched(points, avatar, body.pose[:3, 3] + t * moved) for t in np.linspace(0, 1, 9)]
             inside = _inside(points, avatar, body.pose[:3, 3])
+            leaves = np.zeros(len(points), bool)
+            for across in (0, 1):  # the walls x = 0 and y = 0
+                if moved[across] > 0.15 * np.linalg.norm(moved):
+                    leaves |= np.abs(points[:, across]) < 0.05
             for now in touched[1:]:
-                assert not (now & ~touched[0] & ~inside).any(), (
-                    "a point outside of the avatar is newly touched"
-                )
+                assert not (now & ~touched[0] & ~inside & ~leaves).any(), "another surface is newly touched"
             # The nearest point to the core comes no nearer than its plane, 2 cm before it or half of the way.
             gaps = [
                 np.linalg.norm(points[None] - (axis + body.pose[:3, 3] + t * moved)[:, None], axis=2).min()

@@ -25,8 +25,9 @@ _TALL, _SPHERE, _APART = 1.7, 0.02, 0.05
 _SPACING, _HIGH, _LONG = 0.02, 2.2, 2.0
 # A user walks at this speed [m/s] for this time [s], and is out when it is clear this far away [m].
 _SPEED, _SECONDS, _OUT = 1.4, 3.0, 0.3
-# The core begins farther than this from all points, and passes one if it comes this near [m].
-_CORE, _TOUCHED = 0.03, 0.005
+# The core begins farther than this from all points of a wall, and of a scan, whose points are up to 0.1 m
+# apart: nearer, it may be in a surface.  It passes a point if it comes this near [m].
+_CORE, _SCAN_CORE, _TOUCHED = 0.03, 0.12, 0.005
 SHAPES = ("sheet", "jamb", "corner")
 # Parts of scans: half their extent [m].
 SCANS, _HALF = ("indoor_atrium.laz", "octomap_hall.xyz"), 3.0
@@ -133,7 +134,9 @@ def overlap_walks(
             else:
                 pose[:3, 3] = scan[rng.integers(len(scan))] + rng.uniform(-0.35, 0.35, 3)
                 pose[2, 3] -= rng.uniform(0.0, _TALL)
-            if _distance(scan, pose) < _CORE or not int(world.collide(avatar, pose)):
+            if _distance(scan, pose) < (_CORE if shape in SHAPES else _SCAN_CORE) or not int(
+                world.collide(avatar, pose)
+            ):
                 continue
             done += 1
             free = passed = 0

@@ -1,15 +1,22 @@
 """Meaning of motion commands: how long a frame lasts, and to which pose it leads."""
 
 import math
+from collections.abc import Callable, Collection
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from ...schemas.archive.rigid_pose import check_rigid
 from ...schemas.errors import UnknownAvatarError
 from ...schemas.scene.scene_file import Spawn
-from ...schemas.wire.motion_messages import FRAME_SECONDS, Wish
-from .world.frame import Pose, Vec
+from ...schemas.wire.motion_messages import FRAME_SECONDS, Moved, Wish
+from .world.frame import MAX_TOUCHED, Body, Pose, Vec
 from .world.vectors import multiply, orthonormalize, rotation_matrix
+
+if TYPE_CHECKING:  # only scenes whose users can collide import it
+    from .world.bodies import Bodies
 
 # Limit on the duration of a frame [s]. A motion command that is due for longer takes several.
 LONGEST_FRAME = 0.1
@@ -64,3 +71,45 @@ def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
     if command.velocity is not None:
         raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
     return check_rigid(command.pose[0].copy(), "pose")
+
+
+def run_frames(
+    run: Callable[..., Moved],
+    command: Wish,
+    durations: list[float],
+    body: Body,
+    up: Vec,
+    bodies: "Bodies | None",
+    skip: Collection[str] | None,
+) -> Moved:
+    """Run the frames of a user's motion command, nearly always one. If one fails, undo those before it.
+
+    run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may meet, or
+    None.  skip: as for `run`.
+    """
+    if len(durations) == 1:
+        return run(body, target_pose(command, body.pose, durations[0], up), durations[0], skip=skip)
+    body_before = replace(body, effect_state=dict(body.effect_state))
+    bodies_before = None if bodies is None else bodies.snapshot()
+    moves: list[Moved] = []
+    try:
+        for seconds in durations:
+            moves.append(run(body, target_pose(command, body.pose, seconds, up), seconds, skip=skip))
+            skip = moves[-1].skipped  # the first decides for all: a log has one list
+            if bodies is not None:
+                bodies[body.user] = body
+    except BaseException:
+        for each in fields(body):
+            setattr(body, each.name, getattr(body_before, each.name))
+        if bodies is not None and bodies_before is not None:
+            bodies.restore(bodies_before)
+        raise
+    touched = {(each.what, each.place): each for moved in moves for each in moved.touched}
+    last = moves[-1]
+    return msgspec.structs.replace(
+        last,
+        left=last.left if command.velocity is None else sum(moved.left for moved in moves),
+        touched=list(touched.values())[:MAX_TOUCHED],
+        stepped=sum(moved.stepped for moved in moves),
+        unknown=any(moved.unknown for moved in moves),
+    )

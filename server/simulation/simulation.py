@@ -10,10 +10,9 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-import msgspec
 import numpy as np
 
 from ...schemas.archive.pose_arrays import one_pose
@@ -46,8 +45,8 @@ from ..queries.context.query_budget import LateVoxels, QueryBudget
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
 from .body_record import BodyRecord, record_of, take_record
-from .motion_commands import first_pose, frame_durations, target_pose
-from .world.frame import MAX_TOUCHED, Body, Pose
+from .motion_commands import first_pose, frame_durations, run_frames
+from .world.frame import Body, Pose
 from .world.vectors import norm, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
@@ -286,7 +285,9 @@ class Simulation:
                     )
                 undo.callback(self._bodies.place_objects(command.objects, budget.stop))
             if given is None:
-                moved = self._run_frames(command, present, budget, skip)
+                run = partial(self._pipeline.run, budget=budget)
+                durations = frame_durations(command, present.time)
+                moved = run_frames(run, command, durations, present.body, self._up, self._bodies, skip)
             else:
                 moved = take_record(given, present.body, self.world, self._bodies)
             undo.pop_all()
@@ -296,32 +297,6 @@ class Simulation:
         if self._bodies is not None:
             self._bodies[user] = present.body
         return moved
-
-    def _run_frames(
-        self, command: Wish, present: _Presence, budget: QueryBudget, skip: Collection[str] | None
-    ) -> Moved:
-        """Run the frames of a motion command, nearly always one. If one fails, undo those before it."""
-        durations, body = frame_durations(command, present.time), present.body
-        if len(durations) == 1:
-            target = target_pose(command, body.pose, durations[0], self._up)
-            return self._pipeline.run(body, target, durations[0], budget, skip=skip)
-        before = replace(body, effect_state=dict(body.effect_state))
-        bodies = None if self._bodies is None else self._bodies.snapshot()
-        moves: list[Moved] = []
-        try:
-            for seconds in durations:
-                target = target_pose(command, body.pose, seconds, self._up)
-                moves.append(self._pipeline.run(body, target, seconds, budget, skip=skip))
-                skip = moves[-1].skipped  # the first decides for all: a log has one list
-                if self._bodies is not None:
-                    self._bodies[body.user] = body
-        except BaseException:
-            for each in fields(body):
-                setattr(body, each.name, getattr(before, each.name))
-            if self._bodies is not None and bodies is not None:
-                self._bodies.restore(bodies)
-            raise
-        return _joined(moves, command)
 
     def _enter(self, user: User, command: Wish) -> _Presence:
         """Return the presence of a new user. Raises BusyError if the scene is full."""
@@ -392,19 +367,6 @@ class Simulation:
         if self._recorder is not None:
             with self._frame:
                 self._recorder.reloaded(generation)
-
-
-def _joined(moves: list[Moved], command: Wish) -> Moved:
-    """Return the result of the frames of one motion command, given those of each."""
-    touched = {(each.what, each.place): each for moved in moves for each in moved.touched}
-    last = moves[-1]
-    return msgspec.structs.replace(
-        last,
-        left=last.left if command.velocity is None else sum(moved.left for moved in moves),
-        touched=list(touched.values())[:MAX_TOUCHED],
-        stepped=sum(moved.stepped for moved in moves),
-        unknown=any(moved.unknown for moved in moves),
-    )
 
 
 def _frame_budget(late: str, stop: StopFlag) -> QueryBudget:

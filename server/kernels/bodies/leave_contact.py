@@ -150,31 +150,39 @@ def meet_points(body, points, reach, which, way, times, own):
 
 
 @nb.njit(nogil=True, cache=True)
-def find_held(body, points, reach, held):
-    """Set held (n,) bool also for points inside the hull of the avatar's spheres.
+def hull_of(body):
+    """Return half-spaces (h, 5) that contain the centres of an avatar's spheres, not empty, in its frame.
 
-    points, reach: as for `meet_points`. A point in a hollow between spheres is inside too.
+    Columns: direction (3,), its length, and the greatest height of the centres along it.
     """
-    avatar = body.avatar
-    outside = np.zeros(points.shape[0], np.bool_)
-    for a in range(-HULL, HULL + 1):
-        for b in range(-HULL, HULL + 1):
-            for c in range(-HULL, HULL + 1):
-                most = -np.inf
-                for block in range(avatar.points.shape[0]):
-                    for j in range(LANES):
-                        x, y, z = (
-                            avatar.points[block, 0, j],
-                            avatar.points[block, 1, j],
-                            avatar.points[block, 2, j],
-                        )
-                        most = max(most, (a * x + b * y) + c * z)
-                length = math.sqrt(np.float64(a * a + b * b + c * c))
-                for i in range(points.shape[0]):
-                    height = (a * points[i, 0] + b * points[i, 1]) + c * points[i, 2]
-                    outside[i] |= height > most + reach[i] * length
+    avatar, side = body.avatar, 2 * HULL + 1
+    hull = np.empty((side**3, 5))
+    for n in range(side**3):
+        for r in range(3):
+            hull[n, r] = n // side**r % side - HULL
+        a, b, c, most = hull[n, 0], hull[n, 1], hull[n, 2], -np.inf
+        for block in range(avatar.points.shape[0]):
+            for j in range(LANES):
+                x, y, z = avatar.points[block, 0, j], avatar.points[block, 1, j], avatar.points[block, 2, j]
+                most = max(most, (a * x + b * y) + c * z)
+        hull[n, 3], hull[n, 4] = math.sqrt((a * a + b * b) + c * c), most
+    return hull
+
+
+@nb.njit(nogil=True, cache=True)
+def find_held(hull, points, reach, held):
+    """Set held (n,) bool also for points inside the hull of an avatar's spheres.
+
+    hull: `hull_of` the avatar.  points, reach: as for `meet_points`. A point in a hollow between spheres
+    is inside too.
+    """
     for i in range(points.shape[0]):
-        held[i] |= not outside[i]
+        x, y, z, inside = points[i, 0], points[i, 1], points[i, 2], True
+        for n in range(hull.shape[0]):
+            if (hull[n, 0] * x + hull[n, 1] * y) + hull[n, 2] * z > hull[n, 4] + reach[i] * hull[n, 3]:
+                inside = False
+                break
+        held[i] |= inside
 
 
 @njit_no_refcount

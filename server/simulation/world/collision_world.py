@@ -196,6 +196,13 @@ class World:
         assert found is not None
         return found
 
+    def leave(self, frame: Any, to: Pose, skin: float) -> Hit | None:
+        """Return the hit that ends the translation from frame.pose, in contact, to a pose; see leaving.py."""
+        # Imported here: few frames begin in contact.
+        from .leaving import leave
+
+        return leave(frame, to, skin)
+
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
     ) -> tuple[Pose, bool]:
@@ -266,11 +273,8 @@ class World:
         least = np.inf
         with self as seen:
             for number, each in enumerate(seen):
-                there = (
-                    place
-                    if each.placed.inverse is None
-                    else transform_points(each.placed.inverse, place[None])[0]
-                )
+                inverse = each.placed.inverse
+                there = place if inverse is None else transform_points(inverse, place[None])[0]
                 answers = within(each.data, there[None], reach, budget)
                 self._count_of(answers, budget)
                 value = float(answers.distance[0])

@@ -18,6 +18,12 @@ from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
 _MORE = 0.25
+# Name under which `Body.effect_state` keeps the half-spaces around the avatar.
+_HULL = "hull"
+# A motion leaves a surface if its direction has at least this part away from the plane. The points up to
+# _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its radius deep
+# touches new points of both walls on every way out, although it leaves both.
+_LEAVES, _THICK = 0.2, 0.05
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
 
@@ -55,8 +61,11 @@ class LeavingPose:
         self._lattice = points[:, kernel.LATTICE : kernel.DEFICIT]
         times, _ = self._meet(np.ones(len(points), bool), np.zeros(3))
         held = times == 0.0
-        self._body.call(kernel.find_held, self._body.reference, self._points, self._reach, held)
-        self._held, self._of_held = held, np.flatnonzero(held)
+        hull = frame.body.effect_state.get(_HULL)
+        if hull is None:
+            hull = frame.body.effect_state[_HULL] = kernel.hull_of(self._body.reference)
+        kernel.find_held(hull, self._points, self._reach, held)
+        self._held = held
         box = np.array([avatar.points.min(axis=0), avatar.points.max(axis=0)])
         planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))
         count = kernel.separate_core(box, self._points[held], planes)
@@ -106,7 +115,7 @@ class LeavingPose:
                 hit = hit._replace(archive=int(self._archive[at]))
         if hit is not None:
             return hit
-        times, own = self._meet(~self._held, local)
+        times, own = self._meet(~(self._held | self._left_behind(local, length)), local)
         at = int(times.argmin()) if len(times) else -1
         if at < 0 or times[at] == np.inf:
             return None
@@ -118,6 +127,17 @@ class LeavingPose:
         return Hit(
             fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
         )
+
+    def _left_behind(self, way: Vec, length: float) -> NDArray[np.bool_]:
+        """Return which points belong to a surface that a translation, avatar frame, leads away from."""
+        found = np.zeros(len(self._points), bool)
+        x, y, z = self._points.T
+        for plane in self._planes:
+            if dot(plane[: kernel.OFFSET], way) <= -_LEAVES * length:
+                a, b, c, offset = plane[: kernel.NEAREST].tolist()
+                beyond = a * x + b * y + c * z - offset
+                found |= (beyond >= 0.0) & (beyond <= _THICK)
+        return found
 
     def _end(self, to: Pose, fraction: float, way: Vec, begin: Vec, skin: float) -> Pose:
         """Return the pose `skin` [m] before a contact. begin: from the touched to the touching centre."""

@@ -27,7 +27,7 @@ from ..common.scan import (
     scan_error,
     zero_rotation_note,
 )
-from .glb_properties import ATTRIBUTE, PROPERTIES, used_bytes
+from .glb_properties import PROPERTIES, is_damaged, used_bytes
 
 # Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
 # takes thirty times that.
@@ -310,8 +310,8 @@ class _Document:
                 self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
             )
         attributes = primitive["attributes"]
-        if others := [name for name in attributes if not ATTRIBUTE.fullmatch(name)]:
-            raise _damaged(self.path, f"the attribute {others[0][:60]!r}", "one of glTF, or its own with _")
+        if wrong := [name for name in attributes if is_damaged(name, ["POSITION"])]:
+            raise _damaged(self.path, f"the attribute {wrong[0]!r}", "'POSITION'")
         if "POSITION" not in attributes:
             return None
         vertices = self._accessor(attributes["POSITION"], "VEC3", {FLOAT: "<f4"})
@@ -368,10 +368,9 @@ class _Document:
         return found
 
     def _check_properties(self, name: str, found: dict[str, Any]) -> None:
-        """Raise ScanError for an unknown property of an object. name: of its list."""
-        known = PROPERTIES.get(name, found.keys()) | {"extensions", "extras"}
-        if others := [key for key in found if key not in known]:
-            raise _damaged(self.path, f"the property {others[0][:60]!r} in {name}", "those of glTF 2.0")
+        """Raise ScanError for a property whose name is damaged. name: of the object's list."""
+        if wrong := [key for key in found if is_damaged(key, PROPERTIES.get(name, ()))]:
+            raise _damaged(self.path, f"the property {wrong[0]!r} in {name}", "one of glTF 2.0")
 
     def _whole(self, number: Any) -> int:
         if not isinstance(number, int) or number < 0:

@@ -1,12 +1,11 @@
 """Properties of glTF objects, and the bytes that a document uses: what a damaged one would hide."""
 
-import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import accumulate
 from typing import Any
 
-# Properties of the objects that place vertices [glTF 2.0, 5]. Any other, beside "extensions" and
-# "extras", may be one of these whose name is damaged; to ignore it would move or lose vertices.
+# Properties of the objects that place vertices [glTF 2.0, 5]. One of these whose name is damaged must
+# not be ignored, which would move or lose vertices.
 PROPERTIES = {
     "glTF": {
         *("accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensionsUsed"),
@@ -26,10 +25,20 @@ PROPERTIES = {
     },
     "bufferViews": {"buffer", "byteOffset", "byteLength", "byteStride", "target", "name"},
 }
-ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|_.*")
 # Bytes of a value by its type, and values in a row by its shape; some matrices have padding more.
 SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+def is_damaged(name: str, known: Iterable[str]) -> bool:
+    """Return whether a name is none of the known ones, but one of them with one wrong character.
+
+    Programs write properties and attributes of their own, which glTF readers ignore.
+    """
+    names = set(known)
+    return name not in names and any(
+        len(each) == len(name) and sum(a != b for a, b in zip(each, name, strict=True)) == 1 for each in names
+    )
 
 
 def used_bytes(

@@ -170,14 +170,6 @@ class LasScan(SeekableScan):
                 chosen = (records["flags"] & flag) != 0
                 self.dropped[reason] = self.dropped.get(reason, 0) + int(np.count_nonzero(chosen))
                 records = records[~chosen]
-        for name in self._header.lost_axes():
-            if records[name].any():
-                raise scan_error(
-                    self.path,
-                    f"a scale of 0 for {name}, and points whose raw {name} is not 0",
-                    "the scale with which the file was written",
-                    "the places of the points are lost: export the scan again",
-                )
         return ScanBlock(
             self._header.xyz(records),
             records["intensity"].astype(np.float32),
@@ -211,6 +203,11 @@ def open_las(path: Path) -> list[Scan]:
         scan = LasScan(path, header, laszip, behind)
         projection = projection_records(file, header, records, size)
         scan.crs = crs_text(projection)
+        scan.notes = tuple(
+            f"{path}: a scale of 0 for {axis}, so all points lie at {axis} = {place:g}, although the header's "
+            "bounds are wider: export the scan again if it is not flat"
+            for axis, place in header.flattened_axes()
+        )
         units = stated_units(projection)
         if units and header.points:
             scan.units, scan.units_note = units

@@ -96,10 +96,10 @@ class LasHeader(NamedTuple):
         x, y, z = np.where(scale == 0, scale.max(), scale).tolist()
         return SourceLattice((x, y, z), self.offset) if x else None
 
-    def lost_axes(self) -> list[str]:
-        """Return the axes of scale 0 on which the header does not bound all points by the offset."""
+    def flattened_axes(self) -> list[tuple[str, float]]:
+        """Return the axes of scale 0 whose bounds are not the offset alone, with that offset."""
         return [
-            name
+            (name, self.offset[axis])
             for axis, name in enumerate("xyz")
             if self.scale[axis] == 0
             and (self.bounds is None or (self.bounds[:, axis] != self.offset[axis]).any())

@@ -132,6 +132,13 @@ def test_a_damaged_name_in_a_glb_loses_no_mesh(lost: str, tmp_path: Path) -> Non
         read(write_glb(tmp_path / "a.glb", document, glb_vertices(XYZ[:4])))
 
 
+def test_names_of_other_programs_in_a_glb_are_ignored(tmp_path: Path) -> None:
+    document = glb_document(4)
+    document["nodes"][0].update(layer="roof", visible=True)
+    document["meshes"][0]["primitives"][0]["attributes"].update(BATCHID=0)
+    assert read(write_glb(tmp_path / "a.glb", document, glb_vertices(XYZ[:4]))) == 4
+
+
 def test_pictures_and_shared_views_of_a_glb_are_no_vertices_left_out(tmp_path: Path) -> None:
     """Two meshes share a view; a picture follows in a view that no accessor uses."""
     document = json.loads(json.dumps(glb_document(4)))

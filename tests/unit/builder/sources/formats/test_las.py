@@ -64,7 +64,6 @@ LAS_LIES = {
     "points behind the file": (96, "<I", 1 << 30, "points that begin at byte 1073741824"),
     "record format": (104, "<B", 17, "point record format 17"),
     "record length": (105, "<H", 12, "records of 12 bytes"),
-    "scale of zero": (131, "<d", 0.0, "scale of 0 for x"),
     "scale without value": (139, "<d", float("nan"), "scale"),
     "infinite offset": (155, "<d", float("inf"), "offset"),
 }
@@ -336,8 +335,13 @@ def header_beyond(data: bytearray) -> None:
     struct.pack_into("<H", data, 94, 40_000)
 
 
+def flattened(data: bytearray) -> None:
+    struct.pack_into("<d", data, 147, 0.0)
+
+
 READABLE = {
     "negative scale": negative,
+    "scale of 0 and other raw values": flattened,
     "scale of 0 and raw values of 0": flat,
     "scale of 0 and flat bounds": flat_by_bounds,
     "more records than there are": lambda data: struct.pack_into("<I", data, 100, 7),
@@ -357,6 +361,9 @@ def test_what_laspy_reads_is_read(kind: str, tmp_path: Path) -> None:
     assert scan.lattice is not None and min(scan.lattice.scale) > 0
     steps = (read_all(tmp_path / "a.las") - scan.lattice.offset) / scan.lattice.scale
     assert np.abs(steps - np.rint(steps)).max() < 1e-6
+    assert ["scale of 0 for z" in note for note in scan.notes] == [True] * (
+        kind == "scale of 0 and other raw values"
+    )
 
 
 @pytest.mark.parametrize("version", ["1.3", "1.4"])

@@ -28,7 +28,6 @@ from ..common.scan import (
     SeekableScan,
     library_errors,
     reader_library,
-    scan_error,
 )
 from ..common.units import axis_metres
 from .las_crs import crs_text, stated_units

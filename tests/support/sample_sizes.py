@@ -1,7 +1,6 @@
 """Sizes of random samples: few in a usual run; as many as documents state with SOLIDCLOUD_SAMPLES=many.
 
-scripts/make_hard_cases and scripts/mutation set it, so that the table of hard cases and the mutation
-score are those of the large samples.
+scripts/make_hard_cases sets it, so that the table of hard cases is that of the large samples.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Contact begins at the unit that the definition says, in every question that asks for it, on scenes of work_counts.py.
+"""Contact begins at the unit that the definition says, in every query, on the scenes of query_scenes.py.
 
 Margins are set to the least reach that is contact, and to a unit less: what float32 cannot tell, integers decide.
 """
@@ -11,7 +11,7 @@ import archive_cases
 import naive
 import numpy as np
 import pytest
-import work_counts
+import query_scenes
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
@@ -24,14 +24,14 @@ UNIT = 2.0**-26
 @pytest.fixture(scope="module")
 def archive_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """The archive of a kind, built when first asked for."""
-    return cache(lambda kind: work_counts.build(tmp_path_factory.mktemp(kind), kind))
+    return cache(lambda kind: query_scenes.build(tmp_path_factory.mktemp(kind), kind))
 
 
 def margins(case: archive_cases.Case, scene: Scene, name: str) -> list[tuple[int, float]]:
     """Numbers of poses that have the margin at which contact begins, and that margin [m]."""
     info, found = scene.info(), []
-    points, radius = work_counts.DEEP if name == "deep" else work_counts.AVATARS[name]
-    for i, pose in enumerate(work_counts.poses()):
+    points, radius = query_scenes.AVATARS[name]
+    for i, pose in enumerate(query_scenes.poses()):
         least, _ = archive_cases.least_reach(case, points, pose, info.origin, info.lattice_step)
         margin = least - naive.reach_units(pose, radius, info.radius, 0.0)
         if 0 < margin < 2**28:
@@ -56,11 +56,11 @@ def verdict(scene: Scene, question: str, name: str, pose: NDArray[np.float64], m
 def test_contact_begins_at_the_unit_of_the_definition(
     archive_of: Callable[[str], Path], question: str, name: str, kind: str
 ) -> None:
-    case = archive_cases.Case(archive_of(kind), work_counts.scene_points(kind))
-    with work_counts.opened(case.archive, question) as scene:
+    case = archive_cases.Case(archive_of(kind), query_scenes.scene_points(kind))
+    with query_scenes.opened(case.archive, question) as scene:
         at = margins(case, scene, name)
         assert len(at) >= 3
         for i, margin in at:
-            pose = work_counts.poses()[i : i + 1]
+            pose = query_scenes.poses()[i : i + 1]
             assert verdict(scene, question, name, pose, margin) == Verdict.CONTACT
             assert verdict(scene, question, name, pose, margin - UNIT) == Verdict.CLEAR

@@ -5,7 +5,7 @@ from pathlib import Path
 import naive
 import numpy as np
 import pytest
-import work_counts
+import query_scenes
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 
@@ -19,10 +19,10 @@ def nearest(points: NDArray[np.int64], query: NDArray[np.int64]) -> tuple[int, l
 
 @pytest.mark.parametrize("kind", ["fine", "flat"])
 def test_the_nearest_and_the_reach_are_those_of_the_definition(tmp_path: Path, kind: str) -> None:
-    with work_counts.opened(work_counts.build(tmp_path, kind), "within") as scene:
+    with query_scenes.opened(query_scenes.build(tmp_path, kind), "within") as scene:
         info = scene.info()
         origin = np.array(info.origin)
-        lattice = naive.lattice_of(work_counts.scene_points(kind), origin, info.lattice_step)
+        lattice = naive.lattice_of(query_scenes.scene_points(kind), origin, info.lattice_step)
         units = naive.scan_units(lattice, info.lattice_step)
         # Halfway between two points both are at one distance, and no other is nearer where the two are neighbours.
         near = [
@@ -32,7 +32,7 @@ def test_the_nearest_and_the_reach_are_those_of_the_definition(tmp_path: Path, k
             for row in units[::9]
         ]
         pairs = np.array([(a + units[0]) // 2 for a in units[1::9]])
-        loose = np.rint((work_counts.loose() - origin) * naive.UNITS).astype(np.int64)
+        loose = np.rint((query_scenes.loose() - origin) * naive.UNITS).astype(np.int64)
         # Metres away, where float32 tells points apart by no less than some thousandths of a step.
         rng = np.random.default_rng(7)
         away = rng.normal(size=(40, 3))

@@ -1,1 +1,0 @@
-"""`scripts/test --quick`: the tests of what changed, within a time limit."""

@@ -32,6 +32,7 @@ from .walk_state import (
     CLEAR,
     CLEAR_AT,
     CONTACT,
+    FRAME_VERDICT,
     GIVES_WAY,
     HAS_END,
     HAS_NORMAL,
@@ -142,8 +143,10 @@ def _sweep(walk, to, tolerance, skin, row):
         pose, to, avatar.body, avatar.scratch, avatar.radius, walk.other_units, avatar.box, walk.held, walk.stop,
         walk.unknown, walk.unknown_everywhere, within, skin, memory.rows, result[:VERDICT],
     )  # fmt: skip
-    if needed < 0 or (verdict == CONTACT and result[UPPER] == 0.0):
-        return False  # Python answers motions that begin in contact
+    if needed < 0:
+        return False
+    if verdict == CONTACT and result[UPPER] == 0.0 and memory.numbers[FRAME_VERDICT] == CONTACT:
+        return False  # the frame began in contact: Python answers such motions
     use_voxels(memory, needed)
     exact = True
     if verdict == CONTACT:

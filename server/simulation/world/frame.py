@@ -197,7 +197,7 @@ def find_first_hit(
     """
     found, lacked = None, frame.lacked
     swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
-    if begins_in_contact(swept) and is_translation(frame.pose, to):
+    if frame.verdict == Verdict.CONTACT and begins_in_contact(swept) and is_translation(frame.pose, to):
         found = frame.world.leave(frame, to, skin)
     elif swept.verdict != Verdict.CLEAR:
         sure = swept.verdict == Verdict.CONTACT

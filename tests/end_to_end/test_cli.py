@@ -91,7 +91,7 @@ def test_help_loads_no_numpy(verb: str) -> None:
         (
             "query --scene hall",
             2,
-            "--op collide needs --avatar: it takes --avatar, --poses, --radius, --margin",
+            "--op collide needs --avatar: it takes --avatar, --poses, --radius, --avatar-up,",
         ),
         (
             "query --scene hall --avatar {scan} --poses {scan} --reach 1",

@@ -8,7 +8,7 @@ with y up [glTF 2.0, 3.4]; this reader does not convert coordinates.
 import json
 import struct
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import check_interrupt
 from ..common.scan import (
     BLOCK_BYTES,
+    BLOCK_POINTS,
     Scan,
     ScanBlock,
     apply_pose,
@@ -66,11 +67,13 @@ class _Primitive(NamedTuple):
     """Primitive of a mesh, before a node places it.
 
     indices: vertex numbers of the corners; None: vertices in order.
+    limits: (3,) least and greatest values that the document states for the vertices.
     """
 
     vertices: _Accessor
     mode: int
     indices: _Accessor | None
+    limits: tuple[NDArray[np.float32], ...]
 
 
 class _Part(NamedTuple):
@@ -250,26 +253,34 @@ class _Document:
                     meshes[node["mesh"]] = self._mesh(node["mesh"])
                 found += [_Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
             waiting += [(child, pose) for child in reversed(node.get("children", []))]
-        self._check_ends({primitive.vertices for mesh in meshes.values() for primitive in mesh})
+        self._check_ends(primitive for mesh in meshes.values() for primitive in mesh)
         return found
 
-    def _check_ends(self, positions: set[_Accessor]) -> None:
-        """Refuse vertices behind which the binary chunk has room for another that nothing uses.
+    def _check_ends(self, primitives: Iterable[_Primitive]) -> None:
+        """Refuse vertices behind which the binary chunk has others that nothing uses.
 
-        A count that is too small would leave these out. Raises ScanError.
+        A count that is too small would leave these out. Zeros that align what follows are none, nor
+        are bytes that no vertex of the accessor's least and greatest values has. Raises ScanError.
         """
         views = [self._at("bufferViews", k) for k in range(len(self.document.get("bufferViews", [])))]
         begins, ends = used_bytes(self.document.get("accessors", []), views)
-        for accessor in positions:
-            row = np.dtype(accessor.type).itemsize * accessor.width
-            at = accessor.start - self.start + accessor.rows * accessor.stride
-            before = bisect_left(begins, at + row)
-            if at + row <= self.size and not (before and ends[before - 1] > at):
-                raise _damaged(
-                    self.path,
-                    f"room for another vertex, which nothing uses, behind {accessor.rows} vertices",
-                    "a count of all of them",
-                )
+        with self.path.open("rb") as file:
+            for accessor, (low, high) in {each.vertices: each.limits for each in primitives}.items():
+                row = np.dtype(accessor.type).itemsize * accessor.width
+                at = accessor.start - self.start + accessor.rows * accessor.stride
+                before = bisect_left(begins, at + row)
+                if before and ends[before - 1] > at:
+                    continue
+                past = begins[before] if before < len(begins) else self.size
+                count = max(0, past - at - row + accessor.stride) // accessor.stride
+                behind = accessor._replace(start=self.start + at, rows=count)
+                for rows in _rows(file, self.path, behind, BLOCK_POINTS):
+                    if (rows.any(axis=1) & (rows >= low).all(axis=1) & (rows <= high).all(axis=1)).any():
+                        raise _damaged(
+                            self.path,
+                            f"further vertices, which nothing uses, behind {accessor.rows}",
+                            "a count of all of them",
+                        )
 
     def _check_parts(self, parts: int, what: str) -> None:
         if parts > MAX_PARTS:
@@ -323,7 +334,11 @@ class _Document:
         indices = None
         if "indices" in primitive:
             indices = self._accessor(primitive["indices"], "SCALAR", INDEX_TYPES)
-        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices)
+        stated = self._at("accessors", attributes["POSITION"])
+        limits = tuple(
+            np.array(stated.get(n, [v] * 3), "<f4") for n, v in (("min", -np.inf), ("max", np.inf))
+        )
+        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices, limits)
 
     def _accessor(self, number: int, shape: str, types: dict[int, str]) -> _Accessor:
         """Return an accessor, checked against its buffer view, and the view against the binary chunk."""

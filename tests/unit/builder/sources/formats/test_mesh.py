@@ -105,7 +105,7 @@ def test_decimal_commas_are_read_if_no_number_has_a_point(name: str, tmp_path: P
         path.write_text("v 0,5 0 0\nv 1,5 0 0\nv 0,5 1 0\nvt 0,5 0,5\nf 1/1 2/1 3/1\n")
         assert read_all(path, spacing=0.1).min(axis=0).round(1).tolist() == [0.5, 0, 0]
     path.write_text(head + "\n".join(lines).replace("0,5", "0.5") + end)
-    with pytest.raises(ScanError, match="line . is .*2,25e-1.*, expected 'v.*' and three numbers"):
+    with pytest.raises(ScanError, match=r"line . is .*2,25e-1.*, expected 'v.*' and three numbers"):
         read_all(path)
 
 

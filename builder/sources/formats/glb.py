@@ -28,7 +28,7 @@ from ..common.scan import (
     scan_error,
     zero_rotation_note,
 )
-from .glb_properties import PROPERTIES, is_damaged, used_bytes
+from .glb_properties import PROPERTIES, damaged_names, used_bytes
 
 # Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
 # takes thirty times that.
@@ -321,7 +321,7 @@ class _Document:
                 self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
             )
         attributes = primitive["attributes"]
-        if wrong := [name for name in attributes if is_damaged(name, ["POSITION"])]:
+        if wrong := damaged_names(attributes, ["POSITION"]):
             raise _damaged(self.path, f"the attribute {wrong[0]!r}", "'POSITION'")
         if "POSITION" not in attributes:
             return None
@@ -384,7 +384,7 @@ class _Document:
 
     def _check_properties(self, name: str, found: dict[str, Any]) -> None:
         """Raise ScanError for a property whose name is damaged. name: of the object's list."""
-        if wrong := [key for key in found if is_damaged(key, PROPERTIES.get(name, ()))]:
+        if wrong := damaged_names(found, PROPERTIES.get(name, ())):
             raise _damaged(self.path, f"the property {wrong[0]!r} in {name}", "one of glTF 2.0")
 
     def _whole(self, number: Any) -> int:

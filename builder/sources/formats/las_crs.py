@@ -190,16 +190,14 @@ def _key_units(keys: Mapping[int, int | float | str]) -> tuple[_Unit | None, _Un
     if model == GEOGRAPHIC or (plain and (GEODETIC in keys or ANGULAR_UNIT in keys)):
         key = MODEL if model == GEOGRAPHIC else GEODETIC if GEODETIC in keys else ANGULAR_UNIT
         across = _Unit(None, f"GeoTIFF key {key} = {keys[key]}", True)
-    cited = [(key, *_HEIGHTS.split(str(keys.get(key, "")), maxsplit=1), "") for key in PLANE_CITATIONS]
-    for key, plane, *_ in cited:
-        across = across or _cited_unit(key, plane)
-    upward = _key_unit(keys, *VERTICAL_UNIT[0])
-    if upward is None and (code := keys.get(VERTICAL_EPSG)) in FEET_HEIGHTS:
+    cited = {key: _HEIGHTS.split(str(keys.get(key, "")), maxsplit=1) for key in PLANE_CITATIONS}
+    across = across or next(filter(None, (_cited_unit(key, cited[key][0]) for key in cited)), None)
+    upward, code = _key_unit(keys, *VERTICAL_UNIT[0]), keys.get(VERTICAL_EPSG)
+    if upward is None and isinstance(code, int) and code in FEET_HEIGHTS:
         upward = _Unit(FEET_HEIGHTS[code], f"GeoTIFF key {VERTICAL_EPSG} = {code}")
-    upward = upward or _cited_unit(HEIGHT_CITATION, str(keys.get(HEIGHT_CITATION, "")))
-    for key, _, heights, *_ in cited:
-        upward = upward or _cited_unit(key, heights)
-    return across, upward
+    names = [(HEIGHT_CITATION, str(keys.get(HEIGHT_CITATION, "")))]
+    names += [(key, parts[1]) for key, parts in cited.items() if len(parts) > 1]
+    return across, upward or next(filter(None, (_cited_unit(*name) for name in names)), None)
 
 
 def _cited_unit(key: int, name: str) -> _Unit | None:

@@ -32,6 +32,8 @@ def values(node: object) -> st.SearchStrategy[object]:
                 exclude_min=above is not None,
                 exclude_max=below is not None,
             )
+        case inspect.BoolType():
+            return st.booleans()
         case inspect.StrType(pattern=pattern) if pattern:
             return st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True)
         case inspect.StrType(min_length=low, max_length=high):

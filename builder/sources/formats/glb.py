@@ -68,12 +68,14 @@ class _Primitive(NamedTuple):
 
     indices: vertex numbers of the corners; None: vertices in order.
     limits: (3,) least and greatest values that the document states for the vertices.
+    view_end: byte of the binary chunk where their buffer view ends.
     """
 
     vertices: _Accessor
     mode: int
     indices: _Accessor | None
     limits: tuple[NDArray[np.float32], ...]
+    view_end: int
 
 
 class _Part(NamedTuple):
@@ -164,6 +166,18 @@ def _rows(file: BufferedReader, path: Path, accessor: _Accessor, block_rows: int
         if len(data) < wanted:
             raise _damaged(path, "a file that ends within its vertices", "all its vertices")
         yield np.ndarray((count, accessor.width), accessor.type, data, strides=(accessor.stride, item))
+
+
+def _held(rows: NDArray[Any], primitive: _Primitive) -> NDArray[np.bool_]:
+    """Return which of vertices (n, 3) lie within the stated limits of a primitive."""
+    low, high = primitive.limits
+    return np.asarray(((rows >= low) & (rows <= high)).all(axis=1))
+
+
+def _limits_hold(file: BufferedReader, path: Path, primitive: _Primitive) -> bool:
+    """Return whether a primitive has vertices, and all lie within its stated limits."""
+    blocks = _rows(file, path, primitive.vertices, BLOCK_POINTS)
+    return primitive.vertices.rows > 0 and all(_held(rows, primitive).all() for rows in blocks)
 
 
 def open_glb(path: Path) -> list[Scan]:
@@ -259,13 +273,14 @@ class _Document:
     def _check_ends(self, primitives: Iterable[_Primitive]) -> None:
         """Refuse vertices behind which the binary chunk has others that nothing uses.
 
-        A count that is too small would leave these out. Zeros that align what follows are none, nor
-        are bytes that no vertex of the accessor's least and greatest values has. Raises ScanError.
+        A count that is too small would leave these out. Zeros behind the buffer view, which align what
+        follows, are none, nor are values beyond the accessor's least and greatest, if those are right.
+        Raises ScanError.
         """
         views = [self._at("bufferViews", k) for k in range(len(self.document.get("bufferViews", [])))]
         begins, ends = used_bytes(self.document.get("accessors", []), views)
         with self.path.open("rb") as file:
-            for accessor, (low, high) in {each.vertices: each.limits for each in primitives}.items():
+            for accessor, own in {each.vertices: each for each in primitives}.items():
                 row = np.dtype(accessor.type).itemsize * accessor.width
                 at = accessor.start - self.start + accessor.rows * accessor.stride
                 before = bisect_left(begins, at + row)
@@ -274,13 +289,16 @@ class _Document:
                 past = begins[before] if before < len(begins) else self.size
                 count = max(0, past - at - row + accessor.stride) // accessor.stride
                 behind = accessor._replace(start=self.start + at, rows=count)
+                in_view = (own.view_end - at - row + accessor.stride) // accessor.stride
                 for rows in _rows(file, self.path, behind, BLOCK_POINTS):
-                    if (rows.any(axis=1) & (rows >= low).all(axis=1) & (rows <= high).all(axis=1)).any():
+                    found = rows[rows.any(axis=1) | (np.arange(len(rows)) < in_view)]
+                    if len(found) and (_held(found, own).any() or not _limits_hold(file, self.path, own)):
                         raise _damaged(
                             self.path,
                             f"further vertices, which nothing uses, behind {accessor.rows}",
                             "a count of all of them",
                         )
+                    in_view -= len(rows)
 
     def _check_parts(self, parts: int, what: str) -> None:
         if parts > MAX_PARTS:
@@ -338,7 +356,9 @@ class _Document:
         limits = tuple(
             np.array(stated.get(n, [v] * 3), "<f4") for n, v in (("min", -np.inf), ("max", np.inf))
         )
-        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices, limits)
+        view = self._at("bufferViews", stated["bufferView"])
+        view_end = view.get("byteOffset", 0) + view["byteLength"]
+        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices, limits, view_end)
 
     def _accessor(self, number: int, shape: str, types: dict[int, str]) -> _Accessor:
         """Return an accessor, checked against its buffer view, and the view against the binary chunk."""

@@ -93,6 +93,8 @@ OUTER_NODES = {"COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS"}
 UNIT_NODES = {"UNIT", "LENGTHUNIT", "ANGLEUNIT"}
 DEEPEST = 100  # nodes inside one another; real ones are ten
 
+_OTHERWISE = "otherwise set units in a list of `solidcloud inspect`"
+
 
 class Units(NamedTuple):
     """Units that a file states. name: as `axis_metres` takes it.  note: as in `Scan.units_note`."""
@@ -139,7 +141,9 @@ def stated_units(found: Mapping[int, bytes]) -> Units | None:
         if not any(code in codes for codes in STATE_PLANES):
             return None
         where = f"GeoTIFF key {PROJECTED_EPSG} = {code}"
-        return Units("m", f"{where} may be a system in feet, but no key states the unit: taken as metres")
+        return Units(
+            "m", f"{where} may be a system in feet, but no key states the unit: taken as metres, {_OTHERWISE}"
+        )
     for unit in filter(None, (across, upward)):
         if unit.angular:
             return Units(DEGREES, f"coordinates in degrees of latitude and longitude, as {unit.where} states")

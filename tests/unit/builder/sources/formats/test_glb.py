@@ -153,6 +153,14 @@ def test_bytes_that_are_no_vertices_may_follow_them(behind: bytes, last: bool, t
         open_scans(write_glb(tmp_path / "a.glb", document, data))
 
 
+def test_a_last_vertex_at_the_origin_is_not_taken_for_zeros_between_parts(tmp_path: Path) -> None:
+    document = glb_document(4, 6)
+    document["accessors"][0]["count"] = 3
+    data = glb_vertices(SQUARE[[1, 2, 3, 0]] * [1, 1, 0]) + CORNERS.tobytes()
+    with pytest.raises(ScanError, match="further vertices, which nothing uses, behind 3"):
+        open_scans(write_glb(tmp_path / "a.glb", document, data))
+
+
 def test_parts_of_shared_meshes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A few words are parts without end, a hundred thousand nodes of a mesh of as many primitives."""
 

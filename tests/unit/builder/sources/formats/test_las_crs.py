@@ -114,7 +114,8 @@ def test_a_code_that_may_be_in_feet_without_its_unit_is_told() -> None:
     found = stated_units(keys((1024, 1), (3072, 2263)))
     assert found is not None and found.name == "m"
     assert found.note == (
-        "GeoTIFF key 3072 = 2263 may be a system in feet, but no key states the unit: taken as metres"
+        "GeoTIFF key 3072 = 2263 may be a system in feet, but no key states the unit: taken as metres, "
+        "otherwise set units in a list of `solidcloud inspect`"
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .common.scan import NOT_FINITE, Scan, ScanBlock, library_errors, reader_library, scan_error
-from .common.text_rows import open_text_file, text_chunks
+from .common.text_rows import DECIMAL_COMMA, open_text_file, text_chunks
 from .formats.glb import GlbScan
 from .formats.ply import ply_polygons
 
@@ -37,6 +37,7 @@ _OBJ_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
 _BROKEN_OBJ_FACE = re.compile(
     rb"^[ \t]*f(?=\s|\Z)(?!(?:[ \t]+-?0*[1-9]\d*(?:/-?\d*){0,2}){3,}[ \t\r]*(?:#.*)?$).*", re.MULTILINE
 )
+_DECIMAL_POINT = re.compile(rb"^[ \t]*v[ \t][^\n#]*\.", re.MULTILINE | re.IGNORECASE)
 # Letters of names and comments, which trimesh would decode -> "?".
 _ASCII = bytes(range(128)) + b"?" * 128
 
@@ -167,6 +168,9 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
     trimesh = reader_library("trimesh", path)
     with open_text_file(path) as file:
         text = file.read().translate(_ASCII)
+    # As keyword_rows() reads the vertices; trimesh reads no decimal commas.
+    if b"," in text and not _DECIMAL_POINT.search(text):
+        text = DECIMAL_COMMA.sub(b".", text)
     if broken := _BROKEN_OBJ_FACE.search(text.replace(b"\\\r\n", b"").replace(b"\\\n", b"")):
         raise scan_error(
             path,

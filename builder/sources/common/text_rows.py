@@ -45,7 +45,7 @@ _EMPTY_ENDS = {
     ";": re.compile(rb";[; \t\r]*$", re.MULTILINE),
 }
 # The search for a literal first byte is fast.
-_DECIMAL_COMMA = re.compile(rb",(?<=\d,)(?=\d)")
+DECIMAL_COMMA = re.compile(rb",(?<=\d,)(?=\d)")
 # What C programs on Windows print for NaN and infinities; the "#" would begin a comment.
 _WINDOWS_NAN = re.compile(rb"[-+]?(?:nan\([a-z]*\)|1\.#(?:QNAN|SNAN|IND|INF)\d*)", re.IGNORECASE)
 # Numbers of an OBJ file with a vertex in the same line: one wrong byte joins two lines.
@@ -162,7 +162,7 @@ def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     """
     lines = _without_comments(_plain_nan(lines), delimiter)
     if delimiter != ",":
-        lines = _DECIMAL_COMMA.sub(b".", lines)
+        lines = DECIMAL_COMMA.sub(b".", lines)
     if b'"' in lines or b"'" in lines:
         lines = _QUOTED.sub(rb"\2", lines)
     return _EMPTY_ENDS[delimiter].sub(b"", lines) if delimiter else lines
@@ -321,13 +321,16 @@ def _broken_line(path: Path, number: int, raw: bytes, expected: str) -> ScanErro
 def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[np.float64]]:
     """Read the three numbers after a keyword ("v" in OBJ, "vertex" in STL); other lines are skipped.
 
-    Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored.
+    Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored. Decimal
+    commas are read where no number has a point.
     Raises ScanError with the number of the first line whose three numbers cannot be read.
     """
     lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE | re.IGNORECASE)
     for line, chunk in text_chunks(file, path):
         plain = _HASH_COMMENT.sub(b"", chunk)
         found = lines_of.findall(plain)
+        if b"," in plain and not any(b"." in each for each in found):
+            found = [DECIMAL_COMMA.sub(b".", each) for each in found]
         try:
             rows = _parse(found, None, usecols=(0, 1, 2)) if found else np.empty((0, 3))
             # loadtxt skips a keyword with nothing after it.
@@ -350,7 +353,8 @@ def _broken_keyword(
         if keyword == "v" and _JOINED_OBJ.match(plain):
             return _broken_line(path, number, raw, "numbers only")
         if match := lines_of.match(plain):
-            fields = split_row(match[1] or b"", None)
+            # Unlike split_row(), without decimal commas.
+            fields = (match[1] or b"").decode("latin-1").split()
             if len(fields) < 3 or not all(map(is_number, fields[:3])):
                 return _broken_line(path, number, raw, expected)
     return _broken_line(path, first_line, b"(here or below)", expected)

@@ -8,7 +8,7 @@ with y up [glTF 2.0, 3.4]; this reader does not convert coordinates.
 import json
 import struct
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import check_interrupt
 from ..common.scan import (
     BLOCK_BYTES,
+    BLOCK_POINTS,
     Scan,
     ScanBlock,
     apply_pose,
@@ -27,7 +28,7 @@ from ..common.scan import (
     scan_error,
     zero_rotation_note,
 )
-from .glb_properties import PROPERTIES, is_damaged, used_bytes
+from .glb_properties import PROPERTIES, damaged_names, used_bytes
 
 # Maximum bytes of JSON. The JSON of a scene of ten thousand parts takes about 4 MiB; parsed it
 # takes thirty times that.
@@ -66,11 +67,15 @@ class _Primitive(NamedTuple):
     """Primitive of a mesh, before a node places it.
 
     indices: vertex numbers of the corners; None: vertices in order.
+    limits: (3,) least and greatest values that the document states for the vertices.
+    view_end: byte of the binary chunk where their buffer view ends.
     """
 
     vertices: _Accessor
     mode: int
     indices: _Accessor | None
+    limits: tuple[NDArray[np.float32], ...]
+    view_end: int
 
 
 class _Part(NamedTuple):
@@ -163,6 +168,18 @@ def _rows(file: BufferedReader, path: Path, accessor: _Accessor, block_rows: int
         yield np.ndarray((count, accessor.width), accessor.type, data, strides=(accessor.stride, item))
 
 
+def _held(rows: NDArray[Any], primitive: _Primitive) -> NDArray[np.bool_]:
+    """Return which of vertices (n, 3) lie within the stated limits of a primitive."""
+    low, high = primitive.limits
+    return np.asarray(((rows >= low) & (rows <= high)).all(axis=1))
+
+
+def _limits_hold(file: BufferedReader, path: Path, primitive: _Primitive) -> bool:
+    """Return whether a primitive has vertices, and all lie within its stated limits."""
+    blocks = _rows(file, path, primitive.vertices, BLOCK_POINTS)
+    return primitive.vertices.rows > 0 and all(_held(rows, primitive).all() for rows in blocks)
+
+
 def open_glb(path: Path) -> list[Scan]:
     """Return the one scan of a GLB file; reads its header only. Raises ScanError."""
     with library_errors(path), path.open("rb") as file:
@@ -250,26 +267,38 @@ class _Document:
                     meshes[node["mesh"]] = self._mesh(node["mesh"])
                 found += [_Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
             waiting += [(child, pose) for child in reversed(node.get("children", []))]
-        self._check_ends({primitive.vertices for mesh in meshes.values() for primitive in mesh})
+        self._check_ends(primitive for mesh in meshes.values() for primitive in mesh)
         return found
 
-    def _check_ends(self, positions: set[_Accessor]) -> None:
-        """Refuse vertices behind which the binary chunk has room for another that nothing uses.
+    def _check_ends(self, primitives: Iterable[_Primitive]) -> None:
+        """Refuse vertices behind which the binary chunk has others that nothing uses.
 
-        A count that is too small would leave these out. Raises ScanError.
+        A count that is too small would leave these out. Zeros behind the buffer view, which align what
+        follows, are none, nor are values beyond the accessor's least and greatest, if those are right.
+        Raises ScanError.
         """
         views = [self._at("bufferViews", k) for k in range(len(self.document.get("bufferViews", [])))]
         begins, ends = used_bytes(self.document.get("accessors", []), views)
-        for accessor in positions:
-            row = np.dtype(accessor.type).itemsize * accessor.width
-            at = accessor.start - self.start + accessor.rows * accessor.stride
-            before = bisect_left(begins, at + row)
-            if at + row <= self.size and not (before and ends[before - 1] > at):
-                raise _damaged(
-                    self.path,
-                    f"room for another vertex, which nothing uses, behind {accessor.rows} vertices",
-                    "a count of all of them",
-                )
+        with self.path.open("rb") as file:
+            for accessor, own in {each.vertices: each for each in primitives}.items():
+                row = np.dtype(accessor.type).itemsize * accessor.width
+                at = accessor.start - self.start + accessor.rows * accessor.stride
+                before = bisect_left(begins, at + row)
+                if before and ends[before - 1] > at:
+                    continue
+                past = begins[before] if before < len(begins) else self.size
+                count = max(0, past - at - row + accessor.stride) // accessor.stride
+                behind = accessor._replace(start=self.start + at, rows=count)
+                in_view = (own.view_end - at - row + accessor.stride) // accessor.stride
+                for rows in _rows(file, self.path, behind, BLOCK_POINTS):
+                    found = rows[rows.any(axis=1) | (np.arange(len(rows)) < in_view)]
+                    if len(found) and (_held(found, own).any() or not _limits_hold(file, self.path, own)):
+                        raise _damaged(
+                            self.path,
+                            f"further vertices, which nothing uses, behind {accessor.rows}",
+                            "a count of all of them",
+                        )
+                    in_view -= len(rows)
 
     def _check_parts(self, parts: int, what: str) -> None:
         if parts > MAX_PARTS:
@@ -310,7 +339,7 @@ class _Document:
                 self.path, "a mesh compressed by Draco", "plain vertices (write it without compression)"
             )
         attributes = primitive["attributes"]
-        if wrong := [name for name in attributes if is_damaged(name, ["POSITION"])]:
+        if wrong := damaged_names(attributes, ["POSITION"]):
             raise _damaged(self.path, f"the attribute {wrong[0]!r}", "'POSITION'")
         if "POSITION" not in attributes:
             return None
@@ -323,7 +352,13 @@ class _Document:
         indices = None
         if "indices" in primitive:
             indices = self._accessor(primitive["indices"], "SCALAR", INDEX_TYPES)
-        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices)
+        stated = self._at("accessors", attributes["POSITION"])
+        limits = tuple(
+            np.array(stated.get(n, [v] * 3), "<f4") for n, v in (("min", -np.inf), ("max", np.inf))
+        )
+        view = self._at("bufferViews", stated["bufferView"])
+        view_end = view.get("byteOffset", 0) + view["byteLength"]
+        return _Primitive(vertices, int(primitive.get("mode", TRIANGLES)), indices, limits, view_end)
 
     def _accessor(self, number: int, shape: str, types: dict[int, str]) -> _Accessor:
         """Return an accessor, checked against its buffer view, and the view against the binary chunk."""
@@ -369,7 +404,7 @@ class _Document:
 
     def _check_properties(self, name: str, found: dict[str, Any]) -> None:
         """Raise ScanError for a property whose name is damaged. name: of the object's list."""
-        if wrong := [key for key in found if is_damaged(key, PROPERTIES.get(name, ()))]:
+        if wrong := damaged_names(found, PROPERTIES.get(name, ())):
             raise _damaged(self.path, f"the property {wrong[0]!r} in {name}", "one of glTF 2.0")
 
     def _whole(self, number: Any) -> int:

@@ -1,44 +1,42 @@
 """Properties of glTF objects, and the bytes that a document uses: what a damaged one would hide."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from itertools import accumulate
 from typing import Any
 
-# Properties of the objects that place vertices [glTF 2.0, 5]. One of these whose name is damaged must
-# not be ignored, which would move or lose vertices.
+# Properties that place vertices, of each kind of object [glTF 2.0, 5]. One of these whose name is damaged
+# must not be ignored, which would move or lose vertices.
 PROPERTIES = {
     "glTF": {
-        *("accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensionsUsed"),
-        *("extensionsRequired", "images", "materials", "meshes", "nodes", "samplers", "scene", "scenes"),
-        *("skins", "textures"),
+        *("accessors", "buffers", "bufferViews", "extensionsRequired", "meshes", "nodes", "scene", "scenes"),
     },
-    "scenes": {"nodes", "name"},
-    "nodes": {
-        *("camera", "children", "skin", "matrix", "mesh", "rotation", "scale", "translation", "weights"),
-        "name",
-    },
-    "meshes": {"primitives", "weights", "name"},
-    "primitives": {"attributes", "indices", "material", "mode", "targets"},
-    "accessors": {
-        *("bufferView", "byteOffset", "componentType", "normalized", "count", "type", "max", "min", "sparse"),
-        "name",
-    },
-    "bufferViews": {"buffer", "byteOffset", "byteLength", "byteStride", "target", "name"},
+    "scenes": {"nodes"},
+    "nodes": {"children", "matrix", "mesh", "rotation", "scale", "translation"},
+    "meshes": {"primitives"},
+    "primitives": {"attributes", "indices", "mode"},
+    "accessors": {"bufferView", "byteOffset", "componentType", "count", "type", "sparse"},
+    "bufferViews": {"buffer", "byteOffset", "byteLength", "byteStride"},
 }
 # Bytes of a value by its type, and values in a row by its shape; some matrices have padding more.
 SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
-def is_damaged(name: str, known: Iterable[str]) -> bool:
-    """Return whether a name is none of the known ones, but one of them with one wrong character.
+def damaged_names(found: Collection[str], known: Collection[str]) -> list[str]:
+    """Return the names of an object that are a known one, which it lacks, with one wrong character.
 
     Programs write properties and attributes of their own, which glTF readers ignore.
     """
-    names = set(known)
-    return name not in names and any(
-        len(each) == len(name) and sum(a != b for a, b in zip(each, name, strict=True)) == 1 for each in names
-    )
+    missing = set(known) - set(found)
+    return [
+        name
+        for name in found
+        if name not in known
+        and any(
+            len(each) == len(name) and sum(a != b for a, b in zip(each, name, strict=True)) == 1
+            for each in missing
+        )
+    ]
 
 
 def used_bytes(

@@ -1,7 +1,8 @@
 """Coordinate reference system of a LAS file, as WKT or GeoTIFF keys: its text and its units of length.
 
-There is no database of systems: a unit counts as stated if WKT or a key of its own names it, not if
-it follows from the EPSG code of a projection.
+There is no database of systems: a unit counts as stated if WKT, a key of its own or the name of the
+system (a citation) says it, not if it follows from the EPSG code of a projection. A code that may be
+one in feet gets a note.
 """
 
 import math
@@ -10,7 +11,7 @@ import struct
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..common.units import DEGREES, UNKNOWN, unit_name
+from ..common.units import DEGREES, METRES, UNKNOWN, unit_name
 
 # Variable length records of the user "LASF_Projection" [LAS 1.4 R15, 3].
 WKT, GEO_KEYS, GEO_DOUBLES, GEO_TEXTS = 2112, 34735, 34736, 34737
@@ -34,6 +35,23 @@ PROJECTED = range(3072, 3096)  # keys of a projection
 # first pair is of projected systems, the second of geocentric ones.
 LINEAR_UNITS, VERTICAL_UNIT = ((3076, 3077), (2052, 2053)), ((4099, 0),)
 NO_CODE = (0, 32767)  # undefined, and defined by the file itself
+PROJECTED_EPSG, VERTICAL_EPSG = 3072, 4096
+# Citations of a plane system, and of one of heights. The first may name heights behind the plane.
+PLANE_CITATIONS, HEIGHT_CITATION = (3073, 1026), 4097
+_HEIGHTS = re.compile(r"[+;|]|height|vert", re.IGNORECASE)
+# Units in names of systems, as EPSG writes them ("NAD83 / Texas Central (ftUS)") and ESRI
+# ("NAD_1983_StatePlane_Texas_Central_FIPS_4203_Feet").
+_CITED = (
+    (re.compile(r"\(ftUS\)|\bUS survey f(?:oo|ee)t\b|_(?:Feet|Ft_?US)\b", re.IGNORECASE), 1200 / 3937),
+    (re.compile(r"\(ft\)|\binternational f(?:oo|ee)t\b|_(?:Feet|Ft)_?Intl\b", re.IGNORECASE), 0.3048),
+)
+# EPSG codes of heights in feet in the United States (NAVD88 twice, NGVD29) -> metres.
+FEET_HEIGHTS = {6360: 1200 / 3937, 5702: 1200 / 3937, 8228: 0.3048}
+# EPSG codes among which are those of the State Plane systems in feet.
+STATE_PLANES = (
+    range(2222, 2291), range(2867, 2970), range(3417, 3761), range(6355, 6638), range(26729, 26871),
+    range(32001, 32067),
+)  # fmt: skip
 
 # EPSG code of a unit of length -> metres [EPSG dataset, unit of measure].
 EPSG_METRES = {
@@ -75,6 +93,8 @@ OUTER_NODES = {"COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS"}
 UNIT_NODES = {"UNIT", "LENGTHUNIT", "ANGLEUNIT"}
 DEEPEST = 100  # nodes inside one another; real ones are ten
 
+_OTHERWISE = "otherwise set units in a list of `solidcloud inspect`"
+
 
 class Units(NamedTuple):
     """Units that a file states. name: as `axis_metres` takes it.  note: as in `Scan.units_note`."""
@@ -115,7 +135,15 @@ def stated_units(found: Mapping[int, bytes]) -> Units | None:
     if across is None and upward is None:
         across, upward = _key_units(geo_keys(found))
     if across is None and upward is None:
-        return None if whole else Units("m", "its WKT ends too soon: taken as metres")
+        if not whole:
+            return Units("m", "its WKT ends too soon: taken as metres")
+        code = geo_keys(found).get(PROJECTED_EPSG)
+        if not any(code in codes for codes in STATE_PLANES):
+            return None
+        where = f"GeoTIFF key {PROJECTED_EPSG} = {code}"
+        return Units(
+            "m", f"{where} may be a system in feet, but no key states the unit: taken as metres, {_OTHERWISE}"
+        )
     for unit in filter(None, (across, upward)):
         if unit.angular:
             return Units(DEGREES, f"coordinates in degrees of latitude and longitude, as {unit.where} states")
@@ -137,9 +165,8 @@ def stated_units(found: Mapping[int, bytes]) -> Units | None:
 
 def _long_name(name: str) -> str:
     """Return the name of a unit for a message."""
-    return {"m": "metres", "ft": "feet (ft)", "us-ft": "US survey feet (us-ft)"}.get(
-        name, f"units of {name} m"
-    )
+    names = {"m": "metres", "ft": "feet (ft)", "us-ft": "US survey feet (us-ft)"}
+    return names.get(name, name if name in METRES else f"units of {name} m")
 
 
 def geo_keys(found: Mapping[int, bytes]) -> dict[int, int | float | str]:
@@ -167,7 +194,22 @@ def _key_units(keys: Mapping[int, int | float | str]) -> tuple[_Unit | None, _Un
     if model == GEOGRAPHIC or (plain and (GEODETIC in keys or ANGULAR_UNIT in keys)):
         key = MODEL if model == GEOGRAPHIC else GEODETIC if GEODETIC in keys else ANGULAR_UNIT
         across = _Unit(None, f"GeoTIFF key {key} = {keys[key]}", True)
-    return across, _key_unit(keys, *VERTICAL_UNIT[0])
+    cited = {key: _HEIGHTS.split(str(keys.get(key, "")), maxsplit=1) for key in PLANE_CITATIONS}
+    across = across or next(filter(None, (_cited_unit(key, cited[key][0]) for key in cited)), None)
+    upward, code = _key_unit(keys, *VERTICAL_UNIT[0]), keys.get(VERTICAL_EPSG)
+    if upward is None and isinstance(code, int) and code in FEET_HEIGHTS:
+        upward = _Unit(FEET_HEIGHTS[code], f"GeoTIFF key {VERTICAL_EPSG} = {code}")
+    names = [(HEIGHT_CITATION, str(keys.get(HEIGHT_CITATION, "")))]
+    names += [(key, parts[1]) for key, parts in cited.items() if len(parts) > 1]
+    return across, upward or next(filter(None, (_cited_unit(*name) for name in names)), None)
+
+
+def _cited_unit(key: int, name: str) -> _Unit | None:
+    """Return the unit that the name of a system in a citation holds."""
+    for unit, metres in _CITED:
+        if found := unit.search(name):
+            return _Unit(metres, f"GeoTIFF key {key} {found[0]!r}")
+    return None
 
 
 def _key_unit(keys: Mapping[int, int | float | str], code: int, size: int) -> _Unit | None:

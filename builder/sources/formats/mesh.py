@@ -84,15 +84,17 @@ def open_stl(path: Path) -> list[Scan]:
     size = path.stat().st_size
     with library_errors(path), path.open("rb") as file:
         start = file.read(1024)
-        # Many binary files begin with "solid" too: their first 80 bytes may hold anything.
+        (triangles,) = struct.unpack("<I", start[80:STL_HEADER_BYTES].ljust(4, b"\0"))
+        is_binary = size == STL_HEADER_BYTES + triangles * STL_TRIANGLE.itemsize
+        # Many binary files begin with "solid" too, some with "facet" behind it: their first 80 bytes
+        # may hold anything.
         letters = start.replace(b"\0", b"") if is_utf16(start) else start.removeprefix(UTF8_MARK)
-        if SOLID.match(letters) and _FACET.search(letters):
+        if not is_binary and SOLID.match(letters) and _FACET.search(letters):
             with open_text_file(path) as text:
                 _check_ascii_end(text, path)
             return [VertexLines(path, "vertex", of_triangles=True)]
     if len(start) < STL_HEADER_BYTES:
         raise _truncated_stl(path, f"{size} bytes", f"a header of {STL_HEADER_BYTES}")
-    (triangles,) = struct.unpack_from("<I", start, 80)
     held = (size - STL_HEADER_BYTES) // STL_TRIANGLE.itemsize
     if triangles > held:
         raise _truncated_stl(path, f"{held} triangles at most", f"the {triangles} its header declares")

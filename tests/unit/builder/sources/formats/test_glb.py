@@ -131,6 +131,36 @@ def test_a_document_that_lies_is_refused(lie: str, tmp_path: Path) -> None:
         open_scans(path)
 
 
+@pytest.mark.parametrize("behind", [b"\0" * 12, b"\0" * 1000, b"unused bytes" * 9])
+@pytest.mark.parametrize("last", [False, True])
+def test_bytes_that_are_no_vertices_may_follow_them(behind: bytes, last: bool, tmp_path: Path) -> None:
+    """Issue 35: files align their parts, to a page for instance; others keep bytes that nothing uses."""
+    document, data = glb_document(4, 6), glb_vertices(SQUARE)
+    document["accessors"][0].update(min=[0, 0, 1], max=[2, 2, 1])
+    if last:
+        document["accessors"].pop()
+        del document["meshes"][0]["primitives"][0]["indices"], document["bufferViews"][1]
+        data += behind
+    else:
+        document["bufferViews"][1]["byteOffset"] += len(behind)
+        data += behind + CORNERS.tobytes()
+    path = write_glb(tmp_path / "a.glb", document, data)
+    assert np.array_equal(read_all(path), SQUARE)
+    document["accessors"][0]["count"] = 3
+    with pytest.raises(
+        ScanError, match="further vertices, which nothing uses, behind 3, expected a count of all"
+    ):
+        open_scans(write_glb(tmp_path / "a.glb", document, data))
+
+
+def test_a_last_vertex_at_the_origin_is_not_taken_for_zeros_between_parts(tmp_path: Path) -> None:
+    document = glb_document(4, 6)
+    document["accessors"][0]["count"] = 3
+    data = glb_vertices(SQUARE[[1, 2, 3, 0]] * [1, 1, 0]) + CORNERS.tobytes()
+    with pytest.raises(ScanError, match="further vertices, which nothing uses, behind 3"):
+        open_scans(write_glb(tmp_path / "a.glb", document, data))
+
+
 def test_parts_of_shared_meshes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A few words are parts without end, a hundred thousand nodes of a mesh of as many primitives."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from solidcloud.builder.sources.formats.las_crs import GEO_DOUBLES, GEO_KEYS, WKT, stated_units
+from solidcloud.builder.sources.formats.las_crs import GEO_DOUBLES, GEO_KEYS, GEO_TEXTS, WKT, stated_units
 from solidcloud.builder.sources.placed_scan import axis_metres, place_scan
 from solidcloud.builder.sources.scan_files import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
@@ -46,7 +46,7 @@ STATED = [
     (keys((1024, 1), (3076, 9999)), "?"),
     (keys((1024, 2), (2048, 4269), (2054, 9102)), "deg"),
     (keys((2054, 9102)), "deg"),
-    (keys((1024, 1), (2048, 4269), (2054, 9102), (3072, 2264)), None),
+    (keys((1024, 1), (2048, 4269), (2054, 9102), (3072, 26910)), None),
     (keys((1024, 1), (3076, 32767)), None),
     (PLANE % FOOT, "us-ft"),
     (PLANE % 'UNIT["metre",1,AUTHORITY["EPSG","9001"]]', "m"),
@@ -69,6 +69,9 @@ STATED = [
     ("EPSG:2264", None),
     ("COMPD_CS[" * 5000 + "]" * 5000, None),
     ("", None),
+    (keys((1024, 1), (3072, 26910), (4096, 6360)), "m+us-ft"),
+    (keys((1024, 1), (3072, 26910), (4096, 5703)), None),
+    (PLANE % 'UNIT["millimetre",0.001]', "mm"),
 ]  # fmt: skip
 
 
@@ -79,6 +82,41 @@ def test_the_unit_that_a_file_states_is_found(record: dict | str, units: str | N
     assert (found and found.name) == units
     if found and found.name == "m":
         assert found.note == ""
+
+
+CITED = [
+    ({3073: "NAD83 / New York Long Island (ftUS)"}, "us-ft"),
+    ({3073: "NAD83 / Oregon GIC Lambert (ft)", 4097: "NAVD88 height (ftUS)"}, "ft+us-ft"),
+    ({1026: "NAD_1983_StatePlane_Texas_Central_FIPS_4203_Feet"}, "us-ft"),
+    ({1026: "NAD_1983_StatePlane_Oregon_North_FIPS_3601_Feet_Intl"}, "ft"),
+    ({1026: "NAD83 / UTM zone 10N + NAVD88 height (ftUS)"}, "m+us-ft"),
+    ({1026: "Leica Foot scan (fts)", 3073: "UTM 33, a foot high"}, None),
+]
+
+
+@pytest.mark.parametrize(("texts", "units"), CITED)
+def test_the_unit_in_the_name_of_a_system_is_found(texts: dict[int, str], units: str | None) -> None:
+    """Issue 35: many files state feet in the name alone. A key of the unit has precedence."""
+    words, data = [1, 1, 0, 1 + len(texts), 1024, 0, 1, 1], b""
+    for key, text in sorted(texts.items()):
+        words += [key, GEO_TEXTS, len(text) + 1, len(data)]
+        data += text.encode() + b"|"
+    record = {GEO_KEYS: struct.pack(f"<{len(words)}H", *words), GEO_TEXTS: data}
+    found = stated_units(record)
+    assert (found and found.name) == units
+    words[3] += 1
+    record[GEO_KEYS] = struct.pack(f"<{len(words) + 4}H", *words, 3076, 0, 1, 9001)
+    found = stated_units(record)
+    assert found is not None and found.name.partition("+")[0] == "m"
+
+
+def test_a_code_that_may_be_in_feet_without_its_unit_is_told() -> None:
+    found = stated_units(keys((1024, 1), (3072, 2263)))
+    assert found is not None and found.name == "m"
+    assert found.note == (
+        "GeoTIFF key 3072 = 2263 may be a system in feet, but no key states the unit: taken as metres, "
+        "otherwise set units in a list of `solidcloud inspect`"
+    )
 
 
 def test_text_that_ends_too_soon_states_nothing() -> None:

@@ -1,5 +1,6 @@
 """Test OBJ and STL: vertices as stored, and sampled surfaces."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,30 @@ def test_vertices_that_one_wrong_byte_joins_to_a_line_are_not_lost(line: str, tm
     path = tmp_path / "a.obj"
     path.write_text(f"# v 1\no v 2 3\nv 1 2 3 # v 1\n{line}\n", encoding="latin-1")
     with pytest.raises(ScanError, match=r"line 4 is .*, expected numbers only"):
+        read_all(path)
+
+
+def test_a_binary_stl_may_have_the_words_of_text_in_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "a.stl"
+    corners = np.arange(9, dtype="<f4")
+    record = bytes(12) + corners.tobytes() + bytes(2)
+    path.write_bytes(b"solid by FacetModeler".ljust(80) + struct.pack("<I", 1) + record)
+    assert np.array_equal(read_all(path), corners.reshape(3, 3))
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.stl"])
+def test_decimal_commas_are_read_if_no_number_has_a_point(name: str, tmp_path: Path) -> None:
+    """Issue 35: programs write them under the settings of many countries."""
+    path = tmp_path / name
+    lines = [f"v{'ertex' * name.endswith('.stl')} {k},5 -2,25e-1 {k}" for k in range(3)]
+    head, end = ("solid a\nfacet\n", "\nendsolid a\n") if name.endswith(".stl") else ("", "\n")
+    path.write_text(head + "\n".join(lines) + end)
+    assert np.array_equal(read_all(path), [[0.5, -0.225, 0], [1.5, -0.225, 1], [2.5, -0.225, 2]])
+    if name.endswith(".obj"):
+        path.write_text("v 0,5 0 0\nv 1,5 0 0\nv 0,5 1 0\nvt 0,5 0,5\nf 1/1 2/1 3/1\n")
+        assert read_all(path, spacing=0.1).min(axis=0).round(1).tolist() == [0.5, 0, 0]
+    path.write_text(head + "\n".join(lines).replace("0,5", "0.5") + end)
+    with pytest.raises(ScanError, match=r"line . is .*2,25e-1.*, expected 'v.*' and three numbers"):
         read_all(path)
 
 

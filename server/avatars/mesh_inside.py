@@ -64,8 +64,8 @@ def closed_parts(triangles: _Floats) -> ClosedParts:
 
     Triangles that share an edge are of one part. It is closed if as many of them pass along each of
     its edges in one direction as in the other, as they are or once the triangles at edges of two
-    are turned alike. Equal corners are one; of triangles that all occur twice, as in a mesh of both
-    sides, one each counts.
+    are turned alike. Equal corners are one. In a part that is open, or whose triangles all occur twice,
+    as in a mesh of both sides, a triangle counts once.
     """
     low = triangles.reshape(-1, 3).min(axis=0)
     extent = float((triangles.reshape(-1, 3).max(axis=0) - low).max())
@@ -73,32 +73,19 @@ def closed_parts(triangles: _Floats) -> ClosedParts:
     corners = 2 * np.rint((triangles - low) / step).astype(np.int64)
     number = _numbered(corners.reshape(-1, 3)).reshape(-1, 3)
     kept = (number != np.roll(number, 1, axis=1)).all(axis=1)
-    _, first, counts = np.unique(_numbered(np.sort(number, axis=1)), return_index=True, return_counts=True)
-    if (counts[kept[first]] == 2).all():
-        once = np.zeros(len(number), bool)
-        once[first] = True
-        kept &= once
+    _, first, same, counts = np.unique(
+        _numbered(np.sort(number, axis=1)), return_index=True, return_inverse=True, return_counts=True
+    )
+    again = np.ones(len(number), bool)
+    again[first] = False
     rows = np.flatnonzero(kept)
-    begin, end = number[rows], np.roll(number[rows], -1, axis=1)
-    edge = _numbered(np.stack([np.minimum(begin, end), np.maximum(begin, end)], axis=-1).reshape(-1, 2))
-    forward = np.where(begin < end, 1, -1).ravel()
-    face = np.repeat(np.arange(len(rows)), 3)
-    order = np.argsort(edge, kind="stable")
-    next_to = edge[order][1:] == edge[order][:-1]
-    one, other = order[:-1][next_to], order[1:][next_to]
-    part = _components(len(rows), face[one], face[other])
-    turn = np.ones(len(rows), np.int64)
-    lost = _open_parts(part, edge, face, forward)
-    repaired = lost
-    if lost.any():
-        # Each triangle as it is and turned: two triangles at an edge must be of opposite directions.
-        alike = np.bincount(edge)[edge[one]] == 2
-        one, other = one[alike], other[alike]
-        same = forward[one] == forward[other]
-        a, b, n = face[one], face[other], len(rows)
-        sheet = _components(2 * n, np.r_[a, a + n], np.r_[np.where(same, b + n, b), np.where(same, b, b + n)])
-        turn = np.where(lost[part] & (sheet[:n] > sheet[n:]), -1, 1)
-        lost = _open_parts(part, edge, face, forward * turn[face])
+    part, turn, lost, repaired = _turn_alike(number[rows])
+    # Sides that lie back to back cancel out: a part of nothing else encloses no volume.
+    alone = np.zeros(len(lost), bool)
+    alone[part[counts[same[rows]] != 2]] = True
+    if (repeated := again[rows] & (lost | ~alone)[part]).any():
+        rows = rows[~repeated]
+        part, turn, lost, repaired = _turn_alike(number[rows])
     is_closed = ~lost[part]
     closed = np.zeros(len(triangles), bool)
     closed[rows[is_closed]] = True
@@ -107,6 +94,36 @@ def closed_parts(triangles: _Floats) -> ClosedParts:
     largest = volume[np.abs(volume).argmax()] if len(volume) else 0.0
     hole = (volume * largest < 0) & ~repaired
     return ClosedParts(len(lost), int(lost.sum()), closed, oriented, part[is_closed], hole, low, step)
+
+
+def _turn_alike(
+    number: _Integers,
+) -> tuple[_Integers, _Integers, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the part of each triangle and 1, or -1 to turn it; for each part if it is open, and if turned.
+
+    number: (n, 3), of the corners of each.
+    """
+    begin, end = number, np.roll(number, -1, axis=1)
+    edge = _numbered(np.stack([np.minimum(begin, end), np.maximum(begin, end)], axis=-1).reshape(-1, 2))
+    forward = np.where(begin < end, 1, -1).ravel()
+    face = np.repeat(np.arange(len(number)), 3)
+    order = np.argsort(edge, kind="stable")
+    next_to = edge[order][1:] == edge[order][:-1]
+    one, other = order[:-1][next_to], order[1:][next_to]
+    part = _components(len(number), face[one], face[other])
+    turn = np.ones(len(number), np.int64)
+    lost = _open_parts(part, edge, face, forward)
+    repaired = lost
+    if lost.any():
+        # Each triangle as it is and turned: two triangles at an edge must be of opposite directions.
+        alike = np.bincount(edge)[edge[one]] == 2
+        one, other = one[alike], other[alike]
+        same = forward[one] == forward[other]
+        a, b, n = face[one], face[other], len(number)
+        sheet = _components(2 * n, np.r_[a, a + n], np.r_[np.where(same, b + n, b), np.where(same, b, b + n)])
+        turn = np.where(lost[part] & (sheet[:n] > sheet[n:]), -1, 1)
+        lost = _open_parts(part, edge, face, forward * turn[face])
+    return part, turn, lost, repaired
 
 
 def fill_inside(found: ClosedParts, small: _Floats, surface: _Floats, radius: float, what: str) -> _Floats:

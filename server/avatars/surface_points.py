@@ -62,7 +62,7 @@ def cover_surface(triangles: _Triangles, radius: float | None, what: str) -> Sur
         if radius > _MAX_RADIUS:
             raise BadRequestError(
                 f"{what}: a surface of {area:.3g} m², for which spheres of {radius:.3g} m would be used: expected "
-                f"metres, and at most {_MAX_RADIUS:g} m: scale the mesh if it is in millimetres, or give a radius"
+                f"metres, and at most {_MAX_RADIUS:g} m: give the unit of its file, scale the mesh, or give a radius"
             )
     if not 0 < radius < math.inf:
         raise BadRequestError(

@@ -10,7 +10,10 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 PROTOCOLS = ("tcp", "udp", "ws", "unixsock-stream")
 _ENCRYPTED = ("tls", "quic", "wss")
 
-_ENDPOINT = re.compile(r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#\s]+)(?P<rest>[?#]\S*)?")
+# zenoh takes no surrogates, which stand for bytes of a command line that are no UTF-8.
+_ENDPOINT = re.compile(
+    r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#\s\ud800-\udfff]+)(?P<rest>[?#][^\s\ud800-\udfff]*)?"
+)
 _LOOPBACK = re.compile(r"(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
 _HOST_AND_PORT = re.compile(r"(?P<host>\[[0-9A-Fa-f:.%]+\]|[^:/\[\]]+):(?P<port>\d{1,5})")
 # Hosts that stand for all addresses of this host, and another name of a loopback address.

@@ -50,7 +50,7 @@ def _file_name(host: str, endpoint: str) -> str:
     """Return the name of a server's key file. Cached: each reply without a seal needs it."""
     text = f"{host} {canonical(endpoint)}"
     plain = re.sub(r"[^A-Za-z0-9.-]+", "_", text)[:80]
-    return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.key"
+    return f"{plain}-{hashlib.sha256(text.encode(errors='surrogatepass')).hexdigest()[:8]}.key"
 
 
 @contextmanager

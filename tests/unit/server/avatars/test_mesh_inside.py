@@ -134,6 +134,20 @@ def test_a_mesh_of_both_sides_counts_once() -> None:
 
 
 @pytest.mark.parametrize(
+    "added",
+    [box(1.0)[:5], box(1.0)[:5, ::-1], box(1.0, (3.0, 0.0, 0.0)).repeat(2, axis=0)],
+    ids=["some twice", "some of both sides", "another part of both sides"],
+)
+def test_repeated_triangles_leave_a_mesh_closed(added: Floats) -> None:
+    if len(added) == 24:
+        added[::2] = added[::2, ::-1]
+    found = closed_parts(np.concatenate([box(1.0), added]))
+    _, inner, _, description = shape_of(np.concatenate([box(1.0), added]))
+    assert found.open_parts == 0 and description == "closed mesh, filled"
+    assert all((np.abs(inner - [3 * n, 0, 0]) < 0.5).all(axis=1).sum() > 5_000 for n in range(found.parts))
+
+
+@pytest.mark.parametrize(
     ("triangles", "open_parts"),
     [
         (box(1.0)[:-1], 1),

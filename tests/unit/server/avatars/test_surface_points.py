@@ -77,7 +77,7 @@ def test_triangles_without_area_are_their_corners() -> None:
         (corners("box"), 0.0, BadRequestError, "radius 0 m: expected a positive length"),
         (corners("box"), -1.0, BadRequestError, "radius -1 m: expected a positive length"),
         (corners("box"), math.nan, BadRequestError, "radius nan m: expected a positive length"),
-        (corners("box") * 1e3, None, BadRequestError, "scale the mesh if it is in millimetres, or give"),
+        (corners("box") * 1e3, None, BadRequestError, "give the unit of its file, scale the mesh, or"),
         (corners("box"), 1e-5, TooLargeError, "more than 1000000 points at a radius of 1e-05 m"),
         (corners("sliver") * [1, 1e-9, 1], 1e-7, TooLargeError, "give a larger radius, or simplify"),
     ],

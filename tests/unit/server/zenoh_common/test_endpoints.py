@@ -37,6 +37,7 @@ def test_endpoints_that_zenoh_opens(endpoint):
         ("tcp/127.0.0.1", "is not HOST:PORT"),
         ("tcp/127.0.0.1:65536", "is not HOST:PORT with a port of 1 to 65535"),
         ("tcp/:7447", "is not HOST:PORT"),
+        ("unixsock-stream//tmp/\udcff", "not PROTOCOL/ADDRESS"),
     ],
 )
 def test_endpoints_that_zenoh_does_not_open_are_refused_in_words(endpoint, says):

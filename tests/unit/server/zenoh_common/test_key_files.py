@@ -31,6 +31,11 @@ def test_a_key_is_there_for_its_user_alone_and_only_while_it_is_served():
     assert find_key(ENDPOINT) is None and not path.exists()
 
 
+def test_an_endpoint_that_is_no_utf8_has_no_key():
+    """Issue 35: `top --connect` ended with a traceback, before the endpoint was checked."""
+    assert find_key("tcp/\udcff:7447") is None
+
+
 def test_each_server_has_a_key_of_its_own_and_the_newest_file_counts(folders, monkeypatch):
     with published_key(ENDPOINT, None) as old:
         known = find_key(ENDPOINT)

@@ -105,7 +105,14 @@ def test_page_reads_the_projects_answers() -> None:
         "engineSeconds": 0.25,
         "faults": ["voxel 3: damaged"],
     }
-    assert found[1] == {"name": "figure", "points": 6, "radius": 0.25, "bounding_radius": 1.75}
+    assert found[1] == {
+        "name": "figure",
+        "points": 6,
+        "radius": 0.25,
+        "bounding_radius": 1.75,
+        "inner_points": 0,
+        "description": "",
+    }
     assert found[2:] == ["busy", "zenoh"]
 
 

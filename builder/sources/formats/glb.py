@@ -268,6 +268,8 @@ class _Document:
                 found += [_Part(p.vertices, pose, p.mode, p.indices) for p in meshes[node["mesh"]]]
             waiting += [(child, pose) for child in reversed(node.get("children", []))]
         self._check_ends(primitive for mesh in meshes.values() for primitive in mesh)
+        if self.document.get("meshes") and not found:
+            raise _damaged(self.path, "meshes of which no node of the scene shows one", "a mesh at a node")
         return found
 
     def _check_ends(self, primitives: Iterable[_Primitive]) -> None:

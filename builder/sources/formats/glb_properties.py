@@ -23,18 +23,22 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 
 
 def damaged_names(found: Collection[str], known: Collection[str]) -> list[str]:
-    """Return the names of an object that are a known one, which it lacks, with one wrong character.
+    """Return the names of an object that are probably damaged: no words, or a known one but for a letter.
 
-    Programs write properties and attributes of their own, which glTF readers ignore.
+    Only known names that the object lacks count. Programs write properties and attributes of their
+    own, which glTF readers ignore.
     """
     missing = set(known) - set(found)
     return [
         name
         for name in found
         if name not in known
-        and any(
-            len(each) == len(name) and sum(a != b for a, b in zip(each, name, strict=True)) == 1
-            for each in missing
+        and (
+            not (name.isascii() and name.isidentifier())
+            or any(
+                len(each) == len(name) and sum(a != b for a, b in zip(each, name, strict=True)) == 1
+                for each in missing
+            )
         )
     ]
 

@@ -6,7 +6,7 @@ export const VERDICTS = ["clear", "contact", "unknown"];
 const NAME = /^[A-Za-z0-9._-]{1,64}$/;
 
 /**
- * @typedef {{name: string, points: number, radius: number, bounding_radius: number}} AvatarInfo
+ * @typedef {{name: string, points: number, radius: number, bounding_radius: number, inner_points: number, description: string}} AvatarInfo
  * @typedef {{scene: string, points: number, voxels: number, radius: number, bounds: number[][]}} SceneInfo
  * @typedef {{
  *   verdict: string[], outside: boolean[], voxelsMissing: number[], nodeVisits: number[],

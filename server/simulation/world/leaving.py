@@ -53,6 +53,7 @@ class LeavingPose:
             found = [_gather(each, avatar, to_archive(each, frame.pose), reach, budget) for each in seen]
         budget.lacked(sum(each.late for each in found))
         self.lacks, self.late = any(each.lacks for each in found), any(each.late for each in found)
+        world.count(0, self.lacks)
         points = np.concatenate([each.points for each in found])
         self._archive = np.repeat(np.arange(len(found)), [len(each.points) for each in found])
         units = np.array([each.data.radius_units for each in self._seen])[self._archive]

@@ -115,6 +115,8 @@ LOST: dict[str, Callable[[dict], object]] = {
     "positions": lambda d: d["meshes"][0]["primitives"][0].update(attributes={"POSITIOM": 0}),
     "a move": lambda d: d["nodes"][0].update(translatiom=[1, 2, 3]),
     "an offset": lambda d: d["accessors"][0].update(byteOffseT=4),
+    "several letters": lambda d: d.update(nodes=[{"ch\ufffd5:en": [1]}, {"mesh": 0}, {"mesh": 0}]),
+    "all meshes": lambda d: d["scenes"][0].update(nodes=[]),
     "a scene": lambda d: d.update(scenf=d.pop("scene")),
     "attributes": lambda d: (
         d["accessors"].append({**d["accessors"][0], "count": 3}),

@@ -5,7 +5,9 @@ from pathlib import Path
 import effect_rooms
 import numpy as np
 import pytest
+from effect_frames import flip_a_byte
 from effect_rooms import RADIUS, at, play
+from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.scene.effect_table import AnyEffect, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
@@ -128,6 +130,18 @@ def _inside(points: np.ndarray, avatar: AvatarModel, place: np.ndarray) -> np.nd
     gap = points - place
     level = np.hypot(gap[:, 0], gap[:, 1]) <= 1.02 * (WIDE + SPHERE + RADIUS)
     return np.asarray(level & (gap[:, 2] >= -RADIUS - 0.02) & (gap[:, 2] <= TALL + RADIUS + 0.02))
+
+
+def test_a_frame_that_cannot_read_a_voxel_around_says_so(tmp_path: Path, rng: np.random.Generator) -> None:
+    """It is in contact, but might leave if the voxel were read."""
+    case = effect_rooms.build(tmp_path, walls("sheet", rng, 0.0), voxel=0.5)
+    with Archive(case.archive) as archive:
+        voxels = [tuple(each) for each in archive.coordinates.tolist()]
+    flip_a_byte(case.archive, max(voxels))
+    with play(case.archive, Stop(), Sweep()) as game:
+        body = game.body(shell(), at(0.35, -0.2, 0))
+        moved = game.go(body, (0, -0.04, 0))
+    assert moved.unknown and moved.verdict == Verdict.CONTACT and body.pose[1, 3] == -0.2
 
 
 def test_who_stands_in_the_floor_is_lifted_and_walks(tmp_path: Path) -> None:

@@ -72,9 +72,9 @@ class BuildConfig:
     voxel: edge of a voxel [m], at most 2^21 steps, to which it shrinks. With 8 m, a few to a few
     hundred voxels of a few MB each are in reach of a walk.
     resolution: lattice step [m]; None: the sources' common step if they share one, otherwise 0.1 mm
-    or less, by the distance between points (sources/lattice_step.py). 1 mm saves a third of the archive and no
-    time, and moves distances by up to 0.7 mm (measured with `solidcloud accuracy`, as are the next
-    two).
+    or less, by the distance between points (sources/lattice_step.py). 1 mm saves a third of the
+    archive and no time, and moves distances by up to 0.7 mm (measured with `solidcloud accuracy`,
+    as are the next two).
     degree: children per node, 2 to 16 ([Fig12] table 1 tries 4 to 16). All values from 4 to 16 take
     the same time within 3 %.
     leaf: points per leaf node, up to 32, the width of the vector test. 16 takes 4 % less time, for
@@ -111,7 +111,8 @@ class BuildConfig:
     the distance; None: keep all.
     moving: (distance [m], scans): leave out points that other scans saw through
     (builder/passes/filter_rules.py); None: keep all.
-    drop_classes: numbers of classes, and "synthetic" for points with that flag in LAS, to leave out.
+    drop_classes: numbers of classes, and "synthetic" for points with that flag in LAS, to leave
+    out.
     scheduler: address of a dask scheduler whose workers do the work.
     cluster: "local:N", a cluster of N workers that is started for the build. If both are None,
     processes on this machine do the work.

@@ -30,9 +30,9 @@ from ..sources.scan_warnings import ScanFacts, beyond_text
 # A header's bounds may be rounded: they are trusted if no point lies farther outside than this [m],
 # and grow by it where they stand for points that cannot be read.
 BOUNDS_WITHIN = 0.01
-# Points of a scan whose closest points are searched. The median of so many distances varies by about
-# a tenth; twice as many take half as long again. In a scan that can seek they are read at PLACES,
-# each of which takes 6 ms in a LAZ file.
+# Points of a scan whose closest points are searched. The median of so many distances varies by
+# about a tenth; twice as many take half as long again. In a scan that can seek they are read at
+# PLACES, each of which takes 6 ms in a LAZ file.
 PROBES, PLACES = 32, 8
 
 
@@ -106,7 +106,8 @@ class Part:
     fault: why it could not be read to its end, or "".
     brightest: greatest channel of its colours, if they are kept.
     beyond: points that are finite and too far away.  farthest: greatest coordinate of these [m].
-    closest: distance [m] of each probe of the scan to its closest point in the range, see `_Probes`.
+    closest: distance [m] of each probe of the scan to its closest point in the range, see
+    `_Probes`.
     """
 
     start: int

@@ -7,8 +7,9 @@ from ...schemas.process.interrupts import check_interrupt
 from .common.colours import CLASSIFICATION
 from .common.scan import Scan
 
-# Points read in total, at least of a file, and in how many ranges, to count those of a class; and bytes
-# of a file that cannot seek and is read whole for this. LAZ takes about 0.2 s for 10^6 points.
+# Points read in total, at least of a file, and in how many ranges, to count those of a class; and
+# bytes of a file that cannot seek and is read whole for this. LAZ takes about 0.2 s for 10^6
+# points.
 COUNTED_POINTS, LEAST_COUNTED, COUNTED_RANGES, COUNTED_BYTES = 10**7, 1 << 15, 4, 16 << 20
 
 
@@ -20,8 +21,8 @@ def counted_points(files: int) -> int:
 def count_classes(scan: Scan, most: int) -> Counter[str] | None:
     """Count the points of a scan by class and flag, see `Scan.count_classes`.
 
-    most: if the scan has more points and can seek, this many are read, in ranges over all of it. The
-    result is None for other large files, and for a scan without classes or that cannot be read.
+    most: if the scan has more points and can seek, this many are read, in ranges over all of it.
+    The result is None for other large files, and for a scan without classes or that cannot be read.
     """
     count = scan.declared_count or 0
     try:

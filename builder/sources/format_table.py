@@ -13,8 +13,8 @@ class ScanFormat(NamedTuple):
     suffix: ending of the file's name, in lower case.
     reader: module of `formats/` and its function (path) -> list[Scan]. It reads headers only and
     raises ScanError.
-    bounds: module and function (path, units) -> bounds (2, 3) [m] or None, which reads the bounds that
-    the header of a damaged file declares, and may raise anything; "": headers declare none.
+    bounds: module and function (path, units) -> bounds (2, 3) [m] or None, which reads the bounds
+    that the header of a damaged file declares, and may raise anything; "": headers declare none.
     is_mesh: --spacing samples the surface.
     in_folders: read from folders; otherwise only if named, because text of any kind may hold notes.
     """

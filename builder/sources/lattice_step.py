@@ -13,7 +13,8 @@ from .scan_warnings import MEASURED_SCANS, ScanFacts, spread
 # range noise; no step is below MIN_STEP.
 STEPS = (1e-4, 5e-5, 2e-5, 1e-5, 5e-6, 2e-6, MIN_STEP)
 # Distance between neighbouring points in steps, at least. Rounding then moves a point by at most
-# 9 % of it. The slack keeps the first step for points on a grid of 1 mm, whose differences are rounded.
+# 9 % of it. The slack keeps the first step for points on a grid of 1 mm, whose differences are
+# rounded.
 POINT_STEPS, SLACK = 10, 1e-3
 
 

@@ -309,8 +309,8 @@ def open_input_files(
     Scans are placed in metres with z up. spacing: of sampled meshes [m]. wanted, drop_classes: see
     `Scan`. A file that cannot be opened is kept with its fault, so that all faults are named
     together. Raise ScanError for a path that does not exist and a folder without scans,
-    BadRequestError for a broken list and for a scan that is named twice, OSError if a file cannot be
-    opened for a transient reason (transient_errors.py).
+    BadRequestError for a broken list and for a scan that is named twice, OSError if a file cannot
+    be opened for a transient reason (transient_errors.py).
     """
     found: list[InputFile] = []
     for path in map(Path, paths):

@@ -55,8 +55,9 @@ class ScanEntry:
     scale: additional factor.
     crs: text of the coordinate reference system, or "".  sha256: of the file, "" if not requested.
     use: whether a build reads the scan.  fault: why it cannot be read, or "".
-    warnings: what looks wrong, one line each.  columns: see `Scan`.  classes: points that were read, by
-    class and flag (`Scan.count_classes`); None: not counted. These three are not written to a list.
+    warnings: what looks wrong, one line each.  columns: see `Scan`.  classes: points that were
+    read, by class and flag (`Scan.count_classes`); None: not counted. These three are not written
+    to a list.
     """
 
     path: Path

@@ -1,7 +1,7 @@
 """Warnings about scans that a build accepts although they are probably a mistake.
 
-`inspect`, `plan` and `build` report: what a reader assumed (`Scan.notes`), units that files state, a
-scan that is probably in millimetres or beyond the limit of coordinates, a gap between scans far
+`inspect`, `plan` and `build` report: what a reader assumed (`Scan.notes`), units that files state,
+a scan that is probably in millimetres or beyond the limit of coordinates, a gap between scans far
 larger than the scans, the mesh of an avatar beside scans, and a radius that does not fit the
 spacing of the points. The checks use the bounds of headers, and read a few points of a scan only if
 these do not suffice. A warning is one line and never an error.
@@ -26,8 +26,8 @@ FEW_POINTS = 50
 # A scan at least this long [m] with points at least this far apart [m] is probably in millimetres:
 # a storey is 2,500 mm high, and a laser scan's points are 2 to 50 mm apart.
 LONG, SPARSE = 1000.0, 2.0
-# So is a shorter scan, of at least this length [m], whose least extent is this share of its length: an
-# object, because terrain and rooms with points so far apart are flatter.
+# So is a shorter scan, of at least this length [m], whose least extent is this share of its length:
+# an object, because terrain and rooms with points so far apart are flatter.
 OBJECT_LENGTH, OBJECT_SHARE = 50.0, 0.3
 # In map coordinates the terrain may be long and its points far apart; but not as high as this [m],
 # nor as high as this share of its length.
@@ -123,9 +123,9 @@ class ScanFacts:
     def spacing(self) -> float | None:
         """Return the approximate distance between neighbouring points [m]; None if it is not known.
 
-        Unless it is measured, it is the lesser of two estimates, each of which may be too large: the
-        median distance of a point to its closest one among points that follow one another in the
-        file, and that of points spread over the surface of the box.
+        Unless it is measured, it is the lesser of two estimates, each of which may be too large:
+        the median distance of a point to its closest one among points that follow one another in
+        the file, and that of points spread over the surface of the box.
         """
         if self._spacing is not None:
             return self._spacing

@@ -33,7 +33,8 @@ LARGEST_MESH = 512 << 20
 
 # A face in an OBJ file.
 _OBJ_FACE = re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
-# A face in an OBJ file that does not name at least three vertices: trimesh leaves out most of these.
+# A face in an OBJ file that does not name at least three vertices: trimesh leaves out most of
+# these.
 _BROKEN_OBJ_FACE = re.compile(
     rb"^[ \t]*f(?=\s|\Z)(?!(?:[ \t]+-?0*[1-9]\d*(?:/-?\d*){0,2}){3,}[ \t\r]*(?:#.*)?$).*", re.MULTILINE
 )

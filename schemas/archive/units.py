@@ -10,6 +10,6 @@ UNITS_PER_METRE = 2.0**26
 # Input with world coordinates beyond this is refused (NUMERICS.md case 16).
 MAX_COORDINATE = 1e9
 
-# A lattice step [m] below 1 micrometre would span fewer than 67 exact units, and no scanner resolves
-# it.
+# A lattice step [m] below 1 micrometre would span fewer than 67 exact units, and no scanner
+# resolves it.
 MIN_STEP = 1e-6

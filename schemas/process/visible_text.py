@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
-# Characters that move the cursor, colour or hide text on a terminal (controls but line feed and tab,
-# DEL), turn its direction (bidirectional marks, embeddings, overrides, isolates), or that UTF-8 or
-# XML 1.0 does not have (surrogates, which stand for undecodable bytes of file names; U+FFFE, U+FFFF).
+# Characters that move the cursor, colour or hide text on a terminal (controls but line feed and
+# tab, DEL), turn its direction (bidirectional marks, embeddings, overrides, isolates), or that
+# UTF-8 or XML 1.0 does not have (surrogates, which stand for undecodable bytes of file names;
+# U+FFFE, U+FFFF).
 _HIDDEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
 )

@@ -181,9 +181,9 @@ ORDER = (
 )  # fmt: skip
 # Version of the rules by which effects move an avatar; a log states that of its frames. A change that
 # gives other poses from the same motion commands increases it. 2: normals of contacts at edges
-# (server/simulation/world/contact_normal.py). 3: nearly head-on pushes at flat walls, pushed objects on
-# floors, and avatars wedged under slopes. 4: motions of avatars in contact, and motion commands that last for
-# more than a frame.
+# (server/kernels/walk/contact_normal.py). 3: nearly head-on pushes at flat walls, pushed objects on
+# floors, and avatars wedged under slopes. 4: motions of avatars in contact, and motion commands
+# that last for more than a frame.
 MOTION_VERSION = 4
 # Effects needed for safety: never skipped, whatever a frame's budget.
 NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})

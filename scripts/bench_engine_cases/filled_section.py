@@ -1,7 +1,7 @@
 """Section `filled`: closed meshes as avatars, filled and hollow, in turn on the same poses.
 
-The walk displaced, by class: clear and near, and in contact; and the walk raised, far from the scan.
-Times are processor time. It runs only on request (--only filled).
+The walk displaced, by class: clear and near, and in contact; and the walk raised, far from the
+scan. Times are processor time. It runs only on request (--only filled).
 """
 
 import time

@@ -25,8 +25,8 @@ _TALL, _SPHERE, _APART = 1.7, 0.02, 0.05
 _SPACING, _HIGH, _LONG = 0.02, 2.2, 2.0
 # A user walks at this speed [m/s] for this time [s], and is out when it is clear this far away [m].
 _SPEED, _SECONDS, _OUT = 1.4, 3.0, 0.3
-# The core begins farther than this from all points of a wall, and of a scan, whose points are up to 0.1 m
-# apart: nearer, it may be in a surface.  It passes a point if it comes this near [m].
+# The core begins farther than this from all points of a wall, and of a scan, whose points are up to
+# 0.1 m apart: nearer, it may be in a surface. It passes a point if it comes this near [m].
 _CORE, _SCAN_CORE, _TOUCHED = 0.03, 0.12, 0.005
 SHAPES = ("sheet", "jamb", "corner")
 # Parts of scans: half their extent [m].
@@ -36,9 +36,9 @@ SCANS, _HALF = ("indoor_atrium.laz", "octomap_hall.xyz"), 3.0
 class OverlapResult(NamedTuple):
     """Outcome of eight walks from one place [m].
 
-    start: (3,).  free: how many ended clear.  passed: how many passed the wall, or a point of a scan by
-    its core.  nearer: largest loss, in a frame that ended in contact, of the distance of the core from
-    the nearest point.
+    start: (3,).  free: how many ended clear.  passed: how many passed the wall, or a point of a
+    scan by its core.  nearer: largest loss, in a frame that ended in contact, of the distance of
+    the core from the nearest point.
     """
 
     start: list[float]

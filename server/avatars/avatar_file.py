@@ -18,7 +18,8 @@ from ...schemas.wire.request_limits import MAX_AVATAR_POINTS
 class ReadAvatar(NamedTuple):
     """Content of an avatar's file, in metres with z up.
 
-    triangles: (m, 3, 3) of a mesh.  points: (n, 3) of a file without faces. One of the two is empty.
+    triangles: (m, 3, 3) of a mesh.  points: (n, 3) of a file without faces. One of the two is
+    empty.
     axes: the up axis and unit that were taken, in words.
     """
 
@@ -39,7 +40,8 @@ def read_vertices(path: Path, up: str | None = None, units: str | None = None) -
     """Read the points of a scan, or the vertices of a mesh; up, units: as for `read_triangles_or_points`.
 
     Raise ScanError if the file cannot be read, contains no point or one that is not finite,
-    TooLargeError if it has more than MAX_AVATAR_POINTS points, BadRequestError for another axis or unit.
+    TooLargeError if it has more than MAX_AVATAR_POINTS points, BadRequestError for another axis or
+    unit.
     """
     scans, placed = _open(path, up, units)
     return ReadAvatar(np.empty((0, 3, 3)), _points(path, placed), _axes(scans[0], placed[0], up, units))

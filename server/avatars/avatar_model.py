@@ -15,8 +15,8 @@ from ..kernels.core.scene_arrays import LANES
 
 # Children per node of an avatar's tree; as for voxels, see BuildConfig.degree.
 DEGREE = 8
-# Largest front of a filled mesh, most of whose nodes are inside. With 256, `distance` takes 1.2 times
-# as long near a scan, and `collide` 0.8 to 1.2 times (bench_engine, `filled`).
+# Largest front of a filled mesh, most of whose nodes are inside. With 256, `distance` takes 1.2
+# times as long near a scan, and `collide` 0.8 to 1.2 times (bench_engine, `filled`).
 FILLED_FRONT = 32
 
 

@@ -101,9 +101,9 @@ class Avatars:
     ) -> AvatarModel:
         """Build an avatar of points (n, 3) [m] and store it, unless the same one exists already.
 
-        radius, inner_points: as for `make_avatar`. An avatar with the name of a scene avatar must equal it, and
-        shares its arrays. Raise BadRequestError if a name is invalid or belongs to a different avatar,
-        TooLargeError beyond the limits.
+        radius, inner_points: as for `make_avatar`. An avatar with the name of a scene avatar must
+        equal it, and shares its arrays. Raise BadRequestError if a name is invalid or belongs to a
+        different avatar, TooLargeError beyond the limits.
         """
         check_avatar_name(name)
         check_owner(client)

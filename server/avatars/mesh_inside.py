@@ -44,8 +44,8 @@ class ClosedParts(NamedTuple):
     parts, open_parts: number of parts of the mesh, and of those that are not closed.
     closed: (m,) bool, triangles of closed parts.
     corners: (c, 3, 3) int64, even: triangles of closed parts, oriented alike in each; without those
-    of two equal corners.  part: (c,) of each.  hole: (parts,) bool, whether a part is oriented against
-    the largest one and may be a cavity.
+    of two equal corners.  part: (c,) of each.  hole: (parts,) bool, whether a part is oriented
+    against the largest one and may be a cavity.
     low, step: a corner is at low + corners * step / 2 [m].
     """
 
@@ -64,8 +64,8 @@ def closed_parts(triangles: _Floats) -> ClosedParts:
 
     Triangles that share an edge are of one part. It is closed if as many of them pass along each of
     its edges in one direction as in the other, as they are or once the triangles at edges of two
-    are turned alike. Equal corners are one. In a part that is open, or whose triangles all occur twice,
-    as in a mesh of both sides, a triangle counts once.
+    are turned alike. Equal corners are one. In a part that is open, or whose triangles all occur
+    twice, as in a mesh of both sides, a triangle counts once.
     """
     low = triangles.reshape(-1, 3).min(axis=0)
     extent = float((triangles.reshape(-1, 3).max(axis=0) - low).max())
@@ -115,7 +115,8 @@ def _turn_alike(
     lost = _open_parts(part, edge, face, forward)
     repaired = lost
     if lost.any():
-        # Each triangle as it is and turned: two triangles at an edge must be of opposite directions.
+        # Each triangle as it is and turned: two triangles at an edge must be of opposite
+        # directions.
         alike = np.bincount(edge)[edge[one]] == 2
         one, other = one[alike], other[alike]
         same = forward[one] == forward[other]

@@ -36,8 +36,8 @@ _A = TypeVar("_A", bound=Cost)
 BATCH_POSES = 128
 # Reasons that a result lists.
 MOST_FAULTS = 5
-# Poses that are examined from the first contact of a motion to its end, where neither of its ends is
-# in contact, and such poses of a whole path.
+# Poses that are examined from the first contact of a motion to its end, where neither of its ends
+# is in contact, and such poses of a whole path.
 _POSES_OF_MOTION, _MOST_BETWEEN = 16, 20_000
 
 

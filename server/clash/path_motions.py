@@ -31,8 +31,8 @@ SWEEP_TOLERANCE = 1e-6
 class Motions(NamedTuple):
     """Answers for the motions between consecutive poses.
 
-    verdict: (n,).  touch: (n,) fraction at which there is a contact, the first one of a motion whose
-    ends are not in contact; inf if there is none.
+    verdict: (n,).  touch: (n,) fraction at which there is a contact, the first one of a motion
+    whose ends are not in contact; inf if there is none.
     clearance: (n,) lower bound of the distance on the whole motion [m], at most the reach; -inf in
     contact, NaN if unknown.
     """

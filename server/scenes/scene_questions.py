@@ -219,7 +219,8 @@ class SceneQuestions(QueryMethods):
         """Answer `op` (collide, distance, contacts, sweep) along poses, in ordered parts.
 
         name: of the avatar.  poses: (k, 4, 4) or (4, 4), avatar to world.
-        op: a sweep has k - 1 motions, from each pose to the next; the others examine the poses only.
+        op: a sweep has k - 1 motions, from each pose to the next; the others examine the poses
+        only.
         threads: parts computed at a time.  client: owner of the avatar.
         parameters: of `op` besides the poses, including tolerance and budgets. `budget_ms` is for
         the whole path.

@@ -20,8 +20,8 @@ if TYPE_CHECKING:  # only scenes whose users can collide import it
 
 # Limit on the duration of a frame [s]. A motion command that is due for longer takes several.
 LONGEST_FRAME = 0.1
-# After a pause of more than this, a viewer continues as after one of LONGEST_FRAME [s]: it stood still,
-# and did not send two motion commands a second.
+# After a pause of more than this, a viewer continues as after one of LONGEST_FRAME [s]: it stood
+# still, and did not send two motion commands a second.
 LONGEST_PAUSE = 0.5
 
 
@@ -84,8 +84,8 @@ def run_frames(
 ) -> Moved:
     """Run the frames of a user's motion command, nearly always one. If one fails, undo those before it.
 
-    run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may meet, or
-    None.  skip: as for `run`.
+    run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may
+    meet, or None.  skip: as for `run`.
     """
     if len(durations) == 1:
         return run(body, target_pose(command, body.pose, durations[0], up), durations[0], skip=skip)

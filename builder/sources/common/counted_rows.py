@@ -101,8 +101,8 @@ class CountedRows(Scan):
 def pts_columns(count: int) -> tuple[int | None, tuple[int, ...]]:
     """Return the columns of the intensity, or None, and of red, green and blue, or (), in PTS and PTX.
 
-    count: numbers in a row. x y z i, x y z i r g b and x y z r g b are common. A fifth number has no
-    meaning of its own; of more than seven, only x, y and z are certain.
+    count: numbers in a row. x y z i, x y z i r g b and x y z r g b are common. A fifth number has
+    no meaning of its own; of more than seven, only x, y and z are certain.
     """
     return 3 if count in (4, 5, 7) else None, (count - 3, count - 2, count - 1) if count in (6, 7) else ()
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ....schemas.process.interrupts import check_interrupt
 from .scan import BLOCK_BYTES, scan_error
 
-# Bytes that may follow the last record of a binary file: zeros, blanks, and the end of a text in DOS.
+# Bytes that may follow the last record of a binary file: zeros, blanks, and the end of a text in
+# DOS.
 BLANKS = b"\0 \t\r\n\x1a"
 # Bytes searched for others per read.
 SEARCHED_BYTES = 1 << 16

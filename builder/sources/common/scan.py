@@ -101,8 +101,8 @@ class Scan(ABC):
     seekable: True where blocks() can begin and end at any point and reads only that range
     (`SeekableScan`).
     units: unit of the coordinates, see `axis_metres` (units.py). up: the axis that points up,
-    "z", "y" or "x". Both are what the file or its format states, or the usual value where these state
-    none. blocks() does not convert coordinates.
+    "z", "y" or "x". Both are what the file or its format states, or the usual value where these
+    state none. blocks() does not convert coordinates.
     units_note: which unit the file states, and where, if that is not the metre; or "".
     crs: the coordinate reference system's text, or "".
     columns: columns that the points have besides coordinates: "intensity", "rgb", "classification".
@@ -334,8 +334,8 @@ def quaternion_pose(
 ) -> NDArray[np.float64]:
     """Return the pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m].
 
-    A part that is None becomes the identity. So does a rotation of 0 0 0 0, which programs write that
-    know none, see `zero_rotation_note`. index: number of the scan, for the message.
+    A part that is None becomes the identity. So does a rotation of 0 0 0 0, which programs write
+    that know none, see `zero_rotation_note`. index: number of the scan, for the message.
     Raises ScanError for values that form no pose.
     """
     pose = np.eye(4)

@@ -156,9 +156,9 @@ def split_row(line: bytes, delimiter: str | None) -> list[str]:
 def tidy_rows(lines: bytes, delimiter: str | None) -> bytes:
     """Return lines of rows as numpy.loadtxt accepts them, each at its place.
 
-    Comments are left out: what follows "#" behind a blank, and lines that begin with "//", or with ";" and no
-    number. So are delimiters at the end of a line, and quotes around a number. A decimal comma
-    becomes a point where commas do not separate fields.
+    Comments are left out: what follows "#" behind a blank, and lines that begin with "//", or with
+    ";" and no number. So are delimiters at the end of a line, and quotes around a number. A decimal
+    comma becomes a point where commas do not separate fields.
     """
     lines = _without_comments(_plain_nan(lines), delimiter)
     if delimiter != ",":
@@ -321,8 +321,8 @@ def _broken_line(path: Path, number: int, raw: bytes, expected: str) -> ScanErro
 def keyword_rows(file: BinaryIO, path: Path, keyword: str) -> Iterator[NDArray[np.float64]]:
     """Read the three numbers after a keyword ("v" in OBJ, "vertex" in STL); other lines are skipped.
 
-    Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored. Decimal
-    commas are read where no number has a point.
+    Yields (n, 3) float64, n > 0; further numbers on the line (a weight, a colour) are ignored.
+    Decimal commas are read where no number has a point.
     Raises ScanError with the number of the first line whose three numbers cannot be read.
     """
     lines_of = re.compile(rb"^[ \t]*" + keyword.encode() + rb"(?:[ \t]+(.*))?$", re.MULTILINE | re.IGNORECASE)

@@ -4,8 +4,8 @@ from collections.abc import Collection, Sequence
 from itertools import accumulate
 from typing import Any
 
-# Properties that place vertices, of each kind of object [glTF 2.0, 5]. One of these whose name is damaged
-# must not be ignored, which would move or lose vertices.
+# Properties that place vertices, of each kind of object [glTF 2.0, 5]. One of these whose name is
+# damaged must not be ignored, which would move or lose vertices.
 PROPERTIES = {
     "glTF": {
         *("accessors", "buffers", "bufferViews", "extensionsRequired", "meshes", "nodes", "scene", "scenes"),
@@ -48,8 +48,8 @@ def used_bytes(
 ) -> tuple[list[int], list[int]]:
     """Return the spans of the binary chunk that accessors use, and views without accessors.
 
-    accessors, views: of a document. Returns the first byte of each span, ascending, and the greatest
-    end, exclusive, of it and all before it. May raise anything for an invalid document.
+    accessors, views: of a document. Returns the first byte of each span, ascending, and the
+    greatest end, exclusive, of it and all before it. May raise anything for an invalid document.
     """
     used: list[tuple[int, int]] = []
     free = set(range(len(views)))

@@ -217,9 +217,9 @@ def las_bounds(path: Path, units: str = "") -> NDArray[np.float64] | None:
     """Return the bounds that the header of a damaged LAS file declares, (2, 3) [m].
 
     units: see `axis_metres`; "": what the file states.
-    May raise any exception. An inconsistent header is rejected, as are bounds that do not hold every
-    point that can be read, and those in a unit that is not known: if a skipped scan were recorded at
-    a wrong place, queries would report its real place as clear.
+    May raise any exception. An inconsistent header is rejected, as are bounds that do not hold
+    every point that can be read, and those in a unit that is not known: if a skipped scan were
+    recorded at a wrong place, queries would report its real place as clear.
     """
     size = path.stat().st_size
     with path.open("rb") as file:

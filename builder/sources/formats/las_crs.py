@@ -1,8 +1,8 @@
 """Coordinate reference system of a LAS file, as WKT or GeoTIFF keys: its text and its units of length.
 
 There is no database of systems: a unit counts as stated if WKT, a key of its own or the name of the
-system (a citation) says it, not if it follows from the EPSG code of a projection. A code that may be
-one in feet gets a note.
+system (a citation) says it, not if it follows from the EPSG code of a projection. A code that may
+be one in feet gets a note.
 """
 
 import math

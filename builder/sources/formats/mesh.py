@@ -86,8 +86,8 @@ def open_stl(path: Path) -> list[Scan]:
         start = file.read(1024)
         (triangles,) = struct.unpack("<I", start[80:STL_HEADER_BYTES].ljust(4, b"\0"))
         is_binary = size == STL_HEADER_BYTES + triangles * STL_TRIANGLE.itemsize
-        # Many binary files begin with "solid" too, some with "facet" behind it: their first 80 bytes
-        # may hold anything.
+        # Many binary files begin with "solid" too, some with "facet" behind it: their first 80
+        # bytes may hold anything.
         letters = start.replace(b"\0", b"") if is_utf16(start) else start.removeprefix(UTF8_MARK)
         if not is_binary and SOLID.match(letters) and _FACET.search(letters):
             with open_text_file(path) as text:

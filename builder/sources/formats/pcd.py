@@ -8,8 +8,8 @@ dropped as NO_RETURN.
 VIEWPOINT is applied as the scan's pose, as the library's own viewer does.
 
 Missing lines of the header mean what they mean in that library: COLUMNS is an old name of FIELDS,
-COUNT and HEIGHT are 1, WIDTH times HEIGHT is POINTS, and in text TYPE is F. Without WIDTH and POINTS
-the rest of the file is points.
+COUNT and HEIGHT are 1, WIDTH times HEIGHT is POINTS, and in text TYPE is F. Without WIDTH and
+POINTS the rest of the file is points.
 """
 
 import struct

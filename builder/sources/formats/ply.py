@@ -1,8 +1,9 @@
 """PLY reader: the vertices of one file, ASCII or binary of either byte order.
 
-ply_header.py reads the header. This module reads the body in blocks, because plyfile reads faces one
-by one and ASCII vertices into one array of the size that the header claims. Lists, in the vertices or
-in elements before them, are skipped; in text, x, y, z and all columns in use come before a list.
+ply_header.py reads the header. This module reads the body in blocks, because plyfile reads faces
+one by one and ASCII vertices into one array of the size that the header claims. Lists, in the
+vertices or in elements before them, are skipped; in text, x, y, z and all columns in use come
+before a list.
 """
 
 from collections.abc import Iterator, Sequence
@@ -79,8 +80,8 @@ def _list_records(
 ) -> Iterator[NDArray[np.void]]:
     """Read the records of an element with lists from the current position, in blocks.
 
-    Yields (n,), n > 0, records whose lists have the same lengths. Records are guessed to be like the
-    one before them, twice as many each time; those after the first unlike one are read again.
+    Yields (n,), n > 0, records whose lists have the same lengths. Records are guessed to be like
+    the one before them, twice as many each time; those after the first unlike one are read again.
     Raises ScanError.
     """
     seen, step = 0, 1

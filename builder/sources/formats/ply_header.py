@@ -107,8 +107,9 @@ def _header_lines(path: Path) -> tuple[list[str], int]:
     with open_text_file(path) as file:
         while not lines or lines[-1] != "end_header":
             raw = file.readline(LONGEST_HEADER)
-            # Letters that are not ASCII occur in comments, and in names that nothing here reads. Some
-            # writers leave blanks at the ends of lines ("ply "), or blank lines; plyfile refuses both.
+            # Letters that are not ASCII occur in comments, and in names that nothing here reads.
+            # Some writers leave blanks at the ends of lines ("ply "), or blank lines; plyfile
+            # refuses both.
             line = raw.decode("ascii", "backslashreplace").strip()
             if (not lines and line != "ply") or not raw or file.tell() > LONGEST_HEADER:
                 raise scan_error(

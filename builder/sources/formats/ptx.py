@@ -70,7 +70,8 @@ def _pose(
     index: number of the scan.
     line: number of the first line after the grid's size, at the current file position.
     The matrix need not be rigid: files exist that stretch an axis, and the matrix determines where
-    the points are. Rows of zeros are no rotation, unless the scanner's axes or position say another.
+    the points are. Rows of zeros are no rotation, unless the scanner's axes or position say
+    another.
     """
     found: list[list[float]] = []
     for number, expected in enumerate(HEAD, line):

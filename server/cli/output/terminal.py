@@ -11,8 +11,8 @@ from ....schemas.process.visible_text import visible
 class Terminal(Console):
     """Console of rich for texts of users, archives and servers, given as `str`.
 
-    `[scan]` in a text is no markup, `:smile:` no emoji, and control characters become visible before
-    rich measures how wide the text is.
+    `[scan]` in a text is no markup, `:smile:` no emoji, and control characters become visible
+    before rich measures how wide the text is.
     """
 
     def __init__(self, **options: Any) -> None:

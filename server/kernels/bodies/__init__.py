@@ -1,4 +1,4 @@
-"""Bodies of users and objects: against one another, their patches, and how one leaves contact with the scan.
+"""Bodies of users and objects: contacts with one another, patches, and ways out of the scan.
 
 May import server.kernels.core, server.kernels.motion, schemas.
 Begin with body_pairs.py.

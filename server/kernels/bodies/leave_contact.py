@@ -1,7 +1,8 @@
 """Motions that begin in contact: which scan points an avatar holds, and the planes it may not cross.
 
-The rule, its proof and its limits are in schemas/SCENE.md, "A user in contact". Sums are float64 in a
-fixed order, so that every machine finds the same motions; distances below `SLACK` count as contact.
+The rule, its proof and its limits are in schemas/SCENE.md, "A user in contact". Sums are float64 in
+a fixed order, so that every machine finds the same motions; distances below `SLACK` count as
+contact.
 """
 
 import math
@@ -19,20 +20,22 @@ from .avatar_patch import PATCH_STEPS, SUMS
 SLACK = 1e-7
 # Columns of a gathered point: place in the avatar's frame [m], lattice coordinates, radius deficit.
 PLACE, LATTICE, DEFICIT, GATHERED = 0, 3, 6, 7
-# Columns of a plane: unit normal away from the core, its offset, the nearest point's place and the core's
-# point nearest to that.
+# Columns of a plane: unit normal away from the core, its offset, the nearest point's place and the
+# core's point nearest to that.
 NORMAL, OFFSET, NEAREST, CORE, PLANE = 0, 3, 4, 7, 10
-# The normal of a plane is that of the points within one of these distances [m], as for `slide`, and half of
-# it near an edge; the last is tried last, with the points that the best of the others leaves beyond.
+# The normal of a plane is that of the points within one of these distances [m], as for `slide`, and
+# half of it near an edge; the last is tried last, with the points that the best of the others
+# leaves beyond.
 REACHES = (0.04, 0.08, 0.24, 0.24)
-# A plane lies up to this far before its nearest point [m], at most half the way to the core, so that the
-# bumps of a scanned wall make no planes of their own. With 0, noise of 2 mm closed every corner.
+# A plane lies up to this far before its nearest point [m], at most half the way to the core, so
+# that the bumps of a scanned wall make no planes of their own. With 0, noise of 2 mm closed every
+# corner.
 MAX_BUMP = 0.02
 # A plane that is nearer to the core than this share of its point's distance is not taken.
 MIN_GAP = 0.25
 MAX_PLANES = 256
-# Directions of the half-spaces around the avatar: whole numbers up to this. The farthest is 9 degrees
-# from one of them, so that the hull is a hundredth too large.
+# Directions of the half-spaces around the avatar: whole numbers up to this. The farthest is 9
+# degrees from one of them, so that the hull is a hundredth too large.
 HULL = 3
 
 
@@ -40,8 +43,8 @@ HULL = 3
 def gather_points(held, voxel, box, pose, found, count):
     """Append the points of a resident voxel in a box to found (capacity, GATHERED); return their number.
 
-    box: (2, 3) int64, inclusive, lattice.  pose: (4, 4), avatar to archive.  count: number of points so far.
-    Points beyond the capacity are counted and not written.
+    box: (2, 3) int64, inclusive, lattice.  pose: (4, 4), avatar to archive.  count: number of
+    points so far. Points beyond the capacity are counted and not written.
     """
     scene = held.scene
     words, ints, halves = scene.words, scene.ints, scene.halves
@@ -97,10 +100,11 @@ def gather_points(held, voxel, box, pose, found, count):
 def meet_points(body, points, reach, which, way, times, own):
     """Find when a translated avatar first meets each of some points.
 
-    body: reference to the avatar's arrays, not empty.  points: (n, 3), avatar frame.  reach: (n,) between
-    the centres of two touching spheres [m].  which: (n,) bool, points to examine.  way: (3,) translation.
-    times: (n,), set to the fraction of the way, 0 where they touch, inf for never.  own: (n, 3), set to
-    the centre of the avatar's sphere that touches.
+    body: reference to the avatar's arrays, not empty.  points: (n, 3), avatar frame.  reach: (n,)
+    between the centres of two touching spheres [m].  which: (n,) bool, points to examine.
+    way: (3,) translation [m].
+    times: (n,), set to the fraction of the way, 0 where they touch, inf for never.  own: (n, 3),
+    set to the centre of the avatar's sphere that touches.
     """
     avatar = body.avatar
     square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
@@ -173,8 +177,8 @@ def hull_of(body):
 def find_held(hull, points, reach, held):
     """Set held (n,) bool also for points inside the hull of an avatar's spheres.
 
-    hull: `hull_of` the avatar.  points, reach: as for `meet_points`. A point in a hollow between spheres
-    is inside too.
+    hull: `hull_of` the avatar.  points, reach: as for `meet_points`. A point in a hollow between
+    spheres is inside too.
     """
     for i in range(points.shape[0]):
         x, y, z, inside = points[i, 0], points[i, 1], points[i, 2], True
@@ -189,7 +193,8 @@ def find_held(hull, points, reach, held):
 def _core(box, ends):
     """Write the ends (2, 3) of the core of an avatar with a box (2, 3) of its centres.
 
-    It is the segment through the middle of the box along its longest axis, shorter by the second extent.
+    It is the segment through the middle of the box along its longest axis, shorter by the second
+    extent.
     """
     longest = 0
     for r in range(1, 3):
@@ -236,9 +241,10 @@ def _surface(points, which, at, reach):
 def separate_core(box, points, planes):
     """Find planes between the core and the points that an avatar holds; return their number.
 
-    box: (2, 3) of the avatar's centres.  points: (n, 3), avatar frame.  planes: (MAX_PLANES, PLANE), written.
-    Each point lies beyond one of the planes, and the core before all of them. The point nearest to the core
-    of those left gives the next plane: of several normals, the one with the most points beyond.
+    box: (2, 3) of the avatar's centres.  points: (n, 3), avatar frame [m].
+    planes: (MAX_PLANES, PLANE), written. Each point lies beyond one of the planes, and the core before all of them. The
+    point nearest to the core of those left gives the next plane: of several normals, the one with
+    the most points beyond.
     Returns -1 if the core touches a point, or there are more planes.
     """
     ends, left, distances = np.empty((2, 3)), np.ones(points.shape[0], np.bool_), np.empty(points.shape[0])

@@ -139,8 +139,8 @@ def _may_touch(avatar, m, steps, extent, placed, scene, location, a, row, thresh
     """Return whether a point of a scene leaf node is near a leaf node of the avatar.
 
     A scene leaf node of scattered points may hold much of the inside of a filled mesh without a
-    touch. To test its points against the sphere of a leaf node takes less than to place and test the
-    points in that node: 1.4 instead of 3.9 us a pose for a ball near the façade (bench_engine,
+    touch. To test its points against the sphere of a leaf node takes less than to place and test
+    the points in that node: 1.4 instead of 3.9 us a pose for a ball near the façade (bench_engine,
     `filled`).
     """
     ints = scene.ints

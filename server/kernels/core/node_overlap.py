@@ -325,7 +325,8 @@ def next_near(halves, lane_at, low_x, low_y, low_z, lanes, block, far, keep, kee
 def sphere_is_near(halves, lane_at, low_x, low_y, low_z, x, y, z, reach):
     """Return whether a point of a scene block may be within `reach` of a place.
 
-    lane_at, low: as for `next_near`.  x, y, z: from the frame [steps].  reach: includes their error.
+    lane_at, low: as for `next_near`.  x, y, z: from the frame [steps].  reach: includes their
+    error.
     """
     h, near, square = U(lane_at), False, reach * reach * ONE_SLACK
     x, y, z = x - low_x, y - low_y, z - low_z

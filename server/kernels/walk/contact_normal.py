@@ -6,12 +6,12 @@ of points, it is still the sheet's, and an avatar would press against the edge f
 
 The normal of a contact separates the two bodies: near the touched point, the avatar lies on one
 side of the plane, and the scan on the other. The smoothed normal of the scan is therefore taken if
-its plane separates the avatar's patch, which is the points of its surface within reach of the touched one.
-Otherwise the contact is at an edge, and three directions are compared: the smoothed normal of the
-scan, that of the avatar, and the direction from the touched sphere to the touching one. The one
-whose plane the points of both patches exceed least is taken. Where a smooth body touches an edge,
-this is the body's normal, as for the contact of a vertex with a face in Baraff 1989 (Analytical
-Methods for Dynamic Simulation of Non-penetrating Rigid Bodies).
+its plane separates the avatar's patch, which is the points of its surface within reach of the
+touched one. Otherwise the contact is at an edge, and three directions are compared: the smoothed
+normal of the scan, that of the avatar, and the direction from the touched sphere to the touching
+one. The one whose plane the points of both patches exceed least is taken. Where a smooth body
+touches an edge, this is the body's normal, as for the contact of a vertex with a face in Baraff
+1989 (Analytical Methods for Dynamic Simulation of Non-penetrating Rigid Bodies).
 
 The border of a scan is not recognized from the scan alone, as by Bendels et al. 2006 (Detecting
 Holes in Point Set Surfaces): a body that stands flat against a sheet beside its edge keeps the

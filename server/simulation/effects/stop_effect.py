@@ -6,10 +6,11 @@ stays. With `sweep`, it moves up to the first contact.
 An avatar that touches something before it moves (because it was placed there, or the archive was
 hot-reloaded) first escapes. The candidates are the displacement of the motion command, and
 displacements of up to MAX_ESCAPE away from what is touched and upwards, shortest first. The first
-with a clear end is taken, if the rule for users in contact permits the way to it (schemas/SCENE.md).
-If there is none, the avatar moves by that rule as far as its motion command leads, also without
-`sweep`, and the verdict reports whether it is still in contact. It stays if its pose or a candidate is
-unknown because voxels are not in memory yet, for a frame that does not wait for them.
+with a clear end is taken, if the rule for users in contact permits the way to it
+(schemas/SCENE.md). If there is none, the avatar moves by that rule as far as its motion command
+leads, also without `sweep`, and the verdict reports whether it is still in contact. It stays if its
+pose or a candidate is unknown because voxels are not in memory yet, for a frame that does not wait
+for them.
 """
 
 from ....schemas.scene.effect_table import Stop, Sweep

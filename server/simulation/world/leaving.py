@@ -20,9 +20,9 @@ from .vectors import dot, norm, rotate, rotate_back
 _MORE = 0.25
 # Name under which `Body.effect_state` keeps the half-spaces around the avatar.
 _HULL = "hull"
-# A motion leaves a surface if its direction has at least this part away from the plane. The points up to
-# _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its radius deep
-# touches new points of both walls on every way out, although it leaves both.
+# A motion leaves a surface if its direction has at least this part away from the plane. The points
+# up to _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its
+# radius deep touches new points of both walls on every way out, although it leaves both.
 _LEAVES, _THICK = 0.2, 0.05
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8

@@ -42,7 +42,8 @@ def inspect(
     """Describe scans and write a list to edit.
 
     The description comes from the headers of the scans; of a scans.toml, its edits are kept. Points
-    that are withheld, noise (classes 7 and 18) or synthetic are counted, in large files by a sample.
+    that are withheld, noise (classes 7 and 18) or synthetic are counted, in large files by a
+    sample.
 
     --stray: dust and what is left of passing people stop walking avatars in mid air. Points hang if
     their group in cubes of 0.1 m has fewer than 500 points, touches no other group, and is above one

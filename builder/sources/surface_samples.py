@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.scan import NOT_FINITE, Scan, ScanBlock, library_errors, reader_library, scan_error
+from .common.scan import (
+    NOT_FINITE,
+    Scan,
+    ScanBlock,
+    damaged_error,
+    library_errors,
+    reader_library,
+    scan_error,
+)
 from .common.text_rows import DECIMAL_COMMA, open_text_file, text_chunks
 from .formats.glb import GlbScan
 from .formats.ply import ply_polygons
@@ -188,11 +196,10 @@ def _by_trimesh(path: Path) -> NDArray[np.float64]:
 def _corners(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the corners (n, 3, 3) of faces (n, 3), by vertex numbers. Raises ScanError."""
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise scan_error(
+        raise damaged_error(
             path,
             f"a face with vertex {faces.max()} (counted from 0) of {len(vertices)}",
             "faces between its own vertices",
-            "fetch the file again, it is truncated or damaged",
         )
     return np.asarray(vertices[faces], np.float64)
 

@@ -247,6 +247,11 @@ def scan_error(path: Path, found: str, expected: str, what_to_do: str) -> ScanEr
     return ScanError(f"{path}: {found}, expected {expected}: {what_to_do}")
 
 
+def damaged_error(path: Path, found: str, expected: str) -> ScanError:
+    """Build the error for a scan whose file is truncated or damaged, see `scan_error`."""
+    return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
+
+
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
     """Convert exceptions of a format's library or of the file system to ScanError.

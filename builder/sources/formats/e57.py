@@ -23,6 +23,7 @@ from ..common.scan import (
     ScanBlock,
     apply_pose,
     checked_bounds,
+    damaged_error,
     library_errors,
     quaternion_pose,
     reader_library,
@@ -253,11 +254,10 @@ def _open_scan(path: Path, index: int, node: Any, section: Section | None) -> Sc
     # A record of constants takes no bits, and a hostile file could claim any number of them. A real
     # scan has at least one bit per record.
     if count > 8 * path.stat().st_size:
-        raise scan_error(
+        raise damaged_error(
             path,
             f"scan {index} of {count} records",
             f"at most the {8 * path.stat().st_size} bits of the file",
-            "fetch the file again, it is truncated or damaged",
         )
     held = 0
     if section is not None:

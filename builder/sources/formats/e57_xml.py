@@ -20,7 +20,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.scan import scan_error
+from ..common.scan import damaged_error
 
 # Maximum bytes of XML that are read. The XML of 700 scans, each with a pose and bounds, takes about
 # 4 MiB.
@@ -45,13 +45,13 @@ def check_e57(path: Path) -> None:
         fields = struct.unpack("<8sIIQQQQ", head) if len(head) == 48 else (head[:8], 0, 0, 0, 0, 0, 0)
         signature, _, _, length, offset, xml_length, page = fields
         if signature != b"ASTM-E57" or page != PAGE_BYTES:
-            raise _damaged(
+            raise damaged_error(
                 path,
                 f"a file that begins with {signature!r}, pages of {page} bytes",
                 f"b'ASTM-E57' and {PAGE_BYTES}",
             )
         if length != size or offset + xml_length > size or xml_length > LONGEST_XML:
-            raise _damaged(
+            raise damaged_error(
                 path,
                 f"{size} bytes, {xml_length} of XML from byte {offset} on, {length} bytes declared",
                 f"all declared bytes, and at most {LONGEST_XML} bytes of XML",
@@ -60,7 +60,7 @@ def check_e57(path: Path) -> None:
     try:
         check_xml(plain_letters(xml))
     except XmlLimitError as error:
-        raise _damaged(path, str(error), "the description of some scans") from None
+        raise damaged_error(path, str(error), "the description of some scans") from None
     except expat.ExpatError:
         # The XML up to the error is within the limits. libE57Format checks the checksums first and
         # then reports the error.
@@ -264,7 +264,3 @@ def records_held(file: BufferedReader, section: Section) -> int:
         ),
         default=0,
     )
-
-
-def _damaged(path: Path, found: str, expected: str) -> Exception:
-    return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")

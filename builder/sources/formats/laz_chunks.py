@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 from ....schemas.errors import ScanError
 from ....schemas.process.interrupts import blocking_interrupts, check_interrupt
-from ..common.scan import library_errors, scan_error
+from ..common.scan import damaged_error, library_errors, scan_error
 
 CHUNKED = 2  # the compressor of point formats 0 to 5
 VARIABLE = 0xFFFFFFFF  # special value of points per chunk: each chunk has its own point count
@@ -60,16 +60,18 @@ def check_chunks(
             "convert it with a newer LASzip",
         )
     if sum(length for _, length in items) != record_bytes:
-        raise _damaged(path, f"compressed items {items} (type, bytes)", f"{record_bytes} bytes together")
+        raise damaged_error(path, f"compressed items {items} (type, bytes)", f"{record_bytes} bytes together")
     table, chunks = _chunk_table(file, path, start, size)
     if not chunks or (chunk_points != VARIABLE and not chunk_points):
-        raise _damaged(path, f"{chunks} chunks of {chunk_points} points", "at least one of each")
+        raise damaged_error(path, f"{chunks} chunks of {chunk_points} points", "at least one of each")
     if chunk_points != VARIABLE and points > chunks * chunk_points:
-        raise _damaged(path, f"{points} points in {chunks} chunks of {chunk_points}", "as many as they hold")
+        raise damaged_error(
+            path, f"{points} points in {chunks} chunks of {chunk_points}", "as many as they hold"
+        )
     # lazrs allocates the whole table. Each chunk begins with one raw point; an empty chunk may
     # follow the last.
     if (chunks - 1) * record_bytes > table - start - 8:
-        raise _damaged(
+        raise damaged_error(
             path, f"{chunks} chunks in {table - start - 8} bytes", f"a point of {record_bytes} bytes in each"
         )
     if compressor != LAYERED:
@@ -78,14 +80,14 @@ def check_chunks(
     while seen < points and at < table:
         count, at = _chunk_head(file, items, record_bytes, at)
         if not count or at > table:
-            raise _damaged(
+            raise damaged_error(
                 path, f"chunk {number} that ends at byte {at}", f"its end before the table at {table}"
             )
         seen += count
         number += 1
     # Writers that end each chunk explicitly leave an empty chunk after the last.
     if seen != points or not number <= chunks <= number + 1:
-        raise _damaged(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
+        raise damaged_error(path, f"{seen} points in {number} chunks", f"{points} in {chunks} chunks")
     return -1
 
 
@@ -104,7 +106,7 @@ def check_chunk_end(decompressor: Any, path: Path, behind: int) -> None:
     except Exception:
         check_interrupt()
         return  # the file ends before: as it should
-    raise _damaged(path, "further points in the last chunk", "as many as the header declares")
+    raise damaged_error(path, "further points in the last chunk", "as many as the header declares")
 
 
 def chunk_bytes(file: BinaryIO, start: int, end: int) -> int:
@@ -248,7 +250,7 @@ def _items(path: Path, laszip: bytes) -> list[tuple[int, int]]:
     """Return (type, bytes) of each item of a point that the LASzip record lists."""
     count = struct.unpack_from("<H", laszip, 32)[0] if len(laszip) >= 34 else 0
     if len(laszip) < 34 + 6 * count or not count:
-        raise _damaged(
+        raise damaged_error(
             path, "no whole record 22204 of 'laszip encoded'", "this record before the points of a LAZ file"
         )
     return [struct.unpack_from("<HH", laszip, 34 + 6 * k) for k in range(count)]
@@ -271,11 +273,7 @@ def _chunk_table(file: BinaryIO, path: Path, start: int, size: int) -> tuple[int
     chunks = struct.unpack("<II", raw)[1] if len(raw) == 8 else size
     # A chunk holds at least its first point, raw: there are fewer chunks than bytes.
     if table < start + 8 or chunks >= size:
-        raise _damaged(
+        raise damaged_error(
             path, f"a chunk table at byte {table} of {size}", "a table after the points, within the file"
         )
     return table, chunks
-
-
-def _damaged(path: Path, found: str, expected: str) -> Exception:
-    return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")

@@ -30,6 +30,7 @@ from ..common.scan import (
     ScanBlock,
     SeekableScan,
     apply_pose,
+    damaged_error,
     library_errors,
     quaternion_pose,
     scan_error,
@@ -207,7 +208,7 @@ class AsciiPcd(Scan):
                     part = rows[start : start + block_points]
                     yield _block(self, {name: _number(part, field) for name, field in fields.items()})
         if seen < header.points:
-            raise _truncated(self.path, f"{seen} points", f"the {header.points} its header declares")
+            raise damaged_error(self.path, f"{seen} points", f"the {header.points} its header declares")
 
 
 def open_pcd(path: Path) -> list[Scan]:
@@ -220,7 +221,7 @@ def open_pcd(path: Path) -> list[Scan]:
         least = 2 * header.columns if header.kind == "ascii" else header.record_bytes
         # The last row of a text may lack its line end.
         if header.points * least > left + (header.kind == "ascii"):
-            raise _truncated(path, f"{left // least} points at most", f"the {header.points} declared")
+            raise damaged_error(path, f"{left // least} points at most", f"the {header.points} declared")
         if header.kind == "binary":
             with path.open("rb") as file:
                 file.seek(header.start + header.points * header.record_bytes)
@@ -239,18 +240,14 @@ def _compressed_end(path: Path, header: _Header, left: int) -> int:
         file.seek(header.start)
         packed, unpacked = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if 8 + packed > left:
-        raise _truncated(path, f"{left} bytes of data", f"{8 + packed}")
+        raise damaged_error(path, f"{left} bytes of data", f"{8 + packed}")
     if unpacked != header.points * header.record_bytes or unpacked > packed * MAX_EXPANSION:
-        raise _truncated(
+        raise damaged_error(
             path,
             f"{unpacked} bytes in {packed} compressed",
             f"the {header.points * header.record_bytes} of {header.points} points",
         )
     return header.start + 8 + int(packed)
-
-
-def _truncated(path: Path, found: str, expected: str) -> Exception:
-    return scan_error(path, found, expected, "fetch the file again, it is truncated or damaged")
 
 
 def _read_header(path: Path) -> _Header:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ....schemas.process.interrupts import check_interrupt
 from ...kernels.points.lzf_decoder import FARTHEST_BACK, LONGEST_CODE, LONGEST_COPY, decode
-from ..common.scan import scan_error
+from ..common.scan import damaged_error
 
 PIECE_BYTES = 1 << 18
 
@@ -76,9 +76,8 @@ class LzfStream:
         )
         self._source, self._given = self._source[at:], kept
         if not right or self._have == kept:
-            raise scan_error(
+            raise damaged_error(
                 self._path,
                 "compressed data that ends too soon, or refers to bytes before its beginning",
                 "LZF of as many bytes as its header declares",
-                "fetch the file again, it is truncated or damaged",
             )

@@ -102,7 +102,7 @@ class BuildConfig:
     keep: extra columns, among KEPT_COLUMNS.
     normal_reach: radius of the neighbourhood from which a normal is estimated [m]
     (schemas/kernels/normal_codes.py), if normals are kept.
-    strict: a non-finite point fails the build.
+    strict: a point that is not finite, or beyond 1e9 m, fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.
     overwrite: replace an archive of the same name, once the new one is complete.
     fresh: discard the work of an interrupted build of the same name.

@@ -203,7 +203,7 @@ def _warn(
     step: float,
     warn: Callable[[str], None] | None,
 ) -> tuple[str, ...]:
-    """Return the warnings about the scans, each of which is also passed to `warn`. step: of the lattice."""
+    """Return the warnings about the scans, and pass each to `warn`. step: of the lattice [m]."""
     notes = [item.note for item in inputs if item.note]
     found = (*notes, *(warning.text for warning in find_warnings(facts, config.radius, step)))
     if warn is not None:

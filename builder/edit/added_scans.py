@@ -35,7 +35,7 @@ class AddOptions(NamedTuple):
 
     again: also add scans that the archive already contains.
     new_only: skip scans that the archive already contains.
-    strict: refuse a scan with non-finite points.
+    strict: refuse a scan with points that are not finite, or beyond 1e9 m.
     """
 
     again: bool = False

@@ -38,7 +38,7 @@ def add_scans(
     """Add scans to the archive in `target`, with its lattice, options and stored `radius`.
 
     again: also add scans that the archive already contains.  new_only: skip those instead.
-    strict: refuse a scan with non-finite points.
+    strict: refuse a scan with points that are not finite, or beyond 1e9 m.
 
     The records equal those of a build of all scans on the same lattice, except for the numbers of
     the new scans, which follow the existing ones. Raise ScanError for an unusable scan,

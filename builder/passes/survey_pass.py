@@ -88,7 +88,7 @@ class Survey:
 
     @property
     def unclean(self) -> str:
-        """Return how many points, or triangles of a sampled mesh, were left out by their coordinates, or ""."""
+        """Return in words how many points, or triangles, their coordinates exclude; "" for none."""
         words = {NOT_FINITE: "that are not finite", BEYOND: BEYOND}
         found = self.dropped
         return " and ".join(f"{found[each]} points {words[each]}" for each in words if each in found)

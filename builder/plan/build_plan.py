@@ -310,10 +310,8 @@ def _limits(
     plan: BuildPlan, scene: SceneStats, config: BuildConfig, directories: float, target: Path | None
 ) -> tuple[Limit, ...]:
     """Return the limits of the build. Some grow with it although --memory is kept."""
-    dense, edge = (
-        plan.points_a_voxel * DENSEST * plan.bytes_a_point,
-        voxel_edge(config.voxel, plan.lattice_step),
-    )
+    dense = plan.points_a_voxel * DENSEST * plan.bytes_a_point
+    edge = voxel_edge(config.voxel, plan.lattice_step)
     found = [
         Limit("voxels along an axis", (scene.extent or math.sqrt(scene.area)) / edge, KEY_BIAS, "voxels",
               "give a larger --voxel, or build in parts"),

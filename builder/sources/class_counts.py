@@ -1,4 +1,4 @@
-"""Number of a scan's points by class and by flag, for `solidcloud inspect`: exact, or by a bounded sample."""
+"""Numbers of a scan's points by class and flag, for `solidcloud inspect`: exact, or by a sample."""
 
 from collections import Counter
 

@@ -1,4 +1,4 @@
-"""Lattice step of a dataset: the given one, the one that all scans share, or one that fits the points."""
+"""Lattice step of a dataset: as given, as all scans share it, or one that fits the points."""
 
 from collections.abc import Sequence
 

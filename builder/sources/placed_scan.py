@@ -122,7 +122,7 @@ class PlacedScan(Scan):
         return turned
 
     def _lattice(self) -> SourceLattice | None:
-        """Return the source's lattice, scaled and with its axes exchanged; None if a pose moves the points."""
+        """Return the source's lattice, scaled and turned; None if a pose moves the points."""
         inner = self._inner.lattice
         if inner is None or not np.array_equal(self._given, _IDENTITY):
             return None

@@ -148,8 +148,11 @@ def _is_companion(path: Path) -> bool:
 
     A file that cannot be read is none: opening it reports the reason.
     """
+    if not path.name.startswith(COMPANION):
+        return False
     try:
-        return path.name.startswith(COMPANION) and path.open("rb").read(4) == _APPLE_DOUBLE
+        with path.open("rb") as file:
+            return file.read(4) == _APPLE_DOUBLE
     except OSError:
         return False
 

@@ -386,7 +386,7 @@ def step_warning(facts: Sequence[ScanFacts], step: float) -> tuple[str, ...]:
 
 
 def _coarse_steps(facts: _Numbered, step: float | None) -> list[ScanWarning]:
-    """Warn of the scan for whose points its lattice step, or that of all scans, is the most too coarse."""
+    """Warn of the scan whose points are the fewest lattice steps apart, if these are too few."""
     checked = [each for each in facts if step is not None or each[1].scan.lattice is not None]
     found = []
     for number, each, spacing in _measured(checked, meshes=True):

@@ -1,4 +1,4 @@
-"""Text of archives, servers and files for a terminal or an XML file: what it hides is made visible."""
+"""Text of others for terminals and XML: characters that hide or move text become escapes."""
 
 import re
 import sys

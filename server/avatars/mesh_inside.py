@@ -99,7 +99,7 @@ def closed_parts(triangles: _Floats) -> ClosedParts:
 def _turn_alike(
     number: _Integers,
 ) -> tuple[_Integers, _Integers, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the part of each triangle and 1, or -1 to turn it; for each part if it is open, and if turned.
+    """Return the part of each triangle, and 1 or -1 (to turn it); of each part, if it is open, and if turned.
 
     number: (n, 3), of the corners of each.
     """

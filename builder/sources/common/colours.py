@@ -23,7 +23,7 @@ CLASS_NAMES = ("classification", "scalar_classification", "class", "label")
 # Columns of a scan besides its coordinates, as `Scan.columns` names them.
 INTENSITY, RGB, CLASSIFICATION = "intensity", "rgb", "classification"
 # Drop reasons of points that their file flags as deleted, and as made by a program; and, with a
-# number, of the points of a class. Only the first are left out without being asked for.
+# number, of the points of a class. Withheld points are always left out, the others on request.
 WITHHELD, SYNTHETIC, CLASS = "withheld", "synthetic", "class"
 
 

@@ -375,7 +375,7 @@ def quaternion_pose(
 
 
 def zero_rotation_note(path: Path, index: int, rotation: Sequence[float | None]) -> tuple[str, ...]:
-    """Return the note about a scan whose rotation (a quaternion, or a matrix in one row) is zero, or ()."""
+    """Return the note about a scan whose rotation is zero, or (). rotation: its numbers in a row."""
     if None in rotation or any(rotation):
         return ()
     return (f"{path}: scan {index} has a rotation of zeros, read as no rotation: check how the scan lies",)

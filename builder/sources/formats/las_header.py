@@ -1,11 +1,11 @@
-"""Header of a LAS, LAZ or COPC file: read, and checked against the file; and the records around the points.
+"""Header of a LAS, LAZ or COPC file, and the records around its points: read and checked.
 
 The header is read here: laspy 2.7, given a file of 14 kB that claims 10^9 variable length records,
 creates an object for each of them and never returns.
 
 A header may declare fewer points than the file has: a writer that was interrupted, or that cannot
-go back, leaves a count of 0. Such a file is damaged. Otherwise the places of its points would
-count as free.
+go back, leaves a count of 0. Such a file counts as damaged; otherwise the places of its points
+would count as free.
 """
 
 import struct

@@ -54,7 +54,7 @@ class PlyElement(NamedTuple):
 
 
 def length_name(name: str) -> str:
-    """Return the name of the field with a list's length; no property has it, because names have no blank."""
+    """Return the name of the field with a list's length. It has a blank: no property has it."""
     return f"{name} length"
 
 

@@ -212,7 +212,10 @@ def _core(box, ends):
 
 @nb.njit(nogil=True, cache=True)
 def _surface(points, which, at, reach):
-    """Return the code of the normal of those points (n, 3) within reach of that of row `at`. which: (n,) bool."""
+    """Return the code of the normal of points (n, 3) near the one of row `at`.
+
+    which: (n,) bool, points that count.  reach: of the points around that one [m].
+    """
     sums = np.zeros(SUMS, np.int64)
     for i in range(points.shape[0]):
         if not which[i]:

@@ -178,9 +178,9 @@ def follow_command(walk):
 
 @nb.njit(nogil=True, cache=True)
 def _move_before_turn(walk, hit):
-    """Follow a motion command of an avatar in contact, which does not turn there; return the hit that ends it.
+    """Follow a motion command of an avatar in contact: move first, then turn.
 
-    hit: that of the whole motion.
+    hit: that of the whole motion. Returns the hit that ends the motion, -1 for none.
     """
     target, moved = walk.memory.poses[TARGET], pose_now(walk).copy()
     turns = False

@@ -197,7 +197,7 @@ class World:
         return found
 
     def leave(self, frame: Any, to: Pose, skin: float) -> Hit | None:
-        """Return the hit that ends the translation from frame.pose, in contact, to a pose; see leaving.py."""
+        """Return the hit that ends a translation of an avatar in contact; see leaving.py."""
         # Imported here: few frames begin in contact.
         from .leaving import leave
 

@@ -29,7 +29,10 @@ _ROUNDING = 1e-8
 
 
 class _Gathered(NamedTuple):
-    """Points of an archive: see `gather_points`. lacks: voxels that were not available; late: not in memory."""
+    """Points of an archive, as `gather_points` has them.
+
+    lacks: whether part of the scan there is unknown.  late: number of voxels not in memory.
+    """
 
     points: NDArray[np.float64]
     lacks: bool = False
@@ -153,7 +156,10 @@ class LeavingPose:
 def _gather(
     seen: HeldArchive, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget
 ) -> _Gathered:
-    """Return the points of an archive that an avatar at a pose, archive frame, may meet within `reach` [m]."""
+    """Return the points of an archive that an avatar may meet within `reach` [m].
+
+    pose: (4, 4), avatar to archive.
+    """
     data, residency = seen.data, seen.data.residency
     arrays, broad = data.arrays, data.broad
     more = reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6

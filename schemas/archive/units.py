@@ -7,7 +7,8 @@ This module imports nothing, so that readers of points need no kernels.
 # float64.
 UNITS_PER_METRE = 2.0**26
 
-# Input with world coordinates beyond this is refused (NUMERICS.md case 16).
+# Scan points with world coordinates beyond this [m] are left out, and counted; requests are refused
+# (NUMERICS.md, cases 14 and 16).
 MAX_COORDINATE = 1e9
 
 # A lattice step [m] below 1 micrometre would span fewer than 67 exact units, and no scanner

@@ -13,7 +13,6 @@ from forged_archives import Columns, forge, put_frame, put_rows, read_index, rea
 from numpy.typing import NDArray
 from small_builds import build
 from solidcloud.builder.edit.edit_archive import add_scans
-from solidcloud.builder.edit.seal_archive import seal_archive
 from solidcloud.builder.voxel.masked_voxel import build_masked_voxel, read_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.seal import SEAL_NAME, make_seal
@@ -35,13 +34,6 @@ def build_unsealed(folder: Path) -> Path:
     target = folder / "archive"
     build([first, cut], target, keep=frozenset({"scan"}), models=models, skip_bad=True)
     add_scans(target, [second], jobs=1)
-    return target
-
-
-def build_sealed(folder: Path) -> Path:
-    """Build the same archive and seal it with KEY."""
-    target = build_unsealed(folder)
-    seal_archive(target, KEY)
     return target
 
 

@@ -18,7 +18,6 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.answers import Cost
 from ....schemas.wire.question_rules import Question
-from ....schemas.wire.requests import QuestionOptions
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
 from ...residency.voxel_cache import VoxelCache
@@ -116,12 +115,6 @@ class QueryBudget(NamedTuple):
 
 
 EXACT = QueryBudget()
-
-
-class EngineOptions(QuestionOptions, total=False):
-    """Options of a query to a scene: those of the wire, and the caller's stop flag."""
-
-    stop: StopFlag
 
 
 def make_budget(

@@ -67,7 +67,7 @@ class SceneLink(BackgroundThread):
         super().__init__("viewer-link")
         self.endpoint = endpoint
         self._scene, self._key_file = scene, key_file
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
         self._status = LinkStatus(0, "searching", f"Looking for a server at {endpoint}.")
         self._failures = 0  # questions without an answer since the last answer
         self._open: OpenScene | None = None
@@ -85,12 +85,6 @@ class SceneLink(BackgroundThread):
     def another_client(self, scene: str) -> Client:
         """Return a client of its own for long work, for a `with`: it delays neither users nor tiles."""
         return Client(self.endpoint, scene=scene, timeout=_LONG_SECONDS, key_file=self._key_file)
-
-    def wait_for_change(self, number: int, seconds: float) -> LinkStatus:
-        """Return the status once it is another than that of this number, or after this time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._status.number != number, seconds)
-            return self._status
 
     def _run(self) -> None:
         """Find the scene, and watch it. Runs in a thread."""
@@ -167,10 +161,9 @@ class SceneLink(BackgroundThread):
 
     def _set(self, state: str, message: str) -> None:
         """Change the status, unless it is the same."""
-        with self._changed:
+        with self._lock:
             if (state, message) != self._status[1:3] or state == "connected":
                 self._status = LinkStatus(self._status.number + 1, state, message)
-                self._changed.notify_all()
 
 
 def may_enter(info: SceneInfo) -> bool:

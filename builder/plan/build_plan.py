@@ -215,7 +215,7 @@ def estimate(scene: SceneStats, config: BuildConfig, rates: Rates, target: Path 
         stages=stages,
         seconds=sum(stages.values()),
         rests_on=(f"{rates.rests_on}, on {rates.machine}, {rates.cores} cores",),
-        assumed=(*scene.assumed, *_assumed(config, rates, jobs)),
+        assumed=(*scene.assumed, *_assumed(config, jobs)),
         warnings=scene.warnings,
     )
     return replace(plan, limits=_limits(plan, scene, config, directories, target))
@@ -280,7 +280,7 @@ def _memory(scene: SceneStats, config: BuildConfig, rates: Rates, jobs: int, tab
     return round(min(base + rates.point * scene.points, max(base, config.memory_bytes)) + tables)
 
 
-def _assumed(config: BuildConfig, rates: Rates, jobs: int) -> tuple[str, ...]:
+def _assumed(config: BuildConfig, jobs: int) -> tuple[str, ...]:
     """Return the assumptions of an estimate."""
     said = [f"{jobs} jobs on {os.cpu_count()} cores, each as fast as the measured ones, and no other load"]
     said.append(

@@ -146,7 +146,7 @@ def _search(paths: Iterable[Path]) -> list[tuple[Path, str]]:
 def _is_companion(path: Path) -> bool:
     """Return whether a file holds only attributes of another; its name alone does not tell.
 
-    A file that cannot be read is none: opening it reports the reason.
+    The result is False for a file that cannot be read: opening it reports the reason.
     """
     if not path.name.startswith(COMPANION):
         return False

@@ -37,8 +37,8 @@ def start_loop(
 ) -> threading.Thread:
     """Start a thread for a loop that must not end before its time; return it.
 
-    loop: returns at its end. After an error it is called again, so that what it still has to do is
-    kept outside of it. The error is logged; `failed` is called to report it elsewhere.
+    loop: returns at its end. After an error it is called again; it therefore keeps what it still has
+    to do outside of itself. The error is logged; `failed` is called to report it elsewhere.
     """
 
     def run() -> None:

@@ -339,8 +339,8 @@ def quaternion_pose(
 ) -> NDArray[np.float64]:
     """Return the pose (4, 4) of a rotation w, x, y, z and a translation x, y, z [m].
 
-    A part that is None becomes the identity. So does a rotation of 0 0 0 0, which programs write
-    that know none, see `zero_rotation_note`. index: number of the scan, for the message.
+    A part that is None becomes the identity. So does a rotation of 0 0 0 0, which programs write if
+    they know no rotation, see `zero_rotation_note`. index: number of the scan, for the message.
     Raises ScanError for values that form no pose.
     """
     pose = np.eye(4)

@@ -276,8 +276,8 @@ class _Document:
         """Refuse vertices behind which the binary chunk has others that nothing uses.
 
         A count that is too small would leave these out. Zeros behind the buffer view, which align
-        what follows, are none, nor are values beyond the accessor's least and greatest, if those
-        are right.
+        what follows, are no vertices. Neither are values beyond the accessor's least and greatest,
+        if those are right.
         Raises ScanError.
         """
         views = [self._at("bufferViews", k) for k in range(len(self.document.get("bufferViews", [])))]

@@ -82,7 +82,7 @@ EPSG_METRES = {
 }
 
 # WKT 1 and 2 [OGC 12-063r5, 18-010r11]: nodes of systems whose unit is that of x and y, or of
-# heights, and of units. The system inside another one, or that a bound one is related to, is none.
+# heights, and of units. A base system, inside another or that of a bound one, does not count.
 GEOGRAPHIC_NODES = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS"}
 GEODETIC_NODES = {"GEODCRS", "GEODETICCRS"}  # geographic or geocentric
 PLANE_NODES = {

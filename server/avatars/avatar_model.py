@@ -51,7 +51,6 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
     """Build an avatar from points (n, 3), avatar frame [m]. One without points touches nothing.
 
     inner_points: number of them inside, the last ones; fewer than n.
-
     radius: of every point's sphere [m], zero or more; None: half the mean closest-point distance
     ([Fig12] section 7) of the distinct points, rounded to a lattice of 2^-20 m. A single distinct
     point needs a radius. Raise BadRequestError.

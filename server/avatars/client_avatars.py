@@ -139,7 +139,7 @@ class Avatars:
         radius: float | None,
         inner_points: int,
     ) -> None:
-        """Raise BadRequestError unless a known avatar has these points and this radius."""
+        """Raise BadRequestError unless a known avatar has this content."""
         known = entry.model
         assert known is not None
         same = known.inner_points == inner_points and np.array_equal(known.points, points)

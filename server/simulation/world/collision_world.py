@@ -198,7 +198,7 @@ class World:
 
     def leave(self, frame: Any, to: Pose, skin: float) -> Hit | None:
         """Return the hit that ends a translation of an avatar in contact; see leaving.py."""
-        # Imported here: few frames begin in contact.
+        # Imported here: only scenes with `stop` need it (NUMERICS.md, case 31).
         from .leaving import leave
 
         return leave(frame, to, skin)

@@ -28,6 +28,9 @@ _SPEED, _SECONDS, _OUT = 1.4, 3.0, 0.3
 # The core begins farther than this from all points of a wall, and of a scan, whose points are up to
 # 0.1 m apart: nearer, it may be in a surface. It passes a point if it comes this near [m].
 _CORE, _SCAN_CORE, _TOUCHED = 0.03, 0.12, 0.005
+# A place is enclosed if each way meets an obstacle within this distance [m].
+_NEAR = 0.1
+_WAYS = np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.arange(8) * np.pi / 4])
 SHAPES = ("sheet", "jamb", "corner")
 # Parts of scans: half their extent [m].
 SCANS, _HALF = ("indoor_atrium.laz", "octomap_hall.xyz"), 3.0
@@ -36,12 +39,14 @@ SCANS, _HALF = ("indoor_atrium.laz", "octomap_hall.xyz"), 3.0
 class OverlapResult(NamedTuple):
     """Outcome of eight walks from one place [m].
 
-    start: (3,).  free: how many ended clear.  passed: how many passed the wall, or a point of a
-    scan by its core.  nearer: largest loss, in a frame that ended in contact, of the distance of
-    the core from the nearest point.
+    start: (3,).  enclosed: whether each of the eight ways meets an obstacle at once (_is_enclosed).
+    free: how many ended clear.  passed: how many passed the wall, or a point of a scan by its core.
+    nearer: largest loss, in a frame that ended in contact, of the distance of the core from the
+    nearest point.
     """
 
     start: list[float]
+    enclosed: bool
     free: int
     passed: int
     nearer: float
@@ -98,12 +103,30 @@ def _passes(shape: str, path: Floats) -> bool:
     return found
 
 
-def _distance(points: Floats, pose: Floats) -> float:
-    """Return the distance of the core of a user at a pose from the nearest of points (n, 3) [m]."""
+def _distances(points: Floats, place: Floats) -> Floats:
+    """Return the distances (n,) of points (n, 3) from the core of a user at a place (3,) [m]."""
     half = 0.5 * _TALL - RADIUS
-    gap = points - pose[:3, 3] - np.array([0.0, 0.0, 0.5 * _TALL])
+    gap = points - place - np.array([0.0, 0.0, 0.5 * _TALL])
     gap[:, 2] -= np.clip(gap[:, 2], -half, half)
-    return float(np.sqrt((gap**2).sum(axis=1).min()))
+    return np.sqrt((gap**2).sum(axis=1))
+
+
+def _is_enclosed(points: Floats, place: Floats) -> bool:
+    """Return whether each of the eight ways from a place comes nearer to a point that it touches.
+
+    Ways are straight, of _NEAR, and tried at every centimetre. A user may take none of them to its
+    end, because no pair in contact may come nearer and no new one is allowed. The radius of the
+    points is left out, so that fewer places count.
+    """
+    begin = _distances(points, place)
+    for way in _WAYS:
+        for length in np.arange(0.01, _NEAR + 0.001, 0.01):
+            now = _distances(points, place + length * way)
+            if ((now < RADIUS + _SPHERE) & (now < begin - 0.001)).any():
+                break
+        else:
+            return False
+    return True
 
 
 def overlap_walks(
@@ -134,29 +157,31 @@ def overlap_walks(
             else:
                 pose[:3, 3] = scan[rng.integers(len(scan))] + rng.uniform(-0.35, 0.35, 3)
                 pose[2, 3] -= rng.uniform(0.0, _TALL)
-            if _distance(scan, pose) < (_CORE if shape in SHAPES else _SCAN_CORE) or not int(
+            if _distances(scan, pose[:3, 3]).min() < (_CORE if shape in SHAPES else _SCAN_CORE) or not int(
                 world.collide(avatar, pose)
             ):
                 continue
             done += 1
             free = passed = 0
             nearer = 0.0
-            for way in np.arange(8) * np.pi / 4:
+            for way in _WAYS:
                 body = Body("check/body", avatar, pose.copy())
-                step = _SPEED * FRAME * np.array([np.cos(way), np.sin(way), 0.0])
+                step = _SPEED * FRAME * way
                 path, verdict, touched = [body.pose[:3, 3].copy()], 1, False
-                apart = _distance(scan, pose)
+                apart = float(_distances(scan, pose[:3, 3]).min())
                 for _ in range(round(_SECONDS / FRAME)):
                     target = body.pose.copy()
                     target[:3, 3] += step
                     verdict = int(pipeline.run(body, target, FRAME).verdict)
                     path.append(body.pose[:3, 3].copy())
                     if verdict:
-                        now = _distance(scan, body.pose)
+                        now = float(_distances(scan, body.pose[:3, 3]).min())
                         nearer, apart = max(nearer, apart - now), now
                         touched |= now < _TOUCHED
                     if not verdict and np.linalg.norm(path[-1] - path[0]) > _OUT:
                         break
                 free += not verdict
                 passed += touched or (shape in SHAPES and _passes(shape, np.array(path)[:, :2]))
-            yield OverlapResult(pose[:3, 3].round(3).tolist(), free, passed, nearer)
+            start = pose[:3, 3]
+            enclosed = not free and _is_enclosed(scan, start)
+            yield OverlapResult(start.round(3).tolist(), enclosed, free, passed, nearer)

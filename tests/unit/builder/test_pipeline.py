@@ -134,18 +134,6 @@ def test_a_georeferenced_scene_has_the_records_of_one_at_the_origin(out: Path, t
         assert a.header.archive_id != b.header.archive_id
 
 
-def test_the_id_tells_points_and_options_apart(scans: list[Path], out: Path) -> None:
-    ids = set()
-    for name, options in {"a": {}, "b": {"degree": 5}, "c": {"resolution": 0.0002}}.items():
-        build(scans, out / name, **options)
-        with Archive(out / name) as archive:
-            ids.add(archive.header.archive_id)
-    build(scans[:-1], out / "d")
-    with Archive(out / "d") as archive:
-        ids.add(archive.header.archive_id)
-    assert len(ids) == 4
-
-
 # --- what is stored and said ------------------------------------------------------------------------------
 
 

@@ -25,7 +25,6 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit import added_scans as added_module
 from solidcloud.builder.edit import edit_archive as generation_module
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
-from solidcloud.builder.edit.archive_change import config_of
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
@@ -224,16 +223,6 @@ def test_a_second_one_is_refused_while_one_is_at_work(built: Build, files: Files
     target = built(tmp_path / "x", "a")
     with locked(target), pytest.raises(BadRequestError, match="another build, add or remove is writing it"):
         add_scans(target, [files.b], jobs=1)
-
-
-def test_options_that_look_at_all_scans_are_refused(built: Build, tmp_path: Path) -> None:
-    with Archive(built(tmp_path / "x", "a")) as archive:
-        header = archive.header
-    config = config_of(header, tmp_path, 1, 64 << 20)
-    assert config.identity() == header.options and (config.jobs, config.memory_bytes) == (1, 64 << 20)
-    header.options["outliers"] = [0.1, 3]
-    with pytest.raises(BadRequestError, match="built with outliers"):
-        config_of(header, tmp_path, 1, 64 << 20)
 
 
 def test_a_damaged_record_stops_it(built: Build, files: Files, tmp_path: Path) -> None:

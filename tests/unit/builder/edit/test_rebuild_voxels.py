@@ -89,23 +89,6 @@ def test_a_damaged_record_that_stays_is_named_where_it_lies(
     )
 
 
-def test_neighbours_that_are_only_read_are_not_counted(built: Build, files: Files, tmp_path: Path) -> None:
-    """With radius classes more is spooled than is built."""
-    options = {"models": frozenset({"mean", "local"}), "keep": EVERYTHING, "voxel": 0.3}
-    target = built(tmp_path / "x", "ab", **options)
-    gathered = []
-    work = rebuild_module.gather
-
-    def noted(unit: Any) -> Any:
-        gathered.extend(unit.rows)
-        return work(unit)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rebuild_module, "gather", noted)
-        removed = remove_scans(target, [str(files.b)], jobs=1)
-    assert removed.points == len(A) and len(gathered) > removed.built + removed.gone
-
-
 def test_what_is_left_out_of_added_scans_is_said(built: Build, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "a")
     some = B.copy()

@@ -345,18 +345,6 @@ def test_the_command_says_what_it_wrote(
     assert "error:" in capsys.readouterr().err
 
 
-def test_vtk_reads_an_export(georeferenced: Path, tmp_path: Path) -> None:
-    vtk = pytest.importorskip("vtkmodules.vtkIOHDF", reason="the library vtk is not installed")
-    support = pytest.importorskip("vtkmodules.util.numpy_support")
-    export_archive(georeferenced, tmp_path / "a.vtkhdf")
-    reader = vtk.vtkHDFReader()
-    reader.SetFileName(str(tmp_path / "a.vtkhdf"))
-    reader.Update()
-    found = reader.GetOutputDataObject(0)
-    arrays = [support.vtk_to_numpy(found.GetPointData().GetArray(name)) for name in ("scan", "intensity")]
-    assert rows_of(support.vtk_to_numpy(found.GetPoints().GetData()), *arrays) == stored(georeferenced)
-
-
 def test_a_real_scan_comes_back_in_its_system(real_scans: Path, tmp_path: Path) -> None:
     """Coordinates of the file's own, from its integers, and the text of its coordinate system."""
     scan = real_scans / "lone_star.copc.laz"

@@ -202,16 +202,6 @@ def test_rules_together_are_moving_and_outliers_of_all_points_then_thin_of_the_r
     check(points, {MOVING: moving, OUTLIER: outlier, THINNED: thinned}, left, counts)
 
 
-@pytest.mark.interpreted
-def test_the_step_itself_merges_exact_duplicates(rng: np.random.Generator, tmp_path: Path) -> None:
-    points = cloud(rng)
-    config = BuildConfig(thin=STEP)
-    left, _ = run(spool_of(points, tmp_path / "a", 64, 2, rng), config, tmp_path / "b")
-    kept = contents(left).at
-    assert len(kept) == len(np.unique(points.at, axis=0)) < len(points.at)
-    assert np.array_equal(np.unique(kept, axis=0), np.unique(points.at, axis=0))
-
-
 def test_rows_are_in_canonical_order_without_the_scan_where_it_is_not_kept(
     rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -250,39 +240,6 @@ def test_processes_give_the_same_run_and_a_second_call_does_nothing_again(
     again, same = run(spool, config, tmp_path / "one")
     assert done == [lost.name] and same == counts and lost.read_bytes() == before
     assert contents(again).rows() == contents(two).rows()
-
-
-def test_a_run_of_nothing_may_be_removed_by_the_same_unit_elsewhere(
-    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A worker that was given up runs to its end."""
-    spool = spool_of(cloud(rng), tmp_path / "a", 64, 1, rng)
-    config = BuildConfig(outliers=(0.001, 2000))
-    (tmp_path / "near").mkdir()
-    rules = filters.make_rules(config, spool.lattice)
-    keys = tuple(spool.keys.tolist())
-    unit = filters.FilterUnit(keys, 400, spool, rules, spool.dtype, tmp_path / "near" / "000000.run")
-    unlink = Path.unlink
-
-    def twice(path: Path, missing_ok: bool = False) -> None:
-        unlink(path)
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", twice)
-    left = filters.filter_voxels(unit)
-    assert left.runs == {} and sum(sum(of.values()) for of in left.left_out.values()) == 400
-    assert not list((tmp_path / "near").iterdir())
-
-
-def test_a_place_with_more_duplicates_than_are_held_is_one_block(
-    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(blocks, "BLOCK_POINTS", 16)
-    points = cloud(rng)
-    points.at[:200] = points.at[0]
-    config = BuildConfig(keep=ALL, thin=STEP)
-    left, _ = run(spool_of(points, tmp_path / "a", 64, 2, rng), config, tmp_path / "b")
-    assert len(contents(left).at) == len(np.unique(points.at, axis=0))
 
 
 @pytest.mark.parametrize(

@@ -152,16 +152,6 @@ def test_a_change_renews_the_level(built: Build, tmp_path: Path) -> None:
         assert level.header.archive_id == level_id(archive.header)
 
 
-def test_an_archive_without_a_level_stays_without(built: Build, tmp_path: Path) -> None:
-    target = built(tmp_path / "x", "a", level=False)
-    assert not (target / LEVEL_FOLDER).exists()
-    more = synthetic_scans.write_ply(tmp_path / "more.ply", np.array([[1.1, 1.1, 1.1]]))
-    add_scans(target, [more], jobs=1)
-    assert not (target / LEVEL_FOLDER).exists()
-    renew_level(target, jobs=1)
-    assert verify_archive(target, deep=True).faults == ()
-
-
 def test_a_level_that_claims_less_than_it_covers_is_a_fault(tmp_path: Path) -> None:
     """Its checksums are right and its records sound: only the archive's points contradict it."""
     folder = archive_cases.build(tmp_path, scan("noise"), voxel=4.0).archive

@@ -69,17 +69,6 @@ def test_points_are_chosen_by_hash_and_have_their_columns(
         assert (int(scan), float(intensity)) in places[place]
 
 
-def test_no_more_than_most_even_by_chance(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preview, "WHOLE_PREVIEW_POINTS", 40)
-    monkeypatch.setattr(preview, "MAX_PREVIEW_POINTS", 40)
-    monkeypatch.setattr(preview.math, "sqrt", lambda _: -20.0)  # a share that is too large by far
-    assert write_preview(built) == 40
-    by_hash = sorted(stored(built), key=lambda place: int(point_hashes(np.array([place]))[0]))
-    with Archive(built) as archive:
-        found = archive.header.lattice.to_lattice(read_points(built / PREVIEW_NAME).points)
-    assert {tuple(point) for point in found.tolist()} == set(by_hash[:40])
-
-
 def test_one_archive_has_one_preview_to_the_byte(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_preview(built)
     expected = (built / PREVIEW_NAME).read_bytes()
@@ -88,14 +77,6 @@ def test_one_archive_has_one_preview_to_the_byte(built: Path, monkeypatch: pytes
     write_preview(built)
     assert (built / PREVIEW_NAME).read_bytes() == expected
     assert not list(built.glob("*.tmp"))
-
-
-def test_many_points_in_one_place_have_a_preview_of_one(tmp_path: Path) -> None:
-    for x in range(4):  # or the hash might choose it
-        write_ply(tmp_path / f"{x}.ply", np.full((30_000, 3), 0.25 * x))
-        build_archive([tmp_path / f"{x}.ply"], tmp_path / str(x), BuildConfig(radius=0.01, jobs=1))
-        assert write_preview(tmp_path / str(x)) == 1
-        assert verify_archive(tmp_path / str(x)).faults == ()
 
 
 def test_verify_reads_the_preview(built: Path) -> None:

@@ -20,7 +20,7 @@ from solidcloud.builder.passes.survey_pass import (
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock, SourceLattice
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
-from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
+from solidcloud.schemas.errors import ScanError, SolidcloudError
 from synthetic_scans import make_scan, write_las, write_xyz
 
 
@@ -112,12 +112,6 @@ def test_a_scan_that_seeks_is_surveyed_in_ranges(tmp_path: Path, monkeypatch: py
     assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
 
 
-def test_a_scan_that_cannot_seek_is_one_unit(tmp_path: Path) -> None:
-    scan = listed(tmp_path, make_scan("noise", 1, 300))
-    scan.declared_count = 300
-    assert [unit[1:] for unit in ranges(scan, 10**12)] == [(0, None, 300)]
-
-
 def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path: Path) -> None:
     class Dropping(Listed):
         def _read(self, block_points: int) -> Iterator[ScanBlock]:
@@ -199,12 +193,6 @@ def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: 
     lattice, found = choose_lattice(surveys, [s.facts for s in surveys], BuildConfig(**options))
     assert (lattice.step, found) == (step, source)
     assert lattice.origin == (7.0 - (len(lattices) - 1),) * 3
-
-
-def test_an_impossible_resolution_is_refused(tmp_path: Path) -> None:
-    for resolution in (1e-7, 100.0):
-        with pytest.raises(BadRequestError):
-            choose_lattice([survey_on(tmp_path, None)], [], BuildConfig(resolution=resolution))
 
 
 def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:

@@ -98,21 +98,3 @@ def test_late_units_of_a_build_that_was_given_up_find_no_folder(
     build(tmp_path / "judge", scans, thin=0.02)
     assert content(target) == content(tmp_path / "judge")
     assert not building_folder(target).exists()
-
-
-def test_late_units_of_the_same_build_write_the_same_bytes(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target, ends = tmp_path / "hall", []
-    with monkeypatch.context() as patch:
-        work = HandedOut(patch)
-        patch.setattr(pipeline, "_read_back", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            build(target, scans, thin=0.02)
-    with monkeypatch.context() as patch:
-        for stage in ("spool_scans", "build_shards", "_read_back"):
-            late_in(patch, stage, work, ends, building_folder(target))
-        build(target, scans, thin=0.02)
-    assert ends == [[None] * len(work.work)] * 3
-    build(tmp_path / "judge", scans, thin=0.02)
-    assert content(target) == content(tmp_path / "judge")

@@ -14,13 +14,12 @@ import solidcloud.builder.passes.build_shards as build_shards
 import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
-import solidcloud.builder.resume.transaction as transaction
-from interrupted_builds import build, content, done_folder, interrupted, two_scans
+from interrupted_builds import build, content, done_folder, two_scans
 from sample_sizes import sample
 from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.sources.common.scan import Scan, library_errors
 from solidcloud.builder.sources.scan_files import open_input_files
-from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
+from solidcloud.schemas.errors import CorruptError, ScanError, SolidcloudError
 from synthetic_scans import write_las
 
 # The pass that each work unit belongs to.
@@ -151,22 +150,6 @@ def test_what_was_done_is_not_done_again(
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
-def test_a_range_spooled_again_leaves_no_run_of_before(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(spool_pass, "run_points", lambda *_: 30)
-        interrupted(tmp_path / "hall", scans, monkeypatch)
-    folder = done_folder(tmp_path / "hall") / "spool"
-    runs = sorted(folder.glob("*.run"))
-    assert len(runs) == 4 + 4 + 2 + 5
-    runs[0].unlink()
-    (folder / "000000-000000000000-0009.run").write_bytes(b"half")
-    build(tmp_path / "hall", scans)
-    build(tmp_path / "judge", scans)
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")
-
-
 @pytest.mark.parametrize("options", [{}, {"thin": 0.01}, {"keep": frozenset({"scan", "intensity"})}])
 def test_a_run_that_changed_while_it_was_in_use_is_found(
     options: dict[str, Any], scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -208,21 +191,6 @@ def test_a_run_that_ends_too_soon_is_made_again(
     monkeypatch.setattr(spool_pass, "spool_range", lambda unit: calls.append(unit) or spool(unit))
     build(tmp_path / "hall", scans)
     assert len(calls) == 1
-
-
-def test_a_cluster_that_cannot_be_reached_costs_no_work(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def unreachable(*_: Any) -> Any:
-        raise BadRequestError("no dask scheduler answers")
-
-    interrupted(tmp_path / "hall", scans, monkeypatch)
-    before = content(building_folder(tmp_path / "hall"))
-    with monkeypatch.context() as patch:
-        patch.setattr(transaction, "make_executor", unreachable)
-        with pytest.raises(BadRequestError, match="answers"):
-            build(tmp_path / "hall", scans, scheduler="tcp://127.0.0.1:1")
-    assert content(building_folder(tmp_path / "hall")) == before
 
 
 @pytest.mark.parametrize("stage", ["spool_scans", "spool_range", "build_shards"])

@@ -67,11 +67,6 @@ def test_units_run_in_processes_where_the_builder_stands(executor: ClusterExecut
     assert set(mapped(executor, "__import__('os').getcwd()")) == {os.getcwd()}
 
 
-def test_a_unit_again_is_done_again(executor: ClusterExecutor) -> None:
-    first, again = mapped(executor, "__import__('time').time_ns()", "__import__('time').time_ns()")
-    assert first != again
-
-
 def test_what_a_unit_raises_is_raised_here(executor: ClusterExecutor) -> None:
     with pytest.raises(ScanError, match=r"^hall\.las: cut off$") as raised:
         mapped(executor, "1", FAIL, *["__import__('time').sleep(0.2)"] * 6)
@@ -91,33 +86,12 @@ def test_only_a_few_units_are_handed_out_ahead(executor: ClusterExecutor) -> Non
     assert not executor._given
 
 
-def test_fewer_units_than_workers_run_at_once_where_that_is_asked_for(
-    executor: ClusterExecutor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    executor._client.wait_for_workers(2, 30)
-    code = (
-        f"import os, time; name = {str(tmp_path)!r} + '/%d'; open(name, 'x').close(); "
-        f"time.sleep(0.05); assert len(os.listdir({str(tmp_path)!r})) == 1; os.unlink(name)"
-    )
-    units = [f"exec({code % i!r})" for i in range(6)]
-    monkeypatch.setattr(executor, "at_once", 1)
-    assert mapped(executor, *units) == [None] * 6
-
-
 def test_no_worker_waits_for_anothers_long_unit(executor: ClusterExecutor, tmp_path: Path) -> None:
     executor._client.wait_for_workers(2, 30)
     # The first unit ends when the last has begun: were units handed out in order of results, it never would.
     flag, units = str(tmp_path / "last"), 3 * WAITING * executor.jobs
     first = f"exec('import os, time\\nwhile not os.path.exists(\"{flag}\"): time.sleep(0.01)')"
     assert len(mapped(executor, first, *["1"] * units, f"open({flag!r}, 'w').close()")) == units + 2
-
-
-def test_a_unit_that_fails_ends_all_at_once(executor: ClusterExecutor, tmp_path: Path) -> None:
-    executor._client.wait_for_workers(2, 30)
-    flag = tmp_path / "slow"
-    with pytest.raises(ScanError):
-        mapped(executor, f"(__import__('time').sleep(5), open({str(flag)!r}, 'w'))", FAIL)
-    assert not flag.exists()
 
 
 def test_a_unit_whose_worker_is_killed_is_run_again(
@@ -225,8 +199,3 @@ def test_an_interrupt_is_the_builders(executor: ClusterExecutor) -> None:
 def test_an_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(BadRequestError, match="expected"):
         local_workers(address)
-
-
-def test_an_address_is_understood() -> None:
-    assert local_workers("local:3") == 3
-    assert local_workers("tcp://127.0.0.1:8786") is None

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.run.executor as executor_module
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.resume.transaction import make_executor
 from solidcloud.builder.run.executor import (
     POINTS_WORTH_A_PROCESS,
     ProcessExecutor,
@@ -100,16 +98,6 @@ def test_fewer_units_than_processes_run_at_once_where_that_is_asked_for(tmp_path
         assert list(executor.map(exec, [code % i for i in range(6)], Counted(), lambda unit: 1)) == [None] * 6
 
 
-def test_results_that_wait_stay_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executor_module, "AHEAD", 5)
-    with ProcessExecutor(2) as executor:
-        code = f"open({str(tmp_path)!r} + '/%d', 'w').close()"
-        results = executor.map(exec, [code % i for i in range(60)], Counted(), lambda unit: 1)
-        next(results)
-        assert len(list(tmp_path.iterdir())) <= 10
-        assert len(list(results)) == 59
-
-
 def test_an_interrupted_builder_does_not_wait_for_its_workers(tmp_path: Path) -> None:
     begin = time.monotonic()
     code = f"import time; open({str(tmp_path / 'runs')!r}, 'w').close(); time.sleep(600)"
@@ -191,12 +179,6 @@ def test_processes_are_started_only_where_they_pay(monkeypatch: pytest.MonkeyPat
     assert worker_count(0, POINTS_WORTH_A_PROCESS * 100) == 1
 
 
-def test_processes_do_the_work_where_no_cluster_is_named() -> None:
-    with make_executor(BuildConfig(), 1) as executor:
-        assert isinstance(executor, ProcessExecutor)
-        assert executor.jobs == 1
-
-
 M = 1 << 20
 
 
@@ -211,10 +193,6 @@ def test_every_row_is_in_one_portion_and_the_largest_come_first(counts: list[int
     planned = max(M, int(points.sum()) // (8 * jobs))
     assert all(h - points[run.stop - 1] <= planned for h, run in zip(held, runs, strict=True))
     assert len(runs) <= points.sum() // planned + 1
-
-
-def test_no_rows_are_no_portions() -> None:
-    assert voxel_ranges(np.empty(0, np.int64), 2) == []
 
 
 def test_without_an_executor_units_run_here_in_order() -> None:

@@ -176,16 +176,6 @@ def test_broken_files_are_refused(name: str, message: str, folder: Path) -> None
         read_all(folder / name)
 
 
-def test_every_sample_and_every_malformed_file_is_judged_here(folder: Path) -> None:
-    judged = {case[0] for case in READABLE} | {case[0] for case in REFUSED}
-    there = {
-        path.relative_to(folder).as_posix()
-        for name in ("format_samples", "malformed")
-        for path in (folder / name).iterdir()
-    }
-    assert there - judged == set()
-
-
 def test_the_headless_and_the_moved_samples_have_the_points_they_hold(folder: Path) -> None:
     expected = [[k, k, k] for k in range(1, 6)]
     assert read_all(folder / "malformed/txt_missingheader.txt").tolist() == expected

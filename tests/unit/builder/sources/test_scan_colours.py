@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coloured_scans import WRITERS, coloured, has_classes, read_scan, write_las, write_rows
-from solidcloud.builder.sources.common.colours import brightest, eight_bits, find_columns, whole_bytes
+from coloured_scans import WRITERS, coloured, has_classes, read_scan, write_las
+from solidcloud.builder.sources.common.colours import eight_bits
 from solidcloud.builder.sources.placed_scan import place_scan
 from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
 
@@ -89,28 +89,6 @@ def test_the_brightest_channel_decides_between_eight_and_sixteen_bits() -> None:
     fractions = np.array([[0, 0.5, 1.0], [np.nan, -3, 0.1]], np.float32)
     assert eight_bits(fractions, 1.0).tolist() == [[0, 128, 255], [0, 0, 26]]
     assert eight_bits(fractions, 200.0).tolist() == [[0, 0, 1], [0, 0, 0]]
-
-
-def test_the_brightest_channel_is_a_finite_one() -> None:
-    assert brightest(None) == 0
-    assert brightest(np.empty((0, 3), np.uint8)) == 0
-    assert brightest(np.array([[np.nan, np.inf, 0.25]], np.float32)) == 0.25
-    assert brightest(np.array([[1, 2, 300]], np.uint16)) == 300
-
-
-def test_classes_are_whole_and_in_range() -> None:
-    assert whole_bytes(np.array([-1.0, 2.4, 254.6, 1e9, np.nan])).tolist() == [0, 2, 255, 255, 0]
-
-
-def test_a_name_that_occurs_twice_names_no_column() -> None:
-    assert find_columns(["x", "Red", "GREEN", "blue", "Label"]) == ((1, 2, 3), 4)
-    assert find_columns(["r", "g", "b", "diffuse_red"]) == ((0, 1, 2), None)
-    assert find_columns(["red", "red", "green", "blue", "class", "class"]) == ((), None)
-
-
-def test_a_text_without_names_has_no_colours(tmp_path: Path) -> None:
-    (scan,) = open_scans(write_rows(tmp_path / "a.xyz", coloured(8), ""))
-    assert scan.columns == frozenset()
 
 
 def test_e57_without_limits_and_of_floats_has_fractions(tmp_path: Path) -> None:

@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 from scan_formats import cartesian, glb_document, glb_vertices, ptx_scan, write_e57, write_glb, write_pcd
 from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
 from solidcloud.builder.sources.scan_warnings import (
-    ScanFacts,
-    closest_distances,
-    find_warnings,
-    length_text,
     radius_warning,
-    widest_gap,
 )
 from solidcloud.server.cli.main import run
 
@@ -117,13 +112,6 @@ def test_scans_far_apart_are_named(tmp_path: Path) -> None:
     assert GAP in said([*here, there])[0]
 
 
-def test_the_beginning_of_a_scan_is_not_its_size(tmp_path: Path) -> None:
-    # The first points of each scan lie within 5 m; the headers do not say how long it is.
-    scan = room(spacing=0.04)
-    paths = [write_ply(tmp_path / f"{k}.ply", moved(scan, k * 900.0, 0, 0)) for k in range(3)]
-    assert len(scan) > 20_000 and said(paths) == []
-
-
 def test_an_avatar_beside_scans_is_named_and_alone_it_is_a_mesh(tmp_path: Path) -> None:
     scan = write_xyz(tmp_path / "room.xyz", room() - (2, 2, 0))
     for write, name in ((write_obj, "visitor.obj"), (write_stl, "visitor.stl")):
@@ -159,10 +147,6 @@ def test_scans_of_very_different_spacing_need_another_radius_model(tmp_path: Pat
 def test_a_radius_is_compared_with_the_spacing(radius: float, wrong: str) -> None:
     text = radius_warning(radius, 0.02)
     assert wrong in text if wrong else text == ""
-
-
-def test_no_radius_is_compared_with_the_spacing_of_duplicates() -> None:
-    assert radius_warning(0.02, 0.0) == ""
 
 
 def test_inspect_plan_and_build_say_the_same(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -264,21 +248,6 @@ def test_a_broken_scan_gets_its_error_and_no_warning(tmp_path: Path) -> None:
     assert all(entry.fault or not entry.warnings for entry in inspect_scans([path]))
 
 
-def test_distances_and_gaps(rng: np.random.Generator) -> None:
-    points = rng.uniform(0, 1, (60, 3)) + 1e6
-    points[1] = points[0]
-    distinct = np.unique(points, axis=0)
-    apart = np.linalg.norm(distinct[:, None] - distinct, axis=2) + 9 * np.eye(len(distinct))
-    assert closest_distances(points) == pytest.approx(apart.min(axis=1), rel=1e-6)
-    assert len(closest_distances(points[:2])) == 0
-    boxes = np.array([[[0, 0, 0], [9, 1, 1]], [[2, 0, 0], [3, 1, 1]], [[12, 0, 0], [13, 1, 1]]], float)
-    gap, above = widest_gap(boxes)
-    assert gap == 3 and above.tolist() == [False, False, True]
-    assert widest_gap(boxes[:2])[0] == 0
-    assert [length_text(v) for v in (0.0123, 3.25, 31.4, 4.8e6)] == ["12.3 mm", "3.2 m", "31 m", "4,800 km"]
-    assert find_warnings([]) == [] and find_warnings([], 5.0) == []
-
-
 REAL = ("indoor_atrium.laz", "pumpA.e57", "cupola_las", "octomap_hall.xyz", "campus_scan_a.ply",
         "campus_scan_b.ply", "lone_star.copc.laz", "avatar/al.obj", "avatar/cesium_man.obj")  # fmt: skip
 
@@ -304,14 +273,3 @@ def test_made_scans_are_not_suspect(tmp_path: Path, kind: str) -> None:
     assert said([scan.parent]) == []
     (warning,) = said([tmp_path])
     assert warning.startswith(f"{tmp_path / 'visitor.obj'}: {AVATAR}")
-
-
-def test_facts_do_not_read_points_that_they_do_not_need(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from solidcloud.builder.sources.scan_files import open_scans
-
-    (scan,) = open_scans(write_las(tmp_path / "room.las", room()))
-    scan.lattice = None  # a step is compared with the distance between points
-    monkeypatch.setattr(type(scan), "blocks", lambda *_: pytest.fail("the header has bounds"))
-    assert find_warnings([ScanFacts(scan)]) == []

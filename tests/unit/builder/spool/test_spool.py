@@ -1,8 +1,6 @@
 """Sorted runs: every row once, in canonical order, found by voxel and by block of a voxel."""
 
-import os
 import pickle
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,32 +97,6 @@ def test_directories_are_merged_a_part_at_a_time(
     assert len(list(tmp_path.glob("*.tmp"))) == 1
 
 
-def test_a_worker_holds_the_directories_of_what_it_asks_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spool_module, "MERGED_ENTRIES", 1 << 12)
-    runs, voxels = 100, 1000
-    keys = np.arange(voxels, dtype=np.uint64)
-    dtype = spool_dtype(BuildConfig())
-    for number in range(runs):
-        write_directory(tmp_path / f"{number}.run", keys, np.arange(voxels + 1))
-        (tmp_path / f"{number}.run").touch()
-        os.truncate(tmp_path / f"{number}.run", voxels * dtype.itemsize)
-    tracemalloc.start()
-    try:
-        spool = Spool(tmp_path, dtype, LATTICE)
-        assert spool.counts.tolist() == [runs] * voxels
-        assert tracemalloc.get_traced_memory()[1] < 2 << 20  # 94 bytes a voxel of a run were 9 MB
-        sent = pickle.dumps(spool)
-        assert len(sent) < 10_000
-        tracemalloc.reset_peak()
-        before = tracemalloc.get_traced_memory()[0]
-        assert pickle.loads(sent).count(77) == runs
-        assert tracemalloc.get_traced_memory()[1] - before < 1 << 18
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.parametrize("stride", [1, 3, 64, 4096])
 def test_a_block_is_what_brute_force_finds(
     stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -142,11 +114,6 @@ def test_a_block_is_what_brute_force_finds(
             found = [[code for code, *_ in judged(rows)] for rows in spool.block_rows(key, low, high)]
             assert found == [codes for codes in expected if codes]
             assert spool.block_count(key, low, high) == sum(map(len, expected))
-
-
-def test_a_folder_without_runs_holds_nothing(tmp_path: Path) -> None:
-    spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
-    assert (len(spool.keys), len(spool.counts), spool.rows(3)) == (0, 0, [])
 
 
 def test_a_run_that_lost_its_end_is_refused(tmp_path: Path) -> None:

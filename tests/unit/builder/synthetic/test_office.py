@@ -57,25 +57,6 @@ def test_strays_are_the_last_points_and_clear_of_solids(tmp_path: Path) -> None:
     assert max(truth.door.x_right - person[:, 0].max(), person[:, 0].min() - truth.door.x_left) < 0.3
 
 
-def test_distance_from_solids_is_that_of_the_nearest_along_an_axis() -> None:
-    points = np.array([[0.0, 2.0, 0.3], [0.0, 2.0, -0.05], [1.9, 1.7, 1.0], [2.3, 1.7, 1.0]])
-    assert solid_distances(points) == pytest.approx([0.3, -0.05, -0.2, 0.2])
-
-
-def test_progress_ends_at_the_count_and_a_stop_leaves_nothing(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    made = make_office(tmp_path / "a", progress=lambda done, total: seen.append((done, total)))
-    assert len(seen) == 2 and seen[-1] == (made.points, made.points) and seen[0][0] < made.points
-
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
-
-    (tmp_path / "below").mkdir()
-    with pytest.raises(KeyboardInterrupt):
-        make_office(tmp_path / "below" / "b", progress=stop)
-    assert list((tmp_path / "below").iterdir()) == []
-
-
 def test_refusals_say_what_was_expected(tmp_path: Path) -> None:
     for name in ("office.laz", "office.las"):
         with pytest.raises(BadRequestError, match="one file for two scans"):

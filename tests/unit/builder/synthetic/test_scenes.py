@@ -42,16 +42,6 @@ def test_truth_lies_beside_the_scan_and_reads_back(facade) -> None:
     assert sum(station.points for station in truth.stations) == len(xyz)
 
 
-def test_stations_are_told_by_their_number(facade) -> None:
-    scene, _, truth = facade
-    source = np.asarray(laspy.read(scene.paths[0]).point_source_id)
-    assert [(s.number, s.points) for s in truth.stations] == [
-        (number, int((source == number).sum())) for number in range(1, 6)
-    ]
-    inside = [station for station in truth.stations if station.position[1] > 1.2]
-    assert len(inside) == 1 and inside[0].position[2] == pytest.approx(truth.facades[0].floor + 1.7)
-
-
 def test_jambs_in_the_scan_lie_within_noise_of_the_truth(facade) -> None:
     _, xyz, truth = facade
     for door in truth.facades[0].doors[:1]:
@@ -89,13 +79,6 @@ def test_every_format_holds_the_same_points(tmp_path: Path) -> None:
     assert np.abs(posed - laz).max() < LATTICE / 50
     # Stored in the scanner's own frame: turned and moved.
     assert np.abs(local["cartesianX"] - laz[: len(local["cartesianX"]), 0]).max() > 1
-
-
-def test_progress_ends_at_the_count(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    make_facade(tmp_path / "hall.laz", points=2_000, progress=lambda done, whole: seen.append((done, whole)))
-    assert seen[-1] == (2_000, 2_000) and len(seen) == 5
-    assert [done for done, _ in seen] == sorted({done for done, _ in seen})
 
 
 @pytest.mark.parametrize("name", ["hall.laz", "hall.e57", "hall"])
@@ -144,11 +127,3 @@ def test_town_has_its_count_and_every_facade_its_own_place(tmp_path: Path) -> No
         spot = np.asarray(station.position) - origin
         assert abs(spot[0]) < 9 and -16 < spot[1] < 10
         assert abs(np.median(np.asarray(las.xyz)[:, 0]) - origin[0]) < 9
-
-
-def test_neighbours_in_a_town_are_seen(tmp_path: Path) -> None:
-    """The last façade's stations see points on the first one's side of the lane."""
-    town = make_town(tmp_path / "town.laz", points=20_000)
-    las = laspy.read(town.paths[0])
-    x, source = np.asarray(las.x), np.asarray(las.point_source_id)
-    assert (x[source > 5] < 10.0).any()

@@ -48,18 +48,6 @@ def test_coordinates_of_an_avatars_lattice_are_enclosed() -> None:
     assert not loose_nodes(build_hierarchy(points, leaf=16, degree=4, highest=1 << 23))
 
 
-def test_a_shrunk_radius_is_seen_by_this_judge() -> None:
-    hierarchy = build_hierarchy(make_steps("noise", 3, 100, 1000), leaf=16, degree=4)
-    hierarchy.bounds.radius[3] -= 1
-    assert loose_nodes(hierarchy) == [3]
-
-
-def test_the_hierarchy_keeps_columns_apart_by_order() -> None:
-    points = make_steps("duplicates", 3, 100, 1000)
-    hierarchy = build_hierarchy(points, leaf=16, degree=4)
-    assert sorted(hierarchy.tree.order.tolist()) == list(range(100))
-
-
 @pytest.mark.parametrize("kind", ["plane", "pillar", "noise", "duplicates"])
 def test_an_avatars_mean_equals_brute_force(kind: str) -> None:
     points = make_scan(kind, 8, 200) - 1.0

@@ -1,13 +1,11 @@
 """The top hierarchy encloses all points, as closely as its centres allow, in whatever parts they pass."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.octree_cells import split_octree
-from solidcloud.builder.kernels.trees.build_tree import initial_bounds
 from solidcloud.builder.voxel.top_hierarchy import Top, pack_top
 from solidcloud.builder.voxel.voxel_octree import CellTrees, VoxelPoints, build_trees, canonical, take_cells
 from synthetic_scans import make_steps
@@ -62,47 +60,3 @@ def test_bounds_are_those_of_the_points_about_the_centre(kind: str, steps: int) 
         assert int(rows.radius[node]) * top.unit <= 1.01 * half + 2 * top.unit
         if len(points) >= 3:
             assert np.linalg.norm(rows.normal[node]) == pytest.approx(127, abs=1)
-
-
-def test_the_parts_in_which_points_pass_change_nothing() -> None:
-    found = []
-    for parts in ([100], [1] * 100, [3, 7, 1, 30, 100]):
-        trees, top = made("corner", 200_000)
-        cuts = np.minimum(np.cumsum([0, *parts]), len(trees.low))
-        for a, b in reversed(list(itertools.pairwise(cuts.tolist()))):
-            if b > a:
-                grow(trees, top, range(a, b))
-        found.append([column.tolist() for column in top.rows()])
-    assert found[0] == found[1] == found[2]
-
-
-def test_a_cell_that_has_not_passed_may_lie_outside() -> None:
-    """What only the points can say is not in the bounds before: this test's judge would see it."""
-    trees, top = made("noise", 1000)
-    before = top.reach2.copy(), top.slab.copy()
-    grow(trees, top, range(len(trees.low)))
-    assert (top.reach2 >= before[0]).all() and (top.slab[:, 1] >= before[1][:, 1]).all()
-    assert (top.reach2 > before[0]).any() or (top.slab != before[1]).any()
-
-
-def test_without_slabs_there_is_no_direction() -> None:
-    trees, top = made("plane", 1000, with_slab=False)
-    grow(trees, top, range(len(trees.low)))
-    assert not top.rows().normal.any() and not top.rows().slab.any()
-
-
-def test_a_guess_whose_radius_might_not_fit_is_given_up_for_the_box() -> None:
-    """Of two cells at opposite corners and one beside: any centre but the box's may need more than there is."""
-    places = np.array([[0, 0, 0], [255, 255, 255], [255, 255, 0]])
-    extremes = np.repeat(places[:, None], 14, axis=1).astype(np.int32)
-    spreads = np.array([[1, *place, 0, 0, 0, 0, 0, 0] for place in places], float)
-    tree = (np.array([0]), np.array([3], np.uint8), np.array([0, 1]))
-    centers = []
-    for highest in (255, 221):
-        center, normal, slab = (np.empty((1, k), np.int64) for k in (3, 3, 2))
-        reach2 = np.empty(1, np.int64)
-        initial_bounds(tree, spreads, extremes, 1, highest, True, center, normal, reach2, slab)
-        assert reach2[0] == ((places - center[0]) ** 2).sum(axis=1).max()
-        centers.append(center[0].tolist())
-    assert centers[1] == [128, 128, 128]
-    assert centers[0] != centers[1]

@@ -16,6 +16,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, RIM_BIT
+from solidcloud.schemas.archive.voxel import LeafCells, Nodes
 from solidcloud.schemas.kernels.normal_codes import LINE, THICK, decode_normal
 
 GOLDEN = Path(__file__).resolve().parents[3] / "golden"
@@ -192,7 +193,11 @@ def test_a_build_today_gives_the_golden_points_and_cells(
         assert new.header.archive_id.hex() == expected["archive_id"]
         for row in range(len(golden.voxels)):
             a, b = new.read_voxel(row)[0], golden.read_voxel(row)[0]
-            # In what order cells stand below one node of the top hierarchy is free.
-            assert sorted(zip(*(c.tolist() for c in a.cells), strict=True)) == sorted(
-                zip(*(c.tolist() for c in b.cells), strict=True)
-            )
+            assert rows_of(a.cells) == rows_of(b.cells)
+            if name not in ("archive", "archive-2"):  # which hold the bounds of an older builder
+                assert rows_of(a.nodes) == rows_of(b.nodes), "bounds are these to the bit"
+
+
+def rows_of(part: LeafCells | Nodes) -> list[tuple[Any, ...]]:
+    """Return the rows of columns, sorted: in what order they stand below one node of the top hierarchy is free."""
+    return sorted(zip(*(column.tolist() for column in part), strict=True))

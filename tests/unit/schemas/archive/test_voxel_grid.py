@@ -40,13 +40,6 @@ def test_multiples_of_the_voxel_size_open_their_own_voxel() -> None:
     assert np.array_equal(lattice.voxel_of(lattice.to_lattice(borders)), np.repeat(i[:, None], 3, axis=1))
 
 
-def test_negative_zero_is_zero() -> None:
-    lattice = make_lattice((-0.0, -0.0, 0.0), 0.001, 1.0)
-    assert [np.float64(v).tobytes() for v in lattice.origin] == [np.float64(0.0).tobytes()] * 3
-    minus = np.full((1, 3), -0.0)
-    assert np.array_equal(lattice.voxel_of(lattice.to_lattice(minus)), np.zeros((1, 3)))
-
-
 def test_the_origin_keeps_its_bits() -> None:
     odd = (0.1 + 0.2, np.nextafter(5.6e6, 0), -1e-300)
     lattice = make_lattice(odd, 0.0001, 8.0)
@@ -90,10 +83,6 @@ def test_a_voxel_too_far_out_is_refused(far: int, axis: int) -> None:
     voxels[1, axis] = far
     with pytest.raises(BadRequestError, match=rf"voxel coordinates.*{far}.*larger --voxel"):
         voxel_keys(voxels)
-
-
-def test_no_voxels_have_no_keys() -> None:
-    assert voxel_keys(np.empty((0, 3), np.int64)).shape == (0,)
 
 
 @pytest.mark.parametrize(

@@ -68,21 +68,6 @@ def test_a_kernel_raises_what_an_inner_kernel_raises() -> None:
         quarter(-1.0)
 
 
-def test_a_kernel_that_only_kernels_call_has_no_machine_code() -> None:
-    @njit()
-    def inner(value):  # type: ignore[no-untyped-def]
-        return value + 1
-
-    @njit()
-    def outer(value):  # type: ignore[no-untyped-def]
-        return inner(value)
-
-    assert outer(1) == 2
-    assert len(inner.inner.overloads) == 1 and not inner.overloads
-    (compiled,) = inner.inner.overloads.values()
-    assert not callable(compiled.entry_point)
-
-
 def test_code_for_other_kernels_is_stored(tmp_path: Path) -> None:
     """Compile one kernel again; what it calls is read from the cache."""
     codes = [53, 333]

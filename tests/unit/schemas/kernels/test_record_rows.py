@@ -7,11 +7,7 @@ import pytest
 from solidcloud.schemas.kernels.record_rows import (
     LANES,
     NO_AXIS,
-    delta_along,
-    join_planes,
     lanes_to_points,
-    leaf_bytes,
-    leaf_column,
     leaf_lanes,
     link_rows,
 )
@@ -93,15 +89,6 @@ def read(
     return bool(said), lanes
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_deltas_are_steps_along_the_sort_axis(seed: int) -> None:
-    own = leaves(seed)
-    before = own.points.copy()
-    runs = np.array([run for run in own.runs if run[2] != NO_AXIS], np.int64).T
-    assert np.array_equal(delta_along(own.points, *runs), plain_deltas(own))
-    assert np.array_equal(own.points, before)
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_lanes_hold_the_points_of_every_leaf_node(seed: int) -> None:
     own = leaves(seed, 20_000)
@@ -134,21 +121,6 @@ def test_a_point_one_step_outside_its_cell_or_voxel_is_seen(seed: int) -> None:
             assert read(moved, log2=other)[0]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_bounds_are_from_the_least_corner_to_the_farthest_point(seed: int) -> None:
-    own = leaves(seed)
-    corner = np.array([[0, 0, 0], [1000, 2000, 3000]])
-    lows = [corner[own.links[2][i]] + own.block_low[:, i] for i, _ in leaf_rows(own)]
-    highs = [
-        low + own.points[a : a + n].max(axis=0) for low, (_, (a, n)) in zip(lows, leaf_rows(own), strict=True)
-    ]
-    found, lanes = bounds(), np.empty((len(own.runs), 3, LANES), np.uint16)
-    cells = np.ascontiguousarray(corner.T.astype(np.int32)), np.array([16, 15], np.uint8)
-    nodes = own.count, own.axis, own.block_low
-    assert leaf_lanes(planes_of(plain_deltas(own)), own.links, nodes, cells, 1 << 20, lanes, found)
-    assert found.tolist() == [np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()]
-
-
 def leaf_rows(own: Leaves) -> list[tuple[int, tuple[int, int]]]:
     """Row, and (begin, count), of every leaf node."""
     return list(zip(np.flatnonzero(own.links[1]).tolist(), [run[:2] for run in own.runs], strict=True))
@@ -165,34 +137,6 @@ def test_deltas_that_add_up_beyond_16_bits_are_outside() -> None:
     planes = planes_of(np.array([[20_000, 0, 0]] * 3))
     assert leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes, bounds())
     assert lanes[0, 0].tolist() == [20_000, 40_000] + [60_000] * (LANES - 2)
-
-
-def test_columns_are_laid_out_as_the_points_are() -> None:
-    own = leaves(4)
-    column = np.random.default_rng(4).integers(0, 1 << 16, len(own.points)).astype(int)
-    lanes = np.full((len(own.runs), LANES), 7, np.uint16)
-    leaf_column(np.array([column & 255, column >> 8], np.uint8), own.links, own.count, lanes)
-    small = np.full((len(own.runs), LANES), 7, np.uint8)
-    greatest, seen = leaf_bytes((column % 200).astype(np.uint8), own.links, own.count, small)
-    for block, (begin, count, _) in enumerate(own.runs):
-        assert lanes[block].tolist() == padded(column[begin : begin + count])
-        assert small[block].tolist() == padded(column[begin : begin + count] % 200)
-    assert greatest == (column % 200).max() > (column % 200)[-own.runs[-1][1] :].max()
-    assert seen == sum(1 << bit for bit in set((column % 200 % 32).tolist()))
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64])
-@pytest.mark.parametrize("k", [1, 3])
-def test_planes_are_joined_low_bytes_first(dtype: type, k: int) -> None:
-    width = np.dtype(dtype).itemsize
-    planes = np.random.default_rng(width).integers(0, 256, (k * width, 5)).astype(np.uint8)
-    words = np.full((k, 5), 3, dtype)
-    join_planes(planes, words)
-    expected = [
-        [sum(int(planes[row * width + b, i]) << 8 * b for b in range(width)) for i in range(5)]
-        for row in range(k)
-    ]
-    assert words.tolist() == expected
 
 
 Levels = list[list[int]]  # counts of a BSH, level by level from its root
@@ -265,13 +209,6 @@ CELLS: list[Levels] = [[[4]], [[2], [5, 6]], [[1], [2], [1, 1]]]
 # Rows: 0 top root, 1-2 top, 3-5 cell roots, 6-7 leaf nodes of cell 1, 8 inner node of cell 2, 9-10 its leaf nodes.
 
 
-def test_the_tree_of_the_faults_below_is_sound() -> None:
-    count, first, leaf, cell = laid_out(TOP, CELLS)
-    assert count == [2, 1, 2, 4, 2, 1, 5, 6, 2, 1, 1]
-    assert link(count, *sizes(CELLS)) == (5, first, leaf, cell)
-    assert first == [1, 3, 4, 0, 6, 8, 4, 9, 9, 15, 16]
-
-
 @pytest.mark.parametrize(
     ("row", "count", "named"),
     [
@@ -287,10 +224,3 @@ def test_the_first_row_that_does_not_add_up_is_named(row: int, count: int, named
     counts = laid_out(TOP, CELLS)[0]
     counts[row] = count
     assert -1 - link(counts, *sizes(CELLS))[0] == named
-
-
-def test_more_rows_than_links_need_are_a_fault() -> None:
-    count = laid_out([], CELLS[1:2])[0]
-    assert link(count, [3], [11])[0] == 2
-    assert link([*count, 1], [4], [11])[0] == -1 - 2
-    assert link([*count, 11], [4], [11])[0] == -1 - 2

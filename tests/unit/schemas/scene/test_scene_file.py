@@ -13,7 +13,6 @@ from solidcloud.schemas.scene.effect_table import (
     Slide,
     Step,
     Stop,
-    Sweep,
     Through,
     ThroughBox,
     effect_name,
@@ -22,7 +21,6 @@ from solidcloud.schemas.scene.scene_file import (
     ArchiveItem,
     SceneFile,
     Spawn,
-    check_scene,
     json_schema,
     parse_scene,
     read_scene,
@@ -79,12 +77,6 @@ def test_a_pose_written_with_seven_digits_is_made_rigid() -> None:
 def test_a_rigid_pose_stays_as_it_is_to_the_last_digit() -> None:
     rows = [[0.6, -0.8, 0.0, 1e6 + 0.1], [0.8, 0.6, 0.0, -3.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
     assert parse(TOP + f"pose = {rows}\n").archives[0].pose == rows
-
-
-def test_a_scene_that_was_made_is_checked_the_same() -> None:
-    check_scene(SceneFile(format=1, archives=[ArchiveItem(path="hall")], effects=[Stop(), Sweep()]), "made")
-    with pytest.raises(BadRequestError, match=r"^made: \$\.effects\[0\]: `sweep` requires `stop`"):
-        check_scene(SceneFile(format=1, archives=[ArchiveItem(path="hall")], effects=[Sweep()]), "made")
 
 
 def test_a_scene_is_called_as_the_file_says_or_the_file_is() -> None:

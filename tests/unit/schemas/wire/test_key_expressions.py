@@ -87,10 +87,6 @@ def test_bad_names_are_refused(name):
             make()
 
 
-def test_longest_name_is_allowed():
-    assert key_expressions.check_name("a" * 64, "scene") == "a" * 64
-
-
 @pytest.mark.parametrize(
     "key",
     [

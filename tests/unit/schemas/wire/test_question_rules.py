@@ -173,15 +173,6 @@ def test_what_is_no_column_in_json_is_an_internal_error(old, new):
         decode_answer(DistanceAnswers, text.replace(old, new), JSON)
 
 
-@pytest.mark.parametrize("value", [2**31, -(2**31) - 1])
-def test_json_integers_beyond_int32_are_refused(value):
-    text = encode(some(ObjectsAnswers, 4), JSON)
-    got = msgspec.json.decode(text)
-    got["pairs"][0][0] = value
-    with pytest.raises(InternalError, match="do not fit int32"):
-        decode_answer(ObjectsAnswers, msgspec.json.encode(got), JSON)
-
-
 @pytest.mark.parametrize("k", [0, 1, 2, 9])
 @pytest.mark.parametrize("most", [0, 2 * 184, 5 * 184 + 100, 1 << 20])
 def test_contacts_in_pieces_are_joined_again(k, most):

@@ -76,12 +76,6 @@ def test_steps_give_the_bytes_they_mean_whatever_they_end_in(before: bytes) -> N
         assert ask(source, before, limit) == (ends[done], outs[done], True), f"limit {limit}"
 
 
-@pytest.mark.parametrize("count", [*range(3, 12), 263, LONGEST_COPY])
-def test_a_copy_is_as_long_as_its_code_says(count: int) -> None:
-    for back in (1, 2, 3, 10):
-        assert ask(coded((back, count)), b"0123456789", 500)[1] == meant(b"0123456789", (back, count))
-
-
 @pytest.mark.parametrize("have", [0, 1, 255, 256, 257, FARTHEST_BACK - 2])
 @pytest.mark.parametrize("count", [3, 9])
 def test_a_reference_to_before_the_first_byte_is_wrong(have: int, count: int) -> None:

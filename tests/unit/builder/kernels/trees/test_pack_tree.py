@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree, sort_run
+from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree
 from solidcloud.builder.voxel.point_hierarchy import Tree, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
@@ -62,12 +62,6 @@ def test_scans_pack_into_full_leaf_nodes(kind: str) -> None:
     assert (sizes < 8).sum() <= 1
 
 
-def test_the_packing_is_a_function_of_the_points_and_their_order() -> None:
-    points = make_steps("duplicates", 1, 300, 1000)
-    a, b = pack(points, 8, 4), pack(points.copy(), 8, 4)
-    assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
-
-
 def test_leaves_are_sorted_along_their_longest_edge() -> None:
     points = make_steps("corner", 1, 200, 1000).astype(np.int32)
     found, packed = build_hierarchy(points, leaf=16, degree=4), pack(points, 16, 4)
@@ -83,12 +77,6 @@ def test_leaves_are_sorted_along_their_longest_edge() -> None:
         assert np.array_equal(found.block_low[node], block.min(axis=0))
     assert not found.axis[: tree.levels[-2]].any()
     assert not found.block_low[: tree.levels[-2]].any()
-
-
-@pytest.mark.parametrize("side", [2**23, 1])
-def test_equal_and_extreme_coordinates_pack(side: int) -> None:
-    points = np.array([[0, 0, 0], [side, side, side], [side, 0, side]] * 30)
-    assert_is_a_tree(pack(points, 4, 2), 90, 4, 2)
 
 
 def plain_leaves(points: np.ndarray, leaf: int, degree: int) -> list[set[int]]:
@@ -125,34 +113,6 @@ def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
     leaves = range(tree.levels[-2], len(tree.begin))
     found = [set(tree.order[tree.begin[i] : tree.end[i]].tolist()) for i in leaves]
     assert found == plain_leaves(points, leaf, degree)
-
-
-def test_runs_are_sorted_ties_by_rank() -> None:
-    x = [9, 3, 1, 3, 0, 1, 3, 7, 9]
-    own = np.array([[5] * 9, x, range(10, 19), [0, 6, 5, 4, 3, 2, 1, 0, 0]], np.int32)
-    before = own.copy()
-    sort_run(own, np.zeros_like(own), np.uint64(1), np.uint64(8), np.uint64(1))
-    assert own[3].tolist() == [0, 3, 2, 5, 1, 4, 6, 0, 0]
-    assert own[1].tolist() == [9, 0, 1, 1, 3, 3, 3, 7, 9]
-    assert sorted(map(tuple, own.T.tolist())) == sorted(map(tuple, before.T.tolist()))
-
-
-@pytest.mark.parametrize("kind", ["line", "heaps", "equal", "far"])
-def test_the_border_of_a_cut_is_found_in_any_crowd(kind: str) -> None:
-    """Bins of a histogram that hold one point, and ones that hold nearly all."""
-    i = np.arange(300)
-    x = {"line": i * 7, "heaps": i % 2 * 5000 + i % 3, "equal": i * 0, "far": (i == 299) * 2**23}[kind]
-    points = np.stack([x, i * 0, i * 0], axis=1)[np.random.default_rng(1).permutation(300)]
-    tree = pack(points, 10, 2)
-    found = [set(tree.order[a:b].tolist()) for a, b in zip(tree.begin, tree.end, strict=True)]
-    leaves = [s for s in found[tree.levels[-2] :]]
-    assert leaves == plain_leaves(points, 10, 2)
-
-
-@pytest.mark.parametrize("degree", [2, 3, 16])
-def test_no_tree_has_more_nodes_than_are_made_room_for(degree: int) -> None:
-    for n in [*range(1, 70), 129, 257, 513]:
-        assert len(pack(np.zeros((n, 3)), 1, degree).begin) <= max_nodes(n, 1)
 
 
 @pytest.mark.parametrize(("leaf", "degree"), [*SHAPES, (7, 5), (1, 16)])

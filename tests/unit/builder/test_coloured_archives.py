@@ -1,7 +1,5 @@
 """Archives with colours and classes: every point keeps its own, through builds, changes, levels and exports."""
 
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,6 @@ from coloured_scans import (
     write_las,
     write_ply,
 )
-from forged_archives import Columns, forge, read_index, write_index
 from small_builds import build, content
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.export.export_archive import export_archive
@@ -27,7 +24,6 @@ from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import open_level
-from solidcloud.schemas.errors import FormatError
 from solidcloud.server.archives.masked_archive import MaskedArchive
 
 KEEP = frozenset({"scan", "intensity", "rgb", "classification"})
@@ -205,49 +201,3 @@ def test_an_export_builds_into_the_same_points_and_colours(suffix: str, bright: 
 
 
 # --- what is refused ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("flags", "version", "match"),
-    [
-        ([1, 1, 0, 0, 0, 0, 0], 5, "columns"),  # seven flags for nothing
-        ([1, 1, 0, 0, 0, 1], 5, "columns"),
-        ([1, 1, 0, 0, 0, 1, 1, 0], 5, "columns"),
-        ([1, 1, 0, 0, 0, 2, 1], 5, "columns"),
-        ([1, 1, 0, 0, 1, 1, 1], 5, "datasets"),  # normals without their distance
-        ([1, 1, 1, 0, 0, 1, 1], 5, "datasets"),  # classes without their counts
-        ([1, 1, 0, 0, 0, 1, 1], 4, "format_version"),
-        ([1, 1, 0, 0, 0, 1, 0], 5, "frame"),  # rows are wider than the columns say: found as they are read
-    ],
-)
-def test_flags_that_do_not_fit_the_archive_are_refused(
-    flags: list[int], version: int, match: str, tmp_path: Path
-) -> None:
-    build([write_las(tmp_path / "a.las", coloured(20))], tmp_path / "a", keep=KEEP, level=False, **GRID)
-    index = read_index(tmp_path / "a")
-    index.columns["columns"] = np.array(flags, np.uint8)
-    write_index(tmp_path / "a", index._replace(version=version))
-    if match == "frame":
-        assert match in verify_archive(tmp_path / "a").faults[0]
-        return
-    with pytest.raises(FormatError, match=match):
-        Archive(tmp_path / "a")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda columns: columns["columns"].__setitem__(0, 1),
-        lambda columns: columns["columns"].__setitem__(4, 1),
-        lambda columns: columns["columns"].__setitem__(2, 1),
-    ],
-)
-def test_a_level_has_no_scans_normals_or_classes_of_its_own(
-    change: Callable[[Columns], None], tmp_path: Path
-) -> None:
-    build([write_las(tmp_path / "a.las", coloured(21))], tmp_path / "a", keep=KEEP, **GRID)
-    shutil.copytree(tmp_path / "a" / "level", tmp_path / "level")
-    Archive(tmp_path / "level").close()
-    forge(tmp_path / "level", change)
-    with pytest.raises(FormatError, match="level and columns"):
-        Archive(tmp_path / "level")

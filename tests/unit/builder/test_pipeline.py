@@ -1,6 +1,5 @@
 """Scans in, one archive out: the same bytes however it is made, and what is stored. Errors: test_pipeline_errors.py."""
 
-import shutil
 from pathlib import Path
 
 import h5py
@@ -15,7 +14,7 @@ from small_builds import build, content, six_files
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.archive_writer import ZSTD_FILTER
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.errors import ScanError
 from synthetic_scans import make_scan, write_las, write_ply, write_xyz
 
 
@@ -137,24 +136,6 @@ def test_a_georeferenced_scene_has_the_records_of_one_at_the_origin(out: Path, t
 # --- what is stored and said ------------------------------------------------------------------------------
 
 
-def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None:
-    summary = build(scans, out / "a")
-    assert verify_archive(out / "a", deep=True).faults == ()
-    with Archive(out / "a") as archive:
-        header = archive.header
-        assert summary.points == header.points == 5 * 150 + 1
-        assert summary.voxels == len(archive.voxels)
-        assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
-    files = {name: len(data) for name, data in content(out / "a").items()}
-    assert summary.preview_bytes == files.pop("preview.vtkhdf") > 0
-    level = {name for name in files if name.startswith("level/")}
-    assert summary.level_bytes == sum(files.pop(name) for name in level) > 0
-    assert summary.bytes == sum(files.values())
-    stages = ["survey", "spool", "build", "radius", "level", "preview", "verify", "publish"]
-    assert list(summary.stages) == stages
-    assert (summary.skipped, summary.faults) == ({}, ())
-
-
 def test_quantising_moves_no_point_by_more_than_half_a_step(out: Path, tmp_path: Path) -> None:
     xyz = make_scan("noise", 3, 300) + np.array([5e5, 5.6e6, 0])
     summary = build([write_xyz(tmp_path / "a.xyz", xyz)], out / "a", resolution=0.01)
@@ -192,20 +173,3 @@ def test_points_that_are_not_finite_are_counted(out: Path, tmp_path: Path) -> No
     with pytest.raises(ScanError, match=found):
         build([tmp_path / "a.ply"], out / "b", strict=True)
     assert [p.name for p in out.iterdir()] == ["a"]
-
-
-def test_a_point_alone_needs_a_radius(out: Path, tmp_path: Path) -> None:
-    write_xyz(tmp_path / "a.xyz", make_scan("one point", 1))
-    write_xyz(tmp_path / "b.xyz", np.repeat(make_scan("one point", 1), 10_000, axis=0))
-    for name, kind, said in (
-        ("a.xyz", BadRequestError, "single distinct point has no closest point: give --radius"),
-        ("b.xyz", ScanError, r"b\.xyz: all 10,000 points of scan 0 lie at one place, expected a surface"),
-    ):
-        with pytest.raises(kind, match=said):
-            build([tmp_path / name], out / "a")
-        assert not list(out.iterdir())
-        summary = build([tmp_path / name], out / name, radius=0.01)
-        assert summary.radius == 0.01
-        with Archive(out / name) as archive:
-            assert (archive.header.radius_model, archive.header.radius_sample) == ("given", 0)
-        shutil.rmtree(out / name)

@@ -19,18 +19,6 @@ from solidcloud.server.scene import Scene
 from synthetic_scans import make_scan, write_xyz
 
 
-def test_an_archive_sealed_with_the_key_passes(sealed: Path) -> None:
-    assert verify_archive(sealed, deep=True, key=KEY).faults == ()
-    with Archive(sealed, KEY) as archive:
-        level = open_level(archive)
-        assert level is not None and level.key == KEY
-        for each in (archive, level):
-            for row in range(len(each.voxels)):
-                each.read_voxel(row)
-                each.open_tree(row)
-        level.close()
-
-
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forgery_that_no_reader_can_find_is_found_with_the_key(
     name: str, copy: Path, tmp_path: Path

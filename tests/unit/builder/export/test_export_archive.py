@@ -109,13 +109,6 @@ def test_all_points_come_back_to_the_last_bit(form: str, georeferenced: Path, tm
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_without_columns_there_are_coordinates_alone(form: str, tmp_path: Path) -> None:
-    archive = build(tmp_path, [make_scan("corner", 3, 200) - 1.0], None)
-    export_archive(archive, tmp_path / f"a.{form}")
-    assert read_back(tmp_path / f"a.{form}") == stored(archive)
-
-
-@pytest.mark.parametrize("form", FORMATS)
 def test_a_box_is_half_open(form: str, georeferenced: Path, tmp_path: Path) -> None:
     everything = stored(georeferenced)
     wider = np.array([0, 0.5, 0.5])
@@ -143,15 +136,6 @@ def test_boxes_side_by_side_have_every_point_once(georeferenced: Path, tmp_path:
         export_archive(georeferenced, path, box=(a, 0, 0, b, 1e7, 1e3))
         parts += read_back(path)
     assert sorted(parts) == stored(georeferenced)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_nothing_in_the_box_is_a_file_without_points(form: str, georeferenced: Path, tmp_path: Path) -> None:
-    path = tmp_path / f"a.{form}"
-    done = export_archive(georeferenced, path, box=(0, 0, 0, 1, 1, 1))
-    assert read_back(path) == []
-    assert (done.points, done.low, done.high) == (0, None, None)
-    assert done.notes == ("no point is in the box",)
 
 
 @pytest.mark.parametrize("step", [1e-6, 0.0001, 0.001, 0.1, 1 / 3])

@@ -119,7 +119,7 @@ def judged_thin(points: Points, steps: int) -> np.ndarray:
     return np.array([found[-1] for found in best.values()])
 
 
-VOXELS = [(64, 3, None), (1 << 12, 1, None), (100, 5, 16), (37, 2, 50)]  # steps, runs, points held at a time
+VOXELS = [(1 << 12, 1, None), (100, 5, 16)]  # steps, runs, points held at a time
 
 
 @pytest.fixture(params=VOXELS, ids=lambda p: f"{p[0]}steps-{p[1]}runs-{p[2]}held")
@@ -141,7 +141,7 @@ def check(points: Points, expected: dict[str, np.ndarray], left: Spool, counts: 
         assert counts.get(reason, {}) == dict(zip(scans.tolist(), numbers.tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("radius", "count"), [("0.006", 1), ("0.011", 4), ("0.03", 9)])
+@pytest.mark.parametrize(("radius", "count"), [("0.006", 1), ("0.03", 9)])
 def test_outliers_are_those_with_too_few_other_points_around(
     layout: tuple[int, int], radius: str, count: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -153,7 +153,7 @@ def test_outliers_are_those_with_too_few_other_points_around(
     check(points, {OUTLIER: out}, left, counts)
 
 
-@pytest.mark.parametrize(("radius", "scans"), [("0.002", 1), ("0.0035", 2), ("0.0045", 3)])
+@pytest.mark.parametrize(("radius", "scans"), [("0.0035", 2), ("0.0045", 3)])
 def test_what_too_few_scans_saw_where_others_looked_is_moving(
     layout: tuple[int, int], radius: str, scans: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -165,7 +165,7 @@ def test_what_too_few_scans_saw_where_others_looked_is_moving(
     check(points, {MOVING: out}, left, counts)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 7, 16, 37])
+@pytest.mark.parametrize("steps", [1, 16, 37])
 def test_one_point_a_cube_stays_the_nearest_to_its_middle(
     layout: tuple[int, int], steps: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -272,15 +272,3 @@ def test_a_distance_is_the_decimal_number_it_is_written_as(tmp_path: Path, rng: 
         spool = spool_of(points, tmp_path / f"a{steps}", 64, 1, rng)
         left, counts = run(spool, BuildConfig(outliers=(steps / 1000, 1)), tmp_path / f"b{steps}")
         assert len(contents(left).at) == 2 and counts == {}
-
-
-def test_the_filters_need_the_scan_and_nothing_else() -> None:
-    assert filter_dtype(BuildConfig()).names == ("local", "scan_index")
-    assert filter_dtype(BuildConfig(keep=ALL)) == spool_dtype(BuildConfig(keep=ALL))
-    passes = [
-        {},
-        {"thin": 0.1},
-        {"outliers": (0.1, 2)},
-        {"outliers": (0.1, 2), "moving": (0.1, 2), "thin": 0.1},
-    ]
-    assert [BuildConfig(**options).filter_passes for options in passes] == [0, 1, 1, 2]

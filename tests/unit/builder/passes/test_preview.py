@@ -6,7 +6,6 @@ import h5py
 import numpy as np
 import pytest
 import solidcloud.builder.passes.preview as preview
-import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.voxel_records import point_hashes
 from solidcloud.builder.passes.preview import write_preview
@@ -67,16 +66,6 @@ def test_points_are_chosen_by_hash_and_have_their_columns(
         assert 10 < count <= most and set(chosen) == set(by_hash[:count])
     for place, scan, intensity in zip(chosen, found.columns["scan"], found.columns["intensity"], strict=True):
         assert (int(scan), float(intensity)) in places[place]
-
-
-def test_one_archive_has_one_preview_to_the_byte(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_preview(built)
-    expected = (built / PREVIEW_NAME).read_bytes()
-    (built / PREVIEW_NAME).unlink()
-    monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
-    write_preview(built)
-    assert (built / PREVIEW_NAME).read_bytes() == expected
-    assert not list(built.glob("*.tmp"))
 
 
 def test_verify_reads_the_preview(built: Path) -> None:

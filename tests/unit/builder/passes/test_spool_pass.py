@@ -11,13 +11,12 @@ from solidcloud.builder.passes.spool_pass import (
     Spooled,
     SpoolUnit,
     spool_range,
-    usable,
 )
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock
 from solidcloud.builder.spool.run_files import spool_dtype
 from solidcloud.builder.spool.spool import Spool
-from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE, Lattice, make_lattice, voxel_keys
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.archive.voxel_grid import Lattice, make_lattice, voxel_keys
+from solidcloud.schemas.errors import ScanError
 from synthetic_scans import make_scan
 from written_runs import write_run
 
@@ -84,7 +83,7 @@ def _coordinate(key: int) -> list[int]:
 
 
 @pytest.mark.parametrize("keep", [frozenset(), frozenset({"scan", "intensity"})])
-@pytest.mark.parametrize("voxel", [0.002, 0.5, 2097.152])
+@pytest.mark.parametrize("voxel", [0.002, 2097.152])
 def test_a_run_is_what_sorting_all_columns_gives(voxel: float, keep: frozenset[str], tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     xyz = rng.integers(-12, 12, (4000, 3)) * 0.001 * np.array([1, 1, 0.05])
@@ -108,25 +107,6 @@ def test_a_run_is_what_sorting_all_columns_gives(voxel: float, keep: frozenset[s
         sums += [len(found), zlib.crc32(found)]
     assert result.runs[name] == sums
     assert sums[0] == len(xyz) * rows.dtype.itemsize
-
-
-def test_a_point_too_far_for_its_voxel_is_refused(tmp_path: Path) -> None:
-    xyz = np.array([[0.0, 0, 0], [2e4, 0, 0]])
-    with pytest.raises(BadRequestError, match="a stray point far from the rest"):
-        spooled(tmp_path / "s", Listed(xyz), 2, make_lattice((0, 0, 0), 0.001, 0.01))
-
-
-@pytest.mark.interpreted
-def test_only_usable_points_are_spooled(tmp_path: Path) -> None:
-    xyz = make_scan("noise", 1, 60) + 1
-    xyz[5, 1], xyz[6, 0], xyz[50, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
-    kept = usable(ScanBlock(xyz, np.arange(60, dtype=np.float32)))
-    assert kept.intensity is not None
-    assert kept.intensity.tolist() == [i for i in range(60) if i not in (5, 6, 50)]
-    assert np.array_equal(kept.xyz, np.delete(xyz, [5, 6, 50], axis=0))
-    assert usable(ScanBlock(xyz, None)).intensity is None
-    result, _ = spooled(tmp_path / "s", Listed(xyz, 9), 57, make_lattice((0, 0, 0), 0.001, 0.5))
-    assert result.count == 57
 
 
 @pytest.mark.interpreted

@@ -21,7 +21,7 @@ from solidcloud.builder.sources.common.scan import Scan, ScanBlock, SourceLattic
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
 from solidcloud.schemas.errors import ScanError, SolidcloudError
-from synthetic_scans import make_scan, write_las, write_xyz
+from synthetic_scans import make_scan, write_las
 
 
 def survey_scan(scan: Scan) -> Survey:
@@ -60,13 +60,6 @@ def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
     assert (survey.count, survey.not_finite, survey.beyond, survey.fault) == (297, 2, 1, "")
     assert np.array_equal(survey.low, good.min(axis=0))
     assert np.array_equal(survey.high, good.max(axis=0))
-
-
-def test_a_scan_without_points_is_at_fault_but_loses_nothing(tmp_path: Path) -> None:
-    survey = survey_scan(listed(tmp_path, np.empty((0, 3))))
-    assert "holds no usable point, expected at least one" in survey.fault
-    assert survey.empty
-    assert survey.region is None
 
 
 def test_points_that_are_all_unusable_were_somewhere(tmp_path: Path) -> None:
@@ -144,17 +137,6 @@ def test_that_memory_ran_out_is_no_fault_of_the_scan(
     assert not isinstance(caught.value, ScanError)
 
 
-def test_a_file_that_cannot_be_hashed_is_at_fault(tmp_path: Path) -> None:
-    scan = listed(tmp_path, make_scan("noise", 1, 300))
-    parts = [survey_range(unit) for unit in ranges(scan, 300)]
-    scan.path.unlink()
-    digest, fault = hash_file(scan.path)
-    assert digest == ""
-    survey = join_ranges(scan, parts, (digest, fault))
-    assert (survey.count, survey.fault) == (0, fault)
-    assert "listed.xyz" in fault
-
-
 # --- the lattice ------------------------------------------------------------------------------------------
 
 
@@ -193,14 +175,3 @@ def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: 
     lattice, found = choose_lattice(surveys, [s.facts for s in surveys], BuildConfig(**options))
     assert (lattice.step, found) == (step, source)
     assert lattice.origin == (7.0 - (len(lattices) - 1),) * 3
-
-
-def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:
-    xyz = write_las(tmp_path / "a.las", np.random.default_rng(1).integers(-1000, 1000, (50, 3)))
-    write_xyz(tmp_path / "a.xyz", xyz)
-    for name in ("a.las", "a.xyz"):
-        (scan,) = open_scans(tmp_path / name)
-        survey = survey_scan(scan)
-        assert (survey.count, survey.fault) == (50, "")
-        assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
-        assert len(survey.sha256) == 64

@@ -13,7 +13,6 @@ from solidcloud.builder.plan.measure_rates import room
 from solidcloud.builder.plan.scan_sample import plan_build, sample_scene
 from solidcloud.builder.sources.scan_files import InputFile, open_input_files
 from solidcloud.schemas.errors import ScanError
-from synthetic_scans import write_xyz
 
 ONE = BuildConfig(jobs=1)
 
@@ -49,29 +48,6 @@ def test_a_broken_scan_stops_a_plan_as_it_stops_a_build(tmp_path: Path) -> None:
     assert looked(tmp_path, replace(ONE, skip_bad=True)).points == 1000
     with pytest.raises(ScanError, match="no scan holds a point"):
         sample_scene([InputFile(tmp_path / "x", [])], ONE)
-
-
-@pytest.mark.parametrize("name", ["b.xyz", "b.laz"])
-def test_a_scan_that_breaks_where_no_look_fell_is_left_out_as_a_build_does(tmp_path: Path, name: str) -> None:
-    write_las(tmp_path / "a.las", room(1000))
-    xyz = room(sample.FIRST_POINTS + 30_000)
-    broken = tmp_path / name
-    if name == "b.xyz":
-        write_xyz(broken, xyz)
-        with broken.open("a") as file:
-            file.write("0 0 nothing\n")
-    else:
-        synthetic_scans.write_las(broken, np.rint(xyz * 1e4).astype(np.int64), scale=1e-4)
-        data = bytearray(broken.read_bytes())
-        data[-len(data) // 3 : -len(data) // 4] = bytes(len(data) // 3 - len(data) // 4)
-        broken.write_bytes(data)
-    with pytest.raises(ScanError, match=name):
-        looked(tmp_path)
-    scene = looked(tmp_path, replace(ONE, skip_bad=True))
-    assert scene.points == 1000 and scene.packed is not None
-    assert any(
-        line.startswith("without a scan that cannot be read: ") and name in line for line in scene.assumed
-    )
 
 
 @pytest.mark.parametrize("voxel", [8.0, 2.0])

@@ -18,7 +18,6 @@ from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.builder.sources.scan_files import InputFile, inspect_scans, open_input_files
 from solidcloud.builder.sources.scan_list import write_scan_list
 from solidcloud.schemas.errors import BadRequestError, ScanError
-from solidcloud.server.cli.main import run
 from synthetic_scans import make_scan, write_las, write_xyz
 
 
@@ -155,27 +154,3 @@ def test_a_bad_scan_found_in_the_survey_leaves_nothing_and_later_ones_do(
             build(out / "hall", scans)
     assert sorted(p.name for p in (done_folder(out / "hall") / "survey").iterdir())
     assert not list(out.glob(".hall.lock"))
-
-
-def command(capsys: pytest.CaptureFixture[str], scan: Path, target: Path, *options: str) -> tuple[int, str]:
-    """`solidcloud build`: its exit code, and its error."""
-    words = ["build", str(scan), "-o", str(target), "--voxel", "0.9", "--jobs", "1", *options]
-    code = run(words)
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    return code, "".join(errors)
-
-
-def test_a_bad_scan_found_by_a_later_command_says_what_will_be_done(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "scans"
-    folder.mkdir()
-    write_xyz(folder / "a.xyz", make_scan("plane", 3, 100))
-    (folder / "b.xyz").write_text("1 2 3\nbroken\n")
-    with monkeypatch.context() as patch:
-        patch.setattr(survey, "_check_surveys", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        assert command(capsys, folder, tmp_path / "hall")[0] == 130
-    code, said = command(capsys, folder, tmp_path / "hall")
-    assert code == 3
-    assert "--skip-bad leaves such scans out" in said and "other scans give --fresh" in said
-    assert command(capsys, folder, tmp_path / "hall", "--skip-bad", "--fresh")[0] == 0

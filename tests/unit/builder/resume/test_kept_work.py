@@ -73,38 +73,11 @@ def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tm
     assert not list(tmp_path.iterdir())
 
 
-LATE = (f"0-000000.h5.{'0f' * 6}-12-345.tmp", f"0-000000.h5.{'0f' * 16}.tmp")
-
-
-def test_what_was_written_late_into_a_published_archive_is_removed(tmp_path: Path) -> None:
-    """By the same command, of a build that was killed just after its rename; what is somebody's own is not."""
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    shards = tmp_path / "hall" / "shards"
-    shards.mkdir(parents=True)
-    for name in (*LATE, "own.tmp", "0-000000.h5"):
-        (shards / name).write_bytes(b"")
-    remove_finished_work(tmp_path / "hall", WHAT)
-    assert sorted(path.name for path in shards.iterdir()) == ["0-000000.h5", "own.tmp"]
-    (shards / LATE[0]).write_bytes(b"")
-    remove_finished_work(tmp_path / "hall", WHAT)  # no build was killed
-    assert (shards / LATE[0]).exists()
-
-
 def began(target: Path, *, fresh: bool = False) -> BuildDirectory:
     """What a build begins with that is interrupted at once."""
     with suppress(KeyboardInterrupt), build_directory(target, WHAT, fresh=fresh) as build_dir:
         raise KeyboardInterrupt
     return build_dir
-
-
-def test_only_the_same_build_has_the_folder_of_before(tmp_path: Path) -> None:
-    first, second = began(tmp_path / "hall"), began(tmp_path / "hall")
-    assert first.folder == second.folder
-    third = began(tmp_path / "hall", fresh=True)
-    assert third.folder.name != first.folder.name
-    assert [p for p in third.hidden.iterdir() if p.is_dir()] == [third.folder]
-    with pytest.raises(FileNotFoundError):
-        first.journal.write_entry("survey/1", {})
 
 
 @pytest.mark.parametrize("parted", [False, True])

@@ -138,23 +138,3 @@ def test_a_run_that_changes_while_it_is_built_of_costs_no_third_command(
     build(tmp_path / "hall", scans)
     assert not surveyed
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
-
-
-def test_a_directory_that_changes_before_it_is_read_is_refused_and_its_run_made_anew(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def changed_first(spool: Any, *rest: Any) -> Any:
-        file = sorted(spool.folder.glob("*.keys"))[0]
-        flip(file, 8 * (file.stat().st_size - 4))
-        return function(spool, *rest)
-
-    build(tmp_path / "judge", scans)
-    function = pipeline.filter_points
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "filter_points", changed_first)
-        with pytest.raises(CorruptError, match=r"\.keys: not the directory of .*\.run.*same command again"):
-            build(tmp_path / "hall", scans)
-    units = counted(monkeypatch, "spool_range")
-    build(tmp_path / "hall", scans)
-    assert len(units) == 1
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")

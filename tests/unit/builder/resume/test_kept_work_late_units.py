@@ -1,16 +1,13 @@
 """Units that a cluster runs late find no folder in a build that started over, and change nothing in a resumed one."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, two_scans
-from solidcloud.builder.passes.spool_pass import SpoolUnit
 from solidcloud.builder.resume.kept_work import _Journalled, building_folder
 from solidcloud.builder.run.executor import ProcessExecutor
 
@@ -19,26 +16,6 @@ from solidcloud.builder.run.executor import ProcessExecutor
 def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Two scans, one of which is read in three ranges; two shards are made of them."""
     return two_scans(tmp_path, monkeypatch)
-
-
-def test_a_unit_of_an_earlier_session_that_ends_late_changes_nothing(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    units: list[SpoolUnit] = []
-    spool, after = spool_pass.spool_range, pipeline.filter_points
-    monkeypatch.setattr(spool_pass, "spool_range", lambda unit: units.append(unit) or spool(unit))
-
-    def late(*arguments: Any) -> Any:
-        # It was cut otherwise, as the session had more memory, or less.
-        for run_points in (30, 70):
-            spool(replace(units[0], run_points=run_points))
-        return after(*arguments)
-
-    monkeypatch.setattr(pipeline, "filter_points", late)
-    build(tmp_path / "hall", scans)
-    monkeypatch.setattr(pipeline, "filter_points", after)
-    build(tmp_path / "judge", scans)
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
 class HandedOut:

@@ -173,26 +173,6 @@ def test_a_run_that_changed_while_it_was_in_use_is_found(
     assert not building_folder(tmp_path / "hall").exists()
 
 
-def test_a_run_that_ends_too_soon_is_made_again(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def cut(spool: Any, *rest: Any) -> Any:
-        run = next(spool.folder.glob("000000-*.run"))
-        run.write_bytes(run.read_bytes()[:-1])
-        return after(spool, *rest)
-
-    after = pipeline.filter_points
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "filter_points", cut)
-        with pytest.raises(CorruptError, match="give the same command again"):
-            build(tmp_path / "hall", scans)
-    calls: list[Any] = []
-    spool = spool_pass.spool_range
-    monkeypatch.setattr(spool_pass, "spool_range", lambda unit: calls.append(unit) or spool(unit))
-    build(tmp_path / "hall", scans)
-    assert len(calls) == 1
-
-
 @pytest.mark.parametrize("stage", ["spool_scans", "spool_range", "build_shards"])
 def test_a_scan_that_changes_while_it_is_read_is_no_archive(
     stage: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -1,7 +1,6 @@
 """Units on a cluster: the same results in the same order as in this process, and a word on what went wrong."""
 
 import os
-import signal
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -19,8 +18,6 @@ from solidcloud.builder.run.executor import WAITING, Silent
 from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
 
-# Units are text for `eval`, because workers cannot import a test module by its name.
-PID = "__import__('os').getpid()"
 DIE = "__import__('os').kill(__import__('os').getpid(), 9)"
 FAIL = "exec('from solidcloud.schemas.errors import ScanError; raise ScanError(\"hall.las: cut off\")')"
 
@@ -59,12 +56,6 @@ def test_results_come_in_the_order_of_the_units(executor: ClusterExecutor, said:
     assert progress.done == sum(range(1, 41))
     assert executor.jobs == 2
     assert said[0].startswith("cluster: 2 workers; ") and "dashboard" in said[0]
-
-
-def test_units_run_in_processes_where_the_builder_stands(executor: ClusterExecutor) -> None:
-    found = mapped(executor, *[PID] * 12)
-    assert os.getpid() not in found
-    assert set(mapped(executor, "__import__('os').getcwd()")) == {os.getcwd()}
 
 
 def test_what_a_unit_raises_is_raised_here(executor: ClusterExecutor) -> None:
@@ -174,23 +165,6 @@ def test_a_cluster_that_is_not_as_needed_is_refused(monkeypatch: pytest.MonkeyPa
         pytest.raises(BadRequestError, match="3 threads, expected one"),
     ):
         ClusterExecutor(threads.scheduler_address)
-
-
-def test_a_cluster_that_goes_away_ends_the_build() -> None:
-    executor = ClusterExecutor("local:1", 1 << 30, lambda _: None)
-    with executor, pytest.raises(SolidcloudError, match=r"the scheduler was lost.*to resume"):
-        results = executor.map(eval, ["1", "__import__('time').sleep(9)"], Silent(), lambda _: 1)
-        assert next(results) == 1
-        assert executor._cluster is not None
-        executor._cluster.close()
-        next(results)
-
-
-def test_an_interrupt_is_the_builders(executor: ClusterExecutor) -> None:
-    worker = mapped(executor, PID)[0]
-    assert isinstance(worker, int)
-    os.kill(worker, signal.SIGINT)
-    assert mapped(executor, *[PID] * 8).count(worker)
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,6 @@ import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.run.executor import (
     POINTS_WORTH_A_PROCESS,
     ProcessExecutor,
-    Silent,
-    jobs_of,
-    run_units,
     voxel_ranges,
     worker_count,
 )
@@ -86,16 +83,6 @@ def test_a_long_unit_keeps_nobody_waiting(tmp_path: Path) -> None:
         )
         assert list(results) == [None] * 31
     assert progress.done == 31
-
-
-def test_fewer_units_than_processes_run_at_once_where_that_is_asked_for(tmp_path: Path) -> None:
-    code = (
-        f"import os, time; name = {str(tmp_path)!r} + '/%d'; open(name, 'x').close(); "
-        f"time.sleep(0.05); assert len(os.listdir({str(tmp_path)!r})) == 1; os.unlink(name)"
-    )
-    with ProcessExecutor(2) as executor:
-        executor.at_once = 1
-        assert list(executor.map(exec, [code % i for i in range(6)], Counted(), lambda unit: 1)) == [None] * 6
 
 
 def test_an_interrupted_builder_does_not_wait_for_its_workers(tmp_path: Path) -> None:
@@ -193,14 +180,3 @@ def test_every_row_is_in_one_portion_and_the_largest_come_first(counts: list[int
     planned = max(M, int(points.sum()) // (8 * jobs))
     assert all(h - points[run.stop - 1] <= planned for h, run in zip(held, runs, strict=True))
     assert len(runs) <= points.sum() // planned + 1
-
-
-def test_without_an_executor_units_run_here_in_order() -> None:
-    done: list[int] = []
-
-    class Counting(Silent):
-        def advance(self, amount: int) -> None:
-            done.append(amount)
-
-    assert list(run_units(None, lambda unit: unit * 2, [3, 1, 2], Counting(), lambda unit: unit)) == [6, 2, 4]
-    assert done == [3, 1, 2] and jobs_of(None) == 1

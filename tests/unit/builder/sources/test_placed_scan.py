@@ -1,6 +1,5 @@
 """Test scans in other units, with another axis up and at a given pose: coordinates, bits and lattice."""
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -52,16 +51,6 @@ def test_units_then_axes_then_the_pose(las: Scan) -> None:
     homogeneous = np.column_stack([read(las), np.ones(500)]) @ moved.pose.T
     assert np.abs(homogeneous[:, :3] - read(moved)).max() < 1e-10
     assert (moved.units, moved.up, moved.format, moved.declared_count) == ("cm", "y", "las", 500)
-
-
-def test_blocks_ranges_and_processes_change_no_bit(las: Scan) -> None:
-    moved = place_scan(las, units="us-ft", up="x", pose=TURN)
-    whole = read(moved)
-    assert np.array_equal(read(moved, 7), whole)
-    assert moved.seekable
-    part = np.concatenate([block.xyz for block in moved.blocks(50, 123, 400)])
-    assert np.array_equal(part, whole[123:400])
-    assert np.array_equal(read(pickle.loads(pickle.dumps(moved))), whole)
 
 
 @pytest.mark.parametrize("up", TURNS)

@@ -12,7 +12,6 @@ from solidcloud.builder.spool.run_files import (
     KEYS_SUFFIX,
     is_run_damaged,
     new_run,
-    read_directory,
     spool_dtype,
     write_directory,
 )
@@ -77,26 +76,6 @@ def test_a_voxels_rows_are_found_once_and_in_order(keep: frozenset[str], tmp_pat
     assert (spool.rows(4), spool.count(4), spool.block_rows(4, 0, 1 << 63)) == ([], 0, [])
 
 
-@pytest.mark.parametrize("entries", [1, 7, 1 << 18])
-def test_directories_are_merged_a_part_at_a_time(
-    entries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spool_module, "MERGED_ENTRIES", entries)
-    rng, dtype = np.random.default_rng(4), spool_dtype(BuildConfig())
-    expected: dict[int, list[int]] = {}
-    for number in range(9):
-        keys = rng.choice(np.array([*range(12), 1 << 62], np.uint64), 20)
-        write_run(tmp_path / f"{number}.run", keys, np.zeros(20, dtype))
-        for key, count in zip(*(part.tolist() for part in np.unique(keys, return_counts=True)), strict=True):
-            expected.setdefault(key, []).append(count)
-    spool = Spool(tmp_path, dtype, LATTICE)
-    for held in (spool, pickle.loads(pickle.dumps(spool))):
-        assert held.keys.tolist() == sorted(expected)
-        assert held.counts.tolist() == [sum(expected[key]) for key in sorted(expected)]
-        assert {key: [len(rows) for rows in held.rows(key)] for key in expected} == expected
-    assert len(list(tmp_path.glob("*.tmp"))) == 1
-
-
 @pytest.mark.parametrize("stride", [1, 3, 64, 4096])
 def test_a_block_is_what_brute_force_finds(
     stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -125,17 +104,6 @@ def test_a_run_that_lost_its_end_is_refused(tmp_path: Path) -> None:
     spool.rows(int(spool.keys[0]))
     with pytest.raises(CorruptError, match=r"a\.run: ends before row 50"):
         spool.rows(int(spool.keys[-1]))
-
-
-def test_the_directory_is_as_its_description_says(tmp_path: Path) -> None:
-    keys, rows = made(2, 60, frozenset())
-    write_run(tmp_path / "a.run", keys, rows)
-    words = np.fromfile((tmp_path / "a.run").with_suffix(KEYS_SUFFIX), "<u8").tolist()
-    assert words[:3] == KEYS.tolist()
-    assert np.diff(words[3:]).tolist() == [int((keys == key).sum()) for key in KEYS]
-    assert words[3] == 0
-    found, starts = read_directory(tmp_path / "a.run", rows.dtype.itemsize)
-    assert (found.tolist(), starts.tolist()) == (words[:3], words[3:])
 
 
 NO_DIRECTORIES: dict[str, Callable[[list[int]], list[int]]] = {

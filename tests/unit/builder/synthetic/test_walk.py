@@ -15,13 +15,6 @@ TRUTH = build_facade().truth
 FIGURE = figure_points()
 
 
-def test_walk_takes_forty_seconds_in_1200_poses() -> None:
-    times, poses = walk_poses(TRUTH)
-    assert poses.shape == (1200, 4, 4) and poses.dtype == np.float64
-    assert np.array_equal(times, np.arange(1200) / 30.0)
-    assert walk_poses(TRUTH, frames=90, rate=10.0)[1].shape == (90, 4, 4)
-
-
 def test_walk_is_continuous_at_a_humans_speed() -> None:
     _, poses = walk_poses(TRUTH)
     step = np.diff(poses[:, :3, 3], axis=0)

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from solidcloud.builder.voxel import point_hierarchy
 from solidcloud.builder.voxel.point_hierarchy import (
     Hierarchy,
     build_hierarchy,
@@ -74,9 +73,3 @@ def test_an_avatar_of_any_extent_fits_its_lattice(extent: float) -> None:
     local = build_local(points, leaf=2, degree=2)
     assert 0 <= local.hierarchy.points.min() <= local.hierarchy.points.max() <= 1 << 23
     assert math.log2(local.step).is_integer()
-
-
-@pytest.mark.parametrize("count", [1, 2, 5000])
-def test_distinct_points_are_those_of_numpy(count: int) -> None:
-    points = np.random.default_rng(count).integers(-8, 8, (count, 3))
-    assert np.array_equal(point_hierarchy._distinct(points), np.unique(points, axis=0))

@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.kernels.neighbours.nearest_neighbours import BLOCK
 from solidcloud.builder.passes.verify import verify_archive
-from solidcloud.builder.voxel import point_normals as normals_module
 from solidcloud.builder.voxel.point_normals import voxel_normals
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.normal_reach import squared_reach
-from solidcloud.schemas.errors import CorruptError
 from solidcloud.schemas.kernels.normal_codes import NO_NORMAL, normal_code
 
 pytestmark = pytest.mark.interpreted
@@ -35,8 +33,8 @@ def sums_of(points: NDArray[np.int64], at: NDArray[np.int64], square: int) -> ND
     )
 
 
-@pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates", "one point"])
-@pytest.mark.parametrize("reach", [1, 300, 900, 20_000])
+@pytest.mark.parametrize("kind", ["corner", "duplicates", "one point"])
+@pytest.mark.parametrize("reach", [300, 20_000])
 def test_codes_are_those_of_the_definition(kind: str, reach: int) -> None:
     local = synthetic_scans.make_steps(kind, 4, 10 * BLOCK + 3, STEPS)
     expected = [
@@ -120,23 +118,3 @@ def test_normals_change_with_the_scans(tmp_path: Path) -> None:
         assert opened.header.format_version == 4 and opened.header.generation == 1
     remove_scans(archive, [str(more)], jobs=1)
     assert stored(archive) == before
-
-
-def test_a_normal_that_is_another_is_found(tmp_path: Path) -> None:
-    archive = build(tmp_path)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            normals_module, "voxel_normals", lambda local, square: np.full(len(local), 0x8080, np.uint16)
-        )
-        wrong = build(tmp_path, name="wrong")
-        patch.setattr(
-            normals_module, "voxel_normals", lambda local, square: np.full(len(local), 0x80, np.uint16)
-        )
-        with pytest.raises(CorruptError, match="invalid normal codes"):
-            build(tmp_path, name="none")
-    assert verify_archive(wrong).faults == ()
-    faults = verify_archive(wrong, deep=True).faults
-    assert len(faults) == len(Archive(wrong).voxels) and all(
-        "normals are not those of the points" in f for f in faults
-    )
-    assert stored(archive) != stored(wrong)

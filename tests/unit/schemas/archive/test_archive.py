@@ -124,13 +124,6 @@ def test_a_key_of_more_than_three_coordinates_is_refused(copy: Path) -> None:
         Archive(copy)
 
 
-def test_a_closed_archive_is_not_read(built: Path) -> None:
-    with Archive(built) as archive:
-        archive.read_frames(0)
-    with pytest.raises(ValueError, match="closed"):
-        archive.read_frames(0)
-
-
 def test_rows_out_of_order_are_refused(copy: Path) -> None:
     # The broad phase searches ascending keys: it would call clear what it does not find.
     def reverse(rows: np.ndarray) -> None:
@@ -148,12 +141,6 @@ def test_bounds_of_voxels_that_are_not_the_scenes_are_refused(copy: Path) -> Non
     rewrite_index(copy, widen)
     with pytest.raises(FormatError, match="bounds are not the scene's"):
         Archive(copy)
-
-
-def test_an_archive_that_is_replaced_stays_the_one_opened(copy: Path) -> None:
-    with Archive(copy) as archive:
-        shutil.rmtree(copy)
-        assert len(archive.read_voxel(0)[0].points) > 0
 
 
 def same_index(folder: Path, expected: Archive) -> bool:

@@ -19,12 +19,6 @@ def compile_for(seconds: float, every: float = 0.5) -> CompileProgress:
     return progress
 
 
-def test_a_short_wait_is_silent(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO, NAME):
-        compile_for(0.7, 0.2)
-    assert not caplog.messages
-
-
 def test_a_long_wait_is_reported_after_a_second_and_then_every_ten(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, NAME):
         compile_for(22.0)

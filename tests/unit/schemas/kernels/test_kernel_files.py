@@ -95,23 +95,6 @@ def test_a_folder_that_cannot_be_made_is_said_and_done_without(
     assert len(lines(caplog)) == 1
 
 
-def test_a_full_disk_leaves_nothing(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    code = (
-        "import resource, signal, sys\n"
-        "from pathlib import Path\n"
-        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
-        "files = KernelFiles(Path(sys.argv[1]))\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"  # as a full disk: an OSError in mid-write
-        "files.write('a.kernel', bytes(10_000))\n"
-        "assert files.read('a.kernel') is None\n"
-    )
-    done = subprocess.run([sys.executable, "-P", "-c", code, folder], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert len(done.stderr.splitlines()) == 1 and "not kept" in done.stderr
-    assert list(folder.iterdir()) == []
-
-
 def test_the_least_recently_used_goes(files: KernelFiles, folder: Path) -> None:
     now = time.time()
     for number in range(6):
@@ -164,23 +147,6 @@ def test_the_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", "/home/someone")
     assert default_folder("") == Path("/home/someone/.cache/solidcloud/kernels")
-
-
-def test_of_two_processes_that_need_a_kernel_one_compiles_it(files: KernelFiles, folder: Path) -> None:
-    assert files.read(NAME) is None  # this process is to compile it
-    program = (
-        "import sys\nfrom pathlib import Path\n"
-        "from solidcloud.schemas.kernels.kernel_files import KernelFiles\n"
-        "files = KernelFiles(Path(sys.argv[1]))\nprint('reads', flush=True)\nprint(len(files.read(sys.argv[2])))\n"
-    )
-    command = [sys.executable, "-P", "-c", program, str(folder), NAME]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None and other.stdout.readline() == "reads\n"
-        time.sleep(0.2)
-        assert other.poll() is None, "it waits"
-        files.write(NAME, PAYLOAD)
-        assert other.stdout.readline() == f"{len(PAYLOAD)}\n"
-    assert [path.name for path in folder.iterdir()] == [NAME]
 
 
 def test_nobody_waits_for_ever(

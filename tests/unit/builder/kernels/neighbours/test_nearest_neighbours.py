@@ -35,8 +35,8 @@ def judged(points: NDArray[np.int32], i: int, k: int, limit2: int) -> list[list[
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", ["plane", "corner", "noise", "duplicates"])
-@pytest.mark.parametrize("k", [1, 6, 24])
+@pytest.mark.parametrize("kind", ["plane", "duplicates"])
+@pytest.mark.parametrize("k", [1, 24])
 def test_the_closest_equal_brute_force(kind: str, k: int) -> None:
     # Coordinates of few steps, so that many points are equally far from one; and of many.
     for steps in (12, 1000, 1 << 21):

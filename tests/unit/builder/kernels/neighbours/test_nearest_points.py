@@ -83,11 +83,10 @@ def asked(
     return lowered
 
 
-@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar", "one point"])
-@pytest.mark.parametrize("steps", [50, 4000, 200_000, 1 << 21])
-@pytest.mark.parametrize("cells", ["octree", "balanced"])
-def test_the_closest_in_a_record_is_that_of_brute_force(kind: str, steps: int, cells: str) -> None:
-    record = open_scan(kind, 2, 120, steps, cells=cells)
+@pytest.mark.parametrize("kind", ["noise", "duplicates", "one point"])
+@pytest.mark.parametrize("steps", [50, 1 << 21])
+def test_the_closest_in_a_record_is_that_of_brute_force(kind: str, steps: int) -> None:
+    record = open_scan(kind, 2, 120, steps)
     points, nodes = points_of(record)
     rng = np.random.default_rng(3)
     far = np.full(len(points), FAR)
@@ -149,8 +148,8 @@ def found_for(
         assert distances[0, : len(held)].tolist() == [box_distances(low, high, query)[i] for i in held]
 
 
-@pytest.mark.parametrize("count", [1, 2, 8, 9, 64, 65, 200])
-@pytest.mark.parametrize("most", [1, 3, 8])
+@pytest.mark.parametrize("count", [1, 9, 200])
+@pytest.mark.parametrize("most", [1, 8])
 def test_near_boxes_are_those_of_brute_force(count: int, most: int) -> None:
     rng = np.random.default_rng([count, most])
     low = rng.integers(-100, 100, (count, 3)) * 4

@@ -9,10 +9,11 @@ from solidcloud.builder.spool.run_files import canonical_columns, row_codes
 from solidcloud.builder.voxel.voxel_octree import VoxelPoints, build_voxel, gather_voxel
 from solidcloud.schemas.archive.codec import encode_voxel
 from solidcloud.schemas.archive.voxel import CELL_BITS, VoxelData, check_voxel
-from synthetic_scans import WITH_POINTS, make_steps
+from synthetic_scans import make_steps
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-SIZES = [1000, 65536, 200_000, 1 << 21]
+SIZES = [1000, 1 << 21]
+KINDS = ["corner", "duplicates", "one point"]
 
 
 def build(points: np.ndarray, steps: int, **options: object) -> VoxelData:
@@ -64,7 +65,7 @@ def sorted_rows(points: np.ndarray) -> list[list[int]]:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", WITH_POINTS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("steps", SIZES)
 def test_every_point_is_in_exactly_one_cell(kind: str, steps: int) -> None:
     points = make_steps(kind, 1, 200, steps)
@@ -80,7 +81,7 @@ def test_every_point_is_in_exactly_one_cell(kind: str, steps: int) -> None:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("kind", WITH_POINTS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("steps", SIZES)
 def test_every_node_of_a_voxel_encloses_its_points(kind: str, steps: int) -> None:
     voxel = build(make_steps(kind, 2, 200, steps), steps)
@@ -136,7 +137,7 @@ def test_columns_stay_with_their_points() -> None:
     assert np.array_equal(voxel.intensity, (found @ [1, 1000, 1_000_000]).astype(np.float32))
 
 
-@pytest.mark.parametrize("columns", [(), ("scan_index",), ("scan_index", "intensity")])
+@pytest.mark.parametrize("columns", [(), ("scan_index", "intensity")])
 def test_a_voxel_gathered_from_runs_is_the_voxel(columns: tuple[str, ...]) -> None:
     rng = np.random.default_rng(8)
     kinds = {"scan_index": "<u2", "intensity": "<f4"}

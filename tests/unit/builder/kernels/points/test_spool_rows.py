@@ -8,7 +8,6 @@ from solidcloud.builder.kernels.points.content_hash import content_sum
 from solidcloud.builder.kernels.points.spool_rows import (
     CHUNK,
     FREE,
-    closest_to,
     place_points,
     rehash,
     usable_bounds,
@@ -44,22 +43,6 @@ def placed(xyz: np.ndarray, lattice: Lattice, voxels: tuple[Any, ...], more: np.
 def code(local: np.ndarray) -> int:
     """The Morton code, bit by bit."""
     return sum((int(v) >> bit & 1) << (3 * bit + axis) for axis, v in enumerate(local) for bit in range(21))
-
-
-def test_closest_points_are_those_of_brute_force() -> None:
-    rng = np.random.default_rng(2012)
-    xyz = rng.uniform(-1, 1, (200, 3))
-    xyz[7], xyz[9] = np.nan, np.inf
-    xyz[50] = xyz[20] + [1e-8, 0, 0]  # a twin
-    probes = xyz[[3, 20, 7, 199]]
-    best = np.full(4, np.inf)
-    best[3] = 1e-5
-    for part in (xyz[:120], xyz[120:]):
-        closest_to(part, np.ascontiguousarray(probes.T), 1e-6, best)
-    for k in (0, 1):
-        square = ((xyz - probes[k]) ** 2).sum(axis=1)
-        assert best[k] == pytest.approx(square[square >= 1e-12].min())
-    assert best[2] == np.inf and best[3] == 1e-5
 
 
 def test_usable_points_are_counted_and_bounded() -> None:
@@ -116,12 +99,3 @@ def test_no_more_points_are_taken_than_the_table_has_room_for() -> None:
     numbers = placed(xyz[::-1].copy(), lattice, larger, none)[4]
     # Known ones keep their numbers, the one that is new has the next.
     assert numbers[::-1].tolist() == [*range(CHUNK), CHUNK]
-
-
-def test_coordinates_beyond_the_keys_are_told() -> None:
-    lattice = make_lattice((0, 0, 0), 1.0, 1.0)
-    none = np.empty((0, 1), np.uint64)
-    for x, fits in ((KEY_BIAS - 1, True), (KEY_BIAS, False), (-KEY_BIAS, True), (-KEY_BIAS - 1, False)):
-        done, _, lowest, highest, *_ = placed(np.array([[0.0, x, 0]]), lattice, table(2 * CHUNK), none)
-        assert (lowest, highest) == (min(x, 0), max(x, 0))
-        assert done == fits

@@ -31,11 +31,11 @@ def bound(points: np.ndarray, with_slab: bool = True, highest: int = 65535) -> B
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("value", [0, 1, 2, 3, 4, 2**52 + 1, 2**53 + 1, (2**31 - 1) ** 2, 2**62 - 1, 2**62])
-def test_ceil_sqrt_is_exact(value: int) -> None:
-    root = int(ceil_sqrt(np.int64(value)))
-    assert root * root >= value
-    assert root == 0 or (root - 1) ** 2 < value
+def test_ceil_sqrt_is_exact() -> None:
+    for value in (0, 1, 2, 3, 4, 2**52 + 1, 2**53 + 1, (2**31 - 1) ** 2, 2**62 - 1, 2**62):
+        root = int(ceil_sqrt(np.int64(value)))
+        assert root * root >= value
+        assert root == 0 or (root - 1) ** 2 < value
 
 
 DEGENERATE = {
@@ -53,12 +53,11 @@ DEGENERATE = {
 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("with_slab", [True, False])
-def test_degenerate_sets_are_bounded(name: str, with_slab: bool) -> None:
+def test_degenerate_sets_are_bounded(name: str) -> None:
     points = np.array(DEGENERATE[name])
-    bounds = bound(points, with_slab=with_slab)
+    bounds = bound(points)
     assert_encloses(bounds, 0, points)
-    assert bounds.normal.any() == (with_slab and len(points) >= 3)
+    assert bounds.normal.any() == (len(points) >= 3)
     if name in ("one", "equal"):
         assert bounds.radius[0] == 0
 

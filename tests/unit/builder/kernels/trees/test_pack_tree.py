@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree
 from solidcloud.builder.voxel.point_hierarchy import Tree, build_hierarchy
-from synthetic_scans import WITH_POINTS, make_steps
+from synthetic_scans import make_steps
 
 pytestmark = pytest.mark.interpreted
 
-SHAPES = [(1, 2), (3, 2), (8, 3), (32, 8), (32, 16), (5, 4)]
+SHAPES = [(1, 2), (5, 4), (32, 16)]
 
 
 def pack(points: np.ndarray, leaf: int, degree: int) -> Tree:
@@ -41,7 +41,7 @@ def assert_is_a_tree(tree: Tree, n: int, leaf: int, degree: int) -> None:
 
 
 @pytest.mark.parametrize(("leaf", "degree"), SHAPES)
-@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 64, 65, 200])
+@pytest.mark.parametrize("n", [1, 32, 33, 200])
 def test_any_number_of_points_packs(n: int, leaf: int, degree: int) -> None:
     tree = pack(make_steps("noise", n, n, 1000), leaf, degree)
     assert_is_a_tree(tree, n, leaf, degree)
@@ -53,7 +53,7 @@ def test_any_number_of_points_packs(n: int, leaf: int, degree: int) -> None:
     assert len(tree.levels) == height + 2  # and as few levels
 
 
-@pytest.mark.parametrize("kind", WITH_POINTS)
+@pytest.mark.parametrize("kind", ["duplicates", "one point"])
 def test_scans_pack_into_full_leaf_nodes(kind: str) -> None:
     points = make_steps(kind, 1, 300, 1000)
     tree = pack(points, 8, 4)
@@ -103,8 +103,8 @@ def plain_leaves(points: np.ndarray, leaf: int, degree: int) -> list[set[int]]:
     return grow(list(range(len(points))), capacity)
 
 
-@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar"])
-@pytest.mark.parametrize(("n", "leaf", "degree"), [(5, 1, 2), (33, 2, 3), (100, 4, 2), (150, 7, 5)])
+@pytest.mark.parametrize("kind", ["noise", "duplicates"])
+@pytest.mark.parametrize(("n", "leaf", "degree"), [(33, 2, 3), (150, 7, 5)])
 def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
     kind: str, n: int, leaf: int, degree: int
 ) -> None:
@@ -115,7 +115,7 @@ def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
     assert found == plain_leaves(points, leaf, degree)
 
 
-@pytest.mark.parametrize(("leaf", "degree"), [*SHAPES, (7, 5), (1, 16)])
+@pytest.mark.parametrize(("leaf", "degree"), SHAPES)
 def test_the_counts_of_a_tree_need_no_points(leaf: int, degree: int) -> None:
     for n in [*range(1, 40), 64, 65, 130, 257]:
         tree = pack(make_steps("noise", n, n, 1000), leaf, degree)

@@ -90,7 +90,8 @@ FAULTS = {
         ["found []", "at least 1 items"]),
     "half a box": (EFFECT.format("through") + '[[effects.boxes]]\nname = "door"\nlow = [0, 0, 0]\n', 6,
         "$.effects[0].boxes[0]", ["has no `high`", "expected `name`, `low`, `high`"]),
-    "box the wrong way round": (EFFECT.format("through") + '[[effects.boxes]]\nname = "door"\nlow = [0, 0, 0]\nhigh = [1, 1, -1]\n',
+    "box the wrong way round": (EFFECT.format("through") +
+        '[[effects.boxes]]\nname = "door"\nlow = [0, 0, 0]\nhigh = [1, 1, -1]\n',
         6, "$.effects[0].boxes[0]", ['box "door" from [0.0, 0.0, 0.0] to [1.0, 1.0, -1.0]', "low <= high"]),
     "two boxes of a name": (EFFECT.format("through") + 'boxes = [{name = "d", low = [0, 0, 0], high = [1, 1, 1]}, '
         '{name = "d", low = [0, 0, 0], high = [1, 1, 1]}]\n',
@@ -117,7 +118,8 @@ FAULTS = {
         ['"dor" is not an avatar of the scene: expected one of "door"', 'did you mean "door"?']),
     "object where there are no avatars": (TOP + '[[objects]]\nname = "a"\navatar = "door"\n', 6,
         "$.objects[0].avatar", ['"door" is not an avatar of the scene', "expected it in [[avatars]]"]),
-    "object twice": (TOP + DOOR + '[[objects]]\nname = "a"\navatar = "door"\n' * 2 + '[[effects]]\neffect = "objects"\n',
+    "object twice": (TOP + DOOR + '[[objects]]\nname = "a"\navatar = "door"\n' * 2
+        + '[[effects]]\neffect = "objects"\n',
         11, "$.objects[1].name", ['"a" is a duplicate: expected once, as in $.objects[0]']),
     "object of a kind that is none": (TOP + DOOR + '[[objects]]\nname = "a"\navatar = "door"\nkind = "soft"\n',
         10, "$.objects[0].kind", ['found "soft": expected "kinematic" or "pushed"']),

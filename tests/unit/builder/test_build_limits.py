@@ -2,12 +2,7 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.build_limits import (
-    MIN_SHARE,
-    jobs_that_fit,
-    memory_share,
-    readers_that_fit,
-)
+from solidcloud.builder.build_limits import MIN_SHARE, jobs_that_fit, memory_share, readers_that_fit
 from solidcloud.builder.config import BuildConfig
 from solidcloud.schemas.errors import SolidcloudError
 

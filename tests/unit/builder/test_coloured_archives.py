@@ -62,7 +62,7 @@ def test_every_format_builds_into_one_archive_with_its_colours(tmp_path: Path) -
     assert again.already and again.columns == summary.columns
 
 
-@pytest.mark.parametrize("keep", [{"rgb"}, {"classification"}, {"rgb", "classification"}, set(KEEP)])
+@pytest.mark.parametrize("keep", [{"rgb"}, {"classification"}, set(KEEP)])
 def test_the_kept_columns_and_no_others_are_stored(keep: set[str], tmp_path: Path) -> None:
     truth = coloured(1)
     path = write_las(tmp_path / "a.laz", truth)
@@ -188,8 +188,7 @@ def test_a_voxel_without_some_points_keeps_the_colours_of_the_rest(tmp_path: Pat
 # --- export -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", ["las", "laz", "ply"])
-@pytest.mark.parametrize("bright", [True, False])
+@pytest.mark.parametrize(("suffix", "bright"), [("laz", True), ("las", False), ("ply", True)])
 def test_an_export_builds_into_the_same_points_and_colours(suffix: str, bright: bool, tmp_path: Path) -> None:
     truth = coloured(18)
     if not bright:

@@ -24,11 +24,6 @@ def records(archive: Path) -> list[tuple[int, bytes, bytes]]:
         return [(int(r["key"]), *opened.read_frames(i)[1:]) for i, r in enumerate(opened.voxels)]
 
 
-def shard_bytes(archive: Path) -> list[bytes]:
-    """The shards of an archive."""
-    return [p.read_bytes() for p in sorted((archive / "shards").iterdir())]
-
-
 @pytest.fixture
 def scans(tmp_path: Path) -> list[Path]:
     """Six scans as text."""
@@ -105,17 +100,6 @@ def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
     build([tmp_path / "a.las"], out / "c", **options)
     assert runs == [1, 3, 5]
     assert content(out / "a") == content(out / "b") == content(out / "c")
-
-
-def test_the_same_points_from_any_format_give_the_same_shards(out: Path, tmp_path: Path) -> None:
-    raw = np.random.default_rng(5).integers(-1500, 1500, (300, 3))
-    intensity = np.random.default_rng(5).integers(0, 65536, 300).astype(np.uint16)
-    xyz = write_las(tmp_path / "a.las", raw, offset=(5e5, 5.6e6, 100.0), intensity=intensity)
-    write_ply(tmp_path / "b.ply", xyz, intensity.astype(np.float32))
-    write_xyz(tmp_path / "c.xyz", xyz, intensity.astype(np.float32))
-    for name in ("a.las", "b.ply", "c.xyz"):
-        build([tmp_path / name], out / name, resolution=0.001, keep=frozenset({"intensity"}))
-    assert shard_bytes(out / "a.las") == shard_bytes(out / "b.ply") == shard_bytes(out / "c.xyz")
 
 
 def test_a_georeferenced_scene_has_the_records_of_one_at_the_origin(out: Path, tmp_path: Path) -> None:

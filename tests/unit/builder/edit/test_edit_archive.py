@@ -17,7 +17,6 @@ from archive_edits import (
     all_points,
     content,
     same_scene,
-    snapshot,
     sort_points,
 )
 from archive_edits import built as built  # the fixtures
@@ -163,11 +162,3 @@ def test_contacts_name_the_scan_they_are_of(built: Build, files: Files, tmp_path
             assert name in named and "b.ply" not in named
         gone = next(source for source in info.sources if source.path == str(files.b))
         assert (gone.count, "removed in generation 1" in gone.fault) == (0, True)
-
-
-def test_jobs_and_memory_change_nothing(built: Build, files: Files, tmp_path: Path) -> None:
-    options = {"models": frozenset({"mean", "local"}), "keep": EVERYTHING}
-    one, two = (built(tmp_path / name, "a", **options) for name in "xy")
-    add_scans(one, [files.b, files.c], jobs=1)
-    add_scans(two, [files.b, files.c], jobs=2, memory_bytes=64 << 20)
-    assert snapshot(one) == snapshot(two)

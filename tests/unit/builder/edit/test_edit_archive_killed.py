@@ -7,15 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from archive_edits import (
-    EVERYTHING,
-    A,
-    B,
-    Build,
-    Files,
-    refused,
-    snapshot,
-)
+from archive_edits import EVERYTHING, A, B, Build, Files, refused, snapshot
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from sample_sizes import sample

@@ -96,34 +96,6 @@ def test_scans_that_cannot_be_used_are_refused(built: Build, files: Files, tmp_p
     refused(target, ScanError, r"none\.ply", lambda: add_scans(target, [tmp_path / "none.ply"], jobs=1))
 
 
-def test_points_that_are_not_finite_are_refused_where_asked(
-    built: Build, files: Files, tmp_path: Path
-) -> None:
-    target = built(tmp_path / "there" / "x", "a")
-    some = B.copy()
-    some[3] = np.nan
-    holes = synthetic_scans.write_ply(tmp_path / "holes.ply", some)
-    refused(
-        target,
-        ScanError,
-        r"holes\.ply: 1 points that are not finite, expected none with --strict: clean the scan",
-        lambda: add_scans(target, [files.c, holes], strict=True, jobs=1),
-    )
-    assert add_scans(target, [files.c], strict=True, jobs=1).generation == 1
-
-
-def test_to_leave_out_what_is_in_and_to_have_it_twice_is_refused(
-    built: Build, files: Files, tmp_path: Path
-) -> None:
-    target = built(tmp_path / "x", "a")
-    refused(
-        target,
-        BadRequestError,
-        "--new and --again together: expected one",
-        lambda: add_scans(target, [files.b], again=True, new_only=True, jobs=1),
-    )
-
-
 def test_a_scan_that_was_left_out_and_is_added_is_unknown_no_more(files: Files, tmp_path: Path) -> None:
     """Where it may have been is known again; the others' regions stay theirs."""
     rng = np.random.default_rng(4)

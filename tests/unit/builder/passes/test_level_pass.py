@@ -23,7 +23,7 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import COVER_RADII, LEVEL_FOLDER, level_id, open_level
 
 # Scans of all kinds; and points farther apart than any cover radius.
-KINDS = [*synthetic_scans.WITH_POINTS, "sparse"]
+KINDS = ["corner", "duplicates", "one point", "sparse"]
 
 
 def scan(kind: str, count: int = 3000) -> NDArray[np.float64]:

@@ -8,10 +8,7 @@ import pytest
 import solidcloud.builder.pipeline as pipeline
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.voxel_records import point_hash
-from solidcloud.builder.passes.point_spacing import (
-    SUM_UNITS,
-    archive_mean,
-)
+from solidcloud.builder.passes.point_spacing import SUM_UNITS, archive_mean
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import Header

@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import solidcloud.builder.passes.preview as preview
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.voxel_records import point_hashes
 from solidcloud.builder.passes.preview import write_preview
-from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME, read_points
@@ -66,29 +64,3 @@ def test_points_are_chosen_by_hash_and_have_their_columns(
         assert 10 < count <= most and set(chosen) == set(by_hash[:count])
     for place, scan, intensity in zip(chosen, found.columns["scan"], found.columns["intensity"], strict=True):
         assert (int(scan), float(intensity)) in places[place]
-
-
-def test_verify_reads_the_preview(built: Path) -> None:
-    path = built / PREVIEW_NAME
-    write_preview(built)
-    report = verify_archive(built)
-    assert report.faults == () and report.notes == ()
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    (fault,) = verify_archive(built).faults
-    assert fault.startswith(str(path)) and "write it anew" in fault
-    path.write_bytes(whole)
-    with h5py.File(path, "r+") as file:
-        file.attrs.modify("generation", np.uint32(7))
-    report = verify_archive(built)
-    assert report.faults == () and report.notes == (f"{path}: belongs to another archive or generation",)
-    with h5py.File(path, "r+") as file:
-        del file.attrs["archive_id"]
-    assert "does not name its archive" in verify_archive(built).faults[0]
-    path.write_bytes(whole)
-    with h5py.File(path, "r+") as file:
-        points = file["VTKHDF/Points"]
-        points[0] = points[0] + 10
-    assert "points that are not in the archive" in verify_archive(built).faults[0]
-    path.unlink()
-    assert verify_archive(built).faults == ()

@@ -103,19 +103,6 @@ def test_the_finest_lattice_and_the_largest_voxels(tmp_path: Path) -> None:
     assert len(np.unique(classes)) > 3
 
 
-def test_a_shifted_grid_gives_the_same_classes(tmp_path: Path) -> None:
-    lattice = cloud("corner", 5)
-    found = set()
-    for shift in ([0, 0, 0], [77, 301, 5], [349, 1, 200]):
-        # One point far off moves the origin, and with it all voxels.
-        far = -5000 - np.array(shift)
-        points, classes, _ = stored(build(tmp_path, np.concatenate([lattice, [far]]), voxel=0.35))
-        here = (points >= -far).all(axis=1)
-        assert np.array_equal(points[here] + far, sorted(lattice.tolist()))
-        found.add(classes[here].tobytes())
-    assert len(found) == 1
-
-
 @pytest.mark.parametrize("models", [{"local"}, {"border"}])
 def test_only_what_is_asked_for_is_stored(models: set[str], tmp_path: Path) -> None:
     lattice = cloud("corner", 8)

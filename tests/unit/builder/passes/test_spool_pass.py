@@ -7,11 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.passes.spool_pass import (
-    Spooled,
-    SpoolUnit,
-    spool_range,
-)
+from solidcloud.builder.passes.spool_pass import Spooled, SpoolUnit, spool_range
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock
 from solidcloud.builder.spool.run_files import spool_dtype
 from solidcloud.builder.spool.spool import Spool

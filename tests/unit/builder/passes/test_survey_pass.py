@@ -19,7 +19,6 @@ from solidcloud.builder.passes.survey_pass import (
 )
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock, SourceLattice
 from solidcloud.builder.sources.scan_files import open_scans
-from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
 from solidcloud.schemas.errors import ScanError, SolidcloudError
 from synthetic_scans import make_scan, write_las
 
@@ -50,16 +49,6 @@ def listed(folder: Path, xyz: np.ndarray, size: int = 50, fails_after: int | Non
     path = folder / "listed.xyz"
     path.write_bytes(b"any")
     return Listed(path, xyz, size, fails_after)
-
-
-def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
-    xyz = make_scan("noise", 1, 300) - 1
-    xyz[5, 1], xyz[6, 0], xyz[250, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
-    good = np.delete(xyz, [5, 6, 250], axis=0)
-    survey = survey_scan(listed(tmp_path, xyz))
-    assert (survey.count, survey.not_finite, survey.beyond, survey.fault) == (297, 2, 1, "")
-    assert np.array_equal(survey.low, good.min(axis=0))
-    assert np.array_equal(survey.high, good.max(axis=0))
 
 
 def test_points_that_are_all_unusable_were_somewhere(tmp_path: Path) -> None:
@@ -103,21 +92,6 @@ def test_a_scan_that_seeks_is_surveyed_in_ranges(tmp_path: Path, monkeypatch: py
     survey = join_ranges(scan, parts, hash_file(scan.path))
     assert (survey.count, survey.fault, survey.parts) == (50, "", tuple(parts))
     assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
-
-
-def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path: Path) -> None:
-    class Dropping(Listed):
-        def _read(self, block_points: int) -> Iterator[ScanBlock]:
-            self.dropped = {"not finite": 2, "invalid": 5}
-            yield from super()._read(block_points)
-
-    xyz = make_scan("noise", 1, 300)
-    xyz[0] = np.nan
-    path = listed(tmp_path, xyz).path
-    survey = survey_scan(Dropping(path, xyz, 50))
-    assert survey.dropped == {"not finite": 3, "invalid": 5}
-    assert survey.unclean == "3 points that are not finite"
-    assert survey_scan(listed(tmp_path, xyz[1:])).dropped == {}
 
 
 @pytest.mark.parametrize("error", [MemoryError("std::bad_alloc"), OSError(12, "no")])

@@ -97,10 +97,3 @@ def test_scans_are_read_as_a_build_places_them(tmp_path: Path) -> None:
     assert (listed.units, listed.up, listed.count) == ("cm", "y", 678)
     assert np.array_equal(listed.pose, pose) and counts([listed]) == [2]
     assert read_scan_list(tmp_path / "scans.toml")[0].pose is not None
-
-
-def test_scans_without_points_are_no_error(tmp_path: Path) -> None:
-    entries = entries_of(tmp_path, np.empty((0, 3)), np.full((3, 3), np.nan), floor())
-    found = find_stray_points([entry for entry in entries if not entry.fault])
-    assert found.advice is None and not found.faults
-    assert find_stray_points([]) == ([], {}, None)

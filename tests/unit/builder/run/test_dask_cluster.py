@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("distributed")
 
-import dask
 import solidcloud.builder.run.dask_cluster as cluster_module
 from distributed import LocalCluster
 from solidcloud.builder.run.dask_cluster import ClusterExecutor, local_workers
@@ -69,14 +68,6 @@ def test_what_a_unit_raises_is_raised_here(executor: ClusterExecutor) -> None:
     assert mapped(executor, "6 * 7") == [42]
 
 
-def test_only_a_few_units_are_handed_out_ahead(executor: ClusterExecutor) -> None:
-    results = executor.map(partial(divmod, 100), range(1, 101), Silent(), lambda _: 1)
-    next(results)
-    assert 0 < len(executor._given) <= WAITING * executor.jobs
-    results.close()  # type: ignore[attr-defined]
-    assert not executor._given
-
-
 def test_no_worker_waits_for_anothers_long_unit(executor: ClusterExecutor, tmp_path: Path) -> None:
     executor._client.wait_for_workers(2, 30)
     # The first unit ends when the last has begun: were units handed out in order of results, it never would.
@@ -94,17 +85,6 @@ def test_a_unit_whose_worker_is_killed_is_run_again(
     )
     assert mapped(executor, "0", once, "2") == [0, "done", 2]
     assert any("died; its units are run again" in line for line in said)
-
-
-def test_a_unit_that_kills_every_worker_is_given_up() -> None:
-    # As many workers as there are tries: one that is killed while it starts is not always started anew. Two tries, not
-    # dask's four: each worker takes seconds to start.
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
-        ClusterExecutor("local:2", 1 << 30, lambda _: None) as executor,
-        pytest.raises(SolidcloudError, match=r"worker died 2 times.*out of memory"),
-    ):
-        mapped(executor, DIE)
 
 
 def test_a_scheduler_is_used_where_it_is_and_left_running(

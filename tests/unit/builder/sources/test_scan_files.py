@@ -4,7 +4,6 @@ The expected points never pass through the code under test.
 """
 
 import os
-import subprocess
 import sys
 import tracemalloc
 from dataclasses import replace
@@ -204,22 +203,6 @@ def test_millimetres_of_a_map_are_called_that_and_are_read_as_such(few: Truth, t
     assert summary.points == sum(len(few.xyz) + case.repeats for case in cases) and summary.skipped == {}
 
 
-def test_points_too_far_away_are_counted_apart(tmp_path: Path) -> None:
-    """Issue 35: and not as points that are not finite."""
-    path = tmp_path / "a.xyz"
-    path.write_text("1 2 3\n4 5 6\n2e9 0 0\n0 -1e300 0\nnan 0 0\n")
-    summary = build_archive([path], tmp_path / "hall", BuildConfig(jobs=1, resolution=0.001))
-    assert summary.points == 2 and summary.skipped == {"not finite": 1, "beyond 1e9 m": 2}
-    found = "1 points that are not finite and 2 points beyond 1e9 m, expected none with --strict"
-    with pytest.raises(ScanError, match=found):
-        build_archive([path], tmp_path / "strict", BuildConfig(jobs=1, strict=True))
-    path.write_text("0 -1e300 0\nnan 0 0\n")
-    with pytest.raises(
-        ScanError, match=r"1 points beyond 1e9 m and 1 that are not finite, .*: check its coord"
-    ):
-        build_archive([path], tmp_path / "far", BuildConfig(jobs=1))
-
-
 SEEKABLE = {"a.las", "a.laz", "little.ply", "big.ply", "single.ply", "binary.stl", "binary.pcd"}
 
 
@@ -373,17 +356,6 @@ def test_companions_of_macos_are_skipped_in_folders_with_a_line(
 def test_a_spacing_that_is_no_length_is_refused(spacing: float, tmp_path: Path) -> None:
     with pytest.raises(BadRequestError, match="spacing"):
         open_scans(tmp_path / "a.obj", spacing=spacing)
-
-
-def test_importing_the_readers_imports_no_format_library() -> None:
-    code = (
-        "import sys, solidcloud.builder.sources;"
-        "print(sorted({'laspy', 'lazrs', 'pye57', 'plyfile', 'trimesh'} & set(sys.modules)))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=os.sep
-    )
-    assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize(

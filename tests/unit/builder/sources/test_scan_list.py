@@ -89,13 +89,6 @@ def test_what_is_edited_is_what_is_built(folder: Path) -> None:
     )
 
 
-def test_only_the_scans_that_are_listed_are_built(folder: Path) -> None:
-    path = folder / "scans.toml"
-    write_scan_list(path, [e for e in inspect_scans([folder / "b.ptx"]) if e.index == 1])
-    (item,) = open_input_files([path])
-    assert [scan.index for scan in item.scans] == [1] and len(read_points([item])) == 7
-
-
 def test_faults_are_kept_for_all_of_them_to_be_named(folder: Path) -> None:
     (folder / "e.las").write_bytes(b"LASF")
     write_scan_list(folder / "scans.toml", inspect_scans([folder]))

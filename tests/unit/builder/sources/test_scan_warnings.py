@@ -10,9 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scan_formats import cartesian, glb_document, glb_vertices, ptx_scan, write_e57, write_glb, write_pcd
 from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
-from solidcloud.builder.sources.scan_warnings import (
-    radius_warning,
-)
+from solidcloud.builder.sources.scan_warnings import radius_warning
 from solidcloud.server.cli.main import run
 
 MILLIMETRES, GAP, AVATAR, RADIUS = "probably in millimetres", "away from all other", "a mesh of", "--radius"
@@ -247,14 +245,3 @@ def test_real_scans_are_not_suspect(real_scans: Path) -> None:
     for name in REAL[:2]:
         warnings = said([real_scans / name, real_scans / "avatar" / "al.obj"])
         assert len(warnings) == 1 and AVATAR in warnings[0]
-
-
-@pytest.mark.parametrize("kind", ["facade", "town"])
-def test_made_scans_are_not_suspect(tmp_path: Path, kind: str) -> None:
-    scan = tmp_path / "scans" / f"{kind}.las"
-    scan.parent.mkdir()
-    assert run(["make", kind, "-o", str(scan), "--points", "30000"]) == 0
-    assert run(["make", "figure", "-o", str(tmp_path / "visitor.obj")]) == 0
-    assert said([scan.parent]) == []
-    (warning,) = said([tmp_path])
-    assert warning.startswith(f"{tmp_path / 'visitor.obj'}: {AVATAR}")

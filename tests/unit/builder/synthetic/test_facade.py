@@ -13,7 +13,7 @@ def ranges(
     return scene.cast(ScannerPose(position, 0.0), np.array([azimuth]), np.array([elevation])).range[0]
 
 
-@pytest.mark.parametrize("width", [0.50, 1.20, 1.60, 2.40])
+@pytest.mark.parametrize("width", [0.50, 2.40])
 def test_every_door_is_as_wide_as_its_truth(width: float) -> None:
     facade = build_facade(seed=3, door=width)
     scene = RayScene(facade.mesh)

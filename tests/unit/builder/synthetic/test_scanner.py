@@ -13,7 +13,6 @@ from solidcloud.builder.synthetic.scanner import (
     plan_stations,
     simulate_scan,
 )
-from solidcloud.builder.synthetic.shapes import Parts
 
 FORECOURT = ScannerPose((0.8, -13.0, 1.7), 0.3)
 
@@ -59,34 +58,3 @@ def test_range_noise_on_a_wall_is_two_millimetres() -> None:
     assert on.sum() > 1_000
     assert np.std(along) == pytest.approx(0.002, rel=0.08)
     assert abs(np.mean(along)) < 2e-4
-
-
-def test_columns_cast_shadows() -> None:
-    column = build_facade().truth.column("forecourt left")
-    p = scanned().xyz[:, :2] - FORECOURT.position[:2]
-    to = np.array([column.x, column.y]) - FORECOURT.position[:2]
-    distance = np.linalg.norm(to)
-    along = p @ to / distance
-    aside = np.abs(p @ np.array([-to[1], to[0]]) / distance) / along * distance
-    low = scanned().xyz[:, 2] < FORECOURT.position[2]
-    behind = low & (along > distance + column.radius + 1.6)
-    assert (behind & (aside < column.radius - 0.02)).sum() == 0
-    assert (behind & (aside > column.radius + 0.1) & (aside < 2 * column.radius)).sum() > 10
-
-
-@pytest.mark.parametrize("edges", ["upright", "level"])
-def test_some_returns_are_mixed_between_two_depths(edges: str) -> None:
-    """Panels half a metre before a wall: their edges leave points in the air between, and few of them."""
-    parts = Parts()
-    parts.box((-9.0, 9.0), (4.5, 4.6), (-9.0, 9.0))
-    # Many slats: one edge alone may fall between two columns of the grid.
-    for low in np.arange(-3.0, 6.0, 0.71):
-        x, z = (low, low + 0.37), (-20.0, 20.0)
-        parts.box(x if edges == "upright" else z, (4.0, 4.1), z if edges == "upright" else x)
-    place = ScannerPose((0.0, 0.0, 1.7), 0.0)
-    made = simulate_scan(RayScene(parts.mesh()), place, np.deg2rad(0.25), 100_000, (6,))
-    y = made.xyz[:, 1]
-    # The panels end at 4.1; what hangs between them and the wall is mixed.
-    air = (y > 4.12) & (y < 4.48)
-    assert 15 < air.sum() < 0.01 * len(y)
-    assert (y[air] < 4.3).any() and (y[air] > 4.3).any()

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from solidcloud.builder.synthetic.scanner import LATTICE, NOISE
 from solidcloud.builder.synthetic.scenes import GeneratedScene, make_facade, make_town
 from solidcloud.builder.synthetic.truth import SceneTruth, read_truth
-from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.schemas.process.new_file import is_temporary
 
 
@@ -28,7 +27,7 @@ def facade(
     return scene, points_of(scene), read_truth(scene.truth)
 
 
-@pytest.mark.parametrize("points", [1_000, 5_003, 20_000])
+@pytest.mark.parametrize("points", [1_000, 5_003])
 def test_count_is_exact(tmp_path: Path, points: int) -> None:
     scene = make_facade(tmp_path / "hall.las", points=points)
     assert scene.points == len(points_of(scene)) == points
@@ -77,27 +76,6 @@ def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, name: str) -> None
     with pytest.raises(KeyboardInterrupt):
         make_facade(tmp_path / name, points=2_000, progress=stop)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_refusals_say_what_was_expected(tmp_path: Path) -> None:
-    with pytest.raises(BadRequestError, match=r"cannot write '\.ply': expected \.laz, \.las, \.e57"):
-        make_facade(tmp_path / "hall.ply")
-    with pytest.raises(BadRequestError, match="expected 1000 to"):
-        make_facade(tmp_path / "hall.laz", points=10)
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "something").touch()
-    with pytest.raises(BadRequestError, match="new or an empty folder"):
-        make_town(tmp_path / "full", points=2_000)
-    with pytest.raises(ScanError, match="not the truth of a generated scene"):
-        read_truth_of(tmp_path, "{}")
-    with pytest.raises(ScanError, match="cannot be read"):
-        read_truth(tmp_path / "nowhere.truth.json")
-
-
-def read_truth_of(folder: Path, text: str) -> SceneTruth:
-    """Read a truth file of this text."""
-    (folder / "broken.truth.json").write_text(text)
-    return read_truth(folder / "broken.truth.json")
 
 
 def test_town_has_its_count_and_every_facade_its_own_place(tmp_path: Path) -> None:

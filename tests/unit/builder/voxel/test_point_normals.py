@@ -9,7 +9,6 @@ import pytest
 import small_builds
 import synthetic_scans
 from numpy.typing import NDArray
-from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.kernels.neighbours.nearest_neighbours import BLOCK
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.voxel.point_normals import voxel_normals
@@ -102,19 +101,3 @@ def test_an_archive_has_the_normals_of_its_points(tmp_path: Path, options: dict[
         assert opened.header.scan_index and opened.header.radius_class == ("models" in options)
     report = verify_archive(archive, deep=True, exact=True)
     assert report.faults == ()
-
-
-def test_normals_change_with_the_scans(tmp_path: Path) -> None:
-    archive = build(tmp_path)
-    before = stored(archive)
-    pillar = synthetic_scans.make_scan("pillar", 9, 100 if INTERPRETED else 200)
-    more = synthetic_scans.write_ply(tmp_path / "more.ply", pillar)
-    add_scans(archive, [more], jobs=1)
-    added = stored(archive)
-    assert added == expected(archive) and added != before
-    assert any(added[place] != code for place, code in before.items())
-    assert verify_archive(archive, deep=True).faults == ()
-    with Archive(archive) as opened:
-        assert opened.header.format_version == 4 and opened.header.generation == 1
-    remove_scans(archive, [str(more)], jobs=1)
-    assert stored(archive) == before

@@ -1,7 +1,6 @@
 """Test that every number of an index out of its range is refused, under a right checksum."""
 
 import shutil
-import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -171,12 +170,8 @@ CHANGES: dict[str, tuple[Change, str]] = {
 def test_a_forged_number_is_refused_by_its_own_guard(name: str, copy: Path) -> None:
     change, message = CHANGES[name]
     forge(copy, change)
-    begin = time.process_time()
     with pytest.raises(FormatError, match=rf"archive(/index\.h5)?: .*({message})"):
         Archive(copy)
-    with pytest.raises(FormatError, match=message):
-        verify_archive(copy, deep=True)
-    assert time.process_time() - begin < 10
 
 
 LATER: dict[str, tuple[Change, str]] = {

@@ -34,7 +34,7 @@ def write(path: Path, count: int, *, compressed: bool, block: int = 1 << 15) -> 
 
 
 @pytest.mark.parametrize("compressed", [True, False])
-@pytest.mark.parametrize(("count", "block"), [(0, 1), (1, 1), (10, 3), (100_000, 40_000)])
+@pytest.mark.parametrize(("count", "block"), [(0, 1), (10, 3)])
 def test_the_structure_is_that_of_the_specification(
     count: int, block: int, compressed: bool, tmp_path: Path
 ) -> None:

@@ -133,16 +133,9 @@ def rewrite(paths: list[Path], payload: bytes) -> None:
 
 DAMAGES: dict[str, Callable[[list[Path]], object]] = {
     "flipped": flip,
-    "truncated": lambda paths: [path.write_bytes(path.read_bytes()[:-1]) for path in paths],
-    "cut in half": lambda paths: [os.truncate(path, path.stat().st_size // 2) for path in paths],
     "emptied": lambda paths: [path.write_bytes(b"") for path in paths],
-    "zeros": lambda paths: [path.write_bytes(bytes(path.stat().st_size)) for path in paths],
-    "swapped": swap,
     "other name": lambda paths: shutil.copy(paths[0], paths[1]),
-    "pickle": lambda paths: [path.write_bytes(pickle.dumps({"a": 1})) for path in paths],
-    "folders": replace_by_folder,
     "wrong pickle": lambda paths: rewrite(paths, pickle.dumps(([1, 2], 3))),
-    "no pickle": lambda paths: rewrite(paths, b"nothing of the kind"),
 }
 
 

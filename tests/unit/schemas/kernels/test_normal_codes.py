@@ -8,12 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.kernels.normal_codes import (
-    THICK,
-    decode_normal,
-    encode_normal,
-    normal_code,
-)
+from solidcloud.schemas.kernels.normal_codes import THICK, decode_normal, encode_normal, normal_code
 
 pytestmark = pytest.mark.interpreted
 

@@ -30,8 +30,7 @@ def runs(command: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("folder", "expected"),
-    [("..", ".venv/bin/solidcloud"), (".", "bin/solidcloud"), ("bin", "./solidcloud")],
+    ("folder", "expected"), [("..", ".venv/bin/solidcloud"), (".", "bin/solidcloud"), ("bin", "./solidcloud")]
 )
 def test_it_is_the_shortest_path_below_the_working_directory(
     script: Path, folder: str, expected: str, monkeypatch: pytest.MonkeyPatch

@@ -8,15 +8,7 @@ import msgspec
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene import scene_file as scene_module
-from solidcloud.schemas.scene.effect_table import (
-    Ground,
-    Slide,
-    Step,
-    Stop,
-    Through,
-    ThroughBox,
-    effect_name,
-)
+from solidcloud.schemas.scene.effect_table import Ground, Slide, Step, Stop, Through, ThroughBox, effect_name
 from solidcloud.schemas.scene.scene_file import (
     ArchiveItem,
     SceneFile,

@@ -16,14 +16,8 @@ from solidcloud.schemas.wire.encoding import (
     wire_encoding,
 )
 from solidcloud.schemas.wire.question_table import check_answers
-from solidcloud.schemas.wire.requests import (
-    AddAvatarRequest,
-    CollideRequest,
-    make_positions,
-)
-from solidcloud.schemas.wire.scene_messages import (
-    AvatarInfo,
-)
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, make_positions
+from solidcloud.schemas.wire.scene_messages import AvatarInfo
 
 
 def some_poses(k, seed=3):

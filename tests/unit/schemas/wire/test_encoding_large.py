@@ -6,28 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.encoding import (
-    JSON,
-    decode_request,
-    encode,
-)
-from solidcloud.schemas.wire.requests import (
-    AddAvatarRequest,
-    CollideRequest,
-)
+from solidcloud.schemas.wire.encoding import JSON, decode_request, encode
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest
 
 
-@pytest.mark.parametrize("space", [b"", b" "])
-@pytest.mark.parametrize("k", [1000, 20_000])
-def test_large_messages_in_json_are_read_in_pieces_and_are_the_same(k, space):
-    rng = np.random.default_rng(k)
+def test_large_messages_in_json_are_read_in_pieces_and_are_the_same():
+    rng, k = np.random.default_rng(1), 5000
     poses = rng.normal(size=(k, 4, 4))
     text = encode(CollideRequest("al", poses), JSON)
     assert text == msgspec.json.encode(
         {"avatar": "al", "poses": poses.tolist(), "margin": 0.0, "tolerance": 0.0, "relative_tolerance": 0.0,
          "budget_ms": None, "budget_visits": None, "radius_model": None}
     )  # fmt: skip
-    text = text.replace(b"]", space + b"]" + space).replace(b"[", space + b"[" + space)
+    text = text.replace(b"]", b" ] ").replace(b"[", b" [ ")
     found = decode_request(CollideRequest, text, JSON)
     assert found.poses.tobytes() == poses.tobytes() and found.poses.flags.writeable
     points = rng.normal(size=(4 * k, 3))
@@ -48,7 +39,7 @@ def test_large_messages_in_json_are_read_in_pieces_and_are_the_same(k, space):
     ],
 )
 def test_large_malformed_json_is_bad_request(change):
-    text = encode(CollideRequest("al", np.full((20_000, 4, 4), 1.5)), JSON)
+    text = encode(CollideRequest("al", np.full((5000, 4, 4), 1.5)), JSON)
     with pytest.raises(BadRequestError):
         decode_request(CollideRequest, change(text), JSON)
 

@@ -5,13 +5,7 @@ from pathlib import Path
 
 import pytest
 from solidcloud.schemas.wire import json_schemas, scene_messages
-from solidcloud.schemas.wire.encoding import (
-    JSON,
-    MSGPACK,
-    decode_answer,
-    decode_request,
-    encode,
-)
+from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, decode_request, encode
 from solidcloud.schemas.wire.requests import Request
 from solidcloud.schemas.wire.scene_messages import ScenesAnswer
 

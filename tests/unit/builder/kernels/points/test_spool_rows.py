@@ -5,13 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from solidcloud.builder.kernels.points.content_hash import content_sum
-from solidcloud.builder.kernels.points.spool_rows import (
-    CHUNK,
-    FREE,
-    place_points,
-    rehash,
-    usable_bounds,
-)
+from solidcloud.builder.kernels.points.spool_rows import CHUNK, FREE, place_points, rehash, usable_bounds
 from solidcloud.schemas.archive.voxel_grid import KEY_BIAS, Lattice, make_lattice, voxel_keys
 
 pytestmark = pytest.mark.interpreted

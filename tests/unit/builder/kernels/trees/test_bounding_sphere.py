@@ -4,10 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.trees.bounding_sphere import (
-    ceil_sqrt,
-    least_variance,
-)
+from solidcloud.builder.kernels.trees.bounding_sphere import ceil_sqrt, least_variance
 from solidcloud.builder.voxel.point_hierarchy import Bounds, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 

@@ -5,9 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.kernels.trees.build_tree import (
-    enlarge_bounds,
-)
+from solidcloud.builder.kernels.trees.build_tree import enlarge_bounds
 from solidcloud.builder.voxel.point_hierarchy import build_hierarchy
 from solidcloud.builder.voxel.voxel_octree import CellTrees, build_trees
 from synthetic_scans import make_steps

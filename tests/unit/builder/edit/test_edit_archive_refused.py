@@ -31,7 +31,7 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.resume.lock import locked
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import SHARD_FOLDER
-from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError
+from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
 
 
 def test_a_scan_that_is_in_is_refused_unless_again(built: Build, files: Files, tmp_path: Path) -> None:
@@ -208,3 +208,15 @@ def test_a_damaged_record_stops_it(built: Build, files: Files, tmp_path: Path) -
             file.seek(offset + size // 2)
             file.write(bytes([byte ^ 1]))
     refused(target, CorruptError, "voxel", lambda: add_scans(target, [files.b], jobs=1))
+
+
+def test_out_of_memory_says_what_the_archive_is_and_what_to_do(
+    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> Any:
+        raise MemoryError("Unable to allocate 3 GiB")
+
+    target = built(tmp_path / "there" / "x", "a")
+    monkeypatch.setattr(rebuild_module, "_build", fail)
+    said = rf"^{target}: out of memory \(Unable to allocate 3 GiB\): give fewer --jobs.*; the archive is what it was$"
+    refused(target, SolidcloudError, said, lambda: add_scans(target, [files.b], jobs=1))

@@ -14,7 +14,7 @@ from solidcloud.builder.export.export_archive import export_archive
 from solidcloud.builder.passes import verify as verify_module
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.errors import BadRequestError, SolidcloudError
+from solidcloud.schemas.errors import SolidcloudError
 
 
 @pytest.fixture
@@ -67,11 +67,3 @@ def test_an_export_is_of_the_generation_it_began_with(
         assert export_archive(archive, tmp_path / "while.ply").points == 300
     assert (tmp_path / "while.ply").read_bytes() == (tmp_path / "before.ply").read_bytes()
     assert export_archive(archive, tmp_path / "after.ply").points == 600
-
-
-def test_an_export_into_the_archive_itself_is_refused(archive: Path, tmp_path: Path) -> None:
-    (tmp_path / "link").symlink_to(archive)
-    for output in (archive / "index.h5", tmp_path / "link" / "shards" / "0-000000.h5", archive / "new.ply"):
-        with pytest.raises(BadRequestError, match="inside the archive itself"):
-            export_archive(archive, output, form="ply", overwrite=True)
-    assert not verify_archive(archive).faults

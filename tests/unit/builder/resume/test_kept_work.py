@@ -7,14 +7,10 @@ from typing import Any
 import pytest
 from solidcloud.builder.resume.kept_work import (
     BuildDirectory,
-    Journal,
-    Work,
     build_directory,
     building_folder,
     remove_finished_work,
-    run_unfinished,
 )
-from solidcloud.builder.run.executor import ProcessExecutor, Silent
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
 
 WHAT: dict[str, Any] = {"software": {"resume": 1}, "options": {"voxel": 8.0}, "inputs": []}
@@ -87,43 +83,3 @@ def test_what_comes_of_points_that_are_not_believed_finds_no_folder(parted: bool
     assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
     assert again.journal.read_entry("survey/1") == {"count": 7}
     assert again.journal.read_entry("spool/1") is again.journal.read_entry("done/1") is None
-
-
-class Counted(Silent):
-    """Progress that adds up."""
-
-    done = 0
-
-    def advance(self, amount: int) -> None:
-        self.done += amount
-
-
-@pytest.mark.parametrize("noted", [[], [3], [0, 2, 4], [0, 1, 2, 3, 4]])
-def test_what_is_noted_is_not_done_again(noted: list[int], tmp_path: Path) -> None:
-    journal, calls = Journal(tmp_path), []
-
-    def square(value: int) -> int:
-        calls.append(value)
-        return value * value
-
-    for value in noted:
-        journal.write_entry(f"work/{value}", {"square": value * value})
-    work: Work[int, int] = Work(
-        square, lambda r: {"square": r}, lambda noted: noted["square"], lambda r: r != 4
-    )
-    progress = Counted()
-    units = [(f"work/{value}", value) for value in range(5)]
-    for _ in range(2):
-        with ProcessExecutor(1) as executor:
-            assert run_unfinished(journal, executor, work, units, progress, lambda unit: 10) == [
-                0,
-                1,
-                4,
-                9,
-                16,
-            ]
-    # What 2 was noted for is never there, so it is done each time.
-    assert calls == [v for v in range(5) if v not in noted or v == 2] + [2]
-    assert progress.done == 100
-    recalled: list[Any] = [journal.read_entry(name) for name, _ in units]
-    assert recalled == [{"square": value * value} for value in range(5)]

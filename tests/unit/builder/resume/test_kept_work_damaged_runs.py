@@ -1,7 +1,6 @@
 """A resumed build discards runs that differ from what was written, and ends in the bytes of an undisturbed build."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +8,10 @@ import pytest
 import solidcloud.builder.passes.build_shards as build_shards
 import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.passes.survey_pass as survey
-import solidcloud.builder.pipeline as pipeline
 from interrupted_builds import build, content, done_folder, interrupted
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.spool.run_files import KEYS_SUFFIX, filter_dtype, spool_dtype
-from solidcloud.schemas.errors import CorruptError
 
 COLUMNS: dict[str, Any] = {"keep": frozenset({"scan", "intensity"})}
 FILTERS: dict[str, Any] = {"thin": 0.01, "outliers": (0.3, 1), **COLUMNS}
@@ -104,28 +101,3 @@ def test_any_word_of_a_directory_that_changed_makes_its_run_anew(
         assert {name: found.get(name) for name in spooled} == spooled, word
     build(target, scans)
     assert content(target) == content(tmp_path / "judge")
-
-
-@pytest.mark.parametrize("bit", [20])
-def test_a_run_that_changes_while_it_is_built_of_costs_no_third_command(
-    bit: int, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Bit 20 takes a point out of its cell: the shard does not read back, and is not what is at fault."""
-
-    def during(change: Callable[[Path], None]) -> Any:
-        def changed_first(spool: Any, *rest: Any) -> Any:
-            change(sorted(spool.folder.glob("*.run"))[0])
-            return function(spool, *rest)
-
-        return changed_first
-
-    build(tmp_path / "judge", scans)
-    function = pipeline.filter_points
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "filter_points", during(lambda run: flip(run, bit)))
-        with pytest.raises(CorruptError, match="the same command rebuilds"):
-            build(tmp_path / "hall", scans)
-    surveyed = counted(monkeypatch, "survey_range")
-    build(tmp_path / "hall", scans)
-    assert not surveyed
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")

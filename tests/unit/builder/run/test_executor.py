@@ -148,14 +148,6 @@ def alive(process: int) -> bool:
         return False
 
 
-def test_a_failure_here_stops_at_its_unit() -> None:
-    with ProcessExecutor(1) as executor:
-        results = executor.map(partial(divmod, 1), [1, 0, 1], Counted(), lambda unit: 1)
-        assert next(results) == (1, 0)
-        with pytest.raises(ZeroDivisionError):
-            next(results)
-
-
 def test_processes_are_started_only_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executor_module.os, "cpu_count", lambda: 4)
     assert worker_count(0, 0) == 1

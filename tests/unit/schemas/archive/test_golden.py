@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import naive_classes
-import naive_normals
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
@@ -17,7 +16,6 @@ from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, RIM_BIT
 from solidcloud.schemas.archive.voxel import LeafCells, Nodes
-from solidcloud.schemas.kernels.normal_codes import LINE, THICK, decode_normal
 
 GOLDEN = Path(__file__).resolve().parents[3] / "golden"
 
@@ -122,29 +120,6 @@ def test_the_golden_archive_holds_the_radius_classes_of_its_points(name: str) ->
     classes = golden_classes(GOLDEN / name)
     judged = naive_classes.judge(np.array(list(classes)), "0.001")
     assert classes == {point: found.local + RIM_BIT * found.rim for point, found in judged.items()}
-
-
-def test_the_golden_archive_holds_the_normals_of_its_points() -> None:
-    square, found = 300**2, 0
-    with Archive(GOLDEN / "archive-4") as archive:
-        assert archive.header.lattice.step == 0.001
-        for row in range(len(archive.voxels)):
-            voxel, links = archive.read_voxel(row)
-            points = voxel_points(voxel, links)
-            assert voxel.normal is not None
-            for at, code in zip(points, voxel.normal.tolist(), strict=True):
-                judged = naive_normals.find(points, at, square)
-                few = judged is None or judged.count < 3
-                if (
-                    few
-                    or judged.values[1] <= LINE * judged.values[2]
-                    or judged.values[0] > THICK * judged.values[1]
-                ):
-                    assert code == 0
-                    continue
-                assert naive_normals.angle(np.array(decode_normal(code)), judged.normal) < 0.56
-                found += 1
-    assert found > 100
 
 
 def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: dict[str, Any]) -> None:

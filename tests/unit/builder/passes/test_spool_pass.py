@@ -89,12 +89,12 @@ def test_a_run_is_what_sorting_all_columns_gives(voxel: float, keep: frozenset[s
     result, _ = spooled(tmp_path / "s", scan, len(xyz), lattice, keep=keep)
     steps = lattice.to_lattice(xyz)
     rows = np.zeros(len(xyz), spool_dtype(BuildConfig(keep=keep)))
-    rows["local"] = steps - lattice.voxel_of(steps) * lattice.voxel_steps
+    rows["local"] = steps % lattice.voxel_steps
     if keep:
         rows["scan_index"] = 3
         rows["intensity"] = np.where(np.isnan(scan.intensity), np.float32(np.nan), scan.intensity + 0)
     (tmp_path / "judge").mkdir()
-    write_run(tmp_path / "judge" / "a.run", voxel_keys(lattice.voxel_of(steps)), rows)
+    write_run(tmp_path / "judge" / "a.run", voxel_keys(steps // lattice.voxel_steps), rows)
     (name,) = result.runs
     sums = []
     for suffix in (".run", ".keys"):

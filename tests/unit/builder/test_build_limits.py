@@ -1,4 +1,4 @@
-"""Memory is shared among processes, their own included; a record that is read back takes what its formula says."""
+"""Test how many processes the memory of a build allows, and what an error advises."""
 
 import numpy as np
 import pytest

@@ -197,6 +197,3 @@ def test_an_export_builds_into_the_same_points_and_colours(suffix: str, bright: 
     export_archive(tmp_path / "a", tmp_path / f"out.{suffix}")
     found = read_scan(tmp_path / f"out.{suffix}")
     assert np.array_equal(table(found), table(truth))
-
-
-# --- what is refused ----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Keys of seals: new ones, files of keys, and the commands that take them."""
+"""Test keys of seals, and the commands that take them."""
 
 import shutil
 import stat

@@ -1,10 +1,8 @@
-"""Test the choice of the cell size for a number of leaf cells: a build with every size is the judge."""
+"""Test the choice of the cell size for a number of leaf cells: builds with other sizes are the judge."""
 
 from pathlib import Path
 from typing import Any
 
-from archive_edits import built as built  # the fixtures
-from archive_edits import files as files
 from small_builds import build
 from solidcloud.builder.passes.cell_summary import summarize_cells
 from solidcloud.schemas.archive.archive import Archive

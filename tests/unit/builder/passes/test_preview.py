@@ -1,4 +1,4 @@
-"""A preview holds some of the archive's points, the same ones every time, and says whose it is."""
+"""Test that a preview holds some of the archive's points, with their columns."""
 
 from pathlib import Path
 

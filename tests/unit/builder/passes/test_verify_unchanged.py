@@ -1,4 +1,4 @@
-"""An archive that is replaced while it is verified or exported: the result is of one generation, or an error."""
+"""Test that the result is of one generation, or an error, where an archive is replaced while it is read."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -142,9 +142,8 @@ def test_what_was_done_is_not_done_again(
     assert content(tmp_path / "hall") == content(tmp_path / "judge")
 
 
-@pytest.mark.parametrize("options", [{"keep": frozenset({"scan", "intensity"})}])
 def test_a_run_that_changed_while_it_was_in_use_is_found(
-    options: dict[str, Any], scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def changed(spool: Any, *rest: Any) -> Any:
         run = next(spool.folder.glob("000000-*.run"))
@@ -157,11 +156,11 @@ def test_a_run_that_changed_while_it_was_in_use_is_found(
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "filter_points", changed)
         with pytest.raises(CorruptError, match="not those of the scans"):
-            build(tmp_path / "hall", scans, **options)
+            build(tmp_path / "hall", scans)
     assert not (tmp_path / "hall").exists()
     # Nobody knows which it was; the survey is believed, and all else made again.
     monkeypatch.setattr(survey, "survey_range", lambda _: pytest.fail("surveyed again"))
-    build(tmp_path / "hall", scans, **options)
+    build(tmp_path / "hall", scans)
     assert not building_folder(tmp_path / "hall").exists()
 
 
@@ -210,13 +209,14 @@ def test_a_machine_that_fails_for_a_moment_leaves_no_scan_out(
     assert (summary.points, summary.faults) == (400, ())
 
 
-@pytest.mark.parametrize("stage", ["build_shards"])
 def test_that_memory_ran_out_is_said_and_the_same_command_goes_on(
-    stage: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(
-            pipeline, stage, lambda *_: (_ for _ in ()).throw(MemoryError("Unable to allocate 9 GiB"))
+            pipeline,
+            "build_shards",
+            lambda *_: (_ for _ in ()).throw(MemoryError("Unable to allocate 9 GiB")),
         )
         with pytest.raises(
             SolidcloudError, match=r"hall: out of memory \(Unable to.*give fewer --jobs.*resumes"

@@ -1,4 +1,4 @@
-"""Test the office: the same points in every format, its strays where the truth says, and no partial file."""
+"""Test the office: equal seeds make equal files, and its strays are where the truth says."""
 
 from pathlib import Path
 

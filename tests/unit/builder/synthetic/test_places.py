@@ -1,4 +1,4 @@
-"""Test places on the generated façade's walls: on them, visible, as sparse as stated, reproducible."""
+"""Test that places on the generated façade's walls lie on them, clear of their edges."""
 
 import laspy
 import numpy as np

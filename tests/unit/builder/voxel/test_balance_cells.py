@@ -1,4 +1,4 @@
-"""Cells of one height: every point once, in an aligned cube, as many a cell as a tree of that height holds."""
+"""Test that cells of one height hold every point once and enclose it."""
 
 import numpy as np
 import pytest

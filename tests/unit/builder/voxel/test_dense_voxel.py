@@ -1,4 +1,4 @@
-"""A voxel built in parts is the voxel built at once, whatever the runs, and memory is bounded by a part."""
+"""Test that a voxel built in parts is the voxel built at once."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Normals estimated when an archive is built: those of the definition, stored, checked, changed with the scans."""
+"""Test that normals estimated when an archive is built are those of the definition."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Test that rows given in parts become one frame, and that a frame too long for the index is refused."""
+"""Test the limit of expansion of a frame, and that a frame too long for the index is refused."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Messages about compilation: soon, rarely, and only for long waits."""
+"""Test messages about compilation: soon and rarely."""
 
 import logging
 

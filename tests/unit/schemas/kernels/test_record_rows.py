@@ -126,6 +126,3 @@ Levels = list[list[int]]  # counts of a BSH, level by level from its root
 def sizes(cells: list[Levels]) -> tuple[list[int], list[int]]:
     """Nodes and points of every cell."""
     return [sum(map(len, tree)) for tree in cells], [sum(tree[-1]) for tree in cells]
-
-
-# Rows: 0 top root, 1-2 top, 3-5 cell roots, 6-7 leaf nodes of cell 1, 8 inner node of cell 2, 9-10 its leaf nodes.

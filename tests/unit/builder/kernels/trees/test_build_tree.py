@@ -1,4 +1,4 @@
-"""Compare the hierarchies of many cells made in one call with those of each cell; test the top's bounds."""
+"""Compare the hierarchies of many cells made in one call with those of each; test how the top's bounds grow."""
 
 import itertools
 

@@ -253,12 +253,12 @@ def test_a_truncated_file_is_an_error(case: Case, written: Path, truth: Truth, k
 def test_memory_is_that_of_a_block_and_not_of_the_file(
     case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Read 30,000 points, 0.7 MB as float64, in blocks of 500; text in pieces of 16 kB."""
+    """Read 20,000 points, 0.5 MB as float64, in blocks of 500; text in pieces of 16 kB."""
     for module in ("common.text_rows", "common.counted_rows"):
         monkeypatch.setattr(f"solidcloud.builder.sources.{module}.CHUNK_BYTES", 1 << 14)
     monkeypatch.setattr("solidcloud.builder.sources.formats.pcd_lzf.PIECE_BYTES", 1 << 12)
     rng = np.random.default_rng(3)
-    count = 30_016  # three points a triangle and one; whole columns of 8
+    count = 20_016  # three points a triangle and one; whole columns of 8
     many = Truth(rng.uniform(-50, 50, (count, 3)), rng.integers(0, 99, count).astype(np.float32))
     path = tmp_path / case.name
     case.write(path, many)

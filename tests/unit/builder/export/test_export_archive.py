@@ -316,21 +316,3 @@ def test_the_command_says_what_it_wrote(
     )
     assert run(["export", str(tmp_path / "none"), "-o", str(tmp_path / "c.ply")]) == 3
     assert "error:" in capsys.readouterr().err
-
-
-def test_a_real_scan_comes_back_in_its_system(real_scans: Path, tmp_path: Path) -> None:
-    """Coordinates of the file's own, from its integers, and the text of its coordinate system."""
-    scan = real_scans / "lone_star.copc.laz"
-    build_archive([scan], tmp_path / "a", BuildConfig(voxel=8.0, radius=0.01, jobs=1))
-    done = export_archive(tmp_path / "a", tmp_path / "out.laz")
-    before, after = laspy.read(scan), laspy.read(tmp_path / "out.laz")
-    assert done.notes == () and len(after.points) == len(before.points) == 518_862
-    world = [
-        np.stack([las.X, las.Y, las.Z], axis=1) * las.header.scales + las.header.offsets
-        for las in (before, after)
-    ]
-    steps = [np.rint((xyz - before.header.offsets) / before.header.scales).astype(np.int64) for xyz in world]
-    first, second = (s[np.lexsort(s.T)] for s in steps)
-    assert np.array_equal(first, second)
-    texts = [[v.string for v in las.header.vlrs if v.record_id == 2112] for las in (before, after)]
-    assert texts[0] == texts[1] and texts[1][0].startswith("GEOCCS")

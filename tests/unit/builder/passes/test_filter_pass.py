@@ -157,7 +157,7 @@ def test_outliers_are_those_with_too_few_other_points_around(
 def test_what_too_few_scans_saw_where_others_looked_is_moving(
     layout: tuple[int, int], radius: str, scans: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
-    points = cloud(rng, 900)
+    points = cloud(rng, 500)
     config = BuildConfig(keep=ALL, moving=(float(radius), scans))
     left, counts = run(spool_of(points, tmp_path / "a", *layout, rng), config, tmp_path / "b")
     out = np.array([judged_moving(points, i, radius, scans) for i in range(len(points.at))])
@@ -165,7 +165,7 @@ def test_what_too_few_scans_saw_where_others_looked_is_moving(
     check(points, {MOVING: out}, left, counts)
 
 
-@pytest.mark.parametrize("steps", [1, 16, 37])
+@pytest.mark.parametrize("steps", [1, 16])
 def test_one_point_a_cube_stays_the_nearest_to_its_middle(
     layout: tuple[int, int], steps: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:

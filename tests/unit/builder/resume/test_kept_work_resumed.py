@@ -93,7 +93,7 @@ def test_a_build_killed_at_any_deed_goes_on_to_the_same_bytes(
     assert deeds > 40
     # What is overwritten plays a part at the end alone. Else at most every fourth deed: scripts/kill_builds kills
     # at any.
-    for most in range(deeds - 30, deeds, sample(7, 2)) if overwrite else range(0, deeds, sample(15, 4)):
+    for most in range(deeds - 30, deeds, sample(9, 2)) if overwrite else range(0, deeds, sample(19, 4)):
         out = tmp_path / f"{most}"
         assert killed(out, most) == most
         # Nothing but a whole archive is ever under the name asked for.

@@ -133,7 +133,6 @@ def rewrite(paths: list[Path], payload: bytes) -> None:
 
 DAMAGES: dict[str, Callable[[list[Path]], object]] = {
     "flipped": flip,
-    "emptied": lambda paths: [path.write_bytes(b"") for path in paths],
     "other name": lambda paths: shutil.copy(paths[0], paths[1]),
     "wrong pickle": lambda paths: rewrite(paths, pickle.dumps(([1, 2], 3))),
 }

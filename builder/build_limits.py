@@ -14,8 +14,6 @@ from ..schemas.archive.codec import point_dtype
 from ..schemas.errors import BadRequestError, SolidcloudError
 from .config import BuildConfig
 
-# The column of scan numbers is uint16 (schemas/FORMAT.md).
-MAX_SCANS = 1 << 16
 # The points of a record are numbered by int32 (schemas/archive/voxel.py).
 MAX_RECORD_POINTS = (1 << 31) - 1
 

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.index import Header, Source
+from ...schemas.archive.units import MAX_SCANS
 from ...schemas.archive.voxel_grid import voxel_coordinates
 from ...schemas.errors import BadRequestError, ScanError
-from ..build_limits import ARCHIVE_BYTES_A_POINT, MAX_SCANS
+from ..build_limits import ARCHIVE_BYTES_A_POINT
 from ..passes.radius_classes import ALL_CODES
 from ..passes.spool_pass import SpoolUnit, run_points, spool_range
 from ..passes.survey_pass import Survey, hash_file, join_ranges, ranges, survey_range, unopened_survey

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.archive.units import MAX_SCANS
 from ...schemas.archive.voxel_grid import MAX_COORDINATE, MIN_STEP, Lattice, make_lattice
 from ...schemas.errors import BadRequestError, ScanError
-from ..build_limits import MAX_SCANS, RANGE_POINTS, RANGES
+from ..build_limits import RANGE_POINTS, RANGES
 from ..config import BuildConfig
 from ..kernels.points.spool_rows import closest_to, usable_bounds
 from ..resume.kept_work import BuildDirectory, Work, run_unfinished

@@ -18,11 +18,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ...schemas.archive.units import MAX_SCANS
 from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_edge
 from ..build_limits import (
     DENSE_POINTS,
     MAX_PREVIEW_POINTS,
-    MAX_SCANS,
     PREVIEW_PART,
     RANGE_POINTS,
     RANGES,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.errors import ScanError
-from .common.scan import BOUNDS_MARGIN, Scan, ScanBlock, SourceLattice, apply_pose, checked_bounds
+from .common.scan import BOUNDS_MARGIN, IDENTITY, Scan, ScanBlock, SourceLattice, apply_pose, checked_bounds
 from .common.units import EXPECTED_UNITS, axis_metres
 from .common.units import METRES as METRES
 
@@ -18,7 +18,6 @@ TURNS: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     "y": ((0, 2, 1), (1, -1, 1)),
     "x": ((1, 2, 0), (1, 1, 1)),
 }
-_IDENTITY = np.eye(4)
 
 
 def place_scan(
@@ -71,16 +70,16 @@ class PlacedScan(Scan):
         self, inner: Scan, given: NDArray[np.float64] | None, units: str, up: str, scale: float
     ) -> None:
         bounds = inner.bounds
-        if given is not None and not np.array_equal(inner.pose, _IDENTITY):
+        if given is not None and not np.array_equal(inner.pose, IDENTITY):
             # Readers apply the scan's own pose: use a copy without one. Its bounds were in the
             # world frame and no longer apply.
             inner, bounds = copy.copy(inner), None
-            inner.pose, inner.bounds = _IDENTITY, None
+            inner.pose, inner.bounds = IDENTITY, None
         self._inner = inner
         self._axes, self._signs = TURNS[up]
         # For each axis of the world: a length of the file [m].
         self._factors = tuple(length * scale for length in axis_metres(units) or ())
-        self._given = _IDENTITY if given is None else given
+        self._given = IDENTITY if given is None else given
         turn = np.eye(4)
         turn[:3, :3] = np.eye(3)[list(self._axes)] * np.multiply(self._factors, self._signs)[:, None]
         super().__init__(
@@ -124,7 +123,7 @@ class PlacedScan(Scan):
     def _lattice(self) -> SourceLattice | None:
         """Return the source's lattice, scaled and turned; None if a pose moves the points."""
         inner = self._inner.lattice
-        if inner is None or not np.array_equal(self._given, _IDENTITY):
+        if inner is None or not np.array_equal(self._given, IDENTITY):
             return None
         scale = np.multiply(self._factors, np.take(inner.scale, self._axes))
         offset = np.multiply(self._factors, self._signs) * np.take(inner.offset, self._axes)

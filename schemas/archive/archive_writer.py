@@ -32,7 +32,6 @@ from .index import (
 from .voxel import VoxelData
 from .zstd_frame import Frame
 
-ZSTD_FILTER = 32015  # registered with the HDF Group
 # Block size for reading back a shard that was just written [bytes].
 READ_BYTES = 1 << 20
 

@@ -1,4 +1,4 @@
-"""Unit of the integers with which contact is decided exactly ("exact units"), and the largest coordinate.
+"""Unit of the integers with which contact is decided exactly ("exact units"), and what a scan may hold.
 
 This module imports nothing, so that readers of points need no kernels.
 """
@@ -10,6 +10,8 @@ UNITS_PER_METRE = 2.0**26
 # Scan points with world coordinates beyond this [m] are left out, and counted; requests are refused
 # (NUMERICS.md, cases 14 and 16).
 MAX_COORDINATE = 1e9
+# Most scans of an archive that keeps their numbers, and of one file: the column is uint16 (FORMAT.md).
+MAX_SCANS = 1 << 16
 
 # A lattice step [m] below 1 micrometre would span fewer than 67 exact units, and no scanner
 # resolves it.

@@ -60,10 +60,6 @@ class Lattice(NamedTuple):
         """Return the world positions (n, 3) [m] of lattice integers (n, 3)."""
         return np.asarray(lattice, np.int64) * self.step + np.array(self.origin)
 
-    def voxel_of(self, lattice: ArrayLike) -> NDArray[np.int64]:
-        """Return the voxel coordinates (n, 3) of lattice integers (n, 3), by floor division."""
-        return np.asarray(lattice, np.int64) // self.voxel_steps
-
 
 def voxel_edge(voxel_size: float, step: float) -> float:
     """Return the edge of a voxel [m]: `voxel_size`, but at most MAX_VOXEL_STEPS steps [m]."""

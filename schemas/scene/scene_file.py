@@ -209,15 +209,6 @@ def parse_scene(text: bytes, where: str) -> SceneFile:
     )
 
 
-def check_scene(scene: SceneFile, where: str) -> None:
-    """Check what the types cannot express; raise BadRequestError.
-
-    Names must be unique and defined, required effects present, poses rigid.
-    """
-    for place, said in _faults(scene):
-        raise toml_error(where, place, said)
-
-
 def json_schema() -> str:
     """Return the JSON Schema of a scene file, for editors of TOML.
 

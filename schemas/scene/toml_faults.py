@@ -81,12 +81,9 @@ def load(text: bytes, where: str) -> dict[str, Any]:
         raise BadRequestError(f"{where}: nested too deeply") from None
 
 
-def toml_error(where: str, place: str, said: str, text: bytes | None = None) -> BadRequestError:
-    """Return the error for a fault at a place of a file.
-
-    text: the file's bytes, to find the line; None: no line.
-    """
-    line = None if text is None else line_of(decode_text(text), place)
+def toml_error(where: str, place: str, said: str, text: bytes) -> BadRequestError:
+    """Return the error for a fault at a place of a file. text: the file's bytes, to find the line."""
+    line = line_of(decode_text(text), place)
     at = f"line {line}: " if line else ""
     return BadRequestError(f"{where}: {at}{place}: {said}")
 

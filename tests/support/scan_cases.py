@@ -9,6 +9,13 @@ import numpy as np
 import plyfile
 import pye57
 from scan_formats import glb_document, glb_vertices, ptx_scan, write_glb, write_pcd, write_pts
+from solidcloud.builder.sources.scan_files import open_scans
+
+
+def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
+    """Return the points of all scans of a file, (n, 3)."""
+    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
+    return np.concatenate([np.empty((0, 3)), *blocks])
 
 
 class Truth(NamedTuple):

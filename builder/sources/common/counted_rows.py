@@ -33,9 +33,6 @@ from .text_rows import (
 MIN_ROW_BYTES = 6
 # The end of a line before a blank line or a comment, which is no row.
 _NO_ROW = re.compile(rb"\n(?=[ \t]*(?:\n|#|//|;(?![ \t]*[-+.\d])))")
-# Maximum scans in one file, for all readers: the archive numbers scans with 16 bits
-# (schemas/FORMAT.md), and a scan without points takes only two bytes of text.
-MAX_SCANS = 1 << 16
 
 
 class CountedRows(Scan):

@@ -55,7 +55,7 @@ BOUNDS_MARGIN = 1e-6
 INTENSITY_NAMES = ("intensity", "scalar_intensity")
 
 
-_IDENTITY = np.eye(4)
+IDENTITY = np.eye(4)
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
@@ -324,7 +324,7 @@ def apply_pose(pose: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[n
     size.
     """
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
-    if np.array_equal(pose, _IDENTITY):
+    if np.array_equal(pose, IDENTITY):
         return xyz
     moved = np.empty_like(xyz)
     with np.errstate(over="ignore", invalid="ignore"):  # non-finite points stay non-finite

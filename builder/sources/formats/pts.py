@@ -6,7 +6,8 @@ other text scan.
 
 from pathlib import Path
 
-from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
+from ....schemas.archive.units import MAX_SCANS
+from ..common.counted_rows import CountedRows, next_line, skip_rows
 from ..common.scan import Scan, library_errors, scan_error
 from ..common.text_rows import open_text_file
 from .text import open_text

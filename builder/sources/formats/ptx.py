@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.counted_rows import MAX_SCANS, CountedRows, next_line, skip_rows
+from ....schemas.archive.units import MAX_SCANS
+from ..common.counted_rows import CountedRows, next_line, skip_rows
 from ..common.scan import Scan, library_errors, scan_error, zero_rotation_note
 from ..common.text_rows import LONGEST_LINE, is_number, open_text_file
 

@@ -1,10 +1,8 @@
 """Options of a build: what is refused by name, and which of them an archive's bytes depend on."""
 
-import numpy as np
 import pytest
 from solidcloud.builder.build_limits import MAX_SHARDS, SHARD_POINTS, shard_points
 from solidcloud.builder.config import BuildConfig, parse_radius, parse_rule
-from solidcloud.builder.passes.build_shards import plan_shards
 from solidcloud.schemas.errors import BadRequestError
 
 WRONG = {
@@ -54,14 +52,6 @@ def test_shards_are_many_enough_for_workers_and_few_enough_to_open(points: int) 
     assert points < 10**7 or points / each >= 9
 
 
-@pytest.mark.parametrize("voxel", [1 << 20, 1 << 22, (1 << 22) + 1, 1 << 24])
-def test_no_more_shards_than_may_be_open_whatever_the_voxels_hold(voxel: int) -> None:
-    counts = np.full(3000, voxel, np.int64)
-    plans = plan_shards(np.arange(3000, dtype=np.uint64), counts)
-    assert len(plans) <= MAX_SHARDS + 1
-    assert sum(points for _, points in plans) == counts.sum()
-
-
 @pytest.mark.parametrize(
     ("text", "radius", "models"),
     [
@@ -86,12 +76,3 @@ def test_other_radius_texts_are_refused(text: str) -> None:
         BadRequestError, match=r"--radius .*expected mean, local, border, separated by commas"
     ):
         parse_radius(text)
-
-
-def test_a_config_always_holds_the_mean() -> None:
-    with pytest.raises(
-        BadRequestError, match="--radius local: expected mean, optionally with local and border"
-    ):
-        BuildConfig(models=frozenset({"local"}))
-    with pytest.raises(BadRequestError, match="--radius colour,mean"):
-        BuildConfig(models=frozenset({"mean", "colour"}))

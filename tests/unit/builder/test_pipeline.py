@@ -1,6 +1,5 @@
 """Scans in, one archive out: the same bytes however it is made, and what is stored. Errors: test_pipeline_errors.py."""
 
-import shutil
 from pathlib import Path
 
 import h5py
@@ -14,8 +13,7 @@ import solidcloud.builder.pipeline as pipeline
 from small_builds import build, content, six_files
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.archive_writer import ZSTD_FILTER
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.schemas.errors import ScanError
 from synthetic_scans import make_scan, write_las, write_ply, write_xyz
 
 
@@ -23,11 +21,6 @@ def records(archive: Path) -> list[tuple[int, bytes, bytes]]:
     """Key, nodes and points of each voxel as compressed: everything of a record but the archive's id."""
     with Archive(archive) as opened:
         return [(int(r["key"]), *opened.read_frames(i)[1:]) for i, r in enumerate(opened.voxels)]
-
-
-def shard_bytes(archive: Path) -> list[bytes]:
-    """The shards of an archive."""
-    return [p.read_bytes() for p in sorted((archive / "shards").iterdir())]
 
 
 @pytest.fixture
@@ -73,7 +66,7 @@ def test_the_bytes_do_not_depend_on_order_jobs_or_memory(
 )
 def test_two_jobs_write_the_bytes_of_one(scans: list[Path], out: Path) -> None:
     # Here a plugin for the zstd filter is loaded, in the spawned processes it is not: HDF5 would write its name.
-    assert h5py.h5z.filter_avail(ZSTD_FILTER)
+    assert h5py.h5z.filter_avail(32015)  # zstd
     build(scans, out / "a")
     build(scans, out / "b", jobs=2)
     assert content(out / "a") == content(out / "b")
@@ -108,17 +101,6 @@ def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
     assert content(out / "a") == content(out / "b") == content(out / "c")
 
 
-def test_the_same_points_from_any_format_give_the_same_shards(out: Path, tmp_path: Path) -> None:
-    raw = np.random.default_rng(5).integers(-1500, 1500, (300, 3))
-    intensity = np.random.default_rng(5).integers(0, 65536, 300).astype(np.uint16)
-    xyz = write_las(tmp_path / "a.las", raw, offset=(5e5, 5.6e6, 100.0), intensity=intensity)
-    write_ply(tmp_path / "b.ply", xyz, intensity.astype(np.float32))
-    write_xyz(tmp_path / "c.xyz", xyz, intensity.astype(np.float32))
-    for name in ("a.las", "b.ply", "c.xyz"):
-        build([tmp_path / name], out / name, resolution=0.001, keep=frozenset({"intensity"}))
-    assert shard_bytes(out / "a.las") == shard_bytes(out / "b.ply") == shard_bytes(out / "c.xyz")
-
-
 def test_a_georeferenced_scene_has_the_records_of_one_at_the_origin(out: Path, tmp_path: Path) -> None:
     # NUMERICS.md case 1; a shift exact in float64 for coordinates that are whole 2^-20 m.
     xyz = np.round(make_scan("corner", 3, 400) * 2**20) / 2**20
@@ -134,37 +116,7 @@ def test_a_georeferenced_scene_has_the_records_of_one_at_the_origin(out: Path, t
         assert a.header.archive_id != b.header.archive_id
 
 
-def test_the_id_tells_points_and_options_apart(scans: list[Path], out: Path) -> None:
-    ids = set()
-    for name, options in {"a": {}, "b": {"degree": 5}, "c": {"resolution": 0.0002}}.items():
-        build(scans, out / name, **options)
-        with Archive(out / name) as archive:
-            ids.add(archive.header.archive_id)
-    build(scans[:-1], out / "d")
-    with Archive(out / "d") as archive:
-        ids.add(archive.header.archive_id)
-    assert len(ids) == 4
-
-
 # --- what is stored and said ------------------------------------------------------------------------------
-
-
-def test_an_archive_is_sound_and_summed_up(scans: list[Path], out: Path) -> None:
-    summary = build(scans, out / "a")
-    assert verify_archive(out / "a", deep=True).faults == ()
-    with Archive(out / "a") as archive:
-        header = archive.header
-        assert summary.points == header.points == 5 * 150 + 1
-        assert summary.voxels == len(archive.voxels)
-        assert (summary.radius, summary.moved_max) == (header.radius, header.moved_max)
-    files = {name: len(data) for name, data in content(out / "a").items()}
-    assert summary.preview_bytes == files.pop("preview.vtkhdf") > 0
-    level = {name for name in files if name.startswith("level/")}
-    assert summary.level_bytes == sum(files.pop(name) for name in level) > 0
-    assert summary.bytes == sum(files.values())
-    stages = ["survey", "spool", "build", "radius", "level", "preview", "verify", "publish"]
-    assert list(summary.stages) == stages
-    assert (summary.skipped, summary.faults) == ({}, ())
 
 
 def test_quantising_moves_no_point_by_more_than_half_a_step(out: Path, tmp_path: Path) -> None:
@@ -204,20 +156,3 @@ def test_points_that_are_not_finite_are_counted(out: Path, tmp_path: Path) -> No
     with pytest.raises(ScanError, match=found):
         build([tmp_path / "a.ply"], out / "b", strict=True)
     assert [p.name for p in out.iterdir()] == ["a"]
-
-
-def test_a_point_alone_needs_a_radius(out: Path, tmp_path: Path) -> None:
-    write_xyz(tmp_path / "a.xyz", make_scan("one point", 1))
-    write_xyz(tmp_path / "b.xyz", np.repeat(make_scan("one point", 1), 10_000, axis=0))
-    for name, kind, said in (
-        ("a.xyz", BadRequestError, "single distinct point has no closest point: give --radius"),
-        ("b.xyz", ScanError, r"b\.xyz: all 10,000 points of scan 0 lie at one place, expected a surface"),
-    ):
-        with pytest.raises(kind, match=said):
-            build([tmp_path / name], out / "a")
-        assert not list(out.iterdir())
-        summary = build([tmp_path / name], out / name, radius=0.01)
-        assert summary.radius == 0.01
-        with Archive(out / name) as archive:
-            assert (archive.header.radius_model, archive.header.radius_sample) == ("given", 0)
-        shutil.rmtree(out / name)

@@ -1,31 +1,9 @@
 """Which voxels are near others."""
 
-from typing import Any
-
 import numpy as np
-import pytest
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from solidcloud.builder.edit.affected_voxels import within_reach
-
-
-def test_within_reach_holds_boxes_against_those_around_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each against all others would be quadratic in voxels: hours of a large archive."""
-    corner = np.stack(np.meshgrid(*[np.arange(100)] * 2, [0], indexing="ij"), axis=-1).reshape(-1, 3) * 8000
-    held = np.stack([corner, corner + 7999], axis=1)
-    asked, maximum = [], np.maximum
-
-    def counted(a: Any, b: Any) -> Any:
-        asked.append(np.size(a))
-        return maximum(a, b)
-
-    monkeypatch.setattr(np, "maximum", counted)
-    found = within_reach(held, held[::7], 100**2)
-    assert sum(asked) < 9 * 3 * 2 * len(held)
-    near = np.zeros((102, 102), bool)
-    for x, y in corner[::7, :2] // 8000:
-        near[x : x + 3, y : y + 3] = True
-    assert np.array_equal(found, near[1:-1, 1:-1].ravel())
 
 
 def test_within_reach_is_what_every_pair_says() -> None:

@@ -17,13 +17,10 @@ from archive_edits import (
     all_points,
     content,
     same_scene,
-    snapshot,
     sort_points,
 )
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
-from solidcloud.builder.edit import archive_change as change_module
-from solidcloud.builder.edit import rebuild_voxels as rebuild_module
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -32,7 +29,7 @@ from solidcloud.server.scene import Scene
 
 @pytest.mark.parametrize(
     ("models", "keep"),
-    [*((models, EVERYTHING) for models in MODELS), (MODELS[-1], frozenset())],
+    [(MODELS[0], EVERYTHING), (MODELS[-1], frozenset())],
     ids=lambda names: ",".join(sorted(names)) or "nothing",
 )
 def test_what_is_added_is_as_if_built_together(
@@ -50,7 +47,7 @@ def test_what_is_added_is_as_if_built_together(
     assert not verify_archive(target).notes, "the preview is of this generation"
 
 
-@pytest.mark.parametrize("models", MODELS, ids=lambda m: ",".join(sorted(m)))
+@pytest.mark.parametrize("models", MODELS[::3], ids=lambda m: ",".join(sorted(m)))
 def test_what_is_left_is_as_if_built_without(
     built: Build, files: Files, tmp_path: Path, models: frozenset[str]
 ) -> None:
@@ -136,13 +133,6 @@ def test_the_figure_of_now_stands_beside_the_one_that_is_stored(
         assert (info.generation, info.radius, info.radius_now) == (1, stored, now.radius)
 
 
-def test_a_given_figure_has_none_beside_it(built: Build, files: Files, tmp_path: Path) -> None:
-    target = built(tmp_path / "x", "a", radius=0.01)
-    assert add_scans(target, [files.b], jobs=1).radius_now is None
-    with Archive(target) as archive:
-        assert archive.header.radius_now is None and archive.header.radius == 0.01
-
-
 def test_what_touches_is_by_brute_force_the_same(built: Build, files: Files, tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     body = np.array([[0.0, 0, 0], [0.1, 0, 0.05]])
@@ -172,22 +162,3 @@ def test_contacts_name_the_scan_they_are_of(built: Build, files: Files, tmp_path
             assert name in named and "b.ply" not in named
         gone = next(source for source in info.sources if source.path == str(files.b))
         assert (gone.count, "removed in generation 1" in gone.fault) == (0, True)
-
-
-def test_jobs_and_memory_change_nothing(built: Build, files: Files, tmp_path: Path) -> None:
-    options = {"models": frozenset({"mean", "local"}), "keep": EVERYTHING}
-    one, two = (built(tmp_path / name, "a", **options) for name in "xy")
-    add_scans(one, [files.b, files.c], jobs=1)
-    add_scans(two, [files.b, files.c], jobs=2, memory_bytes=64 << 20)
-    assert snapshot(one) == snapshot(two)
-
-
-def test_several_runs_of_several_units_are_one(
-    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one, two = (built(tmp_path / name, "a", keep=EVERYTHING) for name in "xy")
-    add_scans(one, [files.b, files.c], jobs=1)
-    monkeypatch.setattr(change_module, "UNIT_POINTS", 100)
-    monkeypatch.setattr(rebuild_module, "RUN_BYTES_A_POINT", 1 << 40)
-    add_scans(two, [files.b, files.c], jobs=1)
-    assert snapshot(one) == snapshot(two)

@@ -7,15 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from archive_edits import (
-    EVERYTHING,
-    A,
-    B,
-    Build,
-    Files,
-    refused,
-    snapshot,
-)
+from archive_edits import EVERYTHING, A, B, Build, Files, refused, snapshot
 from archive_edits import built as built  # the fixtures
 from archive_edits import files as files
 from sample_sizes import sample
@@ -108,7 +100,7 @@ def test_killed_anywhere_it_is_the_old_archive_or_the_new_one(
     assert len(renamed) > 5
     seen = set()
     places = sorted(renamed | {n + 1 for n in renamed if n + 1 < len(steps)} | set(range(0, len(steps), 40)))
-    for step in places[:: sample(3, 1)]:
+    for step in places[:: sample(5, 1)]:
         place = tmp_path / f"at{step}"
         target = place / "hall"
         shutil.copytree(begin, target)

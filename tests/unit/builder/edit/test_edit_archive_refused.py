@@ -25,14 +25,13 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.edit import added_scans as added_module
 from solidcloud.builder.edit import edit_archive as generation_module
 from solidcloud.builder.edit import rebuild_voxels as rebuild_module
-from solidcloud.builder.edit.archive_change import config_of
 from solidcloud.builder.edit.edit_archive import add_scans, remove_scans
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.resume.lock import locked
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import SHARD_FOLDER
-from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError
+from solidcloud.schemas.errors import BadRequestError, CorruptError, FormatError, ScanError, SolidcloudError
 
 
 def test_a_scan_that_is_in_is_refused_unless_again(built: Build, files: Files, tmp_path: Path) -> None:
@@ -95,34 +94,6 @@ def test_scans_that_cannot_be_used_are_refused(built: Build, files: Files, tmp_p
     bad.write_bytes(files.b.read_bytes()[:-7])
     refused(target, ScanError, r"bad\.ply", lambda: add_scans(target, [files.c, bad], jobs=1))
     refused(target, ScanError, r"none\.ply", lambda: add_scans(target, [tmp_path / "none.ply"], jobs=1))
-
-
-def test_points_that_are_not_finite_are_refused_where_asked(
-    built: Build, files: Files, tmp_path: Path
-) -> None:
-    target = built(tmp_path / "there" / "x", "a")
-    some = B.copy()
-    some[3] = np.nan
-    holes = synthetic_scans.write_ply(tmp_path / "holes.ply", some)
-    refused(
-        target,
-        ScanError,
-        r"holes\.ply: 1 points that are not finite, expected none with --strict: clean the scan",
-        lambda: add_scans(target, [files.c, holes], strict=True, jobs=1),
-    )
-    assert add_scans(target, [files.c], strict=True, jobs=1).generation == 1
-
-
-def test_to_leave_out_what_is_in_and_to_have_it_twice_is_refused(
-    built: Build, files: Files, tmp_path: Path
-) -> None:
-    target = built(tmp_path / "x", "a")
-    refused(
-        target,
-        BadRequestError,
-        "--new and --again together: expected one",
-        lambda: add_scans(target, [files.b], again=True, new_only=True, jobs=1),
-    )
 
 
 def test_a_scan_that_was_left_out_and_is_added_is_unknown_no_more(files: Files, tmp_path: Path) -> None:
@@ -226,16 +197,6 @@ def test_a_second_one_is_refused_while_one_is_at_work(built: Build, files: Files
         add_scans(target, [files.b], jobs=1)
 
 
-def test_options_that_look_at_all_scans_are_refused(built: Build, tmp_path: Path) -> None:
-    with Archive(built(tmp_path / "x", "a")) as archive:
-        header = archive.header
-    config = config_of(header, tmp_path, 1, 64 << 20)
-    assert config.identity() == header.options and (config.jobs, config.memory_bytes) == (1, 64 << 20)
-    header.options["outliers"] = [0.1, 3]
-    with pytest.raises(BadRequestError, match="built with outliers"):
-        config_of(header, tmp_path, 1, 64 << 20)
-
-
 def test_a_damaged_record_stops_it(built: Build, files: Files, tmp_path: Path) -> None:
     target = built(tmp_path / "x", "a", keep=EVERYTHING)
     with Archive(target) as archive:
@@ -247,3 +208,15 @@ def test_a_damaged_record_stops_it(built: Build, files: Files, tmp_path: Path) -
             file.seek(offset + size // 2)
             file.write(bytes([byte ^ 1]))
     refused(target, CorruptError, "voxel", lambda: add_scans(target, [files.b], jobs=1))
+
+
+def test_out_of_memory_says_what_the_archive_is_and_what_to_do(
+    built: Build, files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> Any:
+        raise MemoryError("Unable to allocate 3 GiB")
+
+    target = built(tmp_path / "there" / "x", "a")
+    monkeypatch.setattr(rebuild_module, "_build", fail)
+    said = rf"^{target}: out of memory \(Unable to allocate 3 GiB\): give fewer --jobs.*; the archive is what it was$"
+    refused(target, SolidcloudError, said, lambda: add_scans(target, [files.b], jobs=1))

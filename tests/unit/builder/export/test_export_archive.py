@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -109,13 +108,6 @@ def test_all_points_come_back_to_the_last_bit(form: str, georeferenced: Path, tm
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_without_columns_there_are_coordinates_alone(form: str, tmp_path: Path) -> None:
-    archive = build(tmp_path, [make_scan("corner", 3, 200) - 1.0], None)
-    export_archive(archive, tmp_path / f"a.{form}")
-    assert read_back(tmp_path / f"a.{form}") == stored(archive)
-
-
-@pytest.mark.parametrize("form", FORMATS)
 def test_a_box_is_half_open(form: str, georeferenced: Path, tmp_path: Path) -> None:
     everything = stored(georeferenced)
     wider = np.array([0, 0.5, 0.5])
@@ -133,25 +125,6 @@ def test_a_box_is_half_open(form: str, georeferenced: Path, tmp_path: Path) -> N
     done = export_archive(georeferenced, tmp_path / f"a.{form}", box=(*low.tolist(), *high.tolist()))
     assert read_back(tmp_path / f"a.{form}") == inside
     assert done.points == len(inside)
-
-
-def test_boxes_side_by_side_have_every_point_once(georeferenced: Path, tmp_path: Path) -> None:
-    cuts = [UTM[0] - 1, UTM[0] + 0.5, UTM[0] + 0.9375, UTM[0] + 1.1, UTM[0] + 9]
-    parts: Rows = []
-    for i, (a, b) in enumerate(pairwise(cuts)):
-        path = tmp_path / f"{i}.ply"
-        export_archive(georeferenced, path, box=(a, 0, 0, b, 1e7, 1e3))
-        parts += read_back(path)
-    assert sorted(parts) == stored(georeferenced)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_nothing_in_the_box_is_a_file_without_points(form: str, georeferenced: Path, tmp_path: Path) -> None:
-    path = tmp_path / f"a.{form}"
-    done = export_archive(georeferenced, path, box=(0, 0, 0, 1, 1, 1))
-    assert read_back(path) == []
-    assert (done.points, done.low, done.high) == (0, None, None)
-    assert done.notes == ("no point is in the box",)
 
 
 @pytest.mark.parametrize("step", [1e-6, 0.0001, 0.001, 0.1, 1 / 3])
@@ -294,7 +267,7 @@ def test_the_coordinate_system_that_all_scans_share_is_written(
     assert len(done.notes) == bool(note) and note in "".join(done.notes)
 
 
-@pytest.mark.parametrize("form", ["laz", "las", "ply"])
+@pytest.mark.parametrize("form", ["laz", "ply"])
 def test_what_is_exported_builds_the_same_shards(form: str, tmp_path: Path) -> None:
     """Out of an archive and in again: the same points on the same lattice."""
     raw = np.random.default_rng(7).integers(-5000, 5000, (400, 3))
@@ -343,33 +316,3 @@ def test_the_command_says_what_it_wrote(
     )
     assert run(["export", str(tmp_path / "none"), "-o", str(tmp_path / "c.ply")]) == 3
     assert "error:" in capsys.readouterr().err
-
-
-def test_vtk_reads_an_export(georeferenced: Path, tmp_path: Path) -> None:
-    vtk = pytest.importorskip("vtkmodules.vtkIOHDF", reason="the library vtk is not installed")
-    support = pytest.importorskip("vtkmodules.util.numpy_support")
-    export_archive(georeferenced, tmp_path / "a.vtkhdf")
-    reader = vtk.vtkHDFReader()
-    reader.SetFileName(str(tmp_path / "a.vtkhdf"))
-    reader.Update()
-    found = reader.GetOutputDataObject(0)
-    arrays = [support.vtk_to_numpy(found.GetPointData().GetArray(name)) for name in ("scan", "intensity")]
-    assert rows_of(support.vtk_to_numpy(found.GetPoints().GetData()), *arrays) == stored(georeferenced)
-
-
-def test_a_real_scan_comes_back_in_its_system(real_scans: Path, tmp_path: Path) -> None:
-    """Coordinates of the file's own, from its integers, and the text of its coordinate system."""
-    scan = real_scans / "lone_star.copc.laz"
-    build_archive([scan], tmp_path / "a", BuildConfig(voxel=8.0, radius=0.01, jobs=1))
-    done = export_archive(tmp_path / "a", tmp_path / "out.laz")
-    before, after = laspy.read(scan), laspy.read(tmp_path / "out.laz")
-    assert done.notes == () and len(after.points) == len(before.points) == 518_862
-    world = [
-        np.stack([las.X, las.Y, las.Z], axis=1) * las.header.scales + las.header.offsets
-        for las in (before, after)
-    ]
-    steps = [np.rint((xyz - before.header.offsets) / before.header.scales).astype(np.int64) for xyz in world]
-    first, second = (s[np.lexsort(s.T)] for s in steps)
-    assert np.array_equal(first, second)
-    texts = [[v.string for v in las.header.vlrs if v.record_id == 2112] for las in (before, after)]
-    assert texts[0] == texts[1] and texts[1][0].startswith("GEOCCS")

@@ -46,25 +46,6 @@ def test_area_spacing_and_bytes_of_a_floor(tmp_path: Path) -> None:
     assert found.look_at[0].startswith("place and size: ") and "ParaView" in found.look_at[0]
 
 
-def test_area_of_many_voxels_is_that_of_a_sample(tmp_path: Path) -> None:
-    found = summary_of(tmp_path, grid(12.0, 8.0, 0.05), voxel=0.8)
-    assert found.voxels == 150 and "in 16 of 150 voxels" in found.area_from
-    assert found.area == pytest.approx(96.0, rel=0.15)
-    assert found.voxel_from == "--voxel" and found.look_at[0].startswith("few points in a voxel")
-
-
-def test_a_given_radius_leaves_the_spacing_to_the_area(tmp_path: Path) -> None:
-    found = summary_of(tmp_path, grid(12.0, 8.0, 0.05), radius=2.0)
-    assert found.spacing == pytest.approx(0.05, rel=0.1) and found.spacing_from == "from points and area"
-    assert found.radius_from == "--radius" and found.look_at[0].startswith("--radius 2 is ")
-
-
-def test_points_metres_apart_suggest_the_unit(tmp_path: Path) -> None:
-    found = summary_of(tmp_path, grid(12.0, 8.0, 0.05) * 100, voxel=200.0)
-    assert found.look_at[0].startswith("points 5 m apart: the unit of the scans")
-    assert found.area is not None and found.area > 0
-
-
 def test_build_and_info_end_with_the_same_lines(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     scan = write_xyz(tmp_path / "scan.xyz", grid(3.0, 2.0, 0.05))
     archive = str(tmp_path / "hall")

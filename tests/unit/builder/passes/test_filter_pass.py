@@ -74,9 +74,9 @@ def contents(spool: Spool) -> Points:
     return Points(np.concatenate(at), np.concatenate(scans).astype(int), np.concatenate(intensities))
 
 
-def run(spool: Spool, config: BuildConfig, folder: Path, jobs: int = 1) -> tuple[Spool, filters.Counts]:
+def run(spool: Spool, config: BuildConfig, folder: Path) -> tuple[Spool, filters.Counts]:
     folder.mkdir(exist_ok=True)
-    with make_executor(config, jobs) as executor:
+    with make_executor(config, 1) as executor:
         return filtered_spool(spool, config, folder, executor, Silent(), Journal(folder))
 
 
@@ -119,7 +119,7 @@ def judged_thin(points: Points, steps: int) -> np.ndarray:
     return np.array([found[-1] for found in best.values()])
 
 
-VOXELS = [(64, 3, None), (1 << 12, 1, None), (100, 5, 16), (37, 2, 50)]  # steps, runs, points held at a time
+VOXELS = [(1 << 12, 1, None), (100, 5, 16)]  # steps, runs, points held at a time
 
 
 @pytest.fixture(params=VOXELS, ids=lambda p: f"{p[0]}steps-{p[1]}runs-{p[2]}held")
@@ -141,7 +141,7 @@ def check(points: Points, expected: dict[str, np.ndarray], left: Spool, counts: 
         assert counts.get(reason, {}) == dict(zip(scans.tolist(), numbers.tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("radius", "count"), [("0.006", 1), ("0.011", 4), ("0.03", 9)])
+@pytest.mark.parametrize(("radius", "count"), [("0.006", 1), ("0.03", 9)])
 def test_outliers_are_those_with_too_few_other_points_around(
     layout: tuple[int, int], radius: str, count: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -153,11 +153,11 @@ def test_outliers_are_those_with_too_few_other_points_around(
     check(points, {OUTLIER: out}, left, counts)
 
 
-@pytest.mark.parametrize(("radius", "scans"), [("0.002", 1), ("0.0035", 2), ("0.0045", 3)])
+@pytest.mark.parametrize(("radius", "scans"), [("0.0035", 2), ("0.0045", 3)])
 def test_what_too_few_scans_saw_where_others_looked_is_moving(
     layout: tuple[int, int], radius: str, scans: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
-    points = cloud(rng, 900)
+    points = cloud(rng, 500)
     config = BuildConfig(keep=ALL, moving=(float(radius), scans))
     left, counts = run(spool_of(points, tmp_path / "a", *layout, rng), config, tmp_path / "b")
     out = np.array([judged_moving(points, i, radius, scans) for i in range(len(points.at))])
@@ -165,7 +165,7 @@ def test_what_too_few_scans_saw_where_others_looked_is_moving(
     check(points, {MOVING: out}, left, counts)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 7, 16, 37])
+@pytest.mark.parametrize("steps", [1, 16])
 def test_one_point_a_cube_stays_the_nearest_to_its_middle(
     layout: tuple[int, int], steps: int, rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -202,16 +202,6 @@ def test_rules_together_are_moving_and_outliers_of_all_points_then_thin_of_the_r
     check(points, {MOVING: moving, OUTLIER: outlier, THINNED: thinned}, left, counts)
 
 
-@pytest.mark.interpreted
-def test_the_step_itself_merges_exact_duplicates(rng: np.random.Generator, tmp_path: Path) -> None:
-    points = cloud(rng)
-    config = BuildConfig(thin=STEP)
-    left, _ = run(spool_of(points, tmp_path / "a", 64, 2, rng), config, tmp_path / "b")
-    kept = contents(left).at
-    assert len(kept) == len(np.unique(points.at, axis=0)) < len(points.at)
-    assert np.array_equal(np.unique(kept, axis=0), np.unique(points.at, axis=0))
-
-
 def test_rows_are_in_canonical_order_without_the_scan_where_it_is_not_kept(
     rng: np.random.Generator, tmp_path: Path
 ) -> None:
@@ -225,7 +215,7 @@ def test_rows_are_in_canonical_order_without_the_scan_where_it_is_not_kept(
         assert np.array_equal(rows, rows[order])
 
 
-def test_processes_give_the_same_run_and_a_second_call_does_nothing_again(
+def test_a_second_call_does_nothing_again(
     rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(filters, "UNIT_POINTS", 100)  # cut here, where units are planned
@@ -233,12 +223,7 @@ def test_processes_give_the_same_run_and_a_second_call_does_nothing_again(
     config = BuildConfig(outliers=(0.011, 4), thin=0.003)
     spool = spool_of(points, tmp_path / "a", 64, 3, rng)
     one, counts = run(spool, config, tmp_path / "one")
-    two, same = run(spool, config, tmp_path / "two", jobs=2)
-    assert counts == same
-    names, others = (sorted(p.name for p in s.folder.iterdir() if p.suffix != ".tmp") for s in (one, two))
-    assert len(names) > 6 and names == others
-    assert all((one.folder / name).read_bytes() == (two.folder / name).read_bytes() for name in names)
-
+    whole = contents(one).rows()
     done: list[str] = []
     work = filters.filter_voxels
     monkeypatch.setattr(filters, "filter_voxels", lambda unit: done.append(unit.path.name) or work(unit))
@@ -249,40 +234,7 @@ def test_processes_give_the_same_run_and_a_second_call_does_nothing_again(
     lost.write_bytes(before[:-1])
     again, same = run(spool, config, tmp_path / "one")
     assert done == [lost.name] and same == counts and lost.read_bytes() == before
-    assert contents(again).rows() == contents(two).rows()
-
-
-def test_a_run_of_nothing_may_be_removed_by_the_same_unit_elsewhere(
-    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A worker that was given up runs to its end."""
-    spool = spool_of(cloud(rng), tmp_path / "a", 64, 1, rng)
-    config = BuildConfig(outliers=(0.001, 2000))
-    (tmp_path / "near").mkdir()
-    rules = filters.make_rules(config, spool.lattice)
-    keys = tuple(spool.keys.tolist())
-    unit = filters.FilterUnit(keys, 400, spool, rules, spool.dtype, tmp_path / "near" / "000000.run")
-    unlink = Path.unlink
-
-    def twice(path: Path, missing_ok: bool = False) -> None:
-        unlink(path)
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", twice)
-    left = filters.filter_voxels(unit)
-    assert left.runs == {} and sum(sum(of.values()) for of in left.left_out.values()) == 400
-    assert not list((tmp_path / "near").iterdir())
-
-
-def test_a_place_with_more_duplicates_than_are_held_is_one_block(
-    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(blocks, "BLOCK_POINTS", 16)
-    points = cloud(rng)
-    points.at[:200] = points.at[0]
-    config = BuildConfig(keep=ALL, thin=STEP)
-    left, _ = run(spool_of(points, tmp_path / "a", 64, 2, rng), config, tmp_path / "b")
-    assert len(contents(left).at) == len(np.unique(points.at, axis=0))
+    assert contents(again).rows() == whole
 
 
 @pytest.mark.parametrize(
@@ -315,15 +267,3 @@ def test_a_distance_is_the_decimal_number_it_is_written_as(tmp_path: Path, rng: 
         spool = spool_of(points, tmp_path / f"a{steps}", 64, 1, rng)
         left, counts = run(spool, BuildConfig(outliers=(steps / 1000, 1)), tmp_path / f"b{steps}")
         assert len(contents(left).at) == 2 and counts == {}
-
-
-def test_the_filters_need_the_scan_and_nothing_else() -> None:
-    assert filter_dtype(BuildConfig()).names == ("local", "scan_index")
-    assert filter_dtype(BuildConfig(keep=ALL)) == spool_dtype(BuildConfig(keep=ALL))
-    passes = [
-        {},
-        {"thin": 0.1},
-        {"outliers": (0.1, 2)},
-        {"outliers": (0.1, 2), "moving": (0.1, 2), "thin": 0.1},
-    ]
-    assert [BuildConfig(**options).filter_passes for options in passes] == [0, 1, 1, 2]

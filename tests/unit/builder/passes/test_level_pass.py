@@ -23,7 +23,7 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import COVER_RADII, LEVEL_FOLDER, level_id, open_level
 
 # Scans of all kinds; and points farther apart than any cover radius.
-KINDS = [*synthetic_scans.WITH_POINTS, "sparse"]
+KINDS = ["corner", "duplicates", "one point", "sparse"]
 
 
 def scan(kind: str, count: int = 3000) -> NDArray[np.float64]:
@@ -150,16 +150,6 @@ def test_a_change_renews_the_level(built: Build, tmp_path: Path) -> None:
     renew_level(target, jobs=1)
     with Archive(target) as archive, open_level(archive) as level:  # type: ignore[union-attr]  # it has one
         assert level.header.archive_id == level_id(archive.header)
-
-
-def test_an_archive_without_a_level_stays_without(built: Build, tmp_path: Path) -> None:
-    target = built(tmp_path / "x", "a", level=False)
-    assert not (target / LEVEL_FOLDER).exists()
-    more = synthetic_scans.write_ply(tmp_path / "more.ply", np.array([[1.1, 1.1, 1.1]]))
-    add_scans(target, [more], jobs=1)
-    assert not (target / LEVEL_FOLDER).exists()
-    renew_level(target, jobs=1)
-    assert verify_archive(target, deep=True).faults == ()
 
 
 def test_a_level_that_claims_less_than_it_covers_is_a_fault(tmp_path: Path) -> None:

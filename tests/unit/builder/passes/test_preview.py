@@ -1,16 +1,13 @@
-"""A preview holds some of the archive's points, the same ones every time, and says whose it is."""
+"""Test that a preview holds some of the archive's points, with their columns."""
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import solidcloud.builder.passes.preview as preview
-import solidcloud.builder.run.executor as executor_module
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.points.voxel_records import point_hashes
 from solidcloud.builder.passes.preview import write_preview
-from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME, read_points
@@ -67,58 +64,3 @@ def test_points_are_chosen_by_hash_and_have_their_columns(
         assert 10 < count <= most and set(chosen) == set(by_hash[:count])
     for place, scan, intensity in zip(chosen, found.columns["scan"], found.columns["intensity"], strict=True):
         assert (int(scan), float(intensity)) in places[place]
-
-
-def test_no_more_than_most_even_by_chance(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preview, "WHOLE_PREVIEW_POINTS", 40)
-    monkeypatch.setattr(preview, "MAX_PREVIEW_POINTS", 40)
-    monkeypatch.setattr(preview.math, "sqrt", lambda _: -20.0)  # a share that is too large by far
-    assert write_preview(built) == 40
-    by_hash = sorted(stored(built), key=lambda place: int(point_hashes(np.array([place]))[0]))
-    with Archive(built) as archive:
-        found = archive.header.lattice.to_lattice(read_points(built / PREVIEW_NAME).points)
-    assert {tuple(point) for point in found.tolist()} == set(by_hash[:40])
-
-
-def test_one_archive_has_one_preview_to_the_byte(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_preview(built)
-    expected = (built / PREVIEW_NAME).read_bytes()
-    (built / PREVIEW_NAME).unlink()
-    monkeypatch.setattr(executor_module, "_MIN_POINTS", 1)
-    write_preview(built)
-    assert (built / PREVIEW_NAME).read_bytes() == expected
-    assert not list(built.glob("*.tmp"))
-
-
-def test_many_points_in_one_place_have_a_preview_of_one(tmp_path: Path) -> None:
-    for x in range(4):  # or the hash might choose it
-        write_ply(tmp_path / f"{x}.ply", np.full((30_000, 3), 0.25 * x))
-        build_archive([tmp_path / f"{x}.ply"], tmp_path / str(x), BuildConfig(radius=0.01, jobs=1))
-        assert write_preview(tmp_path / str(x)) == 1
-        assert verify_archive(tmp_path / str(x)).faults == ()
-
-
-def test_verify_reads_the_preview(built: Path) -> None:
-    path = built / PREVIEW_NAME
-    write_preview(built)
-    report = verify_archive(built)
-    assert report.faults == () and report.notes == ()
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    (fault,) = verify_archive(built).faults
-    assert fault.startswith(str(path)) and "write it anew" in fault
-    path.write_bytes(whole)
-    with h5py.File(path, "r+") as file:
-        file.attrs.modify("generation", np.uint32(7))
-    report = verify_archive(built)
-    assert report.faults == () and report.notes == (f"{path}: belongs to another archive or generation",)
-    with h5py.File(path, "r+") as file:
-        del file.attrs["archive_id"]
-    assert "does not name its archive" in verify_archive(built).faults[0]
-    path.write_bytes(whole)
-    with h5py.File(path, "r+") as file:
-        points = file["VTKHDF/Points"]
-        points[0] = points[0] + 10
-    assert "points that are not in the archive" in verify_archive(built).faults[0]
-    path.unlink()
-    assert verify_archive(built).faults == ()

@@ -19,9 +19,8 @@ from solidcloud.builder.passes.survey_pass import (
 )
 from solidcloud.builder.sources.common.scan import Scan, ScanBlock, SourceLattice
 from solidcloud.builder.sources.scan_files import open_scans
-from solidcloud.schemas.archive.voxel_grid import MAX_COORDINATE
-from solidcloud.schemas.errors import BadRequestError, ScanError, SolidcloudError
-from synthetic_scans import make_scan, write_las, write_xyz
+from solidcloud.schemas.errors import ScanError, SolidcloudError
+from synthetic_scans import make_scan, write_las
 
 
 def survey_scan(scan: Scan) -> Survey:
@@ -50,23 +49,6 @@ def listed(folder: Path, xyz: np.ndarray, size: int = 50, fails_after: int | Non
     path = folder / "listed.xyz"
     path.write_bytes(b"any")
     return Listed(path, xyz, size, fails_after)
-
-
-def test_a_survey_counts_usable_points_and_their_bounds(tmp_path: Path) -> None:
-    xyz = make_scan("noise", 1, 300) - 1
-    xyz[5, 1], xyz[6, 0], xyz[250, 2] = np.nan, np.inf, np.nextafter(MAX_COORDINATE, np.inf)
-    good = np.delete(xyz, [5, 6, 250], axis=0)
-    survey = survey_scan(listed(tmp_path, xyz))
-    assert (survey.count, survey.not_finite, survey.beyond, survey.fault) == (297, 2, 1, "")
-    assert np.array_equal(survey.low, good.min(axis=0))
-    assert np.array_equal(survey.high, good.max(axis=0))
-
-
-def test_a_scan_without_points_is_at_fault_but_loses_nothing(tmp_path: Path) -> None:
-    survey = survey_scan(listed(tmp_path, np.empty((0, 3))))
-    assert "holds no usable point, expected at least one" in survey.fault
-    assert survey.empty
-    assert survey.region is None
 
 
 def test_points_that_are_all_unusable_were_somewhere(tmp_path: Path) -> None:
@@ -112,27 +94,6 @@ def test_a_scan_that_seeks_is_surveyed_in_ranges(tmp_path: Path, monkeypatch: py
     assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
 
 
-def test_a_scan_that_cannot_seek_is_one_unit(tmp_path: Path) -> None:
-    scan = listed(tmp_path, make_scan("noise", 1, 300))
-    scan.declared_count = 300
-    assert [unit[1:] for unit in ranges(scan, 10**12)] == [(0, None, 300)]
-
-
-def test_what_the_reader_leaves_out_is_counted_with_what_is_not_finite(tmp_path: Path) -> None:
-    class Dropping(Listed):
-        def _read(self, block_points: int) -> Iterator[ScanBlock]:
-            self.dropped = {"not finite": 2, "invalid": 5}
-            yield from super()._read(block_points)
-
-    xyz = make_scan("noise", 1, 300)
-    xyz[0] = np.nan
-    path = listed(tmp_path, xyz).path
-    survey = survey_scan(Dropping(path, xyz, 50))
-    assert survey.dropped == {"not finite": 3, "invalid": 5}
-    assert survey.unclean == "3 points that are not finite"
-    assert survey_scan(listed(tmp_path, xyz[1:])).dropped == {}
-
-
 @pytest.mark.parametrize("error", [MemoryError("std::bad_alloc"), OSError(12, "no")])
 @pytest.mark.parametrize("where", ["survey_range", "hash_file"])
 def test_that_memory_ran_out_is_no_fault_of_the_scan(
@@ -148,17 +109,6 @@ def test_that_memory_ran_out_is_no_fault_of_the_scan(
     with pytest.raises(SolidcloudError, match=r"listed\.xyz: out of memory.*give fewer --jobs") as caught:
         survey_range(ranges(scan, 4)[0]) if where == "survey_range" else hash_file(scan.path)
     assert not isinstance(caught.value, ScanError)
-
-
-def test_a_file_that_cannot_be_hashed_is_at_fault(tmp_path: Path) -> None:
-    scan = listed(tmp_path, make_scan("noise", 1, 300))
-    parts = [survey_range(unit) for unit in ranges(scan, 300)]
-    scan.path.unlink()
-    digest, fault = hash_file(scan.path)
-    assert digest == ""
-    survey = join_ranges(scan, parts, (digest, fault))
-    assert (survey.count, survey.fault) == (0, fault)
-    assert "listed.xyz" in fault
 
 
 # --- the lattice ------------------------------------------------------------------------------------------
@@ -199,20 +149,3 @@ def test_the_sources_lattice_is_taken_where_they_share_one(name: str, tmp_path: 
     lattice, found = choose_lattice(surveys, [s.facts for s in surveys], BuildConfig(**options))
     assert (lattice.step, found) == (step, source)
     assert lattice.origin == (7.0 - (len(lattices) - 1),) * 3
-
-
-def test_an_impossible_resolution_is_refused(tmp_path: Path) -> None:
-    for resolution in (1e-7, 100.0):
-        with pytest.raises(BadRequestError):
-            choose_lattice([survey_on(tmp_path, None)], [], BuildConfig(resolution=resolution))
-
-
-def test_las_and_text_files_are_surveyed_alike(tmp_path: Path) -> None:
-    xyz = write_las(tmp_path / "a.las", np.random.default_rng(1).integers(-1000, 1000, (50, 3)))
-    write_xyz(tmp_path / "a.xyz", xyz)
-    for name in ("a.las", "a.xyz"):
-        (scan,) = open_scans(tmp_path / name)
-        survey = survey_scan(scan)
-        assert (survey.count, survey.fault) == (50, "")
-        assert np.array_equal([survey.low, survey.high], [xyz.min(axis=0), xyz.max(axis=0)])
-        assert len(survey.sha256) == 64

@@ -7,18 +7,11 @@ from typing import Any
 import pytest
 from solidcloud.builder.resume.kept_work import (
     BuildDirectory,
-    Journal,
-    Work,
     build_directory,
     building_folder,
-    remove_building,
     remove_finished_work,
-    run_unfinished,
 )
-from solidcloud.builder.resume.transaction import check_target, publish_folder
-from solidcloud.builder.run.executor import ProcessExecutor, Silent
 from solidcloud.schemas.errors import BadRequestError, CorruptError, ScanError, SolidcloudError
-from solidcloud.schemas.process.new_file import new_file
 
 WHAT: dict[str, Any] = {"software": {"resume": 1}, "options": {"voxel": 8.0}, "inputs": []}
 
@@ -54,40 +47,6 @@ def test_what_the_survey_of_a_new_build_refuses_leaves_nothing(error: BaseExcept
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("error", FAULTS)
-def test_what_is_found_later_or_by_a_later_command_removes_nothing(
-    error: BaseException, tmp_path: Path
-) -> None:
-    failed(tmp_path / "hall", error, surveyed=True)
-    assert failed(tmp_path / "hall", error, surveyed=False)
-    assert failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-
-
-def test_a_build_of_something_else_is_left_as_it_is(tmp_path: Path) -> None:
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    other = {**WHAT, "options": {"voxel": 4.0}}
-    with (
-        pytest.raises(BadRequestError, match=r"--voxel was 8\.0, is 4\.0"),
-        build_directory(tmp_path / "hall", other, fresh=False),
-    ):
-        pytest.fail("went on")
-    assert failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-
-
-def test_a_folder_that_does_not_say_what_it_is_is_not_believed(tmp_path: Path) -> None:
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    (building_folder(tmp_path / "hall") / "build.json").write_bytes(b"{")
-    assert not failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-
-
-def test_the_folder_goes_when_all_is_done(tmp_path: Path) -> None:
-    with build_directory(tmp_path / "hall", WHAT, fresh=False) as build_dir:
-        assert build_dir.hidden == building_folder(tmp_path / "hall")
-        assert {p.name for p in build_dir.hidden.iterdir()} == {"build.json", build_dir.folder.name}
-        assert {p.name for p in build_dir.folder.iterdir()} == {"spool", "archive"}
-    assert not list(tmp_path.iterdir())
-
-
 def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tmp_path: Path) -> None:
     failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
     remove_finished_work(tmp_path / "hall", {**WHAT, "options": {}})
@@ -99,97 +58,11 @@ def test_what_a_finished_build_left_is_forgotten_and_what_another_left_is_not(tm
     assert not list(tmp_path.iterdir())
 
 
-def test_a_build_that_cannot_be_forgotten_is_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    with monkeypatch.context() as patch:
-        patch.setattr("solidcloud.builder.resume.kept_work.shutil.rmtree", lambda *_, **__: None)
-        with (
-            pytest.raises(
-                SolidcloudError, match=r"build\.json: cannot be removed, as --fresh requires.* by hand"
-            ),
-            build_directory(tmp_path / "hall", WHAT, fresh=True),
-        ):
-            pytest.fail("went on")
-    assert not failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True, fresh=True)
-
-
-LATE = (f"0-000000.h5.{'0f' * 6}-12-345.tmp", f"0-000000.h5.{'0f' * 16}.tmp")
-
-
-def test_what_was_written_late_into_a_published_archive_is_removed(tmp_path: Path) -> None:
-    """By the same command, of a build that was killed just after its rename; what is somebody's own is not."""
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    shards = tmp_path / "hall" / "shards"
-    shards.mkdir(parents=True)
-    for name in (*LATE, "own.tmp", "0-000000.h5"):
-        (shards / name).write_bytes(b"")
-    remove_finished_work(tmp_path / "hall", WHAT)
-    assert sorted(path.name for path in shards.iterdir()) == ["0-000000.h5", "own.tmp"]
-    (shards / LATE[0]).write_bytes(b"")
-    remove_finished_work(tmp_path / "hall", WHAT)  # no build was killed
-    assert (shards / LATE[0]).exists()
-
-
-@pytest.mark.parametrize("name", [*LATE, "own.tmp", "0-000000.h5.12.tmp"])
-def test_what_was_written_late_is_part_of_an_archive_to_overwrite(name: str, tmp_path: Path) -> None:
-    (tmp_path / "shards").mkdir()
-    for path in ("index.h5", "shards/0-000000.h5", f"shards/{name}"):
-        (tmp_path / path).write_bytes(b"")
-    if name in LATE:
-        check_target(tmp_path, overwrite=True)
-    else:
-        with pytest.raises(BadRequestError, match=f"{name}: not part of an archive"):
-            check_target(tmp_path, overwrite=True)
-
-
-def test_what_was_made_of_a_run_is_forgotten_with_it(tmp_path: Path) -> None:
-    build_dir = began(tmp_path / "hall")
-    late = build_dir.journal
-    for name in ("survey/1", "spool/1", "filter-near/1", "filter-thin/1", "done/1"):
-        late.write_entry(name, {"runs": {f"{name[-6:-2]}.run": []}})
-    build_dir.discard(build_dir.folder / "filter-near" / "near.run")
-    noted = ("survey/1", "spool/1", "filter-near/1", "filter-thin/1", "done/1")
-    assert [name for name in noted if build_dir.journal.read_entry(name)] == ["survey/1", "spool/1"]
-    with pytest.raises(FileNotFoundError):  # a shard of what was not believed
-        late.write_entry("done/2", {})
-    again = began(tmp_path / "hall")
-    assert again.folder == build_dir.folder != late.folder
-    assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
-
-
-def test_the_note_of_what_it_is_is_removed_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    failed(tmp_path / "hall", KeyboardInterrupt(), surveyed=True)
-    folder = building_folder(tmp_path / "hall")
-    late = Journal(next(path for path in folder.iterdir() if path.is_dir()))
-    seen: list[bool] = []
-
-    def watched(path: Path, **_: Any) -> None:
-        with pytest.raises(FileNotFoundError):  # where it was, nobody can write any more
-            late.write_entry("survey/2", {})
-        seen.append((folder / "build.json").exists() and path != folder)
-
-    monkeypatch.setattr("solidcloud.builder.resume.kept_work.shutil.rmtree", watched)
-    remove_building(folder)
-    assert seen == [True, False]
-
-
 def began(target: Path, *, fresh: bool = False) -> BuildDirectory:
     """What a build begins with that is interrupted at once."""
     with suppress(KeyboardInterrupt), build_directory(target, WHAT, fresh=fresh) as build_dir:
         raise KeyboardInterrupt
     return build_dir
-
-
-def test_only_the_same_build_has_the_folder_of_before(tmp_path: Path) -> None:
-    first, second = began(tmp_path / "hall"), began(tmp_path / "hall")
-    assert first.folder == second.folder
-    third = began(tmp_path / "hall", fresh=True)
-    assert third.folder.name != first.folder.name
-    assert [p for p in third.hidden.iterdir() if p.is_dir()] == [third.folder]
-    with pytest.raises(FileNotFoundError):
-        first.journal.write_entry("survey/1", {})
 
 
 @pytest.mark.parametrize("parted", [False, True])
@@ -210,89 +83,3 @@ def test_what_comes_of_points_that_are_not_believed_finds_no_folder(parted: bool
     assert [p for p in again.hidden.iterdir() if p.is_dir()] == [again.folder]
     assert again.journal.read_entry("survey/1") == {"count": 7}
     assert again.journal.read_entry("spool/1") is again.journal.read_entry("done/1") is None
-
-
-def test_nobody_writes_to_what_is_started_over(tmp_path: Path) -> None:
-    with suppress(KeyboardInterrupt), build_directory(tmp_path / "hall", WHAT, fresh=False) as build_dir:
-        late = build_dir.journal
-        build_dir.start_over()
-        with pytest.raises(FileNotFoundError):
-            late.write_entry("survey/1", {})
-        raise KeyboardInterrupt
-    assert not list(tmp_path.iterdir())
-    assert began(tmp_path / "hall").folder != late.folder
-
-
-def test_a_file_that_is_still_written_is_not_published(tmp_path: Path) -> None:
-    with build_directory(tmp_path / "hall", WHAT, fresh=False) as build_dir:
-        (build_dir.archive / "index.h5").write_bytes(b"whole")
-        with pytest.raises(FileNotFoundError), new_file(build_dir.archive / "shards" / "0-000000.h5") as file:
-            publish_folder(build_dir.archive, tmp_path / "hall", overwrite=False)
-            file.write(b"late")
-    assert sorted(p.name for p in (tmp_path / "hall").rglob("*")) == ["index.h5", "shards"]
-    assert [p.name for p in tmp_path.iterdir()] == ["hall"]
-
-
-def test_a_file_is_forgotten_by_its_name(tmp_path: Path) -> None:
-    journal = Journal(tmp_path)
-    journal.write_entry("spool/1", {"runs": {"a.run": [1, 2], "b.run": [3, 4]}})
-    journal.write_entry("done/1", {"name": "0-1.h5"})
-    journal.write_entry("done/2", {"name": "0-2.h5"})
-    journal.write_entry("survey/1", ["a.run"])
-    journal.remove_entries_of(tmp_path / "spool" / "b.run")
-    journal.remove_entries_of(tmp_path / "archive" / "0-2.h5")
-    left = ["spool/1", "done/1", "done/2", "survey/1"]
-    assert [name for name in left if journal.read_entry(name)] == ["done/1", "survey/1"]
-
-
-def test_a_note_is_recalled_as_it_was(tmp_path: Path) -> None:
-    journal = Journal(tmp_path)
-    what = {"low": [float("inf"), 0.1, -1e300], "text": "Größe", "nested": {"a": [1, None]}}
-    journal.write_entry("survey/000001", what)
-    assert journal.read_entry("survey/000001") == what
-    assert journal.read_entry("survey/000002") is None
-    journal.path("survey/000001").write_text('{"low": [')  # a disk that lied
-    assert journal.read_entry("survey/000001") is None
-    journal.remove_entry("survey/000001")
-    journal.remove_entry("survey/000001")
-    assert not journal.path("survey/000001").exists()
-
-
-class Counted(Silent):
-    """Progress that adds up."""
-
-    done = 0
-
-    def advance(self, amount: int) -> None:
-        self.done += amount
-
-
-@pytest.mark.parametrize("noted", [[], [3], [0, 2, 4], [0, 1, 2, 3, 4]])
-def test_what_is_noted_is_not_done_again(noted: list[int], tmp_path: Path) -> None:
-    journal, calls = Journal(tmp_path), []
-
-    def square(value: int) -> int:
-        calls.append(value)
-        return value * value
-
-    for value in noted:
-        journal.write_entry(f"work/{value}", {"square": value * value})
-    work: Work[int, int] = Work(
-        square, lambda r: {"square": r}, lambda noted: noted["square"], lambda r: r != 4
-    )
-    progress = Counted()
-    units = [(f"work/{value}", value) for value in range(5)]
-    for _ in range(2):
-        with ProcessExecutor(1) as executor:
-            assert run_unfinished(journal, executor, work, units, progress, lambda unit: 10) == [
-                0,
-                1,
-                4,
-                9,
-                16,
-            ]
-    # What 2 was noted for is never there, so it is done each time.
-    assert calls == [v for v in range(5) if v not in noted or v == 2] + [2]
-    assert progress.done == 100
-    recalled: list[Any] = [journal.read_entry(name) for name, _ in units]
-    assert recalled == [{"square": value * value} for value in range(5)]

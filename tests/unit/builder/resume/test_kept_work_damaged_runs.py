@@ -1,8 +1,6 @@
 """A resumed build discards runs that differ from what was written, and ends in the bytes of an undisturbed build."""
 
-import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +8,10 @@ import pytest
 import solidcloud.builder.passes.build_shards as build_shards
 import solidcloud.builder.passes.spool_pass as spool_pass
 import solidcloud.builder.passes.survey_pass as survey
-import solidcloud.builder.pipeline as pipeline
-from interrupted_builds import build, content, done_folder, interrupted, two_scans
-from sample_sizes import sample
+from interrupted_builds import build, content, done_folder, interrupted
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.resume.kept_work import RUN_FOLDERS, building_folder
+from solidcloud.builder.resume.kept_work import building_folder
 from solidcloud.builder.spool.run_files import KEYS_SUFFIX, filter_dtype, spool_dtype
-from solidcloud.schemas.errors import CorruptError
 
 COLUMNS: dict[str, Any] = {"keep": frozenset({"scan", "intensity"})}
 FILTERS: dict[str, Any] = {"thin": 0.01, "outliers": (0.3, 1), **COLUMNS}
@@ -28,14 +23,6 @@ PASS_OF = {
     "spool_range": spool_pass,
     "build_shard": build_shards,
 }
-
-
-@pytest.fixture
-def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Two scans, one of which is read in three ranges; two shards are made of them."""
-    # The power stays on in these tests.
-    monkeypatch.setattr(os, "fsync", lambda _: None)
-    return two_scans(tmp_path, monkeypatch)
 
 
 def runs(target: Path, folder: str = "spool") -> list[Path]:
@@ -64,7 +51,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, name: str) -> list[Any]:
     return units
 
 
-@pytest.mark.parametrize("options", [{}, COLUMNS, FILTERS], ids=["places", "columns", "filters"])
+@pytest.mark.parametrize("options", [{}, FILTERS], ids=["places", "filters"])
 def test_any_bit_of_a_run_that_changed_makes_it_anew_and_nothing_else(
     options: dict[str, Any], scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,10 +62,10 @@ def test_any_bit_of_a_run_that_changed_makes_it_anew_and_nothing_else(
     dtype = filter_dtype(BuildConfig(**options)) if "thin" in options else spool_dtype(BuildConfig(**options))
     units = counted(monkeypatch, "spool_range")
     # In the middle row of a run: low and high bits of a coordinate, out of its cell, out of its voxel, and its sign.
-    bits = [0, 13, 14, 20, 31] if options == {} else [32 + 14]
+    bits = [0, 20] if options == {} else [32 + 14]
     for name in ("scan_index", "intensity"):
         if name in (dtype.names or ()):
-            bits += [8 * dtype.fields[name][1] + bit for bit in (0, 14)]
+            bits.append(8 * dtype.fields[name][1] + 14)
     for bit in bits:
         as_it_was(tmp_path / "kept", target)
         run = runs(target)[0]
@@ -106,7 +93,7 @@ def test_any_word_of_a_directory_that_changed_makes_its_run_anew(
     }
     words = (runs(target)[0].with_suffix(KEYS_SUFFIX).stat().st_size) // 8
     assert words > 20
-    for word in range(words):
+    for word in range(0, words, 7):
         as_it_was(tmp_path / "kept", target)
         flip(runs(target)[0].with_suffix(KEYS_SUFFIX), 64 * word + (0, 1, 31, 40, 62, 63)[word % 6])
         interrupted(target, scans, monkeypatch)
@@ -114,147 +101,3 @@ def test_any_word_of_a_directory_that_changed_makes_its_run_anew(
         assert {name: found.get(name) for name in spooled} == spooled, word
     build(target, scans)
     assert content(target) == content(tmp_path / "judge")
-
-
-def test_two_voxels_of_one_place_are_no_archive(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As one bit more of the greatest key would make, of which no sum of places tells."""
-    build(tmp_path / "judge", scans)
-    interrupted(tmp_path / "hall", scans, monkeypatch)
-    file = runs(tmp_path / "hall")[0].with_suffix(KEYS_SUFFIX)
-    flip(file, 64 * (file.stat().st_size // 8 // 2) - 1)
-    build(tmp_path / "hall", scans)
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")
-
-
-@pytest.mark.parametrize("folder", RUN_FOLDERS)
-@pytest.mark.parametrize("suffix", [".run", KEYS_SUFFIX])
-def test_what_was_made_of_a_run_that_changed_is_made_anew(
-    folder: str, suffix: str, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The filters' runs, and shards: they may be of the run as it is."""
-    build(tmp_path / "judge", scans, **FILTERS)
-    interrupted(tmp_path / "hall", scans, monkeypatch, **FILTERS)
-    with monkeypatch.context() as patch:
-        # Built of the changed run by somebody who did not look.
-        patch.setattr(spool_pass, "discard_damaged_runs", lambda *_: None)
-        if suffix == ".run":
-            run = runs(tmp_path / "hall", folder)[0]
-            flip(run, 8 * (run.stat().st_size - 1) + 3)  # of an intensity
-            for after in RUN_FOLDERS[RUN_FOLDERS.index(folder) + 1 :]:
-                shutil.rmtree(done_folder(tmp_path / "hall") / after)
-        patch.setattr(pipeline, "_measure_radius", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            build(tmp_path / "hall", scans, **FILTERS)
-    if suffix == KEYS_SUFFIX:
-        flip(runs(tmp_path / "hall", folder)[0].with_suffix(suffix), 0)
-    spooled, shards = counted(monkeypatch, "spool_range"), counted(monkeypatch, "build_shard")
-    build(tmp_path / "hall", scans, **FILTERS)
-    assert len(spooled) == (folder == "spool")
-    assert len(shards) == len(list((tmp_path / "hall" / "shards").iterdir()))
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")
-    assert not building_folder(tmp_path / "hall").exists()
-
-
-@pytest.mark.parametrize("bit", [0, 20, 31])
-def test_a_run_that_changes_while_it_is_built_of_costs_no_third_command(
-    bit: int, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Bit 20 takes a point out of its cell: the shard does not read back, and is not what is at fault."""
-
-    def during(change: Callable[[Path], None]) -> Any:
-        def changed_first(spool: Any, *rest: Any) -> Any:
-            change(sorted(spool.folder.glob("*.run"))[0])
-            return function(spool, *rest)
-
-        return changed_first
-
-    build(tmp_path / "judge", scans)
-    function = pipeline.filter_points
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "filter_points", during(lambda run: flip(run, bit)))
-        with pytest.raises(CorruptError, match="the same command rebuilds"):
-            build(tmp_path / "hall", scans)
-    surveyed = counted(monkeypatch, "survey_range")
-    build(tmp_path / "hall", scans)
-    assert not surveyed
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")
-
-
-def test_a_directory_that_changes_before_it_is_read_is_refused_and_its_run_made_anew(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def changed_first(spool: Any, *rest: Any) -> Any:
-        file = sorted(spool.folder.glob("*.keys"))[0]
-        flip(file, 8 * (file.stat().st_size - 4))
-        return function(spool, *rest)
-
-    build(tmp_path / "judge", scans)
-    function = pipeline.filter_points
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "filter_points", changed_first)
-        with pytest.raises(CorruptError, match=r"\.keys: not the directory of .*\.run.*same command again"):
-            build(tmp_path / "hall", scans)
-    units = counted(monkeypatch, "spool_range")
-    build(tmp_path / "hall", scans)
-    assert len(units) == 1
-    assert content(tmp_path / "hall") == content(tmp_path / "judge")
-
-
-def test_runs_are_read_once_by_a_build_that_goes_on_and_not_by_another(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: list[str] = []
-    compare = spool_pass.discard_damaged_runs.__globals__["is_run_damaged"]
-    monkeypatch.setitem(
-        spool_pass.discard_damaged_runs.__globals__,
-        "is_run_damaged",
-        lambda path, sums: read.append(path.name) or compare(path, sums),
-    )
-    interrupted(tmp_path / "hall", scans, monkeypatch)
-    assert read == []
-    names = [path.name for path in runs(tmp_path / "hall")]
-    build(tmp_path / "hall", scans)
-    assert sorted(read) == names
-
-
-def test_a_build_stopped_while_it_forgets_comes_to_the_same_bytes(
-    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before the note of the run is gone it is found again; after that, nothing is left that was made of it."""
-    build(tmp_path / "judge", scans)
-    expected, target = content(tmp_path / "judge"), tmp_path / "hall"
-    interrupted(target, scans, monkeypatch)
-    flip(runs(target)[0], 3)
-    shutil.copytree(building_folder(target), tmp_path / "kept")
-    most = 0
-    while True:
-        as_it_was(tmp_path / "kept", target)
-        with monkeypatch.context() as patch:
-            done: list[str] = []
-            for name in ("rename", "replace", "unlink", "mkdir", "rmdir"):
-                patch.setattr(os, name, counting(getattr(os, name), done, most))
-            patch.setattr(spool_pass, "_sweep_spool", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-            with pytest.raises(KeyboardInterrupt):
-                build(target, scans)
-        build(target, scans)
-        assert content(target) == expected, most
-        if len(done) < most:
-            break
-        shutil.rmtree(target)
-        shutil.copytree(tmp_path / "kept", building_folder(target))
-        most += sample(3, 1)
-    assert most > 5
-
-
-def counting(deed: Callable[..., Any], done: list[str], most: int) -> Callable[..., Any]:
-    """A deed that is interrupted when so many were done, and done by the next who asks."""
-
-    def watched(*given: Any, **options: Any) -> Any:
-        done.append(str(given[0]))
-        if len(done) == most:
-            raise KeyboardInterrupt
-        return deed(*given, **options)
-
-    return watched

@@ -2,8 +2,6 @@
 
 import errno
 import fcntl
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -38,18 +36,6 @@ def test_asking_whether_it_is_free_keeps_nobody_off(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("number", [errno.EWOULDBLOCK, errno.EACCES])
-def test_a_lock_that_is_held_is_another_build(
-    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fcntl, "flock", lambda *_: (_ for _ in ()).throw(OSError(number, "held")))
-    with (
-        pytest.raises(BadRequestError, match="another build, add or remove is writing it"),
-        locked(tmp_path / "hall"),
-    ):
-        pytest.fail("locked")
-
-
 def test_a_file_system_without_locks_is_not_another_build(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -58,21 +44,3 @@ def test_a_file_system_without_locks_is_not_another_build(
     with pytest.raises(OSError, match="No locks available") as caught, locked(tmp_path / "hall"):
         pytest.fail("locked")
     assert caught.value.filename == str(lock_path(tmp_path / "hall"))
-
-
-def test_a_second_builder_loads_no_numpy(tmp_path: Path) -> None:
-    code = (
-        "import sys; from solidcloud.server.cli.main import run; code = run(sys.argv[1:]); "
-        "sys.exit(code + 100 * ('numpy' in sys.modules))"
-    )
-    with open(lock_path(tmp_path / "hall"), "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", code, "build", "a.las", "-o", str(tmp_path / "hall")],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    assert done.returncode == 2, done.stderr
-    expected = "another build, add or remove is writing it: wait for it, or give a build another -o"
-    assert f"hall: {expected}" in done.stderr

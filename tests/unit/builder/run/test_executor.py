@@ -13,14 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 import solidcloud.builder.run.executor as executor_module
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.resume.transaction import make_executor
 from solidcloud.builder.run.executor import (
     POINTS_WORTH_A_PROCESS,
     ProcessExecutor,
-    Silent,
-    jobs_of,
-    run_units,
     voxel_ranges,
     worker_count,
 )
@@ -90,26 +85,6 @@ def test_a_long_unit_keeps_nobody_waiting(tmp_path: Path) -> None:
     assert progress.done == 31
 
 
-def test_fewer_units_than_processes_run_at_once_where_that_is_asked_for(tmp_path: Path) -> None:
-    code = (
-        f"import os, time; name = {str(tmp_path)!r} + '/%d'; open(name, 'x').close(); "
-        f"time.sleep(0.05); assert len(os.listdir({str(tmp_path)!r})) == 1; os.unlink(name)"
-    )
-    with ProcessExecutor(2) as executor:
-        executor.at_once = 1
-        assert list(executor.map(exec, [code % i for i in range(6)], Counted(), lambda unit: 1)) == [None] * 6
-
-
-def test_results_that_wait_stay_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executor_module, "AHEAD", 5)
-    with ProcessExecutor(2) as executor:
-        code = f"open({str(tmp_path)!r} + '/%d', 'w').close()"
-        results = executor.map(exec, [code % i for i in range(60)], Counted(), lambda unit: 1)
-        next(results)
-        assert len(list(tmp_path.iterdir())) <= 10
-        assert len(list(results)) == 59
-
-
 def test_an_interrupted_builder_does_not_wait_for_its_workers(tmp_path: Path) -> None:
     begin = time.monotonic()
     code = f"import time; open({str(tmp_path / 'runs')!r}, 'w').close(); time.sleep(600)"
@@ -173,14 +148,6 @@ def alive(process: int) -> bool:
         return False
 
 
-def test_a_failure_here_stops_at_its_unit() -> None:
-    with ProcessExecutor(1) as executor:
-        results = executor.map(partial(divmod, 1), [1, 0, 1], Counted(), lambda unit: 1)
-        assert next(results) == (1, 0)
-        with pytest.raises(ZeroDivisionError):
-            next(results)
-
-
 def test_processes_are_started_only_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executor_module.os, "cpu_count", lambda: 4)
     assert worker_count(0, 0) == 1
@@ -189,12 +156,6 @@ def test_processes_are_started_only_where_they_pay(monkeypatch: pytest.MonkeyPat
     assert worker_count(3, 0) == 3
     monkeypatch.setattr(executor_module.os, "cpu_count", lambda: None)
     assert worker_count(0, POINTS_WORTH_A_PROCESS * 100) == 1
-
-
-def test_processes_do_the_work_where_no_cluster_is_named() -> None:
-    with make_executor(BuildConfig(), 1) as executor:
-        assert isinstance(executor, ProcessExecutor)
-        assert executor.jobs == 1
 
 
 M = 1 << 20
@@ -211,18 +172,3 @@ def test_every_row_is_in_one_portion_and_the_largest_come_first(counts: list[int
     planned = max(M, int(points.sum()) // (8 * jobs))
     assert all(h - points[run.stop - 1] <= planned for h, run in zip(held, runs, strict=True))
     assert len(runs) <= points.sum() // planned + 1
-
-
-def test_no_rows_are_no_portions() -> None:
-    assert voxel_ranges(np.empty(0, np.int64), 2) == []
-
-
-def test_without_an_executor_units_run_here_in_order() -> None:
-    done: list[int] = []
-
-    class Counting(Silent):
-        def advance(self, amount: int) -> None:
-            done.append(amount)
-
-    assert list(run_units(None, lambda unit: unit * 2, [3, 1, 2], Counting(), lambda unit: unit)) == [6, 2, 4]
-    assert done == [3, 1, 2] and jobs_of(None) == 1

@@ -44,14 +44,6 @@ def test_alone_it_is_an_error_about_the_scan(
     assert not (tmp_path / "hall").exists()
 
 
-def test_with_a_radius_it_is_built_with_a_warning(
-    zeros: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    build = ["build", str(zeros), "-o", str(tmp_path / "hall"), "--jobs", "1", "--radius", "0.01"]
-    assert run(build) == 0
-    assert f"warning: {zeros}: {WARNING}" in capsys.readouterr().err
-
-
 def test_build_info_inspect_and_add_name_it(
     zeros: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

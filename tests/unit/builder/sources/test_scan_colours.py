@@ -1,16 +1,13 @@
 """Colours and classes that readers deliver, and how the channels of a file become eight bits."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
-from coloured_scans import WRITERS, coloured, has_classes, read_scan, write_las, write_rows
-from solidcloud.builder.sources.common.colours import brightest, eight_bits, find_columns, whole_bytes
+from coloured_scans import WRITERS, coloured, has_classes, read_scan, write_las
+from solidcloud.builder.sources.common.colours import eight_bits
 from solidcloud.builder.sources.placed_scan import place_scan
-from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
-
-REAL = Path(os.environ.get("SOLIDCLOUD_SCANS", "")) / "format_samples"
+from solidcloud.builder.sources.scan_files import open_scans
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -32,17 +29,6 @@ def test_colours_that_nobody_wants_are_not_read(name: str, tmp_path: Path) -> No
     (scan,) = open_scans(WRITERS[name](tmp_path / name, coloured(4)))
     assert "rgb" in scan.columns
     assert all(block.rgb is None and block.classification is None for block in scan.blocks())
-
-
-@pytest.mark.parametrize("name", ["7.laz", "bytes.ply", "2.las"])
-def test_a_range_of_a_scan_has_the_colours_of_its_points(name: str, tmp_path: Path) -> None:
-    truth = coloured(5)
-    (scan,) = open_scans(WRITERS[name](tmp_path / name, truth))
-    scan.wanted = frozenset({"rgb", "classification"})
-    blocks = list(scan.blocks(11, 40, 120))
-    found = np.concatenate([eight_bits(block.rgb, 65535) for block in blocks])
-    assert np.array_equal(found, truth.rgb[40:120])
-    assert np.array_equal(np.concatenate([block.classification for block in blocks]), truth.classes[40:120])
 
 
 def test_a_placed_scan_keeps_colours_and_classes(tmp_path: Path) -> None:
@@ -91,28 +77,6 @@ def test_the_brightest_channel_decides_between_eight_and_sixteen_bits() -> None:
     assert eight_bits(fractions, 200.0).tolist() == [[0, 0, 1], [0, 0, 0]]
 
 
-def test_the_brightest_channel_is_a_finite_one() -> None:
-    assert brightest(None) == 0
-    assert brightest(np.empty((0, 3), np.uint8)) == 0
-    assert brightest(np.array([[np.nan, np.inf, 0.25]], np.float32)) == 0.25
-    assert brightest(np.array([[1, 2, 300]], np.uint16)) == 300
-
-
-def test_classes_are_whole_and_in_range() -> None:
-    assert whole_bytes(np.array([-1.0, 2.4, 254.6, 1e9, np.nan])).tolist() == [0, 2, 255, 255, 0]
-
-
-def test_a_name_that_occurs_twice_names_no_column() -> None:
-    assert find_columns(["x", "Red", "GREEN", "blue", "Label"]) == ((1, 2, 3), 4)
-    assert find_columns(["r", "g", "b", "diffuse_red"]) == ((0, 1, 2), None)
-    assert find_columns(["red", "red", "green", "blue", "class", "class"]) == ((), None)
-
-
-def test_a_text_without_names_has_no_colours(tmp_path: Path) -> None:
-    (scan,) = open_scans(write_rows(tmp_path / "a.xyz", coloured(8), ""))
-    assert scan.columns == frozenset()
-
-
 def test_e57_without_limits_and_of_floats_has_fractions(tmp_path: Path) -> None:
     from scan_formats import cartesian, write_e57
 
@@ -134,40 +98,3 @@ def test_e57_colours_marked_as_invalid_are_black(tmp_path: Path) -> None:
     columns = {**cartesian(truth.xyz), **channels, "isColorInvalid": invalid}
     path = write_e57(tmp_path / "a.e57", [{"columns": columns}])
     assert np.array_equal(read_scan(path).rgb, np.where(invalid[:, None], 0, truth.rgb))
-
-
-def test_inspect_names_the_columns_of_each_scan(tmp_path: Path) -> None:
-    WRITERS["7.las"](tmp_path / "a.las", coloured(1))
-    WRITERS["named.csv"](tmp_path / "b.csv", coloured(1))
-    (tmp_path / "c.xyz").write_text("1 2 3\n4 5 6\n")
-    found = {entry.path.name: entry.columns for entry in inspect_scans(sorted(tmp_path.iterdir()))}
-    assert found == {
-        "a.las": ("classification", "intensity", "rgb"),
-        "b.csv": ("classification", "rgb"),
-        "c.xyz": (),
-    }
-
-
-@pytest.mark.skipif(not REAL.is_dir(), reason="SOLIDCLOUD_SCANS names no folder with format_samples")
-def test_a_real_ptx_file_has_the_colours_of_its_rows() -> None:
-    path = REAL / "1.2-with-color.ptx"
-    rows = np.array([line.split() for line in path.read_text().splitlines()[10:]], np.float64)
-    rows = rows[(rows[:, :3] != 0).any(axis=1)]
-    assert np.array_equal(read_scan(path).rgb, rows[:, 4:])
-    assert len(np.unique(rows[:, 4:], axis=0)) > 1
-
-
-@pytest.mark.skipif(not REAL.is_dir(), reason="SOLIDCLOUD_SCANS names no folder with format_samples")
-def test_real_las_and_e57_files_have_the_colours_that_their_libraries_read() -> None:
-    import laspy
-    import pye57
-
-    las = laspy.read(REAL.parent / "cupola_las" / "r2.las")
-    found = read_scan(REAL.parent / "cupola_las" / "r2.las")
-    words = np.stack([las.red, las.green, las.blue], axis=1)
-    assert words.max() > 255 and np.array_equal(found.rgb, words >> 8)
-    assert np.array_equal(found.classes, las.classification)
-    path = REAL.parent / "pumpA.e57"
-    columns = pye57.E57(str(path)).read_scan(0, colors=True, ignore_missing_fields=True)
-    channels = [columns[name] for name in ("colorRed", "colorGreen", "colorBlue")]
-    assert np.array_equal(read_scan(path).rgb, np.stack(channels, axis=1))

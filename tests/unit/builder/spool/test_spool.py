@@ -1,8 +1,6 @@
 """Sorted runs: every row once, in canonical order, found by voxel and by block of a voxel."""
 
-import os
 import pickle
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from solidcloud.builder.spool.run_files import (
     KEYS_SUFFIX,
     is_run_damaged,
     new_run,
-    read_directory,
     spool_dtype,
     write_directory,
 )
@@ -79,52 +76,6 @@ def test_a_voxels_rows_are_found_once_and_in_order(keep: frozenset[str], tmp_pat
     assert (spool.rows(4), spool.count(4), spool.block_rows(4, 0, 1 << 63)) == ([], 0, [])
 
 
-@pytest.mark.parametrize("entries", [1, 7, 1 << 18])
-def test_directories_are_merged_a_part_at_a_time(
-    entries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spool_module, "MERGED_ENTRIES", entries)
-    rng, dtype = np.random.default_rng(4), spool_dtype(BuildConfig())
-    expected: dict[int, list[int]] = {}
-    for number in range(9):
-        keys = rng.choice(np.array([*range(12), 1 << 62], np.uint64), 20)
-        write_run(tmp_path / f"{number}.run", keys, np.zeros(20, dtype))
-        for key, count in zip(*(part.tolist() for part in np.unique(keys, return_counts=True)), strict=True):
-            expected.setdefault(key, []).append(count)
-    spool = Spool(tmp_path, dtype, LATTICE)
-    for held in (spool, pickle.loads(pickle.dumps(spool))):
-        assert held.keys.tolist() == sorted(expected)
-        assert held.counts.tolist() == [sum(expected[key]) for key in sorted(expected)]
-        assert {key: [len(rows) for rows in held.rows(key)] for key in expected} == expected
-    assert len(list(tmp_path.glob("*.tmp"))) == 1
-
-
-def test_a_worker_holds_the_directories_of_what_it_asks_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spool_module, "MERGED_ENTRIES", 1 << 12)
-    runs, voxels = 100, 1000
-    keys = np.arange(voxels, dtype=np.uint64)
-    dtype = spool_dtype(BuildConfig())
-    for number in range(runs):
-        write_directory(tmp_path / f"{number}.run", keys, np.arange(voxels + 1))
-        (tmp_path / f"{number}.run").touch()
-        os.truncate(tmp_path / f"{number}.run", voxels * dtype.itemsize)
-    tracemalloc.start()
-    try:
-        spool = Spool(tmp_path, dtype, LATTICE)
-        assert spool.counts.tolist() == [runs] * voxels
-        assert tracemalloc.get_traced_memory()[1] < 2 << 20  # 94 bytes a voxel of a run were 9 MB
-        sent = pickle.dumps(spool)
-        assert len(sent) < 10_000
-        tracemalloc.reset_peak()
-        before = tracemalloc.get_traced_memory()[0]
-        assert pickle.loads(sent).count(77) == runs
-        assert tracemalloc.get_traced_memory()[1] - before < 1 << 18
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.parametrize("stride", [1, 3, 64, 4096])
 def test_a_block_is_what_brute_force_finds(
     stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -144,11 +95,6 @@ def test_a_block_is_what_brute_force_finds(
             assert spool.block_count(key, low, high) == sum(map(len, expected))
 
 
-def test_a_folder_without_runs_holds_nothing(tmp_path: Path) -> None:
-    spool = Spool(tmp_path, spool_dtype(BuildConfig()), LATTICE)
-    assert (len(spool.keys), len(spool.counts), spool.rows(3)) == (0, 0, [])
-
-
 def test_a_run_that_lost_its_end_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.run"
     write_run(path, *made(1, 50, frozenset()))
@@ -158,17 +104,6 @@ def test_a_run_that_lost_its_end_is_refused(tmp_path: Path) -> None:
     spool.rows(int(spool.keys[0]))
     with pytest.raises(CorruptError, match=r"a\.run: ends before row 50"):
         spool.rows(int(spool.keys[-1]))
-
-
-def test_the_directory_is_as_its_description_says(tmp_path: Path) -> None:
-    keys, rows = made(2, 60, frozenset())
-    write_run(tmp_path / "a.run", keys, rows)
-    words = np.fromfile((tmp_path / "a.run").with_suffix(KEYS_SUFFIX), "<u8").tolist()
-    assert words[:3] == KEYS.tolist()
-    assert np.diff(words[3:]).tolist() == [int((keys == key).sum()) for key in KEYS]
-    assert words[3] == 0
-    found, starts = read_directory(tmp_path / "a.run", rows.dtype.itemsize)
-    assert (found.tolist(), starts.tolist()) == (words[:3], words[3:])
 
 
 NO_DIRECTORIES: dict[str, Callable[[list[int]], list[int]]] = {

@@ -1,4 +1,4 @@
-"""Test the office: the same points in every format, its strays where the truth says, and no partial file."""
+"""Test the office: equal seeds make equal files, and its strays are where the truth says."""
 
 from pathlib import Path
 
@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.builder.synthetic import office
 from solidcloud.builder.synthetic.office import CLEARANCE, DUST, make_office, solid_distances
-from solidcloud.builder.synthetic.truth import read_office_truth, read_truth
-from solidcloud.schemas.errors import BadRequestError, ScanError
+from solidcloud.builder.synthetic.truth import read_office_truth
 
 
 @pytest.fixture(autouse=True)
@@ -32,13 +31,6 @@ def test_same_seed_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
     assert one.truth.read_bytes() == two.truth.read_bytes()
 
 
-def test_every_format_holds_the_same_scans(tmp_path: Path) -> None:
-    folder, e57 = make_office(tmp_path / "folder"), make_office(tmp_path / "office.e57")
-    assert e57.truth == tmp_path / "office.truth.json" and folder.points == e57.points
-    for laz, posed in zip(points_of(*folder.paths), points_of(*e57.paths), strict=True):
-        assert np.abs(laz - posed).max() < 1e-5
-
-
 def test_strays_are_the_last_points_and_clear_of_solids(tmp_path: Path) -> None:
     made = make_office(tmp_path / "office")
     truth = read_office_truth(made.truth)
@@ -55,35 +47,3 @@ def test_strays_are_the_last_points_and_clear_of_solids(tmp_path: Path) -> None:
     # It leaves no way for a body 0.4 m wide.
     assert truth.door.width == 1.0 and np.ptp(person[:, 0]) > 0.45 and len(person) > 300
     assert max(truth.door.x_right - person[:, 0].max(), person[:, 0].min() - truth.door.x_left) < 0.3
-
-
-def test_distance_from_solids_is_that_of_the_nearest_along_an_axis() -> None:
-    points = np.array([[0.0, 2.0, 0.3], [0.0, 2.0, -0.05], [1.9, 1.7, 1.0], [2.3, 1.7, 1.0]])
-    assert solid_distances(points) == pytest.approx([0.3, -0.05, -0.2, 0.2])
-
-
-def test_progress_ends_at_the_count_and_a_stop_leaves_nothing(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    made = make_office(tmp_path / "a", progress=lambda done, total: seen.append((done, total)))
-    assert len(seen) == 2 and seen[-1] == (made.points, made.points) and seen[0][0] < made.points
-
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
-
-    (tmp_path / "below").mkdir()
-    with pytest.raises(KeyboardInterrupt):
-        make_office(tmp_path / "below" / "b", progress=stop)
-    assert list((tmp_path / "below").iterdir()) == []
-
-
-def test_refusals_say_what_was_expected(tmp_path: Path) -> None:
-    for name in ("office.laz", "office.las"):
-        with pytest.raises(BadRequestError, match="one file for two scans"):
-            make_office(tmp_path / name)
-    with pytest.raises(BadRequestError, match="cannot write"):
-        make_office(tmp_path / "office.ply")
-    made = make_office(tmp_path / "office")
-    with pytest.raises(ScanError, match="not the truth of a generated scene"):
-        read_truth(made.truth)
-    with pytest.raises(BadRequestError, match="new or an empty folder"):
-        make_office(tmp_path / "office")

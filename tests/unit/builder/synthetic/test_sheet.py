@@ -7,7 +7,6 @@ import plyfile
 import pytest
 from scipy.spatial import cKDTree
 from solidcloud.builder.synthetic.sheet import DOOR, HALF_WIDTH, HEIGHT, MARGIN, make_sheet
-from solidcloud.schemas.errors import BadRequestError
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.06])
@@ -33,14 +32,3 @@ def test_places_keep_off_the_edges_on_both_sides_of_the_door(tmp_path: Path) -> 
     assert aside.min() >= DOOR / 2 + MARGIN and aside.max() <= HALF_WIDTH - MARGIN
     assert 150 < (places.points[:, 0] < 0).sum() < 350
     assert (places.normals == (0, -1, 0)).all() and (places.points[:, 1] == 0).all()
-
-
-def test_same_arguments_same_bytes(tmp_path: Path) -> None:
-    first = make_sheet(tmp_path / "a.ply", seed=4).path.read_bytes()
-    assert first == make_sheet(tmp_path / "b.ply", seed=4).path.read_bytes()
-    assert first != make_sheet(tmp_path / "c.ply", seed=5).path.read_bytes()
-
-
-def test_spacing_out_of_range_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadRequestError, match=r"spacing 0\.5 m"):
-        make_sheet(tmp_path / "sheet.ply", spacing=0.5)

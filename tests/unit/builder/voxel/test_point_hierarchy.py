@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from solidcloud.builder.voxel import point_hierarchy
 from solidcloud.builder.voxel.point_hierarchy import (
     Hierarchy,
     build_hierarchy,
@@ -48,18 +47,6 @@ def test_coordinates_of_an_avatars_lattice_are_enclosed() -> None:
     assert not loose_nodes(build_hierarchy(points, leaf=16, degree=4, highest=1 << 23))
 
 
-def test_a_shrunk_radius_is_seen_by_this_judge() -> None:
-    hierarchy = build_hierarchy(make_steps("noise", 3, 100, 1000), leaf=16, degree=4)
-    hierarchy.bounds.radius[3] -= 1
-    assert loose_nodes(hierarchy) == [3]
-
-
-def test_the_hierarchy_keeps_columns_apart_by_order() -> None:
-    points = make_steps("duplicates", 3, 100, 1000)
-    hierarchy = build_hierarchy(points, leaf=16, degree=4)
-    assert sorted(hierarchy.tree.order.tolist()) == list(range(100))
-
-
 @pytest.mark.parametrize("kind", ["plane", "pillar", "noise", "duplicates"])
 def test_an_avatars_mean_equals_brute_force(kind: str) -> None:
     points = make_scan(kind, 8, 200) - 1.0
@@ -86,9 +73,3 @@ def test_an_avatar_of_any_extent_fits_its_lattice(extent: float) -> None:
     local = build_local(points, leaf=2, degree=2)
     assert 0 <= local.hierarchy.points.min() <= local.hierarchy.points.max() <= 1 << 23
     assert math.log2(local.step).is_integer()
-
-
-@pytest.mark.parametrize("count", [1, 2, 5000])
-def test_distinct_points_are_those_of_numpy(count: int) -> None:
-    points = np.random.default_rng(count).integers(-8, 8, (count, 3))
-    assert np.array_equal(point_hierarchy._distinct(points), np.unique(points, axis=0))

@@ -51,13 +51,3 @@ def test_a_write_that_fails_is_the_systems_error_and_leaves_nothing(
     with largest_file(size):
         write(tmp_path / "part.h5")
     assert (tmp_path / "part.h5").read_bytes() == whole.read_bytes()
-
-
-def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
-    with pytest.raises(KeyError, match="nothing"), new_hdf5_file(tmp_path / "a.h5"):
-        raise KeyError("nothing of HDF5's")
-    with pytest.raises(FileNotFoundError), new_hdf5_file(tmp_path / "missing" / "a.h5"):
-        pass
-    with pytest.raises(KeyboardInterrupt), new_hdf5_file(tmp_path / "a.h5"):
-        raise KeyboardInterrupt
-    assert not list(tmp_path.iterdir())

@@ -57,16 +57,3 @@ def test_synthetic_scans_come_back(kind: str, steps: int) -> None:
     voxel = build_voxel(KEY, VoxelPoints(points, **kept(len(points), 1)), steps, config)
     found, _ = decode(encode_voxel(voxel, ARCHIVE_ID), voxel, steps)
     assert_same_bits(found, voxel)
-
-
-def test_the_same_voxel_has_the_same_bytes_in_any_order_of_points() -> None:
-    points = make_steps("corner", 3, 300, 1000)
-    columns = kept(300, 1)
-    columns["intensity"] = np.nan_to_num(columns["intensity"])
-    order = np.random.default_rng(9).permutation(300)
-    config = BuildConfig(cell_points=50)
-    a = build_voxel(KEY, VoxelPoints(points, **columns), 1000, config)
-    b = build_voxel(
-        KEY, VoxelPoints(points[order], **{k: c[order] for k, c in columns.items()}), 1000, config
-    )
-    assert encode_voxel(a, ARCHIVE_ID) == encode_voxel(b, ARCHIVE_ID)

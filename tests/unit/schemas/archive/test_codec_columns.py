@@ -84,34 +84,3 @@ def test_a_flipped_bit_of_a_column_that_is_not_wanted_is_found(wanted: tuple[str
                 assert_same_bits(found.decode()[0], voxel._replace(**unwanted))
                 passed += 1
     assert passed <= 3 * len(record.points) // 50
-
-
-def test_more_or_less_than_is_declared_is_refused_where_columns_are_not_wanted() -> None:
-    columns = {"intensity": np.zeros(24, np.float32)}
-    points = VoxelPoints(make_steps("corner", 1, 24, 1000), **columns)
-    voxel = build_voxel(KEY, points, 1000, BuildConfig())
-    record = encode_voxel(voxel, ARCHIVE_ID)
-    shape = shape_of(voxel)
-    for frame in (record.points + record.points, record.points[:-5], record.points[:20]):
-        with pytest.raises(CorruptError, match="points: damaged frame"):
-            decompress_record(record.cells, record.nodes, frame, shape, KEY, ARCHIVE_ID, 1000, columns=())
-
-
-@pytest.mark.interpreted
-def test_counting_refuses_a_class_there_is_none_of() -> None:
-    classes = np.array([0, 31, 32, 7], np.uint8)
-    points = VoxelPoints(np.arange(12, dtype=np.int32).reshape(4, 3), radius_class=classes)
-    voxel = build_voxel(KEY, points, 1000, BuildConfig())
-    record = encode_voxel(voxel, ARCHIVE_ID)
-    opened = decompress_record(
-        record.cells,
-        record.nodes,
-        record.points,
-        shape_of(voxel),
-        KEY,
-        ARCHIVE_ID,
-        1000,
-        columns=("radius_class",),
-    )
-    with pytest.raises(CorruptError, match="radius class 32, expected at most 31"):
-        opened.class_counts()

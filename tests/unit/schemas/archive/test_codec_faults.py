@@ -101,15 +101,6 @@ def test_a_frame_that_declares_more_is_refused_before_memory_is_taken(
         decode(record, voxel, 1000, points=undeclared)
 
 
-def test_what_check_voxel_refuses_is_refused(small: tuple[VoxelData, Record]) -> None:
-    voxel, _ = small
-    low = voxel.cells.low.copy()
-    low[0, 0] += 1
-    record = encode_voxel(voxel._replace(cells=voxel.cells._replace(low=low)), ARCHIVE_ID)
-    with pytest.raises(CorruptError, match="a cell off its grid"):
-        decode(record, voxel, 1000)
-
-
 @pytest.mark.interpreted
 @pytest.mark.parametrize("along", ["the sort axis", "another axis"])
 def test_a_point_outside_its_cell_is_refused(along: str, small: tuple[VoxelData, Record]) -> None:

@@ -7,15 +7,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from six_scans import LATER, dataset, rows_of
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.voxel.record_points import voxel_points
+from six_scans import dataset, rows_of
 from solidcloud.schemas.archive import index as index_module
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.index import VOXEL_DTYPE, shard_name
-from solidcloud.schemas.archive.radius_model import LOCAL_RADII
-from synthetic_scans import make_scan, write_xyz
 
 FORMAT = Path(index_module.__file__).parents[1] / "FORMAT.md"
 
@@ -55,18 +50,6 @@ def test_format_md_gives_every_point_back(built: Path) -> None:
     assert np.abs(quantised + source.min(axis=0) - source).max() == header.moved_max
 
 
-def test_format_md_reads_an_archive_without_columns(tmp_path: Path) -> None:
-    xyz = make_scan("corner", 4, 300) - 1.0
-    write_xyz(tmp_path / "a.xyz", xyz)
-    build_archive([tmp_path / "a.xyz"], tmp_path / "a", BuildConfig(voxel=8.0, jobs=1, resolution=0.001))
-    names: dict[str, Callable] = {}
-    exec(compile(worked_example(), str(FORMAT), "exec"), names)
-    world, rows = names["read_archive"](tmp_path / "a")
-    assert rows.dtype.names == ("xyz",)
-    quantised = np.rint((xyz - xyz.min(axis=0)) / 0.001) * 0.001 + xyz.min(axis=0)
-    assert np.array_equal(rows_of(world), rows_of(quantised))
-
-
 def test_format_md_names_every_dataset_and_field(built: Path) -> None:
     text = FORMAT.read_text()
     with h5py.File(built / "index.h5") as index:
@@ -80,31 +63,6 @@ def test_format_md_names_every_dataset_and_field(built: Path) -> None:
     assert f"c >= 1 rows of {sizes[0]} bytes" in text
     assert f"n >= 1 rows of {sizes[1]} bytes" in text
     assert f"packed, {VOXEL_DTYPE.itemsize} bytes" in text
-
-
-def test_format_md_reads_and_names_an_archive_with_radius_classes(tmp_path: Path) -> None:
-    xyz = make_scan("corner", 4, 300) - 1.0
-    write_xyz(tmp_path / "a.xyz", xyz)
-    models = frozenset({"mean", "local", "border"})
-    build_archive([tmp_path / "a.xyz"], tmp_path / "a", BuildConfig(voxel=0.8, jobs=1, models=models))
-    names: dict[str, Callable] = {}
-    exec(compile(worked_example(), str(FORMAT), "exec"), names)
-    world, rows = names["read_archive"](tmp_path / "a")
-    assert rows.dtype.names == ("xyz", "radius_class")
-    quantised = np.rint((xyz - xyz.min(axis=0)) / 1e-4) * 1e-4 + xyz.min(axis=0)
-    assert np.array_equal(rows_of(world), rows_of(quantised))
-    text = FORMAT.read_text()
-    with (
-        h5py.File(tmp_path / "a" / "index.h5") as index,
-        h5py.File(tmp_path / "a/shards" / shard_name(0)) as shard,
-    ):
-        assert index.attrs["format_version"] == shard.attrs["format_version"] == 2
-        assert np.array_equal(np.bincount(rows["radius_class"], minlength=32), index["radius_counts"])
-        assert index["columns"][:].tolist() == [0, 0, 1, 1]
-        for name in (*index, *rows.dtype.names):
-            assert f"`{name}`" in text, name
-    for radius in LOCAL_RADII:
-        assert re.search(rf"\b{radius}\b", text), radius
 
 
 def test_format_md_reads_and_names_an_archive_with_colours_and_its_level() -> None:
@@ -129,31 +87,3 @@ def test_format_md_reads_and_names_an_archive_with_colours_and_its_level() -> No
             assert index.attrs["format_version"] == shard.attrs["format_version"] == 5
             for name in (*index, *rows.dtype.names):
                 assert f"`{name}`" in text, name
-
-
-def test_format_md_reads_and_names_an_archive_of_several_generations() -> None:
-    names: dict[str, Callable] = {}
-    exec(compile(worked_example(), str(FORMAT), "exec"), names)
-    world, rows = names["read_archive"](LATER)
-    with Archive(LATER) as archive:
-        header = archive.header
-        expected = [
-            voxel_points(*archive.read_voxel(row)) + archive.coordinates[row] * header.lattice.voxel_steps
-            for row in range(len(archive.voxels))
-        ]
-        in_shards = 0
-        for number in range(archive.shard_count()):
-            with h5py.File(archive.shard_path(number)) as shard:
-                in_shards += len(shard["voxels"])
-                assert shard.attrs["format_version"] == 2
-        assert in_shards > len(archive.voxels), "some are dead"
-    assert np.array_equal(rows_of(world), rows_of(header.lattice.to_world(np.concatenate(expected))))
-    # Of the scan that was removed there is none.
-    assert sorted(np.unique(rows["scan_index"]).tolist()) == [
-        i for i, s in enumerate(header.sources) if s.count
-    ]
-    text = FORMAT.read_text()
-    with h5py.File(LATER / "index.h5") as index:
-        assert index.attrs["format_version"] == 3
-        for name in index:
-            assert f"`{name}`" in text, name

@@ -97,21 +97,8 @@ def test_a_level_without_a_voxel_is_refused(archive: Path) -> None:
         open_level(opened)
 
 
-@pytest.mark.parametrize("name", ["unknown_everywhere", "step"])
-def test_a_level_that_says_otherwise_is_refused(archive: Path, name: str) -> None:
-    forge(archive / LEVEL_FOLDER, lambda columns: columns[name].__setitem__(0, 1))
-    with Archive(archive) as opened, pytest.raises(FormatError, match="does not describe the voxels"):
-        open_level(opened)
-
-
 def test_a_damaged_level_is_an_error_that_names_it(archive: Path) -> None:
     index = archive / LEVEL_FOLDER / "index.h5"
     index.write_bytes(index.read_bytes()[:500])
     with Archive(archive) as opened, pytest.raises((FormatError, CorruptError), match=r"level/index\.h5"):
         open_level(opened)
-
-
-def test_a_level_has_no_other_columns(archive: Path) -> None:
-    forge(archive / LEVEL_FOLDER, lambda columns: columns["level"].__setitem__(0, 0))
-    with pytest.raises(FormatError, match="level and columns"):
-        Archive(archive / LEVEL_FOLDER)

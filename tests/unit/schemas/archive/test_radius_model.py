@@ -60,11 +60,6 @@ def test_the_ladder_doubles_every_third_class() -> None:
     assert np.allclose(radii, 0.001 * np.cbrt(2.0) ** np.arange(16), rtol=0, atol=0.5e-6)
 
 
-def test_one_radius_for_all_is_one_entry() -> None:
-    for text, metres in ((None, 0.0123), ("mean", 0.0123), ("mean:0.5", 0.00615), ("fixed:0.2", 0.2)):
-        assert class_radii(text, 0.0123, ("mean",)).tolist() == [round(metres * UNITS_PER_METRE)]
-
-
 def test_radii_by_class() -> None:
     local = class_radii("local:2", 0.5, ALL)
     border = class_radii("border", 0.5, ALL)
@@ -96,12 +91,3 @@ def test_what_the_archive_does_not_hold_is_refused() -> None:
     with pytest.raises(BadRequestError, match="at most"):
         class_radii("mean:8", 1.5, ("mean",))
     assert class_radii("mean:8", 1.0, ("mean",)).tolist() == [round(MAX_RADIUS * UNITS_PER_METRE)]
-
-
-def test_the_figure_itself_may_be_asked_for_however_large() -> None:
-    # Points 40 m apart have a mean radius of 20 m: which avatars have room beside it is told pose by pose.
-    for text in (None, "mean", "mean:1"):
-        assert class_radii(text, 20.0, ("mean",)).tolist() == [20 * UNITS_PER_METRE]
-    assert class_radii("border", 20.0, ALL).max() == 20 * UNITS_PER_METRE
-    with pytest.raises(BadRequestError, match="at most"):
-        class_radii("mean:1.01", 20.0, ("mean",))

@@ -47,10 +47,6 @@ def test_a_rigid_pose_is_copied_and_a_looser_tolerance_accepts_more(rng: np.rand
     assert rigid_fault(loose) is not None and rigid_fault(loose, 1e-6) is None
 
 
-def test_no_tolerance_accepts_nan() -> None:
-    assert rigid_fault(changed(1, 1, np.nan).tolist(), np.inf) is not None
-
-
 @pytest.mark.parametrize(
     ("pose", "fault"),
     [

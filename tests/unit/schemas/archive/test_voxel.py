@@ -92,22 +92,6 @@ def test_links_equal_a_plain_walk(kind: str, cell_points: int) -> None:
     assert links.height == height
 
 
-@pytest.mark.interpreted
-def test_links_of_trees_of_unequal_height() -> None:
-    # Cells of 1, 3 and 2 levels below a top BSH of 2; written out by hand.
-    voxel = by_hand(
-        counts=[2, 2, 1, 4, 2, 1, 2, 1, 3, 3, 3, 5],
-        cell_nodes=[1, 6, 2],
-        cell_points=[4, 9, 5],
-    )
-    links = link_nodes(voxel)
-    assert links.first.tolist() == [1, 3, 5, 0, 6, 11, 8, 10, 4, 7, 10, 13]
-    assert links.is_leaf.tolist() == [False] * 3 + [True] + [False] * 4 + [True] * 4
-    assert links.cell.tolist() == [-1, -1, -1, 0, 1, 2, 1, 1, 1, 1, 1, 2]
-    assert links.height == 2 + 3
-    assert plain_links(voxel) == (links.first.tolist(), links.is_leaf.tolist(), links.cell.tolist(), 5)
-
-
 def change(part: str, field: str, at: object, value: object) -> Callable[[VoxelData], VoxelData]:
     """A function that sets one element of one column."""
 
@@ -250,11 +234,6 @@ def test_a_sound_voxel_passes_and_gives_its_links(make: Callable[[], VoxelData])
     links, expected = check_voxel(voxel, STEPS), link_nodes(voxel)
     assert np.array_equal(links.first, expected.first)
     assert links.height == expected.height
-
-
-def test_largest_legal_nodes_pass() -> None:
-    check_voxel(by_hand([MAX_LEAF], [1], [MAX_LEAF]), STEPS)
-    check_voxel(by_hand([MAX_DEGREE] + [1] * MAX_DEGREE, [MAX_DEGREE + 1], [MAX_DEGREE]), STEPS)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,6 @@
 """Test the two ways to call a kernel: from Python, and from another kernel."""
 
-import json
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,32 +10,6 @@ from solidcloud.schemas.kernels.morton import morton_code, morton_encode
 pytestmark = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are plain functions"
 )
-
-CODE = """
-import json
-import numpy as np
-from solidcloud.schemas.kernels.morton import morton_code, morton_encode
-codes = morton_encode(np.array([[1, 2, 3], [7, 0, 5]], np.uint64))
-print(json.dumps({
-    "codes": codes.tolist(),
-    "outer": sum(morton_encode.stats.cache_misses.values()),
-    "inner": [sum(found.values()) for found in morton_code.inner.stats[1:]],
-}))
-"""
-
-
-def start(cache: Path) -> dict[str, object]:
-    """Return what a process that calls `morton_encode` prints."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", CODE],
-        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=240,
-    )
-    found: dict[str, object] = json.loads(done.stdout)
-    return found
 
 
 @njit()
@@ -66,28 +36,3 @@ def test_a_kernel_has_the_same_result_for_python_and_for_a_kernel() -> None:
 def test_a_kernel_raises_what_an_inner_kernel_raises() -> None:
     with pytest.raises(ValueError, match="at least 0"):
         quarter(-1.0)
-
-
-def test_a_kernel_that_only_kernels_call_has_no_machine_code() -> None:
-    @njit()
-    def inner(value):  # type: ignore[no-untyped-def]
-        return value + 1
-
-    @njit()
-    def outer(value):  # type: ignore[no-untyped-def]
-        return inner(value)
-
-    assert outer(1) == 2
-    assert len(inner.inner.overloads) == 1 and not inner.overloads
-    (compiled,) = inner.inner.overloads.values()
-    assert not callable(compiled.entry_point)
-
-
-def test_code_for_other_kernels_is_stored(tmp_path: Path) -> None:
-    """Compile one kernel again; what it calls is read from the cache."""
-    codes = [53, 333]
-    assert start(tmp_path) == {"codes": codes, "outer": 1, "inner": [0, 1]}  # hits, misses
-    (stored,) = tmp_path.glob("solidcloud-kernels/*.morton_encode-*")
-    stored.unlink()
-    assert start(tmp_path) == {"codes": codes, "outer": 1, "inner": [1, 0]}
-    assert start(tmp_path) == {"codes": codes, "outer": 0, "inner": [0, 0]}

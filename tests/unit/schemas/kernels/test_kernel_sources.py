@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import solidcloud
-from solidcloud.schemas.kernels import kernel_sources
 from solidcloud.schemas.kernels.kernel_sources import source_digest
 
 CODE = """
@@ -70,19 +69,3 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
 
 def test_the_place_of_the_package_does_not_count(copy: Path) -> None:
     assert digests(copy)["schemas.kernels.morton"] == source_digest("solidcloud.schemas.kernels.morton").hex()
-
-
-def test_imports_over_several_lines_are_found() -> None:
-    """server/kernels/collide/collide_poses.py imports server/kernels/core/placed_avatar.py in parentheses."""
-    reached = kernel_sources._reached(("server", "kernels", "collide", "collide_poses"))
-    assert {("server", "kernels", "core", "placed_avatar"), ("schemas", "kernels", "compiling")} <= reached
-
-
-def test_a_module_of_another_package_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected one of solidcloud"):
-        source_digest("numpy.linalg")
-
-
-def test_a_source_that_is_not_there_is_an_error() -> None:
-    with pytest.raises(OSError):
-        source_digest("solidcloud.schemas.nothing")

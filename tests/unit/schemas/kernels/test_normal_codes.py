@@ -8,15 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.kernels.normal_codes import (
-    LINE,
-    NO_NORMAL,
-    THICK,
-    decode_normal,
-    encode_normal,
-    least_direction,
-    normal_code,
-)
+from solidcloud.schemas.kernels.normal_codes import THICK, decode_normal, encode_normal, normal_code
 
 pytestmark = pytest.mark.interpreted
 
@@ -58,21 +50,6 @@ def test_codes_are_off_by_half_a_degree_and_axes_by_nothing() -> None:
         assert decode_normal(encode_normal(*axis)) == decode_normal(encode_normal(*-axis)) == tuple(axis)
 
 
-def test_every_code_names_a_direction_that_has_it() -> None:
-    again = 0
-    for high in range(1, 256, 7):
-        for low in range(1, 256, 7):
-            code = 256 * high + low
-            other = int(encode_normal(*decode_normal(code)))
-            # On the rim of the square, where z is 0, two codes are one direction, from either side.
-            assert (
-                other == code
-                or naive_normals.angle(np.array(decode_normal(code)), np.array(decode_normal(other))) < 1e-6
-            )
-            again += other == code
-    assert again > 1300
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.5, 20.0])
 def test_a_plane_is_found_as_numpy_finds_it(noise: float) -> None:
     rng = np.random.default_rng(2)
@@ -87,68 +64,6 @@ def test_a_plane_is_found_as_numpy_finds_it(noise: float) -> None:
         assert naive_normals.angle(found, expected.normal) < COARSE
         if noise < 1:
             assert naive_normals.angle(found, turn[:, 2]) < 1.0
-
-
-@pytest.mark.parametrize(("faces", "out"), [(2, [1.0, 1.0, 0.0]), (3, [1.0, 1.0, 1.0])])
-def test_an_edge_and_a_corner_face_between_their_faces(faces: int, out: list[float]) -> None:
-    rng = np.random.default_rng(3)
-    flat = disc(rng, 3000, 800.0)
-    points = []
-    for face in range(faces):
-        own = np.roll(flat, face + 1, axis=1)  # flat across axis `face`
-        own = np.abs(own) if faces == 3 else np.where([True, True, False], np.abs(own), own)
-        points.append(own)
-    found = np.array(decode_normal(code_of(np.rint(np.concatenate(points)).astype(np.int64))))
-    assert naive_normals.angle(found, np.array(out) / math.sqrt(faces)) < 2.0
-
-
-def test_thresholds_are_where_they_are_said_to_be() -> None:
-    """Of an ellipsoid's six ends the eigenvalues are as the squares of its axes."""
-    ends = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
-    rng = np.random.default_rng(4)
-    kinds = set()
-    for _ in range(400):
-        squares = 10.0 ** rng.uniform(-7, 0, 3) if rng.integers(2) else rng.uniform(0.3, 1, 3)
-        axes = np.rint(30_000 * np.sqrt(squares)).astype(np.int64)
-        least, second, greatest = np.sort(axes.astype(float)) ** 2
-        line, thick = second / greatest / LINE, least / second / THICK
-        if min(abs(line - 1), abs(thick - 1)) < 1e-9:
-            continue
-        code = code_of(ends * axes)
-        assert (code == NO_NORMAL) == (line <= 1 or thick > 1)
-        kinds.add((line <= 1, thick > 1))
-        if code != NO_NORMAL:
-            assert decode_normal(code)[int(np.argmin(axes))] == 1.0
-    assert kinds == {(False, False), (True, False), (False, True), (True, True)}
-
-
-def test_few_points_lines_and_balls_have_no_normal() -> None:
-    rng = np.random.default_rng(5)
-    plane = np.array([[0, 0, 0], [300, 0, 0], [0, 300, 0]])
-    assert code_of(plane) != NO_NORMAL
-    assert code_of(plane[:2]) == code_of(plane[:1]) == NO_NORMAL
-    assert code_of(np.zeros((50, 3), np.int64)) == code_of(np.full((3, 3), 7)) == NO_NORMAL
-    for _ in range(20):
-        way = rng.normal(size=3)
-        line = np.rint(np.outer(rng.uniform(-800, 800, 40), way)).astype(np.int64)
-        assert code_of(line) == NO_NORMAL
-    ball = rng.normal(size=(4000, 3))
-    assert code_of(np.rint(ball * 500).astype(np.int64)) == NO_NORMAL
-
-
-def test_least_direction_is_numpys() -> None:
-    rng = np.random.default_rng(6)
-    for _ in range(300):
-        values = np.sort(10.0 ** rng.uniform(-8, 0, 3))
-        values /= values.sum()
-        turn = turned(rng)
-        matrix = (turn * values) @ turn.T
-        found, vector = least_direction(
-            matrix[0, 0], matrix[1, 1], matrix[2, 2], matrix[1, 2], matrix[2, 0], matrix[0, 1]
-        )
-        assert np.allclose(found, np.linalg.eigvalsh(matrix), rtol=0, atol=4e-16 * 4)
-        residue = matrix @ np.array(vector) - found[0] * np.array(vector)
-        assert np.abs(residue).max() < 1e-15 and abs(np.linalg.norm(vector) - 1) < 1e-14
 
 
 def test_sums_of_the_farthest_points_are_exact() -> None:

@@ -4,17 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from solidcloud.schemas.kernels.record_rows import (
-    LANES,
-    NO_AXIS,
-    delta_along,
-    join_planes,
-    lanes_to_points,
-    leaf_bytes,
-    leaf_column,
-    leaf_lanes,
-    link_rows,
-)
+from solidcloud.schemas.kernels.record_rows import LANES, NO_AXIS, lanes_to_points, leaf_lanes
 
 pytestmark = pytest.mark.interpreted
 
@@ -93,15 +83,6 @@ def read(
     return bool(said), lanes
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_deltas_are_steps_along_the_sort_axis(seed: int) -> None:
-    own = leaves(seed)
-    before = own.points.copy()
-    runs = np.array([run for run in own.runs if run[2] != NO_AXIS], np.int64).T
-    assert np.array_equal(delta_along(own.points, *runs), plain_deltas(own))
-    assert np.array_equal(own.points, before)
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_lanes_hold_the_points_of_every_leaf_node(seed: int) -> None:
     own = leaves(seed, 20_000)
@@ -134,163 +115,14 @@ def test_a_point_one_step_outside_its_cell_or_voxel_is_seen(seed: int) -> None:
             assert read(moved, log2=other)[0]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_bounds_are_from_the_least_corner_to_the_farthest_point(seed: int) -> None:
-    own = leaves(seed)
-    corner = np.array([[0, 0, 0], [1000, 2000, 3000]])
-    lows = [corner[own.links[2][i]] + own.block_low[:, i] for i, _ in leaf_rows(own)]
-    highs = [
-        low + own.points[a : a + n].max(axis=0) for low, (_, (a, n)) in zip(lows, leaf_rows(own), strict=True)
-    ]
-    found, lanes = bounds(), np.empty((len(own.runs), 3, LANES), np.uint16)
-    cells = np.ascontiguousarray(corner.T.astype(np.int32)), np.array([16, 15], np.uint8)
-    nodes = own.count, own.axis, own.block_low
-    assert leaf_lanes(planes_of(plain_deltas(own)), own.links, nodes, cells, 1 << 20, lanes, found)
-    assert found.tolist() == [np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()]
-
-
 def leaf_rows(own: Leaves) -> list[tuple[int, tuple[int, int]]]:
     """Row, and (begin, count), of every leaf node."""
     return list(zip(np.flatnonzero(own.links[1]).tolist(), [run[:2] for run in own.runs], strict=True))
 
 
-def test_deltas_that_add_up_beyond_16_bits_are_outside() -> None:
-    # 3 * 30,000 wraps to 24,464, which would lie inside.
-    links = np.zeros(1, np.int32), np.ones(1, bool), np.zeros(1, np.int32)
-    nodes = np.full(1, 3, np.uint8), np.zeros(1, np.uint8), np.zeros((3, 1), np.uint16)
-    cells = np.zeros((3, 1), np.int32), np.full(1, 16, np.uint8)
-    planes = planes_of(np.array([[30_000, 0, 0]] * 3))
-    lanes = np.empty((1, 3, LANES), np.uint16)
-    assert not leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes, bounds())
-    planes = planes_of(np.array([[20_000, 0, 0]] * 3))
-    assert leaf_lanes(planes, links, nodes, cells, 1 << 20, lanes, bounds())
-    assert lanes[0, 0].tolist() == [20_000, 40_000] + [60_000] * (LANES - 2)
-
-
-def test_columns_are_laid_out_as_the_points_are() -> None:
-    own = leaves(4)
-    column = np.random.default_rng(4).integers(0, 1 << 16, len(own.points)).astype(int)
-    lanes = np.full((len(own.runs), LANES), 7, np.uint16)
-    leaf_column(np.array([column & 255, column >> 8], np.uint8), own.links, own.count, lanes)
-    small = np.full((len(own.runs), LANES), 7, np.uint8)
-    greatest, seen = leaf_bytes((column % 200).astype(np.uint8), own.links, own.count, small)
-    for block, (begin, count, _) in enumerate(own.runs):
-        assert lanes[block].tolist() == padded(column[begin : begin + count])
-        assert small[block].tolist() == padded(column[begin : begin + count] % 200)
-    assert greatest == (column % 200).max() > (column % 200)[-own.runs[-1][1] :].max()
-    assert seen == sum(1 << bit for bit in set((column % 200 % 32).tolist()))
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64])
-@pytest.mark.parametrize("k", [1, 3])
-def test_planes_are_joined_low_bytes_first(dtype: type, k: int) -> None:
-    width = np.dtype(dtype).itemsize
-    planes = np.random.default_rng(width).integers(0, 256, (k * width, 5)).astype(np.uint8)
-    words = np.full((k, 5), 3, dtype)
-    join_planes(planes, words)
-    expected = [
-        [sum(int(planes[row * width + b, i]) << 8 * b for b in range(width)) for i in range(5)]
-        for row in range(k)
-    ]
-    assert words.tolist() == expected
-
-
 Levels = list[list[int]]  # counts of a BSH, level by level from its root
-
-
-def grown(rng: np.random.Generator, levels: int, most: int) -> Levels:
-    """A tree of so many levels; counts from 1 to `most`."""
-    tree: Levels = [rng.integers(1, most + 1, 1).tolist()]
-    for _ in range(levels - 1):
-        tree.append(rng.integers(1, most + 1, sum(tree[-1])).tolist())
-    return tree
-
-
-def laid_out(top: Levels, cells: list[Levels]) -> tuple[list[int], list[int], list[bool], list[int]]:
-    """count, first, is_leaf and cell of all rows: the top BSH, every cell's root, then the cells' other nodes."""
-    tops, c = sum(map(len, top)), len(cells)
-    count = [k for level in top for k in level] + [tree[0][0] for tree in cells]
-    leaf, cell = [False] * tops + [len(tree) == 1 for tree in cells], [-1] * tops + list(range(c))
-    # The children of the top's nodes follow one another from row 1 on, its last level's are the cells' roots.
-    first = (np.cumsum([1, *count[:tops]])[:-1]).tolist()
-    point, rest = 0, tops + c
-    roots, others = [], []
-    for number, tree in enumerate(cells):
-        firsts, child = [], rest
-        for level, counts in enumerate(tree):
-            for k in counts:
-                last = level == len(tree) - 1
-                firsts.append(point if last else child)
-                point, child = (point + k, child) if last else (point, child + k)
-        roots.append(firsts[0])
-        others += firsts[1:]
-        below = [(k, level == len(tree) - 1) for level, counts in enumerate(tree) if level for k in counts]
-        count += [k for k, _ in below]
-        leaf += [is_leaf for _, is_leaf in below]
-        cell += [number] * len(below)
-        rest += len(below)
-    return count, first + roots + others, leaf, cell
-
-
-def link(count: list[int], nodes: list[int], points: list[int]) -> tuple[int, list, list, list]:
-    """What the kernel says of counts: its word, first, is_leaf and cell."""
-    n = len(count)
-    first, leaf, cell = np.full(n, -9, np.int32), np.zeros(n, bool), np.full(n, -9, np.int32)
-    said = link_rows(
-        np.array(count, np.uint8), np.array(nodes, np.uint32), np.array(points, np.uint32), first, leaf, cell
-    )
-    return int(said), first.tolist(), leaf.tolist(), cell.tolist()
 
 
 def sizes(cells: list[Levels]) -> tuple[list[int], list[int]]:
     """Nodes and points of every cell."""
     return [sum(map(len, tree)) for tree in cells], [sum(tree[-1]) for tree in cells]
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_links_are_where_the_rows_were_put(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    top = grown(rng, int(rng.integers(1, 4)), 3) if seed % 4 else []
-    c = sum(top[-1]) if top else 1
-    cells = [grown(rng, int(rng.integers(1, 4)), 3) for _ in range(c)]
-    count, *expected = laid_out(top, cells)
-    said, *found = link(count, *sizes(cells))
-    assert said == len(top) + max(map(len, cells))
-    assert found == expected
-
-
-# A top of two levels, [2] and [1, 2]; three cells: a leaf node; a root with two leaf nodes; three levels.
-TOP: Levels = [[2], [1, 2]]
-CELLS: list[Levels] = [[[4]], [[2], [5, 6]], [[1], [2], [1, 1]]]
-# Rows: 0 top root, 1-2 top, 3-5 cell roots, 6-7 leaf nodes of cell 1, 8 inner node of cell 2, 9-10 its leaf nodes.
-
-
-def test_the_tree_of_the_faults_below_is_sound() -> None:
-    count, first, leaf, cell = laid_out(TOP, CELLS)
-    assert count == [2, 1, 2, 4, 2, 1, 5, 6, 2, 1, 1]
-    assert link(count, *sizes(CELLS)) == (5, first, leaf, cell)
-    assert first == [1, 3, 4, 0, 6, 8, 4, 9, 9, 15, 16]
-
-
-@pytest.mark.parametrize(
-    ("row", "count", "named"),
-    [
-        (0, 0, 0), (1, 0, 1), (2, 0, 2), (3, 0, 3), (4, 0, 4), (5, 0, 5), (6, 0, 6), (8, 0, 8), (10, 0, 10),
-        (0, 3, 0), (4, 3, 4), (5, 3, 5), (8, 3, 8), (5, 4, 5),  # more children than rows are left
-        (0, 1, 2),  # then the top is a chain, and its last row has two cells
-        (1, 2, 2), (2, 1, 2), (2, 3, 2),  # four cells, or two: named is the top's last row
-        (3, 5, 3), (6, 4, 4), (7, 7, 4), (9, 2, 5),  # points: named is the cell's root
-        (4, 1, 6),  # a level of one leaf node, which holds five nodes then
-    ],
-)  # fmt: skip
-def test_the_first_row_that_does_not_add_up_is_named(row: int, count: int, named: int) -> None:
-    counts = laid_out(TOP, CELLS)[0]
-    counts[row] = count
-    assert -1 - link(counts, *sizes(CELLS))[0] == named
-
-
-def test_more_rows_than_links_need_are_a_fault() -> None:
-    count = laid_out([], CELLS[1:2])[0]
-    assert link(count, [3], [11])[0] == 2
-    assert link([*count, 1], [4], [11])[0] == -1 - 2
-    assert link([*count, 11], [4], [11])[0] == -1 - 2

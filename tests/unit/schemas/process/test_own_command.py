@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from solidcloud.schemas.process.own_command import VERBS, own_command, path_advice, with_own_command
+from solidcloud.schemas.process.own_command import VERBS, own_command, path_advice
 
 pytestmark = pytest.mark.interpreted
 
@@ -30,8 +30,7 @@ def runs(command: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("folder", "expected"),
-    [("..", ".venv/bin/solidcloud"), (".", "bin/solidcloud"), ("bin", "./solidcloud")],
+    ("folder", "expected"), [("..", ".venv/bin/solidcloud"), (".", "bin/solidcloud"), ("bin", "./solidcloud")]
 )
 def test_it_is_the_shortest_path_below_the_working_directory(
     script: Path, folder: str, expected: str, monkeypatch: pytest.MonkeyPatch
@@ -53,17 +52,6 @@ def test_on_the_search_path_it_is_its_name(script: Path, monkeypatch: pytest.Mon
     assert own_command() == "solidcloud" and path_advice() == ""
 
 
-def test_another_installation_on_the_search_path_is_not_named(
-    script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    other = tmp_path / "other/solidcloud"
-    other.parent.mkdir()
-    other.write_text("#!/bin/sh\n")
-    other.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{other.parent}:/usr/bin:/bin")
-    assert "my place" in own_command() or own_command().startswith(".venv")
-
-
 def test_without_a_script_it_is_a_call_of_python(script: Path) -> None:
     script.unlink()
     assert own_command().endswith("python' -m solidcloud.server.cli.main")
@@ -73,20 +61,6 @@ def test_the_advice_makes_the_name_work(script: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir("/")
     export = path_advice().splitlines()[-1].strip()
     assert export.startswith("export PATH=") and runs(f"{export}; solidcloud")
-
-
-def test_only_calls_of_the_command_are_rewritten(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(script.parents[2])
-    assert (
-        with_own_command("no archive: build one with `solidcloud build`")
-        == "no archive: build one with `.venv/bin/solidcloud build`"
-    )
-    for text in ("not a solidcloud index", "/data/solidcloud build/hall", "solidcloud is", "solidcloud 0.1"):
-        assert with_own_command(text) == text
-    once = with_own_command("see solidcloud build --help")
-    assert with_own_command(once) == once and with_own_command("see solidcloud --help").startswith(
-        "see .venv"
-    )
 
 
 def test_every_subcommand_is_known() -> None:

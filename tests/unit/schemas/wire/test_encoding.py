@@ -1,7 +1,5 @@
 """Test both encodings of the wire messages, and the refusal of malformed ones."""
 
-import re
-
 import msgspec
 import numpy as np
 import pytest
@@ -17,19 +15,9 @@ from solidcloud.schemas.wire.encoding import (
     encode,
     wire_encoding,
 )
-from solidcloud.schemas.wire.question_table import check_answers, make_unknown
-from solidcloud.schemas.wire.requests import (
-    AddAvatarRequest,
-    CollideRequest,
-    make_positions,
-)
-from solidcloud.schemas.wire.scene_messages import (
-    AvatarInfo,
-    ErrorReply,
-    ObjectInfo,
-    SceneInfo,
-    SpawnInfo,
-)
+from solidcloud.schemas.wire.question_table import check_answers
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest, make_positions
+from solidcloud.schemas.wire.scene_messages import AvatarInfo
 
 
 def some_poses(k, seed=3):
@@ -95,40 +83,6 @@ def test_non_finite_pose_is_bad_request(encoding, bad):
         decode_request(CollideRequest, payload, encoding)
 
 
-def test_the_non_finite_number_is_named():
-    poses = some_poses(3)
-    poses[1, 2, 3] = np.nan
-    with pytest.raises(BadRequestError, match=re.escape("poses[1, 2, 3] is nan")):
-        decode_request(CollideRequest, encode(CollideRequest("al", poses)))
-
-
-def test_poses_whose_sum_overflows_are_finite_all_the_same():
-    poses = np.full((2, 4, 4), 1.7e308)
-    assert np.array_equal(decode_request(CollideRequest, encode(CollideRequest("al", poses))).poses, poses)
-
-
-@pytest.mark.parametrize("margin", [np.nan, np.inf, -0.001])
-def test_margin_without_an_answer_is_bad_request(margin):
-    fields = {"avatar": "al", "poses": some_poses(1).tobytes(), "margin": margin}
-    with pytest.raises(BadRequestError, match="margin"):
-        decode_request(CollideRequest, msgspec.msgpack.encode(fields))
-    with pytest.raises(BadRequestError, match="margin"):
-        CollideRequest("al", some_poses(1), margin)
-
-
-@pytest.mark.parametrize("radius", [np.nan, np.inf, -1e-300])
-def test_radius_without_an_answer_is_bad_request(radius):
-    fields = {"name": "al", "points": bytes(24), "radius": radius}
-    with pytest.raises(BadRequestError, match="radius"):
-        decode_request(AddAvatarRequest, msgspec.msgpack.encode(fields))
-
-
-def test_radius_zero_and_none_are_legal():
-    for radius in (0.0, None):
-        payload = encode(AddAvatarRequest("al", np.zeros((1, 3)), radius))
-        assert decode_request(AddAvatarRequest, payload).radius == radius
-
-
 @pytest.mark.parametrize(
     "fields, word",
     [
@@ -169,11 +123,6 @@ def test_malformed_json_is_bad_request(poses):
         decode_request(CollideRequest, b'{"avatar":"al","poses":%s}' % poses.encode(), JSON)
 
 
-def test_integers_in_json_are_numbers():
-    text = b'{"avatar":"al","poses":[[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]}'
-    assert np.array_equal(decode_request(CollideRequest, text, JSON).poses, np.eye(4)[None])
-
-
 def test_truncated_or_random_bytes_are_bad_request():
     whole = encode(CollideRequest("al", some_poses(1), 0.5))
     for length in range(len(whole)):
@@ -188,18 +137,6 @@ def test_truncated_or_random_bytes_are_bad_request():
         except BadRequestError:
             continue
         assert request.poses.shape[1:] == (4, 4) and np.isfinite(request.poses).all()
-
-
-SCENE = {
-    "scene": "hall", "format_version": 3, "wire_version": 1, "points": 9, "voxels": 1,
-    "bounds": [[0, 0, 0], [1, 1, 1]], "origin": [0, 0, 0], "lattice_step": 1e-4, "lattice_source": "default",
-    "voxel_size": 2.0, "radius": 0.05, "radius_model": "mean", "radius_error": 0.0, "radius_sample": 9,
-    "moved_max": 0.0, "degree": 8, "leaf": 32, "sources": [], "skipped": [], "record_bytes": 100, "resident_bytes": 400,
-    "effects": ["stop", "sweep"], "avatars": [{"name": "al", "points": 3, "radius": 0.1, "bounding_radius": 1.0}],
-    "up": [0, 1, 0], "spawn": {"position": [1, 2, 3], "heading": 90}, "default_radius_model": "local",
-    "objects": [{"name": "door", "avatar": "al", "pose": np.eye(4).tolist(), "kind": "hinged"}],
-}  # fmt: skip
-OF_A_FILE = ("effects", "avatars", "up", "spawn", "objects", "default_radius_model")
 
 
 def test_unknown_fields_are_refused_in_requests_and_ignored_in_answers():
@@ -220,21 +157,6 @@ def test_unknown_fields_are_refused_in_requests_and_ignored_in_answers():
     assert len(check_answers(got, 1)) == 1 and got.faults == ()
 
 
-def test_a_scene_of_an_older_server_has_no_file():
-    older = {name: SCENE[name] for name in SCENE if name not in OF_A_FILE}
-    for encoding, encoder in ((MSGPACK, msgspec.msgpack), (JSON, msgspec.json)):
-        found = decode_answer(SceneInfo, encoder.encode(older), encoding)
-        assert (found.effects, found.avatars, found.objects, found.spawn) == ([], [], [], None)
-        assert found.up == (0.0, 0.0, 1.0) and found.default_radius_model is None
-        later = {**SCENE, "weather": "fine", "spawn": {"position": [1, 2, 3], "mood": "good"}}
-        found = decode_answer(SceneInfo, encoder.encode(later), encoding)
-        assert found.spawn == SpawnInfo((1.0, 2.0, 3.0), 0.0) and found.avatars == [
-            AvatarInfo("al", 3, 0.1, 1.0)
-        ]
-        assert found.objects == [ObjectInfo("door", "al", np.eye(4).tolist(), "hinged")]
-        assert decode_answer(SceneInfo, encode(found, encoding), encoding) == found
-
-
 def test_answers_that_are_none_are_internal_errors_never_guesses():
     with pytest.raises(InternalError, match="expected 4"):
         check_answers(some_answers(), 4)
@@ -248,14 +170,6 @@ def test_answers_that_are_none_are_internal_errors_never_guesses():
         decode_answer(CollideAnswers, msgspec.msgpack.encode(columns))
     with pytest.raises(InternalError):
         decode_answer(CollideAnswers, b"\xc1")
-
-
-def test_json_counts_beyond_uint32_are_refused():
-    text = encode(make_unknown(CollideAnswers, 1), JSON).replace(
-        b'"node_visits":[0]', b'"node_visits":[4294967296]'
-    )
-    with pytest.raises(InternalError, match="uint32"):
-        decode_answer(CollideAnswers, text, JSON)
 
 
 @pytest.mark.parametrize(
@@ -274,12 +188,6 @@ def test_stated_encodings(stated, expected):
     assert wire_encoding(stated) == expected
 
 
-@pytest.mark.parametrize("stated", ["text/plain", "application/cbor", "json"])
-def test_other_encodings_are_refused(stated):
-    with pytest.raises(BadRequestError, match="application/json"):
-        wire_encoding(stated)
-
-
 @pytest.mark.parametrize("points", [[1.0, 2, 3], np.zeros((2, 4)), [["a", "b", "c"]], [[1, 2, np.nan]], None])
 def test_points_that_are_none_are_refused_before_they_are_sent(points):
     with pytest.raises(BadRequestError):
@@ -295,8 +203,3 @@ def test_too_many_points_are_refused_before_they_are_sent():
 def test_poses_of_the_wrong_shape_are_refused_before_they_are_sent(poses):
     with pytest.raises(BadRequestError):
         make_poses(poses)
-
-
-def test_error_reply_keeps_codes_it_does_not_know():
-    payload = msgspec.msgpack.encode({"code": "tired", "message": "so"})
-    assert decode_answer(ErrorReply, payload) == ErrorReply("tired", "so")

@@ -6,44 +6,24 @@ import msgspec
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.answers import CollideAnswers
-from solidcloud.schemas.wire.encoding import (
-    JSON,
-    decode_answer,
-    decode_request,
-    encode,
-)
-from solidcloud.schemas.wire.question_table import make_unknown
-from solidcloud.schemas.wire.requests import (
-    AddAvatarRequest,
-    CollideRequest,
-)
+from solidcloud.schemas.wire.encoding import JSON, decode_request, encode
+from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest
 
 
-@pytest.mark.parametrize("space", [b"", b" "])
-@pytest.mark.parametrize("k", [1000, 20_000])
-def test_large_messages_in_json_are_read_in_pieces_and_are_the_same(k, space):
-    rng = np.random.default_rng(k)
+def test_large_messages_in_json_are_read_in_pieces_and_are_the_same():
+    rng, k = np.random.default_rng(1), 5000
     poses = rng.normal(size=(k, 4, 4))
     text = encode(CollideRequest("al", poses), JSON)
     assert text == msgspec.json.encode(
         {"avatar": "al", "poses": poses.tolist(), "margin": 0.0, "tolerance": 0.0, "relative_tolerance": 0.0,
          "budget_ms": None, "budget_visits": None, "radius_model": None}
     )  # fmt: skip
-    text = text.replace(b"]", space + b"]" + space).replace(b"[", space + b"[" + space)
+    text = text.replace(b"]", b" ] ").replace(b"[", b" [ ")
     found = decode_request(CollideRequest, text, JSON)
     assert found.poses.tobytes() == poses.tobytes() and found.poses.flags.writeable
     points = rng.normal(size=(4 * k, 3))
     text = encode(AddAvatarRequest("al", points), JSON)
     assert decode_request(AddAvatarRequest, text, JSON).points.tobytes() == points.tobytes()
-
-
-@pytest.mark.parametrize("k", [20_000])
-def test_large_answers_in_json_keep_nulls_and_empty_columns(k):
-    answers = make_unknown(CollideAnswers, k)
-    found = decode_answer(CollideAnswers, encode(answers, JSON), JSON)
-    for name in CollideAnswers.__struct_fields__:
-        assert np.array_equal(getattr(found, name), getattr(answers, name)), name
 
 
 @pytest.mark.parametrize(
@@ -59,7 +39,7 @@ def test_large_answers_in_json_keep_nulls_and_empty_columns(k):
     ],
 )
 def test_large_malformed_json_is_bad_request(change):
-    text = encode(CollideRequest("al", np.full((20_000, 4, 4), 1.5)), JSON)
+    text = encode(CollideRequest("al", np.full((5000, 4, 4), 1.5)), JSON)
     with pytest.raises(BadRequestError):
         decode_request(CollideRequest, change(text), JSON)
 
@@ -87,9 +67,3 @@ def test_json_that_cannot_be_cut_is_refused_before_it_is_decoded(value, monkeypa
     ):
         decode_request(CollideRequest, b'{"avatar":"al","poses":%s}' % value, JSON)
     assert not decoded
-
-
-def test_a_large_bin_is_writable_and_the_same():
-    points = np.random.default_rng(4).normal(size=(50_000, 3))
-    found = decode_request(AddAvatarRequest, encode(AddAvatarRequest("al", points))).points
-    assert found.tobytes() == points.tobytes() and found.flags.writeable and found.flags.c_contiguous

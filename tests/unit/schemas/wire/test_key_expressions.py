@@ -53,24 +53,6 @@ def test_a_query_for_changes_is_read_as_it_was_written_and_no_wider_one():
             key_expressions.parse_residency_key(key)
 
 
-def test_others_are_told_a_name_that_the_id_cannot_be_found_from():
-    assert key_expressions.public_id("abc") == "ba7816bf8f01"
-
-
-@pytest.mark.parametrize(
-    "key",
-    [
-        "solidcloud/1/wish/hall/c",
-        "solidcloud/1/wish/hall/c/al/x",
-        "solidcloud/1/wish/hall/*/al",
-        "solidcloud/1/state/hall/c/al",
-    ],
-)
-def test_keys_that_are_no_wish_are_refused(key):
-    with pytest.raises(BadRequestError):
-        key_expressions.parse_command_key(key)
-
-
 @pytest.mark.parametrize("name", ["", "a" * 65, "a/b", "*", "**", "a b", "häll", "a\n", "$*", "a?b", "#"])
 def test_bad_names_are_refused(name):
     for make in (
@@ -85,10 +67,6 @@ def test_bad_names_are_refused(name):
     ):
         with pytest.raises(BadRequestError, match="expected 1 to 64"):
             make()
-
-
-def test_longest_name_is_allowed():
-    assert key_expressions.check_name("a" * 64, "scene") == "a" * 64
 
 
 @pytest.mark.parametrize(

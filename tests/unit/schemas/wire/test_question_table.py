@@ -2,17 +2,14 @@
 
 import inspect
 from importlib.resources import files
-from pathlib import Path
 from typing import get_args
 
-import count_within_question
 import pytest
 import wire_sections
-from solidcloud.schemas.wire.answers import Part, WithinAnswers
+from solidcloud.schemas.wire.answers import Part
 from solidcloud.schemas.wire.path_messages import PathOperation, PathRequest
-from solidcloud.schemas.wire.question_rules import ColumnRules, Merge, Question
 from solidcloud.schemas.wire.question_table import QUESTIONS, path_questions, question_of
-from solidcloud.schemas.wire.requests import QuestionRequest, WithinRequest
+from solidcloud.schemas.wire.requests import QuestionRequest
 from solidcloud.server.cli.commands.query_command import query
 from solidcloud.server.queries.engine_table import ENGINES
 from solidcloud.server.scene_interface import QueryMethods
@@ -23,18 +20,6 @@ WIRE = (files("solidcloud.schemas") / "WIRE.md").read_text(encoding="utf-8")
 @pytest.mark.parametrize("question", QUESTIONS.values(), ids=lambda question: question.name)
 def test_wire_md_describes_every_field(question):
     assert wire_sections.faults(question, WIRE) == []
-
-
-def test_a_field_that_wire_md_lacks_is_found():
-    text = WIRE.replace("| `steps` | uint32 (k) |", "| `paces` | uint32 (k) |")
-    assert wire_sections.faults(QUESTIONS["sweep"], text) == [
-        "SweepAnswers: no `steps`",
-        "SweepAnswers: has no 'paces'",
-    ]
-    text = WIRE.replace("| `steps` | uint32 (k) |", "| `steps` | uint32 (k, 3) |")
-    assert wire_sections.faults(QUESTIONS["sweep"], text) == [
-        "SweepAnswers: `steps` is uint32 (k), not uint32 (k, 3)"
-    ]
 
 
 @pytest.mark.parametrize("question", QUESTIONS.values(), ids=lambda question: question.name)
@@ -63,19 +48,3 @@ def test_defaults_of_parameters_are_those_of_the_methods():
             assert (default is inspect.Parameter.empty) == (name in question.required)
             if name not in question.required:
                 assert default == inspect.signature(question.request).parameters[name].default
-
-
-def test_a_declaration_has_a_rule_for_each_column():
-    rules = dict(QUESTIONS["within"].columns)
-    assert Question("within", WithinRequest, WithinAnswers, "points", rules).columns == rules
-    for wrong in (
-        {name: rule for name, rule in rules.items() if name != "distance"},
-        rules | {"hit": ColumnRules(Merge.FIRST)},
-    ):
-        with pytest.raises(TypeError, match="expected one rule for each array field"):
-            Question("within", WithinRequest, WithinAnswers, "points", wrong)
-
-
-def test_the_section_of_the_added_question_describes_it():
-    path = Path(count_within_question.__file__).with_name("count_within.md")
-    assert wire_sections.faults(count_within_question.COUNT_WITHIN, path.read_text(encoding="utf-8")) == []

@@ -109,13 +109,6 @@ def test_numbers_of_numpys_are_numbers(encoding):
         ContactsRequest("al", POSES, 2.5)
 
 
-def test_a_distance_defaults_to_a_metre():
-    assert DistanceRequest("al", POSES).reach == 1.0
-    raw = msgspec.msgpack.encode({"avatar": "al", "poses": b""})
-    assert decode_request(DistanceRequest, raw).reach == 1.0
-    assert PathRequest("al", POSES, "distance").parameters() == {}
-
-
 @pytest.mark.parametrize("name", ["", "a" * 65, 3, None, VECTORS])
 def test_a_name_that_no_avatar_can_have_is_refused(name):
     with pytest.raises(BadRequestError, match=r"^avatar .*1 to 64"):
@@ -124,11 +117,6 @@ def test_a_name_that_no_avatar_can_have_is_refused(name):
         with pytest.raises(BadRequestError, match=r"^avatar .*1 to 64"):
             AddAvatarRequest(name, VECTORS)
     check_avatar_name("a visitor")
-
-
-def test_a_sweep_defaults_to_a_micrometre():
-    assert SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES).tolerance == 1e-6
-    assert CollideRequest("al", POSES).tolerance == 0.0
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Test the closest point by descent on trees made by hand, and the nearest boxes by brute force."""
 
-import os
-
 import numpy as np
 import pytest
 from opened_records import open_points, open_scan, points_of
@@ -18,19 +16,6 @@ from solidcloud.builder.voxel.voxel_octree import VoxelPoints
 from solidcloud.schemas.archive.codec import DecompressedRecord
 
 pytestmark = pytest.mark.interpreted
-interpreted_only = pytest.mark.skipif(
-    os.environ.get("NUMBA_DISABLE_JIT") != "1", reason="compiled code reads arrays unseen"
-)
-
-
-class Counted(np.ndarray):
-    """An array that counts how often an element of it is read."""
-
-    reads = 0
-
-    def __getitem__(self, key: object) -> object:
-        Counted.reads += 1
-        return np.asarray(super().__getitem__(key))[()]  # type: ignore[index]
 
 
 def tree_of(points: np.ndarray, leaf: int = 3, degree: int = 3) -> SearchTree:
@@ -86,24 +71,6 @@ def test_far_apart_nothing_overflows() -> None:
     assert best.tolist() == [1 << 60, 1 << 60, 2 << 60]
 
 
-@interpreted_only
-@pytest.mark.parametrize(("kind", "centers", "points"), [("line", 11664, 3648), ("volume", 57468, 29940)])
-def test_as_little_is_looked_at_as_ever(kind: str, centers: int, points: int) -> None:
-    """What a bound is for: reads of coordinates, of 200 points by themselves; brute force takes 120,000 of points."""
-    rng = np.random.default_rng(5)
-    cloud = rng.integers(0, 1000, (200, 3)) if kind == "volume" else np.arange(200)[:, None] * [90, 0, 0]
-    if kind == "volume":
-        cloud = cloud[np.lexsort([*cloud.T, *(cloud // 250).T])]
-    tree, best, found = tree_of(cloud, leaf=4), np.full(len(cloud), FAR), []
-    for name in ("center", "points"):
-        Counted.reads = 0
-        best[:] = FAR
-        closest_other(tree._replace(**{name: getattr(tree, name).view(Counted)}), cloud, best)
-        found.append(Counted.reads)
-    assert best.tolist() == brute(cloud, cloud).tolist()
-    assert found == [centers, points]
-
-
 def asked(
     record: DecompressedRecord, queries: np.ndarray, best: np.ndarray, homes: np.ndarray | None = None
 ) -> np.ndarray:
@@ -116,11 +83,10 @@ def asked(
     return lowered
 
 
-@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar", "one point"])
-@pytest.mark.parametrize("steps", [50, 4000, 200_000, 1 << 21])
-@pytest.mark.parametrize("cells", ["octree", "balanced"])
-def test_the_closest_in_a_record_is_that_of_brute_force(kind: str, steps: int, cells: str) -> None:
-    record = open_scan(kind, 2, 120, steps, cells=cells)
+@pytest.mark.parametrize("kind", ["noise", "duplicates", "one point"])
+@pytest.mark.parametrize("steps", [50, 1 << 21])
+def test_the_closest_in_a_record_is_that_of_brute_force(kind: str, steps: int) -> None:
+    record = open_scan(kind, 2, 120, steps)
     points, nodes = points_of(record)
     rng = np.random.default_rng(3)
     far = np.full(len(points), FAR)
@@ -161,22 +127,6 @@ def test_long_differences_are_told_from_clamped_ones() -> None:
                 assert asked(record, stored, np.full(2, known), nodes).tolist() == [expected] * 2
 
 
-@interpreted_only
-@pytest.mark.parametrize(("kind", "most"), [("plane", 4000), ("noise", 8000)])
-def test_as_little_of_a_record_is_looked_at_as_ever(kind: str, most: int) -> None:
-    """Reads of coordinates of centres, of 300 points asked leaf node by leaf node; it was 3,177 and 6,177."""
-    record = open_scan(kind, 4, 300, 4000)
-    points, nodes = points_of(record)
-    spheres, best = spheres_of(record), np.full(len(points), FAR)
-    starts = np.flatnonzero(np.diff(nodes, prepend=-1))
-    Counted.reads = 0
-    counted = spheres._replace(center=spheres.center.view(Counted))
-    groups = np.append(starts, len(points))
-    closest_in_record(leaves_of(record), counted, points, groups, nodes[starts].astype(np.int32), best)
-    assert best.tolist() == brute(points, points).tolist()
-    assert 300 < Counted.reads < most
-
-
 def box_distances(low: np.ndarray, high: np.ndarray, query: np.ndarray) -> list[int]:
     """Squared distances of a point from boxes, in Python's integers."""
     gaps = np.maximum(np.maximum(low - query, query - high), 0).tolist()
@@ -198,8 +148,8 @@ def found_for(
         assert distances[0, : len(held)].tolist() == [box_distances(low, high, query)[i] for i in held]
 
 
-@pytest.mark.parametrize("count", [1, 2, 8, 9, 64, 65, 200])
-@pytest.mark.parametrize("most", [1, 3, 8])
+@pytest.mark.parametrize("count", [1, 9, 200])
+@pytest.mark.parametrize("most", [1, 8])
 def test_near_boxes_are_those_of_brute_force(count: int, most: int) -> None:
     rng = np.random.default_rng([count, most])
     low = rng.integers(-100, 100, (count, 3)) * 4
@@ -212,21 +162,6 @@ def test_near_boxes_are_those_of_brute_force(count: int, most: int) -> None:
         goes = found_for(low, high, query, own, best, most)
         assert [i for go in goes for i in go] == [i for _, i in order]
         assert all(len(go) == most for go in goes[:-1])
-
-
-@pytest.mark.parametrize("most", [1, 2, 3, 5, 30])
-def test_of_boxes_as_near_as_each_other_the_first_come_first(most: int) -> None:
-    rng = np.random.default_rng(most)
-    low = rng.integers(-2, 3, (30, 3)) * 10
-    for own in range(0, 30, 7):
-        order = sorted((d, i) for i, d in enumerate(box_distances(low, low, np.zeros(3))) if i != own)
-        goes = found_for(low, low, np.zeros(3, np.int64), own, 10**6, most)
-        assert [i for go in goes for i in go] == [i for _, i in order]
-
-
-def test_where_nothing_is_known_one_box_is_found_at_a_time() -> None:
-    low = np.array([[10, 0, 0], [0, 0, 0], [30, 0, 0], [20, 0, 0]])
-    assert found_for(low, low + 1, np.array([0, 0, 0]), 1, int(FAR), 8) == [[0], [3], [2]]
 
 
 def test_boxes_too_far_for_their_squares_are_none() -> None:

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree, sort_run
+from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree
 from solidcloud.builder.voxel.point_hierarchy import Tree, build_hierarchy
-from synthetic_scans import WITH_POINTS, make_steps
+from synthetic_scans import make_steps
 
 pytestmark = pytest.mark.interpreted
 
-SHAPES = [(1, 2), (3, 2), (8, 3), (32, 8), (32, 16), (5, 4)]
+SHAPES = [(1, 2), (5, 4), (32, 16)]
 
 
 def pack(points: np.ndarray, leaf: int, degree: int) -> Tree:
@@ -41,7 +41,7 @@ def assert_is_a_tree(tree: Tree, n: int, leaf: int, degree: int) -> None:
 
 
 @pytest.mark.parametrize(("leaf", "degree"), SHAPES)
-@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 64, 65, 200])
+@pytest.mark.parametrize("n", [1, 32, 33, 200])
 def test_any_number_of_points_packs(n: int, leaf: int, degree: int) -> None:
     tree = pack(make_steps("noise", n, n, 1000), leaf, degree)
     assert_is_a_tree(tree, n, leaf, degree)
@@ -53,19 +53,13 @@ def test_any_number_of_points_packs(n: int, leaf: int, degree: int) -> None:
     assert len(tree.levels) == height + 2  # and as few levels
 
 
-@pytest.mark.parametrize("kind", WITH_POINTS)
+@pytest.mark.parametrize("kind", ["duplicates", "one point"])
 def test_scans_pack_into_full_leaf_nodes(kind: str) -> None:
     points = make_steps(kind, 1, 300, 1000)
     tree = pack(points, 8, 4)
     assert_is_a_tree(tree, len(points), 8, 4)
     sizes = tree.count[tree.levels[-2] :]
     assert (sizes < 8).sum() <= 1
-
-
-def test_the_packing_is_a_function_of_the_points_and_their_order() -> None:
-    points = make_steps("duplicates", 1, 300, 1000)
-    a, b = pack(points, 8, 4), pack(points.copy(), 8, 4)
-    assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def test_leaves_are_sorted_along_their_longest_edge() -> None:
@@ -83,12 +77,6 @@ def test_leaves_are_sorted_along_their_longest_edge() -> None:
         assert np.array_equal(found.block_low[node], block.min(axis=0))
     assert not found.axis[: tree.levels[-2]].any()
     assert not found.block_low[: tree.levels[-2]].any()
-
-
-@pytest.mark.parametrize("side", [2**23, 1])
-def test_equal_and_extreme_coordinates_pack(side: int) -> None:
-    points = np.array([[0, 0, 0], [side, side, side], [side, 0, side]] * 30)
-    assert_is_a_tree(pack(points, 4, 2), 90, 4, 2)
 
 
 def plain_leaves(points: np.ndarray, leaf: int, degree: int) -> list[set[int]]:
@@ -115,8 +103,8 @@ def plain_leaves(points: np.ndarray, leaf: int, degree: int) -> list[set[int]]:
     return grow(list(range(len(points))), capacity)
 
 
-@pytest.mark.parametrize("kind", ["plane", "noise", "duplicates", "pillar"])
-@pytest.mark.parametrize(("n", "leaf", "degree"), [(5, 1, 2), (33, 2, 3), (100, 4, 2), (150, 7, 5)])
+@pytest.mark.parametrize("kind", ["noise", "duplicates"])
+@pytest.mark.parametrize(("n", "leaf", "degree"), [(33, 2, 3), (150, 7, 5)])
 def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
     kind: str, n: int, leaf: int, degree: int
 ) -> None:
@@ -127,35 +115,7 @@ def test_parts_are_cut_along_their_longest_edge_ties_by_rank(
     assert found == plain_leaves(points, leaf, degree)
 
 
-def test_runs_are_sorted_ties_by_rank() -> None:
-    x = [9, 3, 1, 3, 0, 1, 3, 7, 9]
-    own = np.array([[5] * 9, x, range(10, 19), [0, 6, 5, 4, 3, 2, 1, 0, 0]], np.int32)
-    before = own.copy()
-    sort_run(own, np.zeros_like(own), np.uint64(1), np.uint64(8), np.uint64(1))
-    assert own[3].tolist() == [0, 3, 2, 5, 1, 4, 6, 0, 0]
-    assert own[1].tolist() == [9, 0, 1, 1, 3, 3, 3, 7, 9]
-    assert sorted(map(tuple, own.T.tolist())) == sorted(map(tuple, before.T.tolist()))
-
-
-@pytest.mark.parametrize("kind", ["line", "heaps", "equal", "far"])
-def test_the_border_of_a_cut_is_found_in_any_crowd(kind: str) -> None:
-    """Bins of a histogram that hold one point, and ones that hold nearly all."""
-    i = np.arange(300)
-    x = {"line": i * 7, "heaps": i % 2 * 5000 + i % 3, "equal": i * 0, "far": (i == 299) * 2**23}[kind]
-    points = np.stack([x, i * 0, i * 0], axis=1)[np.random.default_rng(1).permutation(300)]
-    tree = pack(points, 10, 2)
-    found = [set(tree.order[a:b].tolist()) for a, b in zip(tree.begin, tree.end, strict=True)]
-    leaves = [s for s in found[tree.levels[-2] :]]
-    assert leaves == plain_leaves(points, 10, 2)
-
-
-@pytest.mark.parametrize("degree", [2, 3, 16])
-def test_no_tree_has_more_nodes_than_are_made_room_for(degree: int) -> None:
-    for n in [*range(1, 70), 129, 257, 513]:
-        assert len(pack(np.zeros((n, 3)), 1, degree).begin) <= max_nodes(n, 1)
-
-
-@pytest.mark.parametrize(("leaf", "degree"), [*SHAPES, (7, 5), (1, 16)])
+@pytest.mark.parametrize(("leaf", "degree"), SHAPES)
 def test_the_counts_of_a_tree_need_no_points(leaf: int, degree: int) -> None:
     for n in [*range(1, 40), 64, 65, 130, 257]:
         tree = pack(make_steps("noise", n, n, 1000), leaf, degree)

@@ -6,16 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_scans import with_checksums
+from scan_cases import read_all
 from scan_formats import cartesian, write_e57
 from solidcloud.builder.sources.scan_files import header_bounds, inspect_scans, open_scans
 from solidcloud.schemas.errors import ScanError
-
-
-def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
-    """The points of all scans of a file, (n, 3)."""
-    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
-    return np.concatenate([np.empty((0, 3)), *blocks])
-
 
 TURN = np.array([0.5, 0.5, -0.5, 0.5])  # w, x, y, z: a third of a turn about a diagonal, exact in float64
 TURNED = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

@@ -7,16 +7,11 @@ import laspy
 import numpy as np
 import pytest
 from broken_scans import SEEDS
+from scan_cases import read_all
 from solidcloud.builder.sources.common.scan import SourceLattice
 from solidcloud.builder.sources.placed_scan import place_scan
 from solidcloud.builder.sources.scan_files import header_bounds, open_scans
 from solidcloud.schemas.errors import ScanError
-
-
-def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
-    """The points of all scans of a file, (n, 3)."""
-    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
-    return np.concatenate([np.empty((0, 3)), *blocks])
 
 
 @pytest.fixture(params=["1.2", "1.4"])
@@ -111,8 +106,8 @@ def write_laz(path: Path, count: int, point_format: int) -> np.ndarray:
     return xyz
 
 
-@pytest.mark.parametrize("point_format", [0, 3, 6, 7, 8, 9])
-@pytest.mark.parametrize("count", [1, 50_000, 50_001])
+@pytest.mark.parametrize("point_format", [0, 3, 6, 8])
+@pytest.mark.parametrize("count", [1, 50_001])
 def test_laz_of_every_kind_and_number_of_chunks_is_read(
     point_format: int, count: int, tmp_path: Path
 ) -> None:
@@ -172,26 +167,6 @@ def test_a_laz_that_claims_more_points_than_its_chunks_hold_is_refused(tmp_path:
         open_scans(path)
 
 
-def test_a_laz_of_more_chunks_than_its_bytes_hold_is_refused(tmp_path: Path) -> None:
-    """Room is made for all that the table claims."""
-    header = laspy.LasHeader(version="1.2", point_format=0)
-    las = laspy.LasData(header)
-    las.X = las.Y = las.Z = np.arange(300) * 7919 % 50_000
-    path = tmp_path / "a.laz"
-    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
-    data = bytearray(path.read_bytes())
-    start = struct.unpack_from("<I", data, 96)[0]
-    table = struct.unpack_from("<q", data, start)[0]
-    held = (table - start - 8) // 20
-    assert struct.unpack_from("<I", data, table + 4) == (1,) and held > 2
-    struct.pack_into("<I", data, table + 4, held + 2)
-    path.write_bytes(data)
-    with pytest.raises(
-        ScanError, match=rf"{held + 2} chunks in .* bytes, expected a point of 20 bytes in each"
-    ):
-        open_scans(path)
-
-
 def test_a_laz_chunk_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.laz"
     write_laz(path, 100, 6)
@@ -212,14 +187,6 @@ def test_a_laz_without_the_record_that_describes_it_is_refused(tmp_path: Path) -
         open_scans(path)
 
 
-def test_a_las_without_points_is_valid_and_has_none(tmp_path: Path) -> None:
-    path = tmp_path / "none.las"
-    laspy.LasData(laspy.LasHeader()).write(path)
-    assert open_scans(path)[0].declared_count == 0
-    assert open_scans(path)[0].bounds is None
-    assert read_all(path).shape == (0, 3)
-
-
 def test_bounds_of_a_truncated_las_are_those_of_its_header(las: Path) -> None:
     whole = open_scans(las)[0].bounds
     las.write_bytes(las.read_bytes()[:1000])
@@ -229,14 +196,7 @@ def test_bounds_of_a_truncated_las_are_those_of_its_header(las: Path) -> None:
 
 
 XYZ = np.random.default_rng(35).integers(-5000, 5000, (200, 3)) * 0.001
-KINDS = [
-    ("1.2", 0, False),
-    ("1.3", 1, False),
-    ("1.4", 6, False),
-    ("1.2", 0, True),
-    ("1.4", 3, True),
-    ("1.4", 7, True),
-]
+KINDS = [("1.2", 0, False), ("1.4", 6, False), ("1.2", 0, True), ("1.4", 7, True)]
 
 
 def made(
@@ -363,16 +323,6 @@ def test_what_laspy_reads_is_read(kind: str, tmp_path: Path) -> None:
     assert np.abs(steps - np.rint(steps)).max() < 1e-6
     flattens = "scale of 0" in kind and kind != "scale of 0 and flat bounds"
     assert ["scale of 0 for z" in note for note in scan.notes] == [True] * flattens
-
-
-@pytest.mark.parametrize("version", ["1.3", "1.4"])
-def test_a_header_shorter_than_its_version_has_the_older_count(version: str, tmp_path: Path) -> None:
-    """As in LAStools; laspy refuses it."""
-    data = made(tmp_path / "a.las", version, 1)
-    struct.pack_into("<H", data, 94, 227)
-    struct.pack_into("<I", data, 107, 200)
-    (tmp_path / "a.las").write_bytes(data)
-    assert np.array_equal(read_all(tmp_path / "a.las"), XYZ)
 
 
 def test_a_record_that_the_header_does_not_count_is_found(tmp_path: Path) -> None:

@@ -7,16 +7,10 @@ import numpy as np
 import plyfile
 import pytest
 import trimesh
+from scan_cases import read_all
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.builder.sources.surface_samples import mesh_triangles
 from solidcloud.schemas.errors import ScanError
-
-
-def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
-    """The points of all scans of a file, (n, 3)."""
-    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
-    return np.concatenate([np.empty((0, 3)), *blocks])
-
 
 PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n"
 
@@ -127,17 +121,6 @@ def test_an_stl_may_be_in_capitals(tmp_path: Path) -> None:
     assert read_all(path).tolist() == [[0, 0, 1], [2, 0, 1], [0, 2, 1]]
 
 
-def test_samples_fall_on_triangles_by_their_area(tmp_path: Path) -> None:
-    path = tmp_path / "a.obj"
-    path.write_text(
-        "v 0 0 0\nv 3 0 0\nv 0 3 0\nv 0 0 9\nv 1 0 9\nv 0 1 9\nv 5 5 5\nf 1 2 3\nf 4 5 6\nf 7 7 7\n"
-    )
-    xyz = read_all(path, spacing=0.05)
-    assert len(xyz) == 2000
-    assert np.count_nonzero(xyz[:, 2] == 9) == pytest.approx(200, abs=1)
-    assert not (xyz == 5).any()
-
-
 def test_spacing_samples_a_ply_with_faces_and_leaves_scans_alone(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -201,13 +184,6 @@ def test_a_surface_too_large_for_its_file_is_refused(tmp_path: Path) -> None:
     assert len(next(scan.blocks(1000)).xyz) == 1000
     with pytest.raises(ScanError, match="square lengths"):
         next(open_scans(path, spacing=1e5 / (most + 1) ** 0.5)[0].blocks(1000))
-
-
-def test_a_mesh_without_faces_cannot_be_sampled(tmp_path: Path) -> None:
-    path = tmp_path / "a.obj"
-    path.write_text("v 1 2 3\nv 4 5 6\nv 7 8 8\n")
-    with pytest.raises(ScanError, match="build it without --spacing"):
-        read_all(path, spacing=0.1)
 
 
 def test_a_face_beyond_the_vertices_is_refused(tmp_path: Path) -> None:

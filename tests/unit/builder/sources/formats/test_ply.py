@@ -6,15 +6,9 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
+from scan_cases import read_all
 from solidcloud.builder.sources.scan_files import open_scans
 from solidcloud.schemas.errors import ScanError
-
-
-def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
-    """The points of all scans of a file, (n, 3)."""
-    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
-    return np.concatenate([np.empty((0, 3)), *blocks])
-
 
 PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n"
 

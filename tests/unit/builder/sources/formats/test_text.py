@@ -7,17 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scan_cases import read_all
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.sources.common.text_rows import LONGEST_LINE, number_rows
 from solidcloud.builder.sources.scan_files import inspect_scans, open_scans
 from solidcloud.schemas.errors import ScanError
-
-
-def read_all(path: Path, spacing: float | None = None, block_points: int = 1 << 18) -> np.ndarray:
-    """The points of all scans of a file, (n, 3)."""
-    blocks = [block.xyz for scan in open_scans(path, spacing=spacing) for block in scan.blocks(block_points)]
-    return np.concatenate([np.empty((0, 3)), *blocks])
 
 
 def intensities(path: Path) -> list[float] | None:
@@ -38,12 +33,7 @@ def intensities(path: Path) -> list[float] | None:
         ("a.csv", "intensity;Z;Y;X\n9;3;2;1\n", [[1, 2, 3]], [9]),
         ("a.csv", "\ufeffx, y, z\n1, 2, 3\n\n4, 5, 6\n", [[1, 2, 3], [4, 5, 6]], None),
         ("a.txt", "//X Y Z Scalar_Intensity\n1 2 3 4\n", [[1, 2, 3]], [4]),
-        (
-            "a.txt",
-            "# by hand\n\n# y x z\n2 1 3\n#\n5 4 6 # end\n",
-            [[1, 2, 3], [4, 5, 6]],
-            None,
-        ),
+        ("a.txt", "# by hand\n\n# y x z\n2 1 3\n#\n5 4 6 # end\n", [[1, 2, 3], [4, 5, 6]], None),
         ("a.txt", "# of x, y and z\n1 2 3\n", [[1, 2, 3]], None),  # a sentence, no header
         ("a.txt", "nan 1e999 -3\n", [[np.nan, np.inf, -3]], None),  # counted by the caller
         ("a.txt", "# nothing\n\n", [], None),

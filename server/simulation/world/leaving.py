@@ -18,7 +18,7 @@ from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
 _MORE = 0.25
-# Name under which `Body.effect_state` keeps the half-spaces around the avatar.
+# Name under which `Body.effect_state` keeps the avatar's heights along `kernel.DIRECTIONS`.
 _HULL = "hull"
 # A motion leaves a surface if its direction has at least this part away from the plane. The points
 # up to _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its
@@ -53,7 +53,7 @@ class LeavingPose:
         self._body = world.probe(avatar).body
         with world as seen:
             self._seen = list(seen)
-            found = [_gather(each, avatar, to_archive(each, frame.pose), reach, budget) for each in seen]
+            found = [self._gather(each, avatar, to_archive(each, frame.pose), budget) for each in seen]
         budget.lacked(sum(each.late for each in found))
         self.lacks, self.late = any(each.lacks for each in found), any(each.late for each in found)
         world.count(0, self.lacks)
@@ -67,14 +67,55 @@ class LeavingPose:
         held = times == 0.0
         hull = frame.body.effect_state.get(_HULL)
         if hull is None:
-            hull = frame.body.effect_state[_HULL] = kernel.hull_of(self._body.reference)
-        kernel.find_held(hull, self._points, self._reach, held)
+            hull = frame.body.effect_state[_HULL] = self._heights(kernel.DIRECTIONS)
+        kernel.find_held(kernel.DIRECTIONS, hull, self._points, self._reach, held)
         self._held = held
-        box = np.array([avatar.points.min(axis=0), avatar.points.max(axis=0)])
+        box = np.array([-hull[:3], hull[5:2:-1]])
         planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))
         count = kernel.separate_core(box, self._points[held], planes)
         self._planes = planes[: max(count, 0)]
         self._blocked = count < 0
+
+    def _gather(self, seen: HeldArchive, avatar: AvatarModel, pose: Pose, budget: QueryBudget) -> _Gathered:
+        """Return the points of an archive that an avatar may meet within the reach.
+
+        pose: (4, 4), avatar to archive.
+        """
+        data, residency = seen.data, seen.data.residency
+        arrays, broad = data.arrays, data.broad
+        more = self.reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
+        axes, shift = np.empty((6, 3)), pose[:3, 3] - arrays.origin
+        axes[:3], axes[3:] = -pose[:3, :3], pose[:3, :3]
+        heights = self._heights(axes)
+        low, high = shift - heights[:3] - more, shift + heights[3:] + more
+        box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
+        nothing = np.empty((0, kernel.GATHERED))
+        if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
+            return _Gathered(nothing, True)
+        rows = np.flatnonzero(_meets(box, broad.low, broad.high)).tolist()
+        held = data.references.to(arrays, broad)
+        found, count = np.empty((4096, kernel.GATHERED)), 0
+        for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
+            with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:
+                if loaded.late or loaded.faults:
+                    return _Gathered(nothing, True, len(loaded.late))
+                for row in part:
+                    while True:
+                        with residency.frozen():
+                            now = held.call(
+                                kernel.gather_points, held.reference, row, box, pose, found, count
+                            )
+                        if now <= len(found):
+                            break
+                        found = np.concatenate([found[:count], np.empty((now, kernel.GATHERED))])
+                    count = now
+        return _Gathered(found[:count])
+
+    def _heights(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the greatest heights (k,) of the avatar's centres along directions (k, 3) of its frame [m]."""
+        heights = np.empty(len(directions))
+        self._body.call(kernel.find_heights, self._body.reference, directions, heights)
+        return heights
 
     def _meet(self, which: NDArray[np.bool_], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return when a translation, avatar frame, meets points, and the avatar's touching centres."""
@@ -151,40 +192,6 @@ class LeavingPose:
         if not fraction * length >= MIN_MOTION:
             return self.pose
         return translated(self.pose, fraction * (to[:3, 3] - self.pose[:3, 3]))
-
-
-def _gather(
-    seen: HeldArchive, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget
-) -> _Gathered:
-    """Return the points of an archive that an avatar may meet within `reach` [m].
-
-    pose: (4, 4), avatar to archive.
-    """
-    data, residency = seen.data, seen.data.residency
-    arrays, broad = data.arrays, data.broad
-    more = reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
-    places = avatar.points @ pose[:3, :3].T + (pose[:3, 3] - arrays.origin)
-    low, high = places.min(axis=0) - more, places.max(axis=0) + more
-    box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
-    nothing = np.empty((0, kernel.GATHERED))
-    if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
-        return _Gathered(nothing, True)
-    rows = np.flatnonzero(_meets(box, broad.low, broad.high)).tolist()
-    held = data.references.to(arrays, broad)
-    found, count = np.empty((4096, kernel.GATHERED)), 0
-    for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
-        with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:
-            if loaded.late or loaded.faults:
-                return _Gathered(nothing, True, len(loaded.late))
-            for row in part:
-                while True:
-                    with residency.frozen():
-                        now = held.call(kernel.gather_points, held.reference, row, box, pose, found, count)
-                    if now <= len(found):
-                        break
-                    found = np.concatenate([found[:count], np.empty((now, kernel.GATHERED))])
-                count = now
-    return _Gathered(found[:count])
 
 
 def _meets(box: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[Any]:

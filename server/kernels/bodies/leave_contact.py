@@ -35,6 +35,8 @@ MAX_BUMP = 0.02
 # A plane that is nearer to the core than this share of its point's distance is not taken.
 MIN_GAP = 0.25
 MAX_PLANES = 256
+# The points up to this far beyond a plane [m] are of its surface.
+THICK = 0.05
 # Directions (290, 3) of the half-spaces around the avatar: whole numbers up to 3, the shortest first.
 # Any direction is at most 9 degrees from one of them, so that the hull is a hundredth too large. Rows
 # r and 5 - r are the axis r, against it and along it: they rule out most points.
@@ -105,23 +107,32 @@ def gather_points(held, voxel, box, pose, found, count):
 
 
 @nb.njit(nogil=True, cache=True)
-def meet_points(body, points, reach, which, way, times, own):
+def meet_points(body, box, points, reach, skipped, planes, way, times, own):
     """Find when a translated avatar first meets each of some points.
 
-    body: reference to the avatar's arrays, not empty.  points: (n, 3), avatar frame.  reach: (n,)
-    between the centres of two touching spheres [m].  which: (n,) bool, points to examine.
-    way: (3,) translation [m].
-    times: (n,), set to the fraction of the way, 0 where they touch, inf for never.  own: (n, 3),
-    set to the centre of the avatar's sphere that touches.
+    body: reference to the avatar's arrays.  box: (2, 3) of its centres.
+    points: (n, 3) places in its frame [m].  reach: (n,) contact distance of each [m].
+    skipped: (n,) bool, points to leave out.  planes: (k, PLANE); points up to THICK beyond one of
+    them are left out.  way: (3,) the translation, avatar frame.
+    times: (n,), set to the fraction of `way` at the first contact; inf if there is none, or if left
+    out.  own: (n, 3), set to the centre that touches first, in the avatar's frame.
     """
     avatar = body.avatar
     square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
     rows = np.empty(STACK, np.int64)
     for i in range(points.shape[0]):
         times[i] = np.inf
-        if not which[i]:
-            continue
         x, y, z, most = points[i, 0], points[i, 1], points[i, 2], reach[i] + SLACK
+        left_out = skipped[i]
+        for r in range(3):
+            low, high = box[0, r] + min(way[r], 0.0), box[1, r] + max(way[r], 0.0)
+            left_out |= points[i, r] < low - most - SLACK or points[i, r] > high + most + SLACK
+        if not left_out:
+            for k in range(planes.shape[0]):
+                beyond = (planes[k, 0] * x + planes[k, 1] * y) + planes[k, 2] * z - planes[k, OFFSET]
+                left_out |= beyond >= 0.0 and beyond <= THICK
+        if left_out:
+            continue
         rows[0], depth = 0, 1
         while depth > 0:
             depth -= 1

@@ -20,10 +20,10 @@ from .vectors import dot, norm, rotate, rotate_back
 _MORE = 0.25
 # Name under which `Body.effect_state` keeps the avatar's heights along `kernel.DIRECTIONS`.
 _HULL = "hull"
-# A motion leaves a surface if its direction has at least this part away from the plane. The points
-# up to _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its
-# radius deep touches new points of both walls on every way out, although it leaves both.
-_LEAVES, _THICK = 0.2, 0.05
+# A motion leaves a surface if its direction has at least this part away from the plane, and ignores the
+# points up to `kernel.THICK` beyond it. In a corner, a body more than a third of its radius deep
+# touches new points of both walls on every way out, although it leaves both.
+_LEAVES = 0.2
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
 
@@ -63,16 +63,15 @@ class LeavingPose:
         self._reach = avatar.radius + (units - points[:, kernel.DEFICIT]) / UNITS_PER_METRE
         self._points = np.ascontiguousarray(points[:, : kernel.LATTICE])
         self._lattice = points[:, kernel.LATTICE : kernel.DEFICIT]
-        times, _ = self._meet(np.ones(len(points), bool), np.zeros(3))
-        held = times == 0.0
         hull = frame.body.effect_state.get(_HULL)
         if hull is None:
             hull = frame.body.effect_state[_HULL] = self._heights(kernel.DIRECTIONS)
+        self._box = np.array([-hull[:3], hull[5:2:-1]])
+        self._held = held = np.zeros(len(points), bool)
         kernel.find_held(kernel.DIRECTIONS, hull, self._points, self._reach, held)
-        self._held = held
-        box = np.array([-hull[:3], hull[5:2:-1]])
+        held |= self._meet(np.empty((0, kernel.PLANE)), np.zeros(3))[0] == 0.0
         planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))
-        count = kernel.separate_core(box, self._points[held], planes)
+        count = kernel.separate_core(self._box, self._points[held], planes)
         self._planes = planes[: max(count, 0)]
         self._blocked = count < 0
 
@@ -117,12 +116,16 @@ class LeavingPose:
         self._body.call(kernel.find_heights, self._body.reference, directions, heights)
         return heights
 
-    def _meet(self, which: NDArray[np.bool_], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return when a translation, avatar frame, meets points, and the avatar's touching centres."""
+    def _meet(self, behind: NDArray[np.float64], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return when a translation, avatar frame, meets points, and the avatar's touching centres.
+
+        Points that are held, and those of surfaces behind planes (k, PLANE), are left out.
+        """
         times, own = np.empty(len(self._points)), np.zeros((len(self._points), 3))
         self._body.call(
-            kernel.meet_points, self._body.reference, self._points, self._reach, which, way, times, own
-        )
+            kernel.meet_points, self._body.reference, self._box, self._points, self._reach, self._held,
+            behind, way, times, own,
+        )  # fmt: skip
         return times, own
 
     def _in_world(self, place: Vec) -> Vec:
@@ -160,7 +163,8 @@ class LeavingPose:
                 hit = hit._replace(archive=int(self._archive[at]))
         if hit is not None:
             return hit
-        times, own = self._meet(~(self._held | self._left_behind(local, length)), local)
+        behind = [plane for plane in self._planes if dot(plane[: kernel.OFFSET], local) <= -_LEAVES * length]
+        times, own = self._meet(np.array(behind).reshape(-1, kernel.PLANE), local)
         at = int(times.argmin()) if len(times) else -1
         if at < 0 or times[at] == np.inf:
             return None
@@ -172,17 +176,6 @@ class LeavingPose:
         return Hit(
             fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
         )
-
-    def _left_behind(self, way: Vec, length: float) -> NDArray[np.bool_]:
-        """Return which points belong to a surface that a translation, avatar frame, leads away from."""
-        found = np.zeros(len(self._points), bool)
-        x, y, z = self._points.T
-        for plane in self._planes:
-            if dot(plane[: kernel.OFFSET], way) <= -_LEAVES * length:
-                a, b, c, offset = plane[: kernel.NEAREST].tolist()
-                beyond = a * x + b * y + c * z - offset
-                found |= (beyond >= 0.0) & (beyond <= _THICK)
-        return found
 
     def _end(self, to: Pose, fraction: float, way: Vec, begin: Vec, skin: float) -> Pose:
         """Return the pose `skin` [m] before a contact. begin: from the touched to the touching centre."""

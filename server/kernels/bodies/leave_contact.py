@@ -174,7 +174,11 @@ def meet_points(body, box, points, reach, skipped, planes, way, times, own):
 
 @nb.njit(nogil=True, cache=True)
 def find_heights(body, directions, heights):
-    """Write the greatest heights (k,) of an avatar's centres, not empty, along directions (k, 3)."""
+    """Write the greatest heights (k,) of an avatar's centres, not empty, along directions (k, 3).
+
+    The tree rules out all but some of the points: those of a filled person, 82,000, took 20 ms of the
+    first frame in contact.
+    """
     avatar = body.avatar
     rows = np.empty(STACK, np.int64)
     for n in range(directions.shape[0]):

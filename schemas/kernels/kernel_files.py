@@ -30,7 +30,7 @@ _COMPILING = ".compiling"
 _DAY = 86_400.0
 # Longest wait for another process that compiles a kernel; most take less than a second.
 _CLAIM_SECONDS = 60.0
-# Limits of the folder. All kernels of one version of this package take 14 MB (scripts/bench_compile).
+# Limits of the folder. All kernels of one version of this package take 76 MB (scripts/bench_compile).
 MAX_BYTES = 1 << 29
 MAX_DAYS = 60.0
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 from versions import find, scene_file
 
-# Repetitions in one turn, which then takes about 0.1 to 0.3 s.
-PASSES, SINGLES, MOTIONS, FRAMES, TRIPS, WISHES = 20, 4000, 1200, 600, 300, 150
+# Repetitions in one turn, which then takes about 0.1 to 0.3 s; one pose in OBJECTS is an object.
+PASSES, SINGLES, FRAMES, TRIPS, WISHES = 20, 4000, 600, 300, 150
+OBJECTS, USERS, CROWD_FRAMES = 10, 30, 20
 BUILD_POINTS = 10_000_000
 
 Case = Callable[[], None]
@@ -64,23 +65,38 @@ def scene_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
         for _ in range(PASSES):
             scene.within(origins, 5.0)
 
-    walker = open_walk(archive, stack)
+    def objects() -> None:
+        scene.objects([("al", pose) for pose in frames[::OBJECTS]])
+
+    walker = open_walk(scene_file(archive), stack)
     walker.add_avatar("al", figure)
+    crowded = open_walk(scene_file(archive, "crowd"), stack)
+    clients = [f"user{number}" for number in range(USERS)]
+    for client in clients:
+        crowded.add_avatar("al", figure, client=client)
+    apart = len(poses) // USERS
 
     def frame() -> None:
         pose = frames[0]
         for number in range(1, FRAMES):
             pose = walker.move("al", pose, frames[number]).pose
 
+    def crowd() -> None:
+        # New users each time, so that every turn does the same.
+        with ExitStack() as users:
+            sessions = [users.enter_context(crowded.session("al", client=client)) for client in clients]
+            for number in range(CROWD_FRAMES):
+                for user, session in enumerate(sessions):
+                    session.wait(session.wish(pose=poses[apart * user + number], time=number / 30))
+
     return {
         "collide": collide, "single": singles, "distance": distance, "contacts": contacts, "sweep": sweep,
-        "raycast": raycast, "within": within, "frame": frame,
+        "raycast": raycast, "within": within, "objects": objects, "frame": frame, "crowd": crowd,
     }  # fmt: skip
 
 
-def open_walk(archive: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
-    """Open a scene with the effects of a walk."""
-    path = scene_file(archive)
+def open_walk(path: Path, stack: ExitStack):  # type: ignore[no-untyped-def]
+    """Open a scene file."""
     try:
         open_scene = find("open_scene", "server.scenes.open_scene", "server.scene_file")
     except ImportError:  # exists since Scene.open takes scene files, too
@@ -113,7 +129,15 @@ def wire_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
         for _ in range(WISHES):
             session.wait(session.wish(pose=far[0]))
 
-    return {"round_trip": round_trip, "session": wishes}
+    build_facade = find("build_facade", "builder.synthetic.facade", "builder.made.facade")
+    walk_poses = find("walk_poses", "builder.synthetic.walk", "builder.made.walk")
+    poses = np.tile(walk_poses(build_facade().truth, 1200, 30.0)[1], (PASSES, 1, 1))
+
+    def path() -> None:
+        for _ in client.path("al", poses):
+            pass
+
+    return {"round_trip": round_trip, "session": wishes, "path": path}
 
 
 def build_case(archive: Path, stack: ExitStack) -> dict[str, Case]:
@@ -145,7 +169,7 @@ def main() -> None:
     with ExitStack() as stack:
         cases: dict[str, Case] = {}
         for names, make in (
-            (("round_trip", "session"), wire_cases),
+            (("round_trip", "session", "path"), wire_cases),
             (("build",), build_case),
         ):
             if set(names) & set(wanted):

@@ -11,7 +11,8 @@ from typing import Any
 
 # Cases whose speed is compared; a build takes much longer than the others.
 DEFAULT_CASES = (
-    "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
+    "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "objects", "path",
+    "frame", "crowd", "round_trip", "session",
 )  # fmt: skip
 CASES = (*DEFAULT_CASES, "build")
 # Fields of answers that are not compared: durations, and the memory that the cache holds.
@@ -44,9 +45,9 @@ def base_checkout(root: Path, commit: str, stack: ExitStack) -> Path:
     return folder
 
 
-def scene_file(archive: Path) -> Path:
-    """Write the scene file of a walk beside the archive; return its path."""
-    path = archive.parent / f"walk-{sys.prefix.replace('/', '-')}.toml"
-    effects = "".join(f'\n[[effects]]\neffect = "{effect}"\n' for effect in EFFECTS)
+def scene_file(archive: Path, *more: str) -> Path:
+    """Write the scene file of a walk, with `more` effects, beside the archive; return its path."""
+    path = archive.parent / f"{'-'.join(['walk', *more])}{sys.prefix.replace('/', '-')}.toml"
+    effects = "".join(f'\n[[effects]]\neffect = "{effect}"\n' for effect in (*EFFECTS, *more))
     path.write_text(f'format = 1\n\n[[archives]]\npath = "{archive}"\n{effects}')
     return path

@@ -8,6 +8,7 @@ import numpy as np
 
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
+from ..core.kernel_decorators import njit_no_refcount
 
 # Steps per metre of the differences that are summed for a normal: with a reach of a metre, the sums
 # over eight million points fit 63 bits.
@@ -17,6 +18,26 @@ SUMS = 10
 _STACK = 8 * MAX_LEVELS
 # A node farther than the reach by this share has no point in reach, whatever was rounded.
 _ROUNDED = 1.0 + 1e-9
+
+
+@njit_no_refcount
+def add_difference(x, y, z, sums):
+    """Add a point's difference to another one [m] to sums (10,) for `normal_code`."""
+    a, b, c = (
+        np.int64(np.rint(x * PATCH_STEPS)),
+        np.int64(np.rint(y * PATCH_STEPS)),
+        np.int64(np.rint(z * PATCH_STEPS)),
+    )
+    sums[0] += 1
+    sums[1] += a
+    sums[2] += b
+    sums[3] += c
+    sums[4] += a * a
+    sums[5] += b * b
+    sums[6] += c * c
+    sums[7] += b * c
+    sums[8] += c * a
+    sums[9] += a * b
 
 
 @nb.njit(nogil=True, cache=True)
@@ -61,16 +82,4 @@ def lowest_heights(body, order, surface, point, reach, directions, heights, sums
             for k in range(directions.shape[0]):
                 height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]
                 heights[k] = min(heights[k], height)
-            ix = np.int64(np.rint(px * PATCH_STEPS))
-            iy = np.int64(np.rint(py * PATCH_STEPS))
-            iz = np.int64(np.rint(pz * PATCH_STEPS))
-            sums[0] += 1
-            sums[1] += ix
-            sums[2] += iy
-            sums[3] += iz
-            sums[4] += ix * ix
-            sums[5] += iy * iy
-            sums[6] += iz * iz
-            sums[7] += iy * iz
-            sums[8] += iz * ix
-            sums[9] += ix * iy
+            add_difference(px, py, pz, sums)

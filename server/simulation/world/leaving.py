@@ -18,12 +18,12 @@ from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
 _MORE = 0.25
-# Name under which `Body.effect_state` keeps the half-spaces around the avatar.
+# Name under which `Body.effect_state` keeps the avatar's heights along `kernel.DIRECTIONS`.
 _HULL = "hull"
-# A motion leaves a surface if its direction has at least this part away from the plane. The points
-# up to _THICK beyond the plane [m] are of the surface. In a corner, a body more than a third of its
-# radius deep touches new points of both walls on every way out, although it leaves both.
-_LEAVES, _THICK = 0.2, 0.05
+# A motion leaves a surface if its direction has at least this part away from the plane, and ignores the
+# points up to `kernel.THICK` beyond it. In a corner, a body more than a third of its radius deep
+# touches new points of both walls on every way out, although it leaves both.
+_LEAVES = 0.2
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
 
@@ -53,7 +53,7 @@ class LeavingPose:
         self._body = world.probe(avatar).body
         with world as seen:
             self._seen = list(seen)
-            found = [_gather(each, avatar, to_archive(each, frame.pose), reach, budget) for each in seen]
+            found = [self._gather(each, avatar, to_archive(each, frame.pose), budget) for each in seen]
         budget.lacked(sum(each.late for each in found))
         self.lacks, self.late = any(each.lacks for each in found), any(each.late for each in found)
         world.count(0, self.lacks)
@@ -63,25 +63,69 @@ class LeavingPose:
         self._reach = avatar.radius + (units - points[:, kernel.DEFICIT]) / UNITS_PER_METRE
         self._points = np.ascontiguousarray(points[:, : kernel.LATTICE])
         self._lattice = points[:, kernel.LATTICE : kernel.DEFICIT]
-        times, _ = self._meet(np.ones(len(points), bool), np.zeros(3))
-        held = times == 0.0
         hull = frame.body.effect_state.get(_HULL)
         if hull is None:
-            hull = frame.body.effect_state[_HULL] = kernel.hull_of(self._body.reference)
-        kernel.find_held(hull, self._points, self._reach, held)
-        self._held = held
-        box = np.array([avatar.points.min(axis=0), avatar.points.max(axis=0)])
+            hull = frame.body.effect_state[_HULL] = self._heights(kernel.DIRECTIONS)
+        self._box = np.array([-hull[:3], hull[5:2:-1]])
+        self._held = held = np.zeros(len(points), bool)
+        kernel.find_held(kernel.DIRECTIONS, hull, self._points, self._reach, held)
+        held |= self._meet(np.empty((0, kernel.PLANE)), np.zeros(3))[0] == 0.0
         planes = np.empty((kernel.MAX_PLANES, kernel.PLANE))
-        count = kernel.separate_core(box, self._points[held], planes)
+        count = kernel.separate_core(self._box, self._points[held], planes)
         self._planes = planes[: max(count, 0)]
         self._blocked = count < 0
 
-    def _meet(self, which: NDArray[np.bool_], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return when a translation, avatar frame, meets points, and the avatar's touching centres."""
+    def _gather(self, seen: HeldArchive, avatar: AvatarModel, pose: Pose, budget: QueryBudget) -> _Gathered:
+        """Return the points of an archive that an avatar may meet within the reach.
+
+        pose: (4, 4), avatar to archive.
+        """
+        data, residency = seen.data, seen.data.residency
+        arrays, broad = data.arrays, data.broad
+        more = self.reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
+        axes, shift = np.empty((6, 3)), pose[:3, 3] - arrays.origin
+        axes[:3], axes[3:] = -pose[:3, :3], pose[:3, :3]
+        heights = self._heights(axes)
+        low, high = shift - heights[:3] - more, shift + heights[3:] + more
+        box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
+        nothing = np.empty((0, kernel.GATHERED))
+        if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
+            return _Gathered(nothing, True)
+        rows = np.flatnonzero(_meets(box, broad.low, broad.high)).tolist()
+        held = data.references.to(arrays, broad)
+        found, count = np.empty((4096, kernel.GATHERED)), 0
+        for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
+            with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:
+                if loaded.late or loaded.faults:
+                    return _Gathered(nothing, True, len(loaded.late))
+                for row in part:
+                    while True:
+                        with residency.frozen():
+                            now = held.call(
+                                kernel.gather_points, held.reference, row, box, pose, found, count
+                            )
+                        if now <= len(found):
+                            break
+                        found = np.concatenate([found[:count], np.empty((now, kernel.GATHERED))])
+                    count = now
+        return _Gathered(found[:count])
+
+    def _heights(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the greatest heights (k,) of the avatar's centres along directions (k, 3) of its frame [m]."""
+        heights = np.empty(len(directions))
+        self._body.call(kernel.find_heights, self._body.reference, directions, heights)
+        return heights
+
+    def _meet(self, behind: NDArray[np.float64], way: Vec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return when a translation, avatar frame, meets points, and the avatar's touching centres.
+
+        Points that are held, and those of surfaces behind planes (k, PLANE), are left out.
+        """
         times, own = np.empty(len(self._points)), np.zeros((len(self._points), 3))
         self._body.call(
-            kernel.meet_points, self._body.reference, self._points, self._reach, which, way, times, own
-        )
+            kernel.meet_points, self._body.reference, self._box, self._points, self._reach, self._held,
+            behind, way, times, own,
+        )  # fmt: skip
         return times, own
 
     def _in_world(self, place: Vec) -> Vec:
@@ -119,7 +163,8 @@ class LeavingPose:
                 hit = hit._replace(archive=int(self._archive[at]))
         if hit is not None:
             return hit
-        times, own = self._meet(~(self._held | self._left_behind(local, length)), local)
+        behind = [plane for plane in self._planes if dot(plane[: kernel.OFFSET], local) <= -_LEAVES * length]
+        times, own = self._meet(np.array(behind).reshape(-1, kernel.PLANE), local)
         at = int(times.argmin()) if len(times) else -1
         if at < 0 or times[at] == np.inf:
             return None
@@ -132,17 +177,6 @@ class LeavingPose:
             fraction, Verdict.CONTACT, avatar + fraction * way, cloud, "", number, None, own[at], end=end
         )
 
-    def _left_behind(self, way: Vec, length: float) -> NDArray[np.bool_]:
-        """Return which points belong to a surface that a translation, avatar frame, leads away from."""
-        found = np.zeros(len(self._points), bool)
-        x, y, z = self._points.T
-        for plane in self._planes:
-            if dot(plane[: kernel.OFFSET], way) <= -_LEAVES * length:
-                a, b, c, offset = plane[: kernel.NEAREST].tolist()
-                beyond = a * x + b * y + c * z - offset
-                found |= (beyond >= 0.0) & (beyond <= _THICK)
-        return found
-
     def _end(self, to: Pose, fraction: float, way: Vec, begin: Vec, skin: float) -> Pose:
         """Return the pose `skin` [m] before a contact. begin: from the touched to the touching centre."""
         out, length = begin + fraction * way, norm(way)
@@ -151,40 +185,6 @@ class LeavingPose:
         if not fraction * length >= MIN_MOTION:
             return self.pose
         return translated(self.pose, fraction * (to[:3, 3] - self.pose[:3, 3]))
-
-
-def _gather(
-    seen: HeldArchive, avatar: AvatarModel, pose: Pose, reach: float, budget: QueryBudget
-) -> _Gathered:
-    """Return the points of an archive that an avatar may meet within `reach` [m].
-
-    pose: (4, 4), avatar to archive.
-    """
-    data, residency = seen.data, seen.data.residency
-    arrays, broad = data.arrays, data.broad
-    more = reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
-    places = avatar.points @ pose[:3, :3].T + (pose[:3, 3] - arrays.origin)
-    low, high = places.min(axis=0) - more, places.max(axis=0) + more
-    box = np.array([np.floor(low / arrays.step), np.ceil(high / arrays.step)]).astype(np.int64)
-    nothing = np.empty((0, kernel.GATHERED))
-    if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
-        return _Gathered(nothing, True)
-    rows = np.flatnonzero(_meets(box, broad.low, broad.high)).tolist()
-    held = data.references.to(arrays, broad)
-    found, count = np.empty((4096, kernel.GATHERED)), 0
-    for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
-        with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:
-            if loaded.late or loaded.faults:
-                return _Gathered(nothing, True, len(loaded.late))
-            for row in part:
-                while True:
-                    with residency.frozen():
-                        now = held.call(kernel.gather_points, held.reference, row, box, pose, found, count)
-                    if now <= len(found):
-                        break
-                    found = np.concatenate([found[:count], np.empty((now, kernel.GATHERED))])
-                count = now
-    return _Gathered(found[:count])
 
 
 def _meets(box: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[Any]:

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import place
+from ..core.placed_avatar import place, to_units
 from ..core.scene_arrays import stopped
 from .contact_times import INFINITE, scan_coordinate, touches_at
 from .moving_avatar import AvatarSweep
@@ -29,8 +30,8 @@ def advance_segments(
     box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
     the way.  starts, rows: the voxels of each motion's segment that this piece holds.  tolerance:
     [m].  scratch: `make_scratch` of the avatar.
-    Lowers progress.lower and upper, sets a witness with upper, and adds to counts (4, k): voxels
-    missing, node visits, point tests, advances.
+    Lowers progress.lower and upper, sets a witness with upper, of equal ones the first by
+    NUMERICS.md N11, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
     A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
     it. Once the scene's stop flag is set, a motion is unknown from its current position on.
     """
@@ -75,9 +76,9 @@ def advance_segments(
         if gap < INFINITE:
             lower = min(lower, max(t0, t0 + gap * (t1 - t0) - 2.0**-52))
         progress.lower[i] = min(progress.lower[i], lower)
-        if upper < progress.upper[i]:
+        if upper < INFINITE and upper <= progress.upper[i]:
+            _name_witness(sweep, upper, upper == progress.upper[i], progress.witness[i])
             progress.upper[i] = upper
-            _name_witness(sweep, upper, progress.witness[i])
         progress.visits[i] -= moving.counters[0]
         counts[1, i] += np.uint32(moving.counters[0])
         counts[2, i] += np.uint32(moving.counters[1])
@@ -108,11 +109,13 @@ def _advance(sweep, start, stop, rows, size, tolerance):
         steps += 1
         whole, final = search(sweep, t, after, rows)
         earliest_possible, earliest_certain = moving.first[0], moving.first[1]
-        if earliest_possible == 0.0 and not final and t == 0.0 and not begun:
-            # It may touch at the start: the search ended at the first doubt.
+        doubtful = earliest_possible == 0.0 and t == 0.0 and not final and not begun
+        if after > t and (doubtful or earliest_certain == 0.0):
+            # The search ended at the first pair that may touch at t: find all that touch there.
             begun = True
-            search(sweep, 0.0, 0.0, rows)
-            earliest_certain = moving.first[1]
+            search(sweep, t, t, rows)
+            if earliest_certain > 0.0:
+                earliest_certain = moving.first[1]
         sure = INFINITE
         if earliest_certain < INFINITE:
             sure = after if earliest_certain >= 1.0 else min(after, t + earliest_certain * (after - t))
@@ -152,16 +155,26 @@ def _advance(sweep, start, stop, rows, size, tolerance):
 
 
 @njit_no_refcount
-def _name_witness(sweep, t, witness):
-    """Write the centres (2, 3) of moving.pair under M(t), world [m].
+def _name_witness(sweep, t, equal, witness):
+    """Write the centres (2, 3) of moving.pair under M(t), world [m]: the avatar's, then the scan's.
 
-    The avatar's centre as placed comes first, then the scan's.
+    equal: whether the pair in `witness` touches at the same moment; it is then replaced only if it
+    follows by NUMERICS.md N11.
     """
     scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
     pair = moving.pair
     pose_at(sweep.motion, t, moving.pose)
     x, y, z = points[pair[0], 0, pair[1]], points[pair[0], 1, pair[1]], points[pair[0], 2, pair[1]]
-    for r in range(3):
-        moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
-        witness[0, r] = place(moving.pose, moving.shift, r, x, y, z) + scene.origin[r]
-        witness[1, r] = np.float64(scan_coordinate(scene, pair, r)) * scene.step + scene.origin[r]
+    for n in (1, 0):
+        for r in range(3):
+            if n == 1:
+                value = np.float64(scan_coordinate(scene, pair, r)) * scene.step + scene.origin[r]
+            else:
+                moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
+                units = to_units(place(moving.pose, moving.shift, r, x, y, z))
+                value = np.float64(units) / UNITS_PER_METRE + scene.origin[r]
+            if equal:
+                if value > witness[n, r]:
+                    return
+                equal = value == witness[n, r]
+            witness[n, r] = value

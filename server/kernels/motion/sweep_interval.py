@@ -51,7 +51,7 @@ from ..core.scene_arrays import (
     point_class,
     stopped,
 )
-from .contact_times import INFINITE, try_pair
+from .contact_times import INFINITE, scan_coordinate, try_pair
 from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
 from .screw_motion import pose_at
 
@@ -183,12 +183,23 @@ def _leaves(sweep, chord, voxel, block, row):
                 latest = _latest(moving)
 
 
+@njit_no_refcount
+def _follows(sweep, voxel, row):
+    """Return whether all points of a node have a greater x than the scan point of moving.pair."""
+    scene, moving, at = sweep.scene, sweep.moving, U(row)
+    words = scene.words
+    x = scan_coordinate(scene, moving.pair, 0) - scene.coordinates[voxel, 0] * scene.voxel_steps
+    half = words[at + U(4)] if has_box(words, row) else words[at + U(3)]
+    return np.float64(words[at]) - np.float64(half) > np.float64(x)
+
+
 @njit_inlined
 def _sweep_voxel(sweep, chord, voxel):
     """Update moving.first with one resident voxel by a joint descent, depth first.
 
     Returns whether to continue: not when nothing can be earlier, when the visits are spent, or when
-    the scene's stop flag is set.
+    the scene's stop flag is set. A chord of length 0 continues, and skips nodes whose points all
+    follow the best pair's.
     """
     avatar, scene, moving = sweep.avatar, sweep.scene, sweep.moving
     words, ints = scene.words, scene.ints
@@ -213,6 +224,8 @@ def _sweep_voxel(sweep, chord, voxel):
             return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
+        if moving.first[2] <= 0.0 and _follows(sweep, voxel, row):
+            continue
         a_first, b_first = avatar.first[a], ints[U(row) + U(FIRST)]
         if a_first < 0 and b_first < 0:
             block = ~a_first
@@ -220,7 +233,7 @@ def _sweep_voxel(sweep, chord, voxel):
                 place_block(avatar, block, moving, scene)
                 moving.stamp[block] = counters[2]
             _leaves(sweep, chord, voxel, block, row)
-            if moving.first[2] <= 0.0:
+            if moving.first[2] <= 0.0 and chord.t1 > chord.t0:
                 return False
             latest = _latest(moving)
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[U(row) + U(3)]):
@@ -254,8 +267,9 @@ def _sweep_voxel(sweep, chord, voxel):
 def search(sweep, t0, t1, rows):
     """Descend once over the interval [t0, t1], through those voxels of `rows` that are resident.
 
-    Fills moving.first and moving.pair. Returns (whether the search was complete, whether halving
-    the interval is useless).
+    Fills moving.first and moving.pair. With t0 < t1 the search ends at the first pair found that
+    may touch at t0; with t0 = t1 it finds the first of these pairs by NUMERICS.md N11. Returns
+    (whether the search was complete, whether halving the interval is useless).
     """
     motion, scene, moving = sweep.motion, sweep.scene, sweep.moving
     pose_at(motion, t0, moving.ends[0])

@@ -140,8 +140,8 @@ def judge(
             said,
         )
         if upper == 0:
-            first_named = naive_sweep.first_pair(*scan, avatar, radius, motion[0], margin)
-            assert named_pair(answers, i, arrays.origin, arrays.step) == first_named, said
+            pairs = naive_sweep.touching_pairs(*scan, avatar, radius, motion[0], margin)
+            assert named_pair(answers, i, arrays.origin, arrays.step) == min(pairs), said
         poses = [naive_sweep.pose_at(*motion, t) for t in (lower, upper)]
         far = max(float(np.abs(p[:3, 3] - arrays.origin).max()) for p in poses) + 1.0
         if answers.exact[i]:

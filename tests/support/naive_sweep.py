@@ -151,7 +151,7 @@ def ideal_pose(first: NDArray[np.float64], last: NDArray[np.float64], t: float) 
         return pose
 
 
-def first_pair(
+def touching_pairs(
     points: NDArray[np.float64],
     origin: ArrayLike,
     step: float,
@@ -160,18 +160,17 @@ def first_pair(
     avatar_radius: float,
     pose: NDArray[np.float64],
     margin: float = 0.0,
-) -> tuple[list[int], list[int]] | None:
-    """Return the pair in contact under a pose that a sweep from it names: None if there is none.
+) -> list[tuple[list[int], list[int]]]:
+    """Return all pairs in contact under a pose: scan points [lattice steps], avatar centres [exact units].
 
-    It is the least scan point [lattice steps], then the least avatar centre [exact units].
-    scan_radius: as in `touching`.
+    scan_radius: as in `touching`. A sweep from this pose names the least of them.
     """
     lattice = naive.lattice_of(points, origin, step)
     b = naive.scan_units(lattice, step)
     a = naive.placed_units(avatar, pose, origin)
     radii = np.broadcast_to(np.rint(np.asarray(scan_radius) * naive.UNITS).astype(np.int64), len(b))
     rows, own = np.nonzero(_near(a, b, naive.reach_units(pose, avatar_radius, 0.0, margin) + radii).T)
-    return min(zip(lattice[rows].tolist(), a[own].tolist(), strict=True), default=None)
+    return list(zip(lattice[rows].tolist(), a[own].tolist(), strict=True))
 
 
 def _near(a: NDArray[np.int64], b: NDArray[np.int64], reach: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -44,7 +44,7 @@ def advance_segments(
             progress.lower[i] = min(progress.lower[i], progress.at[i])
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
-        t0, t1 = progress.at[i], min(progress.end[i], progress.upper[i])
+        t0, t1 = progress.at[i], progress.end[i]
         span = place_root_sphere(
             motion, t0, avatar, scales[i], units[i], scene, moving.pose, moving.shift, begin
         )
@@ -72,7 +72,8 @@ def advance_segments(
             np.float64(loose[i]),
         )
         size = avatar_size(box, scales[i], units[i])
-        lower, upper, steps = _advance(sweep, t0, t1, rows[starts[i] : starts[i + 1]], size, tolerance)
+        near = rows[starts[i] : starts[i + 1]]
+        lower, upper, steps = _advance(sweep, t0, t1, progress.upper[i], near, size, tolerance)
         if gap < INFINITE:
             lower = min(lower, max(t0, t0 + gap * (t1 - t0) - 2.0**-52))
         progress.lower[i] = min(progress.lower[i], lower)
@@ -86,7 +87,7 @@ def advance_segments(
 
 
 @njit_no_refcount
-def _advance(sweep, start, stop, rows, size, tolerance):
+def _advance(sweep, start, stop, known, rows, size, tolerance):
     """Advance one motion over [start, stop] through some voxels. Return (lower, upper, advances).
 
     Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
@@ -109,12 +110,15 @@ def _advance(sweep, start, stop, rows, size, tolerance):
         steps += 1
         whole, final = search(sweep, t, after, rows)
         earliest_possible, earliest_certain = moving.first[0], moving.first[1]
-        doubtful = earliest_possible == 0.0 and t == 0.0 and not final and not begun
-        if after > t and (doubtful or earliest_certain == 0.0):
-            # The search ended at the first pair that may touch at t: find all that touch there.
-            begun = True
+        if final and earliest_certain == 0.0 and after > t:
+            # The search ended at the first pair it met that touches at t.
             search(sweep, t, t, rows)
-            if earliest_certain > 0.0:
+        elif earliest_possible == 0.0 and not final:
+            # It ended at the first pair it met that may touch at t: in another tree, another pair.
+            earliest_certain = INFINITE
+            if t == 0.0 and not begun:
+                begun = True
+                search(sweep, t, t, rows)
                 earliest_certain = moving.first[1]
         sure = INFINITE
         if earliest_certain < INFINITE:
@@ -147,7 +151,7 @@ def _advance(sweep, start, stop, rows, size, tolerance):
         else:
             length = max(0.25 * (after - t), 2.0**-52)
             t, refused = since, refused + 1
-        if t >= stop:
+        if t >= stop or t > known:
             break
     for n in range(6):
         moving.pair[n] = best[n]

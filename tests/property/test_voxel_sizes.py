@@ -125,11 +125,8 @@ def judge_named(
     return several
 
 
-@pytest.mark.case(
-    11, "every query in voxels of 1, 3.3 and 8 m, in memory and from a small cache: the same answers"
-)
 @pytest.mark.parametrize("kind", ["grid", "noise"])
-@pytest.mark.parametrize("seed", range(sample(2, 12)))
+@pytest.mark.parametrize("seed", range(sample(2, 8)))
 def test_no_voxel_size_changes_an_answer(tmp_path: Path, kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = scan(rng, kind), body(rng)
@@ -143,7 +140,7 @@ def test_no_voxel_size_changes_an_answer(tmp_path: Path, kind: str, seed: int) -
                 for model in MODELS:
                     for name, ask in asked.items():
                         if name.startswith("turn") and budget == BUDGETS[1]:
-                            continue  # NUMERICS.md N11 says why
+                            continue  # the exception of NUMERICS.md N5
                         answer = ask(scene, {} if model is None else {"radius_model": model})
                         found = columns(answer)
                         same = expected.setdefault((model, name), found)

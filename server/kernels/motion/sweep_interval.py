@@ -29,7 +29,13 @@ by 32 half units in the last place of the chord.
 The resulting interval is halved and quartered until its ends are within the tolerance, or until B
 (t1 - t0)^2 / 8 is negligible beside rounding; what is undecided then is a graze. The pairs that are
 examined in float64 may differ from tree to tree. Their results do not, and the least result is
-taken: no tree, voxel or order therefore changes an answer.
+taken: no tree, voxel or order therefore changes an answer. A search that ends at the first pair that
+may touch where the interval begins decides only that one may.
+
+At a moment, an interval of length 0, the search names the first of the pairs in contact by
+NUMERICS.md N11. It visits nodes of lesser x first, and skips nodes whose points all follow. In a hall
+this takes 25 us more than a search that ends at the first contact (9 us), for a body of 8,000 points
+with 3,400 pairs in contact.
 """
 
 import math
@@ -184,13 +190,28 @@ def _leaves(sweep, chord, voxel, block, row):
 
 
 @njit_no_refcount
-def _follows(sweep, voxel, row):
-    """Return whether all points of a node have a greater x than the scan point of moving.pair."""
-    scene, moving, at = sweep.scene, sweep.moving, U(row)
-    words = scene.words
-    x = scan_coordinate(scene, moving.pair, 0) - scene.coordinates[voxel, 0] * scene.voxel_steps
-    half = words[at + U(4)] if has_box(words, row) else words[at + U(3)]
-    return np.float64(words[at]) - np.float64(half) > np.float64(x)
+def _least(words, row, r):
+    """Return a lower bound of coordinate r of a node's points, from the voxel's low corner [steps]."""
+    at = U(row)
+    half = words[at + U(4 + r)] if has_box(words, row) else words[at + U(3)]
+    return np.float64(words[at + U(r)]) - np.float64(half)
+
+
+@njit_no_refcount
+def _follows(sweep, chord, voxel, a, row):
+    """Return whether every pair of two nodes that touches follows moving.pair (NUMERICS.md N11)."""
+    scene, moving = sweep.scene, sweep.moving
+    x = scan_coordinate(scene, moving.pair, 0)
+    # A scan point that touches the avatar's node is within its radius and the reach; 1: rounding.
+    reach = np.float64(moving.nodes[3, a]) + chord.outer / scene.units_per_step + 1.0
+    if np.float64(moving.nodes[0, a]) - reach > np.float64(x - moving.frame[0]):
+        return True
+    for r in range(3):
+        named = scan_coordinate(scene, moving.pair, r) - scene.coordinates[voxel, r] * scene.voxel_steps
+        least = _least(scene.words, row, r)
+        if least != np.float64(named):
+            return least > np.float64(named)
+    return False
 
 
 @njit_inlined
@@ -224,7 +245,7 @@ def _sweep_voxel(sweep, chord, voxel):
             return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
-        if moving.first[2] <= 0.0 and _follows(sweep, voxel, row):
+        if moving.first[2] <= 0.0 and _follows(sweep, chord, voxel, a, row):
             continue
         a_first, b_first = avatar.first[a], ints[U(row) + U(FIRST)]
         if a_first < 0 and b_first < 0:
@@ -252,6 +273,7 @@ def _sweep_voxel(sweep, chord, voxel):
             dx, dy, dz, inverse = nodes[4, a], nodes[5, a], nodes[6, a], nodes[7, a]
             count = ints[U(row) + U(COUNT)] & COUNTED
             counters[0] += count
+            begin = depth
             for i in range(count):
                 child_row = base + (b_first + i) * ROW_WORDS
                 threshold = widest if mask == ONE_CLASS else thresholds[node_class(ints, child_row, mask)]
@@ -260,6 +282,10 @@ def _sweep_voxel(sweep, chord, voxel):
                 ):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
+            if chord.t0 == chord.t1:  # the node with the least x first
+                for at in range(begin, depth - 1):
+                    if _least(words, stack[at, 1], 0) < _least(words, stack[depth - 1, 1], 0):
+                        stack[at, 1], stack[depth - 1, 1] = stack[depth - 1, 1], stack[at, 1]
     return True
 
 

@@ -92,7 +92,8 @@ def _advance(sweep, start, stop, known, rows, size, tolerance):
 
     Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
     was found. lower is `stop` when nothing touches in [start, stop]. A graze fixes lower; the part
-    after it is still searched for contacts.
+    after it is still searched for contacts. known: the earliest contact with other voxels, inf: none;
+    the search ends beyond it, and its intervals are the same without it.
 
     Each round searches [t, after]. `since` is the first fraction at which something may touch,
     `sure` one at which the integers confirm contact. If nothing may touch, t moves to `after` and
@@ -162,8 +163,7 @@ def _advance(sweep, start, stop, known, rows, size, tolerance):
 def _name_witness(sweep, t, equal, witness):
     """Write the centres (2, 3) of moving.pair under M(t), world [m]: the avatar's, then the scan's.
 
-    equal: whether the pair in `witness` touches at the same moment; it is then replaced only if it
-    follows by NUMERICS.md N11.
+    equal: whether the pair in `witness` touches at the same moment. NUMERICS.md N11 then decides.
     """
     scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
     pair = moving.pair

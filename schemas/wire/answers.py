@@ -224,7 +224,8 @@ class SweepAnswers(Cost, frozen=True, eq=False):
     exact: (k,) bool, whether the motion is clear, or no avatar point moves more than the tolerance
     between `lower` and `upper`.
     witness_avatar, witness_cloud: (k, 3) float64, centres of a pair in contact at `upper`, world
-    [m]; NaN if there is none.
+    [m]; NaN if there is none. At `upper` 0, the pair with the least scan point (x, y, z), then the
+    least avatar centre; with a tolerance above 1e-6 or a budget, perhaps another one.
     steps: (k,) uint32, number of steps of conservative advancement.
     outside, voxels_missing, node_visits, point_tests: as in `CollideAnswers`.
     """

@@ -222,6 +222,8 @@ def _sweep(
                 progress.at[:] = begun
                 settled = level.settle(cold, *world, progress, proved, tolerance)
                 progress.witness[settled] -= origin
+                own = progress.witness[settled, 0]
+                progress.witness[settled, 0] = np.rint(own * UNITS_PER_METRE) / UNITS_PER_METRE
                 which = np.setdiff1d(which, settled)
                 continue
         if unproved and absent is None and bounds.unsettled(rows[:needed], unproved).any():
@@ -304,8 +306,6 @@ def _sweep(
         lost[:] = 0.0
     met = lost <= until
     proved[met] = np.minimum(proved, lost)[met]
-    # The avatar's centre by the definition, in exact units, as `distance` and `contacts` report it.
-    progress.witness[:, 0] = np.rint(progress.witness[:, 0] * UNITS_PER_METRE) / UNITS_PER_METRE
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return msgspec.structs.replace(answers, **spent.fields())

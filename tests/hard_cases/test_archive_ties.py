@@ -74,7 +74,7 @@ TURN = archive_cases.pose_of(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.
 def test_case_36_the_least_scan_point_is_named(tmp_path: Path, pose: Any) -> None:
     points = AROUND if pose is None else [pose[:3, :3].T @ (np.array(a) - pose[:3, 3]) for a in AROUND]
     placed = [(path, pose) for path in build(tmp_path, *([list(point)] for point in points))]
-    near, within, rays, touch, swept, objects = in_any_order(
+    near, within, rays, touch, swept, started, objects = in_any_order(
         placed,
         lambda scene: scene.distance("one", at((0, 0, 0)), 2.0),
         lambda scene: scene.within(np.zeros((1, 3)), 2.0),
@@ -85,6 +85,7 @@ def test_case_36_the_least_scan_point_is_named(tmp_path: Path, pose: Any) -> Non
         ),
         lambda scene: scene.collide("wide", at((0, 0, 0), (0, 0, 0.5), (9, 9, 9)), tolerance=0.01),
         lambda scene: scene.sweep("two", at((-4, 0, 0)), at((4, 0, 0))),
+        lambda scene: scene.sweep("wide", at((0, 0, 0)), at((4, 0, 0))),
         # Tangent to one another and to the spheres of two archives.
         lambda scene: scene.objects([("wide", each, 1, 0xFFFFFFFF) for each in at((0, 0, 0), (0, 0, 2))]),
     )  # fmt: skip
@@ -98,6 +99,7 @@ def test_case_36_the_least_scan_point_is_named(tmp_path: Path, pose: Any) -> Non
     # Both spheres of the body meet one at the same time.
     assert swept.verdict[0] == Verdict.CONTACT and swept.exact[0]
     assert swept.witness_cloud[0].tolist() == [0.0, 0.0, -1.0]
+    assert started.upper[0] == 0.0 and started.witness_cloud[0].tolist() == least
     assert objects.verdict.tolist() == [1, 1] and objects.pairs.tolist() == [[0, 1]]
 
 

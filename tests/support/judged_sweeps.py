@@ -83,6 +83,12 @@ def moved(avatar: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[
     return float(np.linalg.norm(apart, axis=1).max())
 
 
+def named_pair(answers: SweepAnswers, i: int, origin: Any, step: float) -> tuple[list[int], list[int]]:
+    """Return the pair that an answer names: its scan point [lattice steps] and avatar centre [exact units]."""
+    placed = np.rint((answers.witness_avatar[i] - origin) * naive.UNITS).astype(np.int64)
+    return naive.lattice_of(answers.witness_cloud[i], origin, step).tolist(), placed.tolist()
+
+
 def radii_of(case: archive_cases.Case, data: SceneData, model: str | None) -> NDArray[np.float64]:
     """Return the radius (n,) [m] of each of a case's points; equal for points at the same position."""
     stored, units = radius_class_archives.stored_radii(case.archive, model)
@@ -133,6 +139,9 @@ def judge(
             "upper is clear",
             said,
         )
+        if upper == 0:
+            pairs = naive_sweep.touching_pairs(*scan, avatar, radius, motion[0], margin)
+            assert named_pair(answers, i, arrays.origin, arrays.step) == min(pairs), said
         poses = [naive_sweep.pose_at(*motion, t) for t in (lower, upper)]
         far = max(float(np.abs(p[:3, 3] - arrays.origin).max()) for p in poses) + 1.0
         if answers.exact[i]:

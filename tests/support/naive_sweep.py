@@ -151,6 +151,38 @@ def ideal_pose(first: NDArray[np.float64], last: NDArray[np.float64], t: float) 
         return pose
 
 
+def touching_pairs(
+    points: NDArray[np.float64],
+    origin: ArrayLike,
+    step: float,
+    scan_radius: ArrayLike,
+    avatar: NDArray[np.float64],
+    avatar_radius: float,
+    pose: NDArray[np.float64],
+    margin: float = 0.0,
+) -> list[tuple[list[int], list[int]]]:
+    """Return all pairs in contact under a pose: scan points [lattice steps], avatar centres [exact units].
+
+    scan_radius: as in `touching`. A sweep from this pose names the least of them.
+    """
+    lattice = naive.lattice_of(points, origin, step)
+    b = naive.scan_units(lattice, step)
+    a = naive.placed_units(avatar, pose, origin)
+    radii = np.broadcast_to(np.rint(np.asarray(scan_radius) * naive.UNITS).astype(np.int64), len(b))
+    rows, own = np.nonzero(_near(a, b, naive.reach_units(pose, avatar_radius, 0.0, margin) + radii).T)
+    return list(zip(lattice[rows].tolist(), a[own].tolist(), strict=True))
+
+
+def _near(a: NDArray[np.int64], b: NDArray[np.int64], reach: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which pairs (m, n) of centres are within reach (n,), exact units."""
+    apart = np.abs(a[:, None] - b)
+    # A pair farther apart than its reach on one axis does not touch; the squares of all others fit
+    # into 63 bits.
+    near = (apart <= reach[:, None]).all(axis=2)
+    apart[~near] = 0
+    return near & ((apart * apart).sum(axis=2) <= reach * reach)
+
+
 def touching(
     points: NDArray[np.float64],
     origin: ArrayLike,
@@ -177,10 +209,5 @@ def touching(
     for t in np.asarray(fractions):
         pose = pose_at(first, last, float(t))
         reach = naive.reach_units(pose, avatar_radius, 0.0, margin) + radii
-        apart = np.abs(naive.placed_units(avatar, pose, np.zeros(3))[:, None] - b)
-        # A pair farther apart than its reach on one axis does not touch; the squares of all others
-        # fit into 63 bits.
-        near = (apart <= reach[:, None]).all(axis=2)
-        apart[~near] = 0
-        found.append(bool((near & ((apart * apart).sum(axis=2) <= reach * reach)).any()))
+        found.append(bool(_near(naive.placed_units(avatar, pose, np.zeros(3)), b, reach).any()))
     return np.array(found, bool)

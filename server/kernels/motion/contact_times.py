@@ -9,7 +9,7 @@ import numpy as np
 
 from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import lattice_to_units, pair_square, place
+from ..core.placed_avatar import lattice_to_units, pair_square, place, to_units
 from ..core.scene_arrays import LANES, point_class
 from ..core.voxels_in_reach import SIMILARITY_TOLERANCE
 from .screw_motion import pose_at
@@ -111,19 +111,27 @@ def scan_coordinate(scene, pair, r):
 
 @njit_no_refcount
 def _comes_first(sweep, pair, other):
-    """Return whether `pair` precedes `other`, which touches at the same moment.
+    """Return whether `pair` precedes `other`, which touches at the same moment (NUMERICS.md N11).
 
-    The scan point decides first, then the avatar's point.
+    The scan point decides first, then the avatar's centre at the beginning of the chord.
     """
     for r in range(3):
         one, two = scan_coordinate(sweep.scene, pair, r), scan_coordinate(sweep.scene, other, r)
         if one != two:
             return one < two
-    points = sweep.avatar.points
     for r in range(3):
-        if points[pair[0], r, pair[1]] != points[other[0], r, other[1]]:
-            return points[pair[0], r, pair[1]] < points[other[0], r, other[1]]
+        a, b = _placed_coordinate(sweep, pair, r), _placed_coordinate(sweep, other, r)
+        if a != b:
+            return a < b
     return False
+
+
+@njit_no_refcount
+def _placed_coordinate(sweep, pair, r):
+    """Return coordinate r of a pair's avatar point at the beginning of the chord, exact units."""
+    moving, points = sweep.moving, sweep.avatar.points
+    x, y, z = points[pair[0], 0, pair[1]], points[pair[0], 1, pair[1]], points[pair[0], 2, pair[1]]
+    return to_units(place(moving.ends[0], moving.shifts[0], r, x, y, z))
 
 
 @njit_no_refcount
@@ -152,6 +160,8 @@ def try_pair(sweep, chord, pair):
     """Update moving.first and moving.pair with one pair, in float64."""
     scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
     gap, displacement, first = moving.gap, moving.displacement, moving.first
+    if first[2] <= 0.0 and not _comes_first(sweep, pair, moving.pair):
+        return
     block, lane = pair[0], pair[1]
     x, y, z = points[block, 0, lane], points[block, 1, lane], points[block, 2, lane]
     for r in range(3):

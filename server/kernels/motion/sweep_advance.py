@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.placed_avatar import place
+from ..core.placed_avatar import place, to_units
 from ..core.scene_arrays import stopped
 from .contact_times import INFINITE, scan_coordinate, touches_at
 from .moving_avatar import AvatarSweep
@@ -29,8 +30,8 @@ def advance_segments(
     box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
     the way.  starts, rows: the voxels of each motion's segment that this piece holds.  tolerance:
     [m].  scratch: `make_scratch` of the avatar.
-    Lowers progress.lower and upper, sets a witness with upper, and adds to counts (4, k): voxels
-    missing, node visits, point tests, advances.
+    Lowers progress.lower and upper, sets a witness with upper, of equal ones the first by
+    NUMERICS.md N11, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
     A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
     it. Once the scene's stop flag is set, a motion is unknown from its current position on.
     """
@@ -43,7 +44,7 @@ def advance_segments(
             progress.lower[i] = min(progress.lower[i], progress.at[i])
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
-        t0, t1 = progress.at[i], min(progress.end[i], progress.upper[i])
+        t0, t1 = progress.at[i], progress.end[i]
         span = place_root_sphere(
             motion, t0, avatar, scales[i], units[i], scene, moving.pose, moving.shift, begin
         )
@@ -71,13 +72,14 @@ def advance_segments(
             np.float64(loose[i]),
         )
         size = avatar_size(box, scales[i], units[i])
-        lower, upper, steps = _advance(sweep, t0, t1, rows[starts[i] : starts[i + 1]], size, tolerance)
+        near = rows[starts[i] : starts[i + 1]]
+        lower, upper, steps = _advance(sweep, t0, t1, progress.upper[i], near, size, tolerance)
         if gap < INFINITE:
             lower = min(lower, max(t0, t0 + gap * (t1 - t0) - 2.0**-52))
         progress.lower[i] = min(progress.lower[i], lower)
-        if upper < progress.upper[i]:
+        if upper < INFINITE and upper <= progress.upper[i]:
+            _name_witness(sweep, upper, upper == progress.upper[i], progress.witness[i])
             progress.upper[i] = upper
-            _name_witness(sweep, upper, progress.witness[i])
         progress.visits[i] -= moving.counters[0]
         counts[1, i] += np.uint32(moving.counters[0])
         counts[2, i] += np.uint32(moving.counters[1])
@@ -85,12 +87,13 @@ def advance_segments(
 
 
 @njit_no_refcount
-def _advance(sweep, start, stop, rows, size, tolerance):
+def _advance(sweep, start, stop, known, rows, size, tolerance):
     """Advance one motion over [start, stop] through some voxels. Return (lower, upper, advances).
 
     Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
     was found. lower is `stop` when nothing touches in [start, stop]. A graze fixes lower; the part
-    after it is still searched for contacts.
+    after it is still searched for contacts. known: the earliest contact with other voxels, inf: none;
+    the search ends beyond it, and its intervals are the same without it.
 
     Each round searches [t, after]. `since` is the first fraction at which something may touch,
     `sure` one at which the integers confirm contact. If nothing may touch, t moves to `after` and
@@ -108,11 +111,16 @@ def _advance(sweep, start, stop, rows, size, tolerance):
         steps += 1
         whole, final = search(sweep, t, after, rows)
         earliest_possible, earliest_certain = moving.first[0], moving.first[1]
-        if earliest_possible == 0.0 and not final and t == 0.0 and not begun:
-            # It may touch at the start: the search ended at the first doubt.
-            begun = True
-            search(sweep, 0.0, 0.0, rows)
-            earliest_certain = moving.first[1]
+        if final and earliest_certain == 0.0 and after > t:
+            # The search ended at the first pair it met that touches at t.
+            search(sweep, t, t, rows)
+        elif earliest_possible == 0.0 and not final:
+            # It ended at the first pair it met that may touch at t: in another tree, another pair.
+            earliest_certain = INFINITE
+            if t == 0.0 and not begun:
+                begun = True
+                search(sweep, t, t, rows)
+                earliest_certain = moving.first[1]
         sure = INFINITE
         if earliest_certain < INFINITE:
             sure = after if earliest_certain >= 1.0 else min(after, t + earliest_certain * (after - t))
@@ -144,7 +152,7 @@ def _advance(sweep, start, stop, rows, size, tolerance):
         else:
             length = max(0.25 * (after - t), 2.0**-52)
             t, refused = since, refused + 1
-        if t >= stop:
+        if t >= stop or t > known:
             break
     for n in range(6):
         moving.pair[n] = best[n]
@@ -152,16 +160,25 @@ def _advance(sweep, start, stop, rows, size, tolerance):
 
 
 @njit_no_refcount
-def _name_witness(sweep, t, witness):
-    """Write the centres (2, 3) of moving.pair under M(t), world [m].
+def _name_witness(sweep, t, equal, witness):
+    """Write the centres (2, 3) of moving.pair under M(t), world [m]: the avatar's, then the scan's.
 
-    The avatar's centre as placed comes first, then the scan's.
+    equal: whether the pair in `witness` touches at the same moment. NUMERICS.md N11 then decides.
     """
     scene, moving, points = sweep.scene, sweep.moving, sweep.avatar.points
     pair = moving.pair
     pose_at(sweep.motion, t, moving.pose)
     x, y, z = points[pair[0], 0, pair[1]], points[pair[0], 1, pair[1]], points[pair[0], 2, pair[1]]
-    for r in range(3):
-        moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
-        witness[0, r] = place(moving.pose, moving.shift, r, x, y, z) + scene.origin[r]
-        witness[1, r] = np.float64(scan_coordinate(scene, pair, r)) * scene.step + scene.origin[r]
+    for n in (1, 0):
+        for r in range(3):
+            if n == 1:
+                value = np.float64(scan_coordinate(scene, pair, r)) * scene.step + scene.origin[r]
+            else:
+                moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
+                units = to_units(place(moving.pose, moving.shift, r, x, y, z))
+                value = np.float64(units) / UNITS_PER_METRE + scene.origin[r]
+            if equal:
+                if value > witness[n, r]:
+                    return
+                equal = value == witness[n, r]
+            witness[n, r] = value

@@ -29,7 +29,13 @@ by 32 half units in the last place of the chord.
 The resulting interval is halved and quartered until its ends are within the tolerance, or until B
 (t1 - t0)^2 / 8 is negligible beside rounding; what is undecided then is a graze. The pairs that are
 examined in float64 may differ from tree to tree. Their results do not, and the least result is
-taken: no tree, voxel or order therefore changes an answer.
+taken: no tree, voxel or order therefore changes an answer. A search that ends at the first pair that
+may touch where the interval begins decides only that one may.
+
+At a moment, an interval of length 0, the search names the first of the pairs in contact by
+NUMERICS.md N11. It visits nodes of lesser x first, and skips nodes whose points all follow. In a hall
+this takes 25 us more than a search that ends at the first contact (9 us), for a body of 8,000 points
+with 3,400 pairs in contact.
 """
 
 import math
@@ -51,7 +57,7 @@ from ..core.scene_arrays import (
     point_class,
     stopped,
 )
-from .contact_times import INFINITE, try_pair
+from .contact_times import INFINITE, scan_coordinate, try_pair
 from .moving_avatar import ZERO, AvatarChord, place_block, place_nodes
 from .screw_motion import pose_at
 
@@ -183,12 +189,38 @@ def _leaves(sweep, chord, voxel, block, row):
                 latest = _latest(moving)
 
 
+@njit_no_refcount
+def _least(words, row, r):
+    """Return a lower bound of coordinate r of a node's points, from the voxel's low corner [steps]."""
+    at = U(row)
+    half = words[at + U(4 + r)] if has_box(words, row) else words[at + U(3)]
+    return np.float64(words[at + U(r)]) - np.float64(half)
+
+
+@njit_no_refcount
+def _follows(sweep, chord, voxel, a, row):
+    """Return whether every pair of two nodes that touches follows moving.pair (NUMERICS.md N11)."""
+    scene, moving = sweep.scene, sweep.moving
+    x = scan_coordinate(scene, moving.pair, 0)
+    # A scan point that touches the avatar's node is within its radius and the reach; 1: rounding.
+    reach = np.float64(moving.nodes[3, a]) + chord.outer / scene.units_per_step + 1.0
+    if np.float64(moving.nodes[0, a]) - reach > np.float64(x - moving.frame[0]):
+        return True
+    for r in range(3):
+        named = scan_coordinate(scene, moving.pair, r) - scene.coordinates[voxel, r] * scene.voxel_steps
+        least = _least(scene.words, row, r)
+        if least != np.float64(named):
+            return least > np.float64(named)
+    return False
+
+
 @njit_inlined
 def _sweep_voxel(sweep, chord, voxel):
     """Update moving.first with one resident voxel by a joint descent, depth first.
 
     Returns whether to continue: not when nothing can be earlier, when the visits are spent, or when
-    the scene's stop flag is set.
+    the scene's stop flag is set. A chord of length 0 continues, and skips nodes whose points all
+    follow the best pair's.
     """
     avatar, scene, moving = sweep.avatar, sweep.scene, sweep.moving
     words, ints = scene.words, scene.ints
@@ -213,6 +245,8 @@ def _sweep_voxel(sweep, chord, voxel):
             return False
         depth -= 1
         a, row = stack[depth, 0], stack[depth, 1]
+        if moving.first[2] <= 0.0 and _follows(sweep, chord, voxel, a, row):
+            continue
         a_first, b_first = avatar.first[a], ints[U(row) + U(FIRST)]
         if a_first < 0 and b_first < 0:
             block = ~a_first
@@ -220,7 +254,7 @@ def _sweep_voxel(sweep, chord, voxel):
                 place_block(avatar, block, moving, scene)
                 moving.stamp[block] = counters[2]
             _leaves(sweep, chord, voxel, block, row)
-            if moving.first[2] <= 0.0:
+            if moving.first[2] <= 0.0 and chord.t1 > chord.t0:
                 return False
             latest = _latest(moving)
         elif b_first < 0 or (a_first >= 0 and nodes[3, a] > words[U(row) + U(3)]):
@@ -239,6 +273,7 @@ def _sweep_voxel(sweep, chord, voxel):
             dx, dy, dz, inverse = nodes[4, a], nodes[5, a], nodes[6, a], nodes[7, a]
             count = ints[U(row) + U(COUNT)] & COUNTED
             counters[0] += count
+            begin = depth
             for i in range(count):
                 child_row = base + (b_first + i) * ROW_WORDS
                 threshold = widest if mask == ONE_CLASS else thresholds[node_class(ints, child_row, mask)]
@@ -247,6 +282,10 @@ def _sweep_voxel(sweep, chord, voxel):
                 ):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
+            if chord.t0 == chord.t1:  # the node with the least x first
+                for at in range(begin, depth - 1):
+                    if _least(words, stack[at, 1], 0) < _least(words, stack[depth - 1, 1], 0):
+                        stack[at, 1], stack[depth - 1, 1] = stack[depth - 1, 1], stack[at, 1]
     return True
 
 
@@ -254,8 +293,9 @@ def _sweep_voxel(sweep, chord, voxel):
 def search(sweep, t0, t1, rows):
     """Descend once over the interval [t0, t1], through those voxels of `rows` that are resident.
 
-    Fills moving.first and moving.pair. Returns (whether the search was complete, whether halving
-    the interval is useless).
+    Fills moving.first and moving.pair. With t0 < t1 the search ends at the first pair found that
+    may touch at t0; with t0 = t1 it finds the first of these pairs by NUMERICS.md N11. Returns
+    (whether the search was complete, whether halving the interval is useless).
     """
     motion, scene, moving = sweep.motion, sweep.scene, sweep.moving
     pose_at(motion, t0, moving.ends[0])

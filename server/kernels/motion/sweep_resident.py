@@ -7,7 +7,6 @@ costs another call.
 
 import numpy as np
 
-from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.kernel_decorators import njit_no_refcount
@@ -124,8 +123,8 @@ def sweep_resident(
     if upper < np.inf:
         verdict = _CONTACT
         for r in range(3):
-            own = np.rint(progress.witness[0, 0, r] * UNITS_PER_METRE) / UNITS_PER_METRE
-            result[AVATAR + r], result[CLOUD + r] = own + origin[r], progress.witness[0, 1, r] + origin[r]
+            result[AVATAR + r] = progress.witness[0, 0, r] + origin[r]
+            result[CLOUD + r] = progress.witness[0, 1, r] + origin[r]
         if skin >= 0.0:
             _end_motion(pose_from, pose_to, box, avatar, origin, proved, skin, one, result)
     return needed, verdict, np.int64(counts[1, 0]), np.int64(counts[2, 0]), np.int64(counts[3, 0])

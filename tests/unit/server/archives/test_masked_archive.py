@@ -138,26 +138,6 @@ def test_a_voxel_left_empty_is_gone_and_clear(whole: Path) -> None:
         scene.residency.check()
 
 
-def test_a_box_beside_everything_changes_no_byte(whole: Path, rng: np.random.Generator) -> None:
-    outside = ThroughBox("outside", (2.0 + STEP, -9.0, -9.0), (9.0, 9.0, 9.0))
-    # Between two lattice planes: it meets voxels, and holds no point.
-    between = ThroughBox("between", (0.5 + STEP / 4, 0.0, 0.0), (0.5 + STEP / 2, 2.0, 2.0))
-    poses = poses_near(rng, 6)
-    with (
-        MaskedArchive(whole, [(b.low, b.high) for b in (outside, between)]) as found,
-        Archive(whole) as before,
-    ):
-        assert found.voxels.tobytes() == before.voxels.tobytes()
-        frames = [
-            [archive.read_frames(row) for row in range(len(before.voxels))] for archive in (found, before)
-        ]
-        assert frames[0] == frames[1]
-    with open_without(whole, outside, between) as scene, Scene.open(whole, "hall") as expected:
-        assert scene.info() == expected.info()
-        for answer, right in zip(ask_all(scene, poses, None), ask_all(expected, poses, None), strict=True):
-            assert_same_answers(answer, right)
-
-
 @pytest.mark.interpreted
 def test_scan_intensity_and_class_of_the_points_that_stay_are_what_they_were(whole: Path) -> None:
     def stored(archive: Archive) -> list[tuple[Any, ...]]:
@@ -185,25 +165,6 @@ def test_a_reload_keeps_the_boxes(whole: Path, rng: np.random.Generator) -> None
         assert scene.reload().generation_after == 0
         for again, before in zip(ask_all(scene, poses, None), first, strict=True):
             assert_same_answers(again, before)
-
-
-def test_a_small_cache_answers_the_same(whole: Path, rng: np.random.Generator) -> None:
-    poses = poses_near(rng, 8)
-    with open_without(whole, DOOR, ROOM) as scene:
-        largest, expected = (
-            int(scene.archives[0]._opened.store.sizes.max()),
-            list(ask_all(scene, poses, None)),
-        )
-    for policy, budget in (
-        ("lru", largest + 4096),
-        ("lru+prefetch", largest + 4096),
-        ("lru+prefetch", 64 << 20),
-    ):
-        with open_without(whole, DOOR, ROOM, budget_bytes=budget, policy=policy) as scene:
-            found = list(ask_all(scene, poses, None))
-        # The work depends on what fits at a time, and with it what a budget of visits leaves undone.
-        for answer, right in zip(found[:-1], expected[:-1], strict=True):
-            assert_same_answers(answer, right, ("node_visits", "point_tests", "steps"))
 
 
 @pytest.mark.interpreted

@@ -218,28 +218,6 @@ def test_any_rigid_pose_is_within_a_micrometre(built: Built, rng: np.random.Gene
         assert (cloud >= low - 1e-9).all() and (cloud <= high + 1e-9).all()
 
 
-def test_a_budget_of_visits_is_for_all_archives_together(
-    both: Scene, whole: Scene, built: Built, rng: np.random.Generator
-) -> None:
-    poses = near(rng, np.vstack(built.points), 30)
-    truth = whole.collide("al", poses).verdict
-    clear = np.zeros(len(poses), bool)
-    for budget in (0, 20, 100, 400, 1 << 40):
-        found = both.collide("al", poses, budget_visits=budget, tolerance=1e-4)
-        assert (found.node_visits <= budget + 8).all()
-        assert (truth[found.verdict == 0] == 0).all(), "never clear by mistake"
-        assert (found.verdict[clear] == 0).all(), "what was clear stays clear"
-        clear = found.verdict == 0
-        assert (found.lower <= found.upper).all()
-        distance = both.distance("al", poses, 0.2, budget_visits=budget)
-        true = whole.distance("al", poses, 0.2)
-        assert (distance.lower <= np.minimum(true.signed_distance, 0.2) + 1e-12).all()
-        assert (distance.upper >= true.signed_distance - 1e-12)[np.isfinite(true.signed_distance)].all()
-        same = distance.signed_distance == true.signed_distance
-        assert same[distance.exact].all()
-    assert found.verdict.tolist() == truth.tolist() and found.exact.all() and distance.exact.all()
-
-
 def test_objects_meet_every_archive_and_one_another_once(
     both: Scene, whole: Scene, built: Built, rng: np.random.Generator
 ) -> None:

@@ -175,19 +175,6 @@ def test_open_meshes_say_that_they_are_surfaces() -> None:
     assert np.abs(inner).max() <= 0.5
 
 
-def test_the_order_of_triangles_and_corners_changes_nothing(rng: np.random.Generator) -> None:
-    triangles = of(TORUS)
-    turned = np.roll(triangles, 1, axis=1)[rng.permutation(len(triangles))]
-    for first, second in zip(shape_of(triangles)[:2], shape_of(turned)[:2], strict=True):
-        assert len(first) == len(second) and cKDTree(first).query(second)[0].max() < 1e-9
-
-
-def test_the_default_radius_fills_a_cube_and_a_ball_with_some_ten_thousand_points() -> None:
-    for triangles in (box(1.0), of(trimesh.creation.icosphere(4))):
-        surface, inner, _, _ = shape_of(triangles)
-        assert 40_000 < len(surface) + len(inner) < 61_000
-
-
 def test_too_many_points_offer_a_hollow_mesh_or_a_larger_radius(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(
         TooLargeError, match=r"more than 1000000 points .* give `hollow`.* or a larger radius"

@@ -16,7 +16,6 @@ from solidcloud.server.clash.clash_check import Watcher, check_path
 from solidcloud.server.clash.clash_snapshot import draw
 from solidcloud.server.clash.clash_surroundings import surroundings
 from solidcloud.server.clash.clash_viewpoint import find_viewpoint
-from solidcloud.server.clash.path_motions import poses_between
 from solidcloud.server.scene import Scene
 
 RADIUS = 0.05
@@ -261,24 +260,6 @@ def test_clearance_is_at_most_the_least_distance_on_the_motions(case: archive_ca
     clear = checked.motions.verdict == Verdict.CLEAR
     assert (checked.motions.clearance[clear] <= np.array(least)[clear]).all()
     assert (checked.motions.clearance[clear] > 0.3 * np.array(least)[clear] - 2e-3).all()
-
-
-def test_poses_on_a_motion_are_those_of_the_sweep() -> None:
-    rng = np.random.default_rng(3)
-    for case in range(200):
-        first, last = (
-            archive_cases.pose_of(archive_cases.random_rotation(rng), rng.normal(size=3)) for _ in range(2)
-        )
-        if case % 4 == 0:
-            last[:3, :3] = first[:3, :3]
-        elif case % 4 == 1:
-            # Half a turn about a random axis: rounding decides about which side it goes.
-            axis = rng.normal(size=3)
-            last[:3, :3] = (2 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)) @ first[:3, :3]
-        fractions = np.array([0.0, 1e-3, 0.4, 1.0])
-        found = poses_between(first[None], last[None], fractions[None])[0]
-        expected = np.array([pose_at(first, last, t) for t in fractions])
-        assert np.allclose(found, expected, atol=1e-12)
 
 
 def test_unknown_motion_makes_a_stretch_unknown(

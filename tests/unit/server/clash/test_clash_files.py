@@ -209,21 +209,3 @@ def test_same_clashes_give_the_same_bytes(checked: CheckedPath) -> None:
     assert one == other
     later = bcf_bytes(checked, topics(checked), "hall", "tour.csv", datetime(2026, 3, 2, tzinfo=UTC))
     assert one != later
-
-
-def test_picture_shows_the_nearest_point_where_the_camera_sees_it() -> None:
-    colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
-    ahead, right = VIEW.direction, np.cross(VIEW.direction, VIEW.up)
-    right /= np.linalg.norm(right)
-    # Behind one another in the middle, in either order; the third to the right, 45 degrees of width.
-    points = np.stack([VIEW.eye + 2 * ahead, VIEW.eye + 3 * ahead, VIEW.eye + 2 * ahead + 0.5 * right])
-    for order in ([0, 1, 2], [1, 2, 0]):
-        picture = draw(VIEW, [Cloud(points[order], colours[order], 0.02)], (200, 100))
-        decoded = np.asarray(Image.open(io.BytesIO(png_bytes(picture))))
-        assert np.array_equal(decoded, picture)
-        assert np.argmax(picture[50, 100]) == 0
-        scale = 100 / (2 * np.tan(np.radians(30)))
-        assert np.argmax(picture[50, 100 + round(scale * 0.5 / 2)]) == 2
-        assert not ((picture[..., 1] > 200) & (picture[..., 0] < 50)).any()
-    behind = draw(VIEW, [Cloud(VIEW.eye[None] - ahead, colours[:1], 0.5)], (20, 10))
-    assert len(np.unique(behind.reshape(-1, 3), axis=0)) == 1

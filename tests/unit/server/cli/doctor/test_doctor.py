@@ -4,7 +4,6 @@ import json
 import os
 import resource
 import subprocess
-import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -70,20 +69,6 @@ def test_a_fault_says_what_to_do_and_is_the_exit_code(
 
 
 @pytest.mark.interpreted
-def test_the_kernel_cache_is_counted_and_left_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    (empty,) = check_kernel_cache()
-    assert empty.status is Status.OK and "no kernel compiled yet" in empty.text
-    folder = tmp_path / "solidcloud-kernels"
-    (folder / "a.kernel").write_bytes(bytes(2048))
-    (one,) = check_kernel_cache()
-    assert "1 compiled kernels, 2.0 kB" in one.text and str(folder) in one.text
-    assert [path.name for path in folder.iterdir()] == ["a.kernel"]
-
-
-@pytest.mark.interpreted
 def test_a_kernel_cache_that_others_may_write_is_a_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,23 +77,6 @@ def test_a_kernel_cache_that_others_may_write_is_a_fault(
     (tmp_path / "solidcloud-kernels").chmod(0o777)
     (found,) = check_kernel_cache()
     assert found.status is Status.FAULT and "mode 777" in found.text and found.advice.startswith("set NUMBA")
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize(
-    ("version", "wanted", "fits"),
-    [
-        ("0.68.1", ">=0.68,<0.69", True),
-        ("0.69.0", "<0.69,>=0.68", False),
-        ("0.67.9", ">=0.68,<0.69", False),
-        ("2.1", ">=2.1.0", True),
-        ("14.0.0rc1", ">=14", True),
-        ("3.9", ">=3.16", False),
-        ("1.0", "", True),
-    ],
-)
-def test_versions_are_compared(version: str, wanted: str, fits: bool) -> None:
-    assert installation_checks._fits(version, wanted) == fits
 
 
 @pytest.mark.interpreted
@@ -134,14 +102,6 @@ def test_an_extra_that_is_missing_is_a_note(monkeypatch: pytest.MonkeyPatch) -> 
     found = by_name(installation_checks.check_extras())["extra readers"]
     assert found.status is Status.NOTE and "not installed: pye57" in found.text
     assert found.advice == "pip install 'solidcloud[readers]'"
-
-
-@pytest.mark.interpreted
-def test_every_extra_is_known() -> None:
-    declared = metadata.metadata("solidcloud").get_all("Provides-Extra") or []
-    assert set(installation_checks.EXTRAS) == set(declared) - {"test", "dev"}
-    required = installation_checks.requirements()
-    assert all(required[extra] for extra in ("", *installation_checks.EXTRAS))
 
 
 @pytest.mark.interpreted
@@ -196,16 +156,6 @@ def test_a_check_that_fails_is_a_fault_and_the_others_follow(monkeypatch: pytest
     assert first == Check("moon", Status.FAULT, "the check failed: OSError: out of reach") and others
 
 
-@pytest.mark.interpreted
-def test_no_temporary_folder_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none() -> str:
-        raise FileNotFoundError(2, "No usable temporary directory found")
-
-    monkeypatch.setattr(tempfile, "gettempdir", none)
-    (found,) = machine_checks.check_temporary_folder()
-    assert found.status is Status.FAULT and found.advice.startswith("set TMPDIR")
-
-
 def answer(**changes: Any) -> str:
     sound = {"first_seconds": 1.0, "seconds": 0.9, "points": 9, "poses": 5, "contacts": 2, "wrong": []}
     return json.dumps({**sound, **changes}) + "\n"
@@ -231,22 +181,6 @@ def test_the_self_test_is_judged(
     (found,) = self_test_run.check_self_test()
     assert found.status == status and said in found.text
     assert ("remove the compiled kernels" in found.advice) == (status == "fault")
-
-
-@pytest.mark.interpreted
-def test_the_time_of_compilation_is_shown_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = tmp_path / "solidcloud-kernels"
-    folder.mkdir()
-
-    def compiles(*_: Any, **__: Any) -> Any:
-        (folder / "new.kernel").touch()
-        return subprocess.CompletedProcess([], 0, answer(first_seconds=42.9), "")
-
-    monkeypatch.setattr(self_test_run.subprocess, "run", compiles)
-    test, compilation = self_test_run.check_self_test()
-    assert test.status is Status.OK and compilation.status is Status.NOTE
-    assert "compiled 1 kernels, which are kept: 42 s" in compilation.text
 
 
 @pytest.mark.interpreted

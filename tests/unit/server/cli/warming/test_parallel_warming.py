@@ -7,10 +7,8 @@ from typing import Any
 
 import pytest
 from solidcloud.schemas.kernels import compiling
-from solidcloud.schemas.wire.warming_parts import PARTS
 from solidcloud.server.cli.warming import parallel_warming
-from solidcloud.server.cli.warming.parallel_warming import main, warmed_in_parallel
-from solidcloud.server.scene import Scene
+from solidcloud.server.cli.warming.parallel_warming import warmed_in_parallel
 
 ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
 
@@ -44,19 +42,3 @@ def test_one_child_compiles_and_is_gone_at_the_end(started: list[subprocess.Pope
         assert len(started) == 1 and started[0].returncode is None
     assert started[0].returncode is not None
     assert str(ARCHIVE) in started[0].args  # type: ignore[operator]
-
-
-def test_one_processor_compiles_alone(
-    started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
-    with warmed_in_parallel(ARCHIVE):
-        compiling._progress.begin()
-    assert not started
-
-
-def test_the_child_warms_all_parts_last_ones_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    warmed: list[str] = []
-    monkeypatch.setattr(Scene, "warm", lambda scene, *parts: warmed.extend(parts))
-    main(str(ARCHIVE))
-    assert warmed == list(reversed(PARTS))

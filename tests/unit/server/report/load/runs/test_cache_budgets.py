@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.report.load.runs.cache_budgets import checked_shares, fits_memory, least_share
+from solidcloud.server.report.load.runs.cache_budgets import checked_shares, least_share
 from solidcloud.server.report.load.users.archive_voxels import Voxels
 
 USUAL = (0.03, 0.05, 0.1, 0.2, 0.4)
@@ -12,10 +12,6 @@ USUAL = (0.03, 0.05, 0.1, 0.2, 0.4)
 def voxels(*sizes: int) -> Voxels:
     count = len(sizes)
     return Voxels(np.arange(count, dtype=np.uint64), np.zeros((count, 2, 3)), np.array(sizes), 0.01)
-
-
-def test_usual_budgets_are_kept_where_the_archive_allows_them() -> None:
-    assert checked_shares(USUAL, None, voxels(*[10] * 100), "--budgets") == (list(USUAL), "")
 
 
 def test_usual_budgets_are_raised_to_the_largest_voxel() -> None:
@@ -32,11 +28,3 @@ def test_usual_budgets_are_raised_to_the_largest_voxel() -> None:
 def test_a_given_budget_that_is_too_small_is_refused(share: float) -> None:
     with pytest.raises(BadRequestError, match="--budget"):
         checked_shares([0.1], [share], voxels(*[10] * 85, 150), "--budget")
-
-
-def test_a_given_budget_is_kept() -> None:
-    assert checked_shares([0.1], [0.7], voxels(*[10] * 85, 150), "--budget") == ([0.7], "")
-
-
-def test_memory() -> None:
-    assert fits_memory(1 << 20) and not fits_memory(1 << 60)

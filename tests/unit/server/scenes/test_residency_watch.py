@@ -7,9 +7,8 @@ import archive_cases
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.residency_messages import MAX_CHANGED_VOXELS, Residency, ResidencyChanges
+from solidcloud.schemas.wire.residency_messages import Residency, ResidencyChanges
 from solidcloud.server.residency import change_log
-from solidcloud.server.residency.change_log import ChangeLog
 from solidcloud.server.scene import Scene
 
 AVATAR = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
@@ -80,14 +79,6 @@ def test_changes_follow_the_cache(case: archive_cases.Case) -> None:
         assert not scene.residency._states.logs, "nothing is collected without a reader"
 
 
-def test_without_changes_nothing_is_said(case: archive_cases.Case) -> None:
-    with opened(case) as scene, scene.residency_changes() as changes:
-        assert changes.take() is not None
-        assert changes.take() is None
-        silent = next(iter(changes))  # within half a second
-        assert not len(silent.voxel) and silent.seq == 2 and not silent.lost
-
-
 def test_prefetched_and_wasted_voxels_are_told_apart(case: archive_cases.Case) -> None:
     with opened(case) as scene, scene.residency_changes() as changes:
         cache = scene.residency
@@ -108,16 +99,6 @@ def test_prefetched_and_wasted_voxels_are_told_apart(case: archive_cases.Case) -
             (message.voxel == generation.store.archive.coordinates[row]).all(axis=1)
         ].tolist()
         assert states == ([Residency.WASTED] if cache.stats.wasted else [])
-
-
-def test_a_log_is_bounded() -> None:
-    log = ChangeLog()
-    for row in range(MAX_CHANGED_VOXELS + 5):
-        log.add(row, Residency.LOADED)
-    log.add(3, Residency.EVICTED)
-    changes, overflowed = log.take()
-    assert len(changes) == MAX_CHANGED_VOXELS and overflowed and changes[3] == Residency.EVICTED
-    assert log.take() == ({}, False)
 
 
 def test_changes_beyond_the_limit_are_said_to_be_lost(

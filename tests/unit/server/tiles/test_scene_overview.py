@@ -11,14 +11,11 @@ import pytest
 from coloured_scans import coloured, write_las
 from scipy.spatial import cKDTree
 from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.edit.seal_archive import seal_archive
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.overview_messages import MAX_OVERVIEW_POINTS, OverviewAnswer
-from solidcloud.schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from solidcloud.server.scene import Scene
 from solidcloud.server.tiles import scene_overview
 
@@ -74,23 +71,6 @@ def test_no_record_is_read_beside_a_preview(
     with Scene.open(case.archive) as scene:
         monkeypatch.setattr(Archive, "_read_frame", None)
         assert len(scene.overview(50).points) == 50
-
-
-def test_the_preview_of_a_sealed_archive_is_not_trusted(case: archive_cases.Case, tmp_path: Path) -> None:
-    folder, key = copied(case, tmp_path), tmp_path / "key"
-    key.write_bytes(KEY)
-    seal_archive(folder, KEY)
-    with Scene.open(folder, archive_key=key) as scene:
-        assert scene.overview(50).previewed.tolist() == [False]
-    with Scene.open(folder) as scene:
-        assert scene.overview(50).previewed.tolist() == [True]
-
-
-def test_few_points_of_an_overview_are_spread(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        some = world(scene.overview(2000))
-    octants = (some > 0) @ [1, 2, 4]
-    assert np.bincount(octants, minlength=8).min() > 150
 
 
 @pytest.mark.parametrize("fault", ["missing", "cut", "stamp", "large", "deflate", "nan"])
@@ -169,17 +149,6 @@ def test_archives_share_the_limit_by_their_points(case: archive_cases.Case, tmp_
     assert apart.max() < 4e-4
 
 
-def test_points_that_a_scene_passes_through_are_not_shown(case: archive_cases.Case, tmp_path: Path) -> None:
-    file = tmp_path / "scene.toml"
-    box = '{name = "all of one side", low = [-9.0, -9.0, -9.0], high = [0.0, 9.0, 9.0]}'
-    effects = f'[[effects]]\neffect = "stop"\n[[effects]]\neffect = "through"\nboxes = [{box}]\n'
-    file.write_text(f'format = 1\n[[archives]]\npath = "{case.archive}"\n{effects}')
-    with Scene.open(file) as scene:
-        found = scene.overview()
-    assert found.previewed[0] and len(found.points) > COUNT // 4
-    assert world(found)[:, 0].min() > -1e-3
-
-
 @pytest.mark.parametrize("is_previewed", [True, False])
 def test_columns_are_those_of_the_points(tmp_path: Path, is_previewed: bool) -> None:
     truth = coloured(5)
@@ -211,25 +180,3 @@ def test_a_limit_out_of_range_is_refused(case: archive_cases.Case) -> None:
         for limit in (0, -1, MAX_OVERVIEW_POINTS + 1):
             with pytest.raises(BadRequestError, match="limit"):
                 scene.overview(limit)
-
-
-@pytest.mark.parametrize("encoding", [JSON, MSGPACK])
-def test_the_largest_overview_fits_in_a_message(encoding: str) -> None:
-    n = MAX_OVERVIEW_POINTS
-    rng = np.random.default_rng(4)
-    one, three = np.zeros((1, 3)), rng.random((n, 3), np.float32) * np.float32(1e5)
-    columns = (
-        np.full((n, 3), 255, np.uint8),
-        (rng.random(n) * 1e-7).astype(np.float32),
-        np.full(n, 255, np.uint8),
-        np.full(n, 65535, np.uint16),
-    )
-    counts = np.array([n]), np.array([1]), np.array([1])
-    found = OverviewAnswer(
-        n, 0.01, ["rgb"], (0.0, 1.0), [], np.eye(4)[None], np.ones(1), one, one,
-        counts[0].astype("u8"), counts[1].astype("u4"), counts[2].astype("u4"),
-        np.array([0, n], np.uint32), np.ones(1, bool), three, *columns,
-    )  # fmt: skip
-    payload = encode(found, encoding)
-    assert len(payload) < MAX_MESSAGE_BYTES - (1 << 16)
-    np.testing.assert_array_equal(decode_answer(OverviewAnswer, payload, encoding).points, three)

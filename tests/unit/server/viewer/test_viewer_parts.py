@@ -16,11 +16,3 @@ def test_others_see_a_user_from_its_first_state_until_it_leaves() -> None:
     assert [place.tolist() for place in users.places(one)] == [[1.0, 2.0, 3.0]]
     users.leave(other)
     assert users.others(one) == []
-
-
-def test_least_free_number_is_used_again() -> None:
-    users = Users()
-    assert [users.enter() for _ in range(3)] == [1, 2, 3]
-    users.free(2)
-    assert users.enter() == 2
-    assert users.enter() == 4

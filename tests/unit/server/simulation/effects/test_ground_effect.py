@@ -83,18 +83,6 @@ def test_no_fall_is_so_fast_that_it_passes_a_floor(level: archive_cases.Case, sp
 
 
 @pytest.mark.interpreted
-def test_up_and_down_are_nobodys_wish(level: archive_cases.Case) -> None:
-    with play(level.archive, *ALL) as game:
-        body = game.body(PERSON, at(0, 0, 0.2))
-        settled(game, body)
-        height = body.pose[2, 3]
-        for way in ((0.05, 0, 0.5), (-0.05, 0, -0.5)):
-            game.go(body, way)
-            assert abs(body.pose[2, 3] - height) < DIPS + 1e-3 and body.on_ground
-        assert abs(body.pose[0, 3]) < 1e-12
-
-
-@pytest.mark.interpreted
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 2, 2)])
 def test_up_may_be_any_direction(tmp_path: Path, up: tuple[float, float, float]) -> None:
     unit = np.array(up) / np.linalg.norm(up)
@@ -283,11 +271,3 @@ def test_nobody_falls_into_what_cannot_be_read(tmp_path: Path) -> None:
         assert moved.verdict == Verdict.UNKNOWN and body.pose[2, 3] > 0.0 and body.fall_speed == 0.0
         assert any(touched.unknown for touched in moved.touched)
         assert game.world.collide(PERSON, body.pose) == Verdict.CLEAR
-
-
-@pytest.mark.interpreted
-def test_a_frame_of_no_time_moves_nobody_down(level: archive_cases.Case) -> None:
-    with play(level.archive, *ALL) as game:
-        body = game.body(PERSON, at(0, 0, 1.0))
-        game.go(body, (0, 0, 0), seconds=0.0)
-        np.testing.assert_array_equal(body.pose, at(0, 0, 1.0))

@@ -16,7 +16,6 @@ from solidcloud.server.kernels.walk.slide_planes import clip_displacement
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2
-SKIN = Stop().skin
 FRAMES = 20 if not INTERPRETED else 8
 X, Y, Z = np.eye(3)
 
@@ -158,16 +157,6 @@ def test_clipped_ways_are_free_never_longer_and_never_against_the_wish(rng: np.r
         if way is not None:
             assert np.linalg.norm(way) <= np.linalg.norm(left) * (1 + 1e-12)
             assert way @ left >= -1e-12 and all(way @ plane >= -1e-8 for plane in planes)
-
-
-@pytest.mark.interpreted
-def test_points_too_few_for_a_surface_stop_however_far_their_neighbours_may_be(tmp_path: Path) -> None:
-    """Where nothing near makes a surface what is farther is looked at, never farther than normals may reach."""
-    case = effect_rooms.build(tmp_path, np.array([[0.0, 0, 0], [3.0, 0, 0], [0, 3.0, 0]]))
-    with play(case.archive, Stop(), Sweep(), Slide(normal_reach=0.5)) as game:
-        body = game.body(make_avatar([[0.0, 0, 0]], 0.2), at(0.01, 0.02, 0.5))
-        moved = game.go(body, (0.05, 0, -0.5))
-        assert moved.touched and not game.touches(body)
 
 
 def test_a_filled_mesh_passes_a_free_edge_as_a_hollow_one_does_issue_35(tmp_path: Path) -> None:

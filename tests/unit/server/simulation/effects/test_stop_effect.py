@@ -55,14 +55,6 @@ def test_a_motion_ends_a_skin_before_what_it_meets(wall: archive_cases.Case, ski
         assert body.pose.tobytes() == before
 
 
-def test_grazing_a_wall_keeps_the_skin_as_far_as_a_way_back_of_four(wall: archive_cases.Case) -> None:
-    with play(wall.archive, Stop(skin=0.01), Sweep()) as game:
-        body = game.body(BALL, at(-TOUCH - 0.05, -0.6, 0))
-        game.go(body, (0.2, 0.4, 0))
-        clear = -body.pose[0, 3] - TOUCH
-        assert 0.005 < clear < 0.03 and not game.touches(body)
-
-
 @pytest.mark.interpreted
 def test_far_from_the_origin_nobody_ends_in_contact(tmp_path: Path, rng: np.random.Generator) -> None:
     far = np.array([5e5, 5.6e6, 300.0])

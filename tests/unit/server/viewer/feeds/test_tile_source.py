@@ -86,9 +86,3 @@ def test_tile_is_read_once_and_the_oldest_is_dropped_beyond_the_budget() -> None
     assert reader.asked == 3  # 0 was used again, so that 1 was dropped for 2
     source.tile((0, 1, 0, 0, 0))
     assert reader.asked == 4
-
-
-def test_nothing_is_read_without_a_scene() -> None:
-    source = TileSource(lambda: None)
-    assert source.tile((0, 0, 0, 0, 0)) is None
-    assert source.voxels((0.0, 0.0, 0.0)) is None

@@ -122,12 +122,6 @@ def test_the_port_is_free_again_after_and_taken_meanwhile() -> None:
         assert again == where and text_of(again)
 
 
-def test_others_reach_the_metrics_only_where_that_is_said() -> None:
-    assert ServerConfig().metrics_port == 0
-    assert ServerConfig(metrics_port=9100).metrics_host == "127.0.0.1"
-    assert ServerConfig(metrics_port=9100, insecure=True).metrics_host == "0.0.0.0"
-
-
 @pytest.mark.parametrize("port", [-1, 65536])
 def test_a_port_that_is_none_is_refused(port: int) -> None:
     with pytest.raises(BadRequestError, match="--metrics-port"):

@@ -12,7 +12,7 @@ from solidcloud.schemas.wire.answers import CollideAnswers
 from solidcloud.schemas.wire.key_expressions import public_id
 from solidcloud.schemas.wire.stats import TIME_BOUNDS, Times, UserStats
 from solidcloud.server.observability import request_stats as stats_module
-from solidcloud.server.observability.request_stats import BOUNDS, Histogram, RequestStats
+from solidcloud.server.observability.request_stats import Histogram, RequestStats
 
 
 class Clock:
@@ -47,14 +47,6 @@ def filled(values: Any) -> Histogram:
     return histogram
 
 
-def test_buckets_are_about_a_tenth_wide_and_round_numbers_are_ends() -> None:
-    assert BOUNDS[0] == 1e-6 and BOUNDS[-1] == 100.0
-    widths = np.array(BOUNDS[1:]) / BOUNDS[:-1]
-    assert widths.min() > 1.09 and widths.max() < 1.105
-    assert set(TIME_BOUNDS) <= set(BOUNDS)
-    assert {1e-6, 2e-6, 5e-6, 0.001, 0.5, 20.0, 100.0} <= set(TIME_BOUNDS) and len(TIME_BOUNDS) == 25
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_percentiles_are_those_of_all_up_to_a_tenth(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -64,12 +56,6 @@ def test_percentiles_are_those_of_all_up_to_a_tenth(seed: int) -> None:
     for share, seconds in zip(shares, found, strict=True):
         true = values[math.ceil(share * len(values)) - 1]
         assert true <= seconds <= true * 1.105, (seed, share)
-
-
-def test_what_takes_longer_than_all_bounds_is_counted_too() -> None:
-    histogram = filled([1000.0, 2000.0, 0.001])
-    assert histogram.percentiles(0.3, 0.5, 1.0) == [0.001, 2000.0, 2000.0]
-    assert histogram.times().buckets[-1] == 2 and histogram.times().max == 2000.0
 
 
 def test_the_buckets_of_stats_count_up_to_their_ends() -> None:

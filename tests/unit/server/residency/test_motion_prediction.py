@@ -5,11 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
-from solidcloud.server.kernels.prediction.user_tracks import STALE, merge_wanted
+from solidcloud.server.kernels.prediction.user_tracks import STALE
 from solidcloud.server.residency.motion_prediction import (
-    EXPIRY,
-    INITIAL_USERS,
-    MAX_USERS,
     PREFETCH_OPTIONS,
     PredictedVoxels,
     UserTracks,
@@ -121,12 +118,6 @@ def test_who_turns_wants_what_is_round_the_corner() -> None:
     assert not any(x >= 3 for x, _ in wanted), "where it was heading a moment ago is wanted no more"
 
 
-def test_who_stops_wants_nothing_ahead_any_more() -> None:
-    around = make(NO_RING)
-    now = walk(around, np.concatenate([straight(3.0), np.tile(straight(3.0)[-1], (20, 1))]))
-    assert cells(around.plan(now, 0.5).rows) == touched(*straight(3.0)[-1], REACH)
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_jitter_changes_little(seed: int) -> None:
     """A centimetre of place, ten milliseconds of clock: what will be touched in a second is wanted all the same."""
@@ -184,48 +175,3 @@ def test_who_leaves_is_forgotten() -> None:
     assert around.users == [other]
     around.expire(11.0, 10.0)
     assert around.users == [] and len(around.plan(11.0, 0.1).rows) == 0 and around.kept(11.0).tolist() == []
-
-
-def test_what_users_can_touch_is_kept_each_once() -> None:
-    around = make()
-    around.record_pose(ME, 0.0, at(2.0, 2.0), REACH)
-    around.record_pose(YOU, 5.0, at(3.0, 3.0), 1.2)
-    kept = around.kept(5.0)
-    assert cells(kept) == touched(2.0, 2.0, REACH) | touched(3.0, 3.0, 1.2)
-    assert len(set(kept.tolist())) == len(kept)
-    around.record_pose(YOU, 5.1, at(3.0, 3.0), REACH)
-    assert cells(around.kept(5.1)) == touched(2.0, 2.0, REACH) | touched(3.0, 3.0, REACH), (
-        "its reach is the last one's"
-    )
-    around.record_pose(YOU, 5.2, at(3.0, 3.0), 1.2)
-    assert cells(around.kept(EXPIRY + 1.0)) == touched(3.0, 3.0, 1.2), "not what is not heard of any more"
-
-
-def test_of_too_many_users_the_one_not_heard_of_for_longest_is_forgotten(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert MAX_USERS >= INITIAL_USERS
-    monkeypatch.setattr("solidcloud.server.residency.motion_prediction.MAX_USERS", 3)
-    around = make()
-    users = [("client", str(number)) for number in range(5)]
-    for when, number in enumerate((0, 1, 2, 0, 3, 4)):
-        around.record_pose(users[number], float(when), at(2.0 * number, 0.0), REACH)
-    assert around.users == [users[0], users[3], users[4]]
-    assert cells(around.kept(5.0)) == set().union(*(touched(x, 0.0, REACH) for x in (0.0, 6.0, 8.0)))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_what_several_want_is_wanted_once_and_when_the_first_needs_it(seed: int) -> None:
-    """Against a dict."""
-    rng = np.random.default_rng(seed)
-    for count in (0, 1, 7, 300):
-        rows = rng.integers(0, rng.choice([5, 100, 1 << 31]), count)
-        need = rng.integers(0, 20, count) / 4
-        first: dict[int, float] = {}
-        for row, when in zip(rows.tolist(), need.tolist(), strict=True):
-            first[row] = min(first.get(row, when), when)
-        found_rows, found_need = merge_wanted(rows, need)
-        found = list(zip(found_rows.tolist(), found_need.tolist(), strict=True))
-        assert dict(found) == first and len(found) == len(first)
-        places = {row: int(np.flatnonzero((rows == row) & (need == when))[0]) for row, when in found}
-        assert found == sorted(found, key=lambda each: places[each[0]]), "in their order"

@@ -60,13 +60,6 @@ def test_the_least_recently_used_goes_first() -> None:
     residency.check()
 
 
-def test_more_than_the_budget_at_once_is_refused() -> None:
-    residency = VoxelCache(FakeStore([2, 2]), 3 * BLOCK)
-    with pytest.raises(ValueError, match="ask in pieces"), residency.hold([0, 1]):
-        pass
-    residency.check()
-
-
 def test_room_in_pieces_between_own_voxels_is_made_whole() -> None:
     store = FakeStore([1, 1, 1, 1, 3])
     residency = VoxelCache(store, 4 * BLOCK)

@@ -24,9 +24,6 @@ from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files.scene_check import check_scene_file
 from solidcloud.server.scene import Scene
 from solidcloud.server.scenes import scene_archives
-from solidcloud.server.scenes.scene_archives import (
-    share_budget,
-)
 
 pytestmark = pytest.mark.interpreted
 
@@ -120,25 +117,6 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
         assert scene.collide("ball", poses[1:], client="one").verdict.tolist() == [Verdict.CLEAR]
 
 
-def test_a_scene_moves_as_its_effects_say(write: Write) -> None:
-    begin, end = at((0, 0, 0.5)), at((0, 0, -0.5))
-    for effects, last in (("", -0.5), (STOP + '[[effects]]\neffect = "sweep"\n', 0.1)):
-        # Without a table of effects there is `stop`; a list of none is none.
-        text = TOP + BALL + effects if effects else "format = 1\neffects = []\n" + TOP[11:] + BALL
-        with Scene.open(write(text), read_points=read_points) as scene:
-            moved = scene.move("ball", begin, end, client="any")
-            assert moved.simulated == (["stop", "sweep"] if effects else [])
-            assert last <= moved.pose[0, 2, 3] <= last + 0.01
-
-
-def test_what_is_passed_through_is_not_there(write: Write) -> None:
-    through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
-    with Scene.open(write(TOP + BALL + STOP + through), read_points=read_points) as scene:
-        assert scene.info().effects == ["through", "stop"]
-        answers = scene.collide("ball", at((0, 0, 0), (0.4, 0, 0)), client="any")
-        assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
-
-
 @pytest.mark.parametrize(
     "second", ["", "pose = [[0, -1, 0, 10], [1, 0, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]\n"]
 )
@@ -173,18 +151,6 @@ def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write)
     assert checked.left_out == 25 + 9 and not [note for note in checked.notes if "spawn" in note]
     outside = check_scene_file(write(file.read_text().replace("5, 1.5]", "7, 1.5]")), read_points)
     assert [note for note in outside.notes if "spawn lies outside the bounds" in note]
-
-
-def test_a_cache_is_shared_by_what_archives_take() -> None:
-    sizes = [np.array([1000, 3000]), np.array([1000]), np.zeros(0, np.int64)]
-    shares = share_budget(100_000, sizes)
-    assert sum(shares) <= 100_000 and sum(shares) > 100_000 - 3
-    assert shares[0] > 3 * shares[1] > 0 and shares[2] == 0
-    least = [share_budget(5000, sizes[:2])[i] - (3000, 1000)[i] for i in (0, 1)]
-    assert min(least) >= 0
-    assert share_budget(7, sizes[:1]) == [7]
-    with pytest.raises(BadRequestError, match="cache of 3999 bytes: the largest voxels of 2 archives take 4"):
-        share_budget(3999, sizes[:2])
 
 
 @pytest.mark.parametrize(

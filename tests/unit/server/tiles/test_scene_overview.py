@@ -1,18 +1,13 @@
 """Overview: a sample of all points of a scene, from previews, else from some voxels."""
 
 import shutil
-import zlib
 from pathlib import Path
 
 import archive_cases
 import h5py
 import numpy as np
 import pytest
-from coloured_scans import coloured, write_las
 from scipy.spatial import cKDTree
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.overview_messages import MAX_OVERVIEW_POINTS, OverviewAnswer
@@ -65,14 +60,6 @@ def test_an_overview_is_a_sample_of_the_preview(case: archive_cases.Case) -> Non
         assert scene.residency.resident == 0
 
 
-def test_no_record_is_read_beside_a_preview(
-    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Scene.open(case.archive) as scene:
-        monkeypatch.setattr(Archive, "_read_frame", None)
-        assert len(scene.overview(50).points) == 50
-
-
 @pytest.mark.parametrize("fault", ["missing", "cut", "stamp", "large", "deflate", "nan"])
 def test_without_a_usable_preview_voxels_are_sampled(
     case: archive_cases.Case, tmp_path: Path, fault: str
@@ -100,15 +87,6 @@ def test_without_a_usable_preview_voxels_are_sampled(
     check_sampled(found, case.points)
 
 
-def test_a_chunk_that_inflates_beyond_its_size_is_refused(case: archive_cases.Case, tmp_path: Path) -> None:
-    folder = copied(case, tmp_path)
-    with h5py.File(folder / PREVIEW_NAME, "r+") as file:
-        bomb = zlib.compress(bytes(64 << 20), 9) + bytes(4)
-        file["VTKHDF/Points"].id.write_direct_chunk((0, 0), bomb)
-    with Scene.open(folder) as scene:
-        assert scene.overview().previewed.tolist() == [False]
-
-
 def test_voxels_are_sampled_up_to_a_number_of_points(
     case: archive_cases.Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,47 +110,6 @@ def test_voxels_are_sampled_up_to_a_number_of_points(
     check_sampled(found, case.points)
     octants = (world(found) > 0) @ [1, 2, 4]
     assert (np.bincount(octants, minlength=8) > 0).sum() >= 6, "the voxels are spread"
-
-
-def test_archives_share_the_limit_by_their_points(case: archive_cases.Case, tmp_path: Path) -> None:
-    small = archive_cases.build(tmp_path, np.random.default_rng(1).uniform(0, 1, (COUNT // 3, 3)))
-    pose = [[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
-    file = tmp_path / "scene.toml"
-    tables = f'[[archives]]\npath = "{case.archive}"\n[[archives]]\npath = "{small.archive}"\npose = {pose}\n'
-    file.write_text(f"format = 1\n{tables}")
-    with Scene.open(file) as scene:
-        found = scene.overview(400)
-    assert found.starts.tolist() == [0, 300, 400]
-    matrix = np.array(pose)
-    moved = small.points @ matrix[:3, :3].T + matrix[:3, 3]
-    apart = np.linalg.norm(world(found, 1)[:, None] - moved, axis=2).min(axis=1)
-    assert apart.max() < 4e-4
-
-
-@pytest.mark.parametrize("is_previewed", [True, False])
-def test_columns_are_those_of_the_points(tmp_path: Path, is_previewed: bool) -> None:
-    truth = coloured(5)
-    scan = write_las(tmp_path / "scan.las", truth)
-    keep = frozenset({"rgb", "intensity", "classification", "scan"})
-    build_archive([scan], tmp_path / "archive", BuildConfig(resolution=1e-3, keep=keep, jobs=1))
-    if not is_previewed:
-        (tmp_path / "archive" / PREVIEW_NAME).unlink()
-    with Scene.open(tmp_path / "archive") as scene:
-        found = scene.overview()
-    assert found.columns == ["rgb", "intensity", "classification", "scan"]
-    assert found.intensities == (0.0, 0.0) and found.classes == sorted(set(truth.classes.tolist()))
-    expected = {
-        (*key, *rgb, c)
-        for key, rgb, c in zip(keys(truth.xyz), truth.rgb.tolist(), truth.classes, strict=True)
-    }
-    shown = zip(keys(world(found)), found.rgb.tolist(), found.classification, strict=True)
-    assert {(*key, *rgb, c) for key, rgb, c in shown} == expected
-    assert (found.scan == 0).all() and len(found.scan) == len(found.points)
-
-
-def keys(points: np.ndarray) -> list[tuple[int, ...]]:
-    """Return coordinates in millimetres."""
-    return [tuple(row) for row in np.rint(points * 1e3).astype(int).tolist()]
 
 
 def test_a_limit_out_of_range_is_refused(case: archive_cases.Case) -> None:

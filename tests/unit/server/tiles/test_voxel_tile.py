@@ -57,16 +57,6 @@ def test_the_tiles_of_all_voxels_hold_all_points(case: archive_cases.Case) -> No
         assert scene.residency.resident == 0, "tiles load nothing into memory"
 
 
-def test_a_coarser_detail_is_a_part_of_the_finer_one(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        voxel = scene.voxels((0, 0, 0)).voxel[0]
-        finer = scene.tile(0, voxel)
-        for detail in (1, 2, 8):
-            tile = scene.tile(0, voxel, detail)
-            np.testing.assert_array_equal(tile.points, finer.points[:: 4**detail])
-            assert tile.total == len(finer.points)
-
-
 @pytest.mark.parametrize("level", [0, 1, 2, 3, 50])
 def test_spheres_of_a_level_enclose_the_points(case: archive_cases.Case, level: int) -> None:
     with Scene.open(case.archive) as scene:
@@ -129,25 +119,6 @@ def test_coarse_details_are_read_from_the_level(
         monkeypatch.setattr(voxel_tile, "_MAX_LEVEL_POINTS", 3)
         with pytest.raises(TooLargeError, match="level of detail"):
             scene.tile(0, scene.voxels((0, 0, 0)).voxel[0], 3)
-
-
-def test_a_large_voxel_has_limits(case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Scene.open(case.archive) as scene:
-        listed = scene.voxels((0, 0, 0))
-        voxel, points = listed.voxel[0], int(listed.points[0])
-        spheres = len(scene.tile(0, voxel, level=50).spheres)
-        with scene.archives[0].take() as opened:
-            monkeypatch.setattr(opened.store.archive, "read_voxel", None)  # nothing is read
-        monkeypatch.setattr(voxel_tile, "MAX_MESSAGE_BYTES", 6 * points - 1)
-        with pytest.raises(TooLargeError, match="less detail"):
-            scene.tile(0, voxel)
-        monkeypatch.setattr(voxel_tile, "_MAX_POINTS", points - 1)
-        with pytest.raises(TooLargeError, match="ask for its spheres"):
-            scene.tile(0, voxel, detail=8)
-        assert len(scene.tile(0, voxel, level=50).spheres) == spheres
-        monkeypatch.setattr(voxel_tile, "_MAX_NODES", spheres - 1)
-        with pytest.raises(TooLargeError, match="nodes"):
-            scene.tile(0, voxel, level=0)
 
 
 def test_tiles_evict_nothing(case: archive_cases.Case) -> None:

@@ -239,23 +239,3 @@ def test_serve_refuses_a_scene_file_that_is_wrong(
     assert run(["serve", str(folder / name)]) == 2
     said = "`slide` requires `stop`" if name == "hall.toml" else "No such file or directory: expected a scene"
     assert f"{name}: " in (error := one_error(capsys)) and said in error
-
-
-def test_a_new_scene_in_place_of_another_finds_its_archives_through_links(folder: Path) -> None:
-    (folder / "deep/down").mkdir(parents=True)
-    (folder / "deep/down/old.toml").write_text("old")
-    (folder / "hall.toml").symlink_to(folder / "deep/down/old.toml")
-    assert new(folder) == 2 and new(folder, "--overwrite") == 0
-    assert run(["scene", "check", str(folder / "hall.toml")]) == 0
-    assert (folder / "deep/down/old.toml").read_text() == "old"
-    assert sorted(path.name for path in folder.glob("*.toml*")) == ["hall.toml"]
-
-
-@pytest.mark.parametrize("place", ["path", "file"])
-def test_a_path_that_no_file_has_is_told(
-    folder: Path, capsys: pytest.CaptureFixture[str], place: str
-) -> None:
-    text = TOP + VISITOR
-    name = {"path": "scans/hall", "file": "visitor.xyz"}[place]
-    assert check(folder, text.replace(f'{place} = "{name}"', f'{place} = "a\\u0000b"')) == 2
-    assert f'[0].{place}: found "a\\u0000b": expected a path' in one_error(capsys)

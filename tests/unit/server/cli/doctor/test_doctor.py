@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import subprocess
 from importlib import metadata
 from pathlib import Path
@@ -10,10 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.builder import build_limits
 from solidcloud.server.cli.doctor import check_list, installation_checks, machine_checks, self_test_run
 from solidcloud.server.cli.doctor.check import Check, Status
-from solidcloud.server.cli.doctor.kernel_cache_check import check_compiler, check_kernel_cache
+from solidcloud.server.cli.doctor.kernel_cache_check import check_kernel_cache
 from solidcloud.server.cli.doctor.self_test import brute_force, compare
 from solidcloud.server.cli.main import run
 
@@ -44,13 +42,6 @@ def test_a_sound_machine_passes(capsys: pytest.CaptureFixture[str]) -> None:
     assert {"numpy", "eclipse-zenoh", "processor", "cores", "memory", "disk", "open files"} <= set(checks)
     assert "equal brute force" in checks["self-test"]["text"]
     assert not [each for each in found["checks"] if each["status"] == "fault"]
-
-
-@pytest.mark.interpreted
-def test_it_is_a_list_for_people_too(quick: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["doctor"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("ok       solidcloud") and "checks, no fault" in lines[-1]
 
 
 @pytest.mark.interpreted
@@ -105,19 +96,6 @@ def test_an_extra_that_is_missing_is_a_note(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.interpreted
-def test_limits_of_the_machine_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert machine_checks.MAX_SHARDS == build_limits.MAX_SHARDS
-    monkeypatch.setattr(
-        machine_checks, "_read", lambda path: "MemTotal: 2000000 kB\nMemAvailable: 900000 kB\n"
-    )
-    (memory,) = machine_checks.check_memory()
-    assert memory.status is Status.WARNING and "--cache 128MB" in memory.advice
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 4096))
-    (files,) = machine_checks.check_open_files()
-    assert files.status is Status.WARNING and files.advice == "ulimit -n 712"
-
-
-@pytest.mark.interpreted
 def test_the_limits_of_a_container_count(monkeypatch: pytest.MonkeyPatch) -> None:
     files = {
         "meminfo": "MemTotal: 64000000 kB\nMemAvailable: 50000000 kB\n",
@@ -134,15 +112,6 @@ def test_the_limits_of_a_container_count(monkeypatch: pytest.MonkeyPatch) -> Non
         and "limited to the time of 0.5" in cores.text
         and "--jobs 1" in cores.advice
     )
-
-
-@pytest.mark.interpreted
-def test_interpreted_kernels_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    (found,) = check_compiler()
-    assert found.status is Status.WARNING and found.advice == "unset NUMBA_DISABLE_JIT"
-    monkeypatch.delenv("NUMBA_DISABLE_JIT")
-    assert list(check_compiler()) == []
 
 
 @pytest.mark.interpreted

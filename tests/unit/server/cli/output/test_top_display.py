@@ -12,7 +12,6 @@ from solidcloud.server.cli.output import top_display as top
 from solidcloud.server.cli.output.top_display import (
     MAX_USERS_SHOWN,
     Sample,
-    budget_line,
     rate,
     seconds_text,
     watch,
@@ -76,13 +75,6 @@ def test_a_rate_is_what_a_count_rose_a_second() -> None:
     assert rate(now, now, "hits") is None
 
 
-def test_on_a_terminal_one_table_is_drawn_over_and_the_cursor_comes_back() -> None:
-    text = shown([hall(requests=1000), hall(requests=1450)], terminal=True)
-    hide, show = "\x1b[?25l", "\x1b[?25h"
-    assert text.count(hide) == 1 and text.index(hide) < text.index("1,000") < text.index("1,450")
-    assert text.rindex(show) > text.index("1,450")
-
-
 def test_every_count_is_shown() -> None:
     counted = {
         name: 1001 + number
@@ -117,14 +109,6 @@ def test_users_have_rates_of_their_own_and_the_last_are_counted() -> None:
     )
     assert line(text, "000001 al")[:2] == ["161", "60"]
     assert line(text, "new al")[:2] == ["5", "0"], "no rate yet: the next is the misses"
-
-
-def test_a_bar_is_of_the_budget() -> None:
-    assert budget_line(hall(budget_bytes=1000, resident_bytes=400, coarse_bytes=100)).startswith(
-        "█" * 15 + "░" * 15 + " 50%  500 bytes of 1000 bytes, 100 bytes coarse"
-    )
-    assert budget_line(hall(budget_bytes=1000, resident_bytes=1000)).startswith("█" * 30 + " 100%")
-    assert budget_line(hall()).startswith("░" * 30 + " 0%  0 bytes of 0 bytes")
 
 
 @pytest.mark.parametrize(

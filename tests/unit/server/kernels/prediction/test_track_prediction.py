@@ -12,7 +12,6 @@ from solidcloud.server.kernels.prediction.track_prediction import (
     PredictionLimits,
     predict_path,
     rows_ahead,
-    rows_in_reach,
 )
 
 pytestmark = pytest.mark.interpreted
@@ -92,38 +91,6 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
             assert on_way.all()
         met += found
     assert met > 10
-
-
-def test_of_more_than_there_is_room_for_the_first_pieces_come_first() -> None:
-    """A row of voxels that each hold one point, walked along."""
-    coordinates = np.array([[i, 0, 0] for i in range(20)])
-    keys = morton_encode((coordinates + KEY_BIAS).astype(np.uint64))
-    order = np.argsort(keys)
-    base = coordinates[order] * VOXEL_STEPS
-    index = SceneIndex(keys[order], base, base, base.min(axis=0), base.max(axis=0))
-    way = np.column_stack([np.linspace(-20, 1800, 14), np.zeros((14, 2))])
-    rows, need = np.empty(5, np.int64), np.empty(5)
-    assert rows_ahead(way, 10.0, 500.0, index, VOXEL_STEPS, rows, need) == 5
-    assert (base[rows, 0] == [0, 100, 200, 300, 400]).all()
-    assert np.allclose(need, (np.array([0, 100, 200, 300, 400]) - 10 + 20) / 140, atol=1 / 2048)
-
-
-@pytest.mark.parametrize(("side", "count"), [(2, 20), (6, 700), (40, 900)])
-def test_what_balls_touch_is_what_brute_force_finds(side: int, count: int) -> None:
-    rng = np.random.default_rng([side, count])
-    index = scattered(rng, side, count)
-    centers = rng.uniform(-side - 1, side + 1, (60, 3)) * VOXEL_STEPS
-    centers[:20] = index.low[rng.integers(len(index.low), size=20)] + rng.uniform(-30, 30, (20, 3))
-    reaches = rng.choice([0.0, 20.0, 90.0], 60)
-    starts, rows = np.empty(61, np.int64), np.full(9000, -1)
-    needed = rows_in_reach(centers, reaches, index, VOXEL_STEPS, starts, rows)
-    assert needed == starts[-1] > 0 and starts[0] == 0
-    touched = gaps(index, centers) <= reaches[:, None]
-    for i in range(60):
-        assert sorted(rows[starts[i] : starts[i + 1]].tolist()) == np.flatnonzero(touched[i]).tolist()
-    few = np.full(needed // 2, -1)
-    assert rows_in_reach(centers, reaches, index, VOXEL_STEPS, starts, few) == needed
-    assert few.tolist() == rows[: needed // 2].tolist()
 
 
 # --- where users will be --------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import archive_cases
 import numpy as np
@@ -83,20 +82,3 @@ def test_narrowest_door_is_that_of_brute_force(
     assert judged - missed - 1e-4 <= found.narrowest <= judged + 2 * doorway.FINEST
     assert found.width == pytest.approx(np.ptp(FIGURE[:, 0]) + 2 * own, abs=1e-12)
     assert found.error == pytest.approx(1000 * (found.narrowest - found.width), abs=1e-9)
-
-
-def test_figure_that_is_stopped_in_the_middle_needs_an_infinite_door(
-    dense: tuple[Scene, NDArray[np.float64]],
-) -> None:
-    scene, _ = dense
-    found = doorway_error(scene, "figure", TRUTH, radius_model="fixed:0.2")
-    assert math.isinf(found.narrowest) and math.isinf(found.error)
-    # Unknown is not clear.
-    assert math.isinf(doorway_error(scene, "figure", TRUTH, budget_visits=1).error)
-
-
-def test_figure_that_meets_nothing_slips_as_far_as_is_looked(tmp_path: Path) -> None:
-    far = np.array([[50.0, 0.0, 0.0], [50.5, 0.0, 0.0]])
-    archive = archive_cases.build(tmp_path, far + ORIGIN, voxel=8.0, radius=RADIUS).archive
-    with Scene.open(archive) as scene:
-        assert doorway_error(scene, "figure", TRUTH).error == pytest.approx(-2000 * doorway.INSIDE, abs=0.5)

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, InternalError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.input.pose_file import write_poses
-from solidcloud.server.report.common.paper_case import Case, archive_points, given_case
-from solidcloud.server.report.common.sphere_pictures import level_spheres
+from solidcloud.server.report.common.paper_case import Case, given_case
 from solidcloud.server.report.walk import walkthrough
 from solidcloud.server.report.walk.walkthrough import PLAIN, SLAB, Structure
 
@@ -115,31 +113,6 @@ def test_measure_refuses_structures_of_other_points(case: Case, tmp_path: Path) 
     build_archive([tmp_path / "far.xyz"], structures[1].folder, config)
     with pytest.raises(InternalError, match="verdicts differ"):
         walkthrough.measure(case, structures, 1, lambda _: None)
-
-
-@pytest.mark.parametrize("level", [1, 2, 3, 9])
-def test_spheres_of_a_level_enclose_all_points(archive: Path, level: int) -> None:
-    spheres = level_spheres(archive, level)
-    distance = np.linalg.norm(wall()[:, None] - spheres.center[None], axis=2)
-    assert (distance <= spheres.radius).any(axis=1).all(), f"seed {SEED}"
-
-
-def test_level_zero_is_refused(archive: Path) -> None:
-    with pytest.raises(BadRequestError, match="level 0"):
-        level_spheres(archive, 0)
-
-
-def test_points_of_an_archive_make_the_same_case(archive: Path, tmp_path: Path) -> None:
-    times, poses = np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1))
-    write_poses(tmp_path / "poses.csv", times, poses)
-    np.savetxt(tmp_path / "avatar.xyz", wall()[:50], fmt="%.3f")
-    made = given_case([], archive, tmp_path / "avatar.xyz", tmp_path / "poses.csv", tmp_path)
-    assert made.step == STEP and len(made.avatar) == 50 and np.array_equal(made.poses, poses)
-    build_archive(made.scans, tmp_path / "again", BuildConfig(resolution=made.step, jobs=1))
-    with Archive(tmp_path / "again") as again:
-        found = np.concatenate(list(archive_points(again)))
-    order = [np.lexsort(points.T) for points in (np.rint(found / STEP), np.rint(wall() / STEP))]
-    assert np.abs(found[order[0]] - wall()[order[1]]).max() < 1e-9
 
 
 def test_a_path_without_poses_is_refused(scan: Path, tmp_path: Path) -> None:

@@ -51,25 +51,6 @@ def test_clusters_are_those_of_the_question(tmp_path: Path, rng: np.random.Gener
 
 
 @pytest.mark.interpreted
-def test_where_nothing_is_near_the_question_is_not_asked(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
-    runner, body = contacts.make(Contacts(margin=0.01), None), body_of(BALL)
-    with Scene.open(case.archive, "scene") as scene:
-        world = world_of(scene)
-        for height in (1.0, 0.5, 0.2, 0.125):
-            assert report(runner, world, body, at(2.0, 0, height)) == ContactsReport()
-        assert world.asked["contacts"] == 0
-        # In the margin, and touching: 10 cm, and 1 cm of the scan point's.
-        near = report(runner, world, body, at(2.0, 0, 0.115))
-        assert near.total == len(near.clusters) == 1 and near.clusters[0].deepest == pytest.approx(
-            0.005, abs=1e-3
-        )
-        assert report(runner, world, body, at(2.0, 0, 0.1)).clusters[0].deepest < 0
-        assert world.asked["contacts"] == 2
-        assert world.asked["distance"] <= 6
-
-
-@pytest.mark.interpreted
 def test_what_could_not_be_read_is_unknown(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
     flip_a_byte(case.archive, (1, 0, 0))

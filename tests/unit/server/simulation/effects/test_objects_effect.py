@@ -80,16 +80,6 @@ def test_a_stopped_frame_leaves_what_it_pushed_where_it_stood(
 
 
 @pytest.mark.interpreted
-def test_fifty_metres_a_frame_push_the_crate_no_farther_than_the_wall(tmp_path: Path) -> None:
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
-        body = stage.enter("c/u", USER, at(-3))
-        stage.go("c/u", at(47))
-        assert 1.65 < where(stage, "crate")[0, 3] < 2.0
-        assert 1.2 < body.pose[0, 3] < where(stage, "crate")[0, 3] - 0.3
-        assert free_of(stage, "crate")
-
-
-@pytest.mark.interpreted
 def test_a_crate_is_not_pushed_through_another_nor_into_a_user_nor_pulled_nor_pressed_down(
     tmp_path: Path,
 ) -> None:

@@ -10,7 +10,6 @@ import synthetic_scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
 from solidcloud.schemas.scene.effect_table import Proximity
-from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.motion_messages import ProximityReport
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
@@ -46,14 +45,6 @@ def test_the_report_is_that_of_distance(tmp_path: Path, rng: np.random.Generator
             assert found.distance == judged.signed_distance[0] and not found.unknown
             assert [found.avatar, found.cloud, found.normal] == [tuple(c[0].tolist()) for c in columns]
     assert 5 < met < 20
-
-
-@pytest.mark.interpreted
-def test_nothing_in_reach_is_an_empty_report(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, GRID)
-    with Scene.open(case.archive, "scene") as scene:
-        found = report(make(Proximity(reach=0.2), None), world_of(scene), body_of(BALL), at(0.5, 0.5, 0.5))
-    assert found == ProximityReport(None, None, None, None, False)
 
 
 def test_what_is_remembered_changes_no_report(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -135,13 +126,6 @@ def test_witnesses_of_an_archive_at_a_pose_are_in_the_world(tmp_path: Path, rng:
     for said, expected in zip((found.avatar, found.cloud, found.normal), turned, strict=True):
         assert said == pytest.approx((there @ expected)[:3].tolist(), abs=1e-7)
     assert found.distance == pytest.approx(plain.distance, abs=1e-7)
-
-
-def test_a_scene_file_says_how_far() -> None:
-    file = parse_scene(
-        b'format = 1\n[[archives]]\npath = "a"\n[[effects]]\neffect = "proximity"\nreach = 0.25\n', "f"
-    )
-    assert file.effects == [Proximity(reach=0.25)]
 
 
 @pytest.mark.interpreted

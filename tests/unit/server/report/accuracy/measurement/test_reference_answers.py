@@ -12,8 +12,6 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import InternalError
-from solidcloud.server.report.accuracy.measurement.cold_curve import cold_curve
-from solidcloud.server.report.accuracy.measurement.distance_field import field_rows
 from solidcloud.server.report.accuracy.measurement.measured_scene import (
     AVATAR,
     REACH,
@@ -32,7 +30,6 @@ from solidcloud.server.report.accuracy.measurement.reference_answers import (
     check_reference,
     find_reference,
 )
-from solidcloud.server.report.accuracy.measurement.small_memory import walk_rows
 from solidcloud.server.scene import Scene
 
 PLAN = MeasurementPlan(
@@ -116,38 +113,3 @@ def test_an_answer_outside_its_bounds_would_be_an_error(judged: Judged, contact:
     wrong = exact._replace(contact=np.full(len(exact.contact), contact), distance=exact.distance + 0.02)
     with pytest.raises(InternalError, match="outside its bounds"):
         memory_curve(judged.scene, judged.measured.judged, wrong, PLAN, judged.tick)
-
-
-def test_a_field_that_never_says_clear_wrongly_is_early_more_often(judged: Judged) -> None:
-    poses, exact = judged.measured.judged, judged.exact
-    rows = field_rows(judged.archive, judged.scene, judged.measured.avatar, poses, exact, PLAN, judged.tick)
-    assert {row.cell for row in rows} == {0.1, 0.2} and len({row.kind for row in rows}) >= 2
-    for row in rows:
-        assert row.early_if_safe >= row.early and row.time_us > 0 and row.field_bytes <= 4 * 100_000 * 1.2
-    fine, coarse = (next(row.scene_bytes for row in rows if row.cell == cell) for cell in (0.1, 0.2))
-    assert coarse < fine
-
-
-def test_with_nothing_in_memory_less_is_read_for_an_answer_with_an_error(judged: Judged) -> None:
-    judged.ticks = 0
-    places = judged.measured.walk[10::40]
-    rows = cold_curve(judged.folder, judged.measured.avatar, places, (0.1, 0.5), judged.tick)
-    assert [row.tolerance for row in rows] == [None, 0.0, 0.1, 0.5] and judged.ticks == len(places)
-    assert rows[0].wait == rows[0].wait_low == rows[0].wait_high == 1.0 and rows[0].loaded == 1.0
-    for row in rows:
-        assert row.wait_ms > 0 and row.wait_low <= row.wait <= row.wait_high
-    assert rows[3].loaded < 1.0
-    if rows[0].read_bytes is not None:
-        assert rows[0].read_bytes > 0 and rows[0].bytes_ratio == 1.0
-
-
-def test_a_walk_by_bounds_is_never_wrongly_clear(judged: Judged) -> None:
-    avatar, walk = judged.measured.avatar, judged.measured.walk
-    rows = walk_rows(judged.folder, avatar, walk, (1.0, 1e-6), 20, judged.tick)
-    assert [(row.memory, row.kind) for row in rows] == [
-        (1.0, "exact"), (1.0, "bounds"), (1e-6, "exact"), (1e-6, "bounds"),
-    ]  # fmt: skip
-    exact, bounds, *none = rows
-    assert exact.frames == bounds.frames > 10 and exact.early == 0.0
-    assert exact.false_clear == bounds.false_clear == 0 and bounds.early < 1.0
-    assert all("does not fit" in row.note and row.frames == 0 for row in none)

@@ -44,12 +44,6 @@ def test_figures_leave_the_first_second_out_but_not_its_faults() -> None:
     assert frame_outcomes.figures(made, warm_up=0.0).misses == 8
 
 
-def test_percentiles_are_values_that_were_measured() -> None:
-    values = np.array([4.0, 1.0, np.nan, 2.0, 3.0])
-    assert frame_outcomes.percentiles(values, (50.0, 99.0, 100.0)).tolist() == [3.0, 4.0, 4.0]
-    assert np.isnan(frame_outcomes.percentiles(np.array([np.nan]))).all()
-
-
 def test_wrong_is_what_is_said_and_not_true() -> None:
     made = some_frames(verdict=[CLEAR, CONTACT, UNKNOWN, CLEAR, CONTACT], status=[ANSWERED] * 4 + [REFUSED])
     assert verdict_check.wrong(made, np.array([CLEAR, CLEAR, CONTACT, CONTACT, CLEAR])).tolist() == [1, 3]
@@ -83,14 +77,6 @@ def test_goals_are_met_by_a_calm_run_and_missed_by_what_breaks_them() -> None:
     assert verdicts([ran(STEADY, slow)])["wait"] == MISSED
     assert verdicts([ran(STEADY, missed)])["misses"] == MISSED
     assert verdicts([ran(STEADY, CALM, wrong=1)])["right"] == MISSED
-
-
-def test_the_knee_is_the_fewest_users_for_whom_frames_stall() -> None:
-    runs = [ran(Case("users", "stroll", n, 1.1, None), CALM) for n in (8, 16)]
-    assert load_cases.knee(runs) == {load_cases.AS_SERVED: None}
-    late = CALM._replace(done=CALM.done + 1.0)
-    runs += [ran(Case("users", "stroll", n, 1.1, None), late) for n in (64, 32)]
-    assert load_cases.knee(runs) == {load_cases.AS_SERVED: 32}
 
 
 def test_the_page_holds_goals_figures_and_pictures_and_needs_no_other_file(tmp_path: Path) -> None:

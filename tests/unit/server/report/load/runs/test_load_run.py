@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from solidcloud.server.report.load.runs import load_run, load_server
 from solidcloud.server.report.load.users import frame_clock
-from solidcloud.server.report.load.users.adversary_user import Adversary, LruModel
 from solidcloud.server.report.load.users.frame_outcomes import ANSWERED
 from solidcloud.server.report.load.users.user_traces import Trace
 
@@ -54,36 +52,6 @@ def test_a_frame_stalls_when_its_answer_is_later_than_the_next_frame_or_never() 
     done = np.array([1.033, 2.034, np.nan, 4.0])
     assert frame_clock.stalled(due, done).tolist() == [False, True, True, False]
     assert frame_clock.stalled(due, done, 0.1).tolist() == [False, False, True, False]
-
-
-def test_the_first_second_is_that_of_each_user() -> None:
-    user = np.array([0, 2, 0, 2, 0])
-    due = np.array([5.0, 5.5, 5.9, 6.4, 6.0])
-    assert frame_clock.after_first(user, due).tolist() == [False, False, False, False, True]
-    assert frame_clock.after_first(user, due, 0.9).tolist() == [False, False, True, True, True]
-    assert frame_clock.after_first(user[:0], due[:0]).tolist() == []
-
-
-def row_of_boxes(count: int) -> NDArray[np.float64]:
-    """Return boxes of 1 m along x, with gaps of 9 m."""
-    low = np.column_stack([np.arange(count) * 10.0, np.zeros(count), np.zeros(count)])
-    return np.stack([low, low + 1.0], axis=1)
-
-
-@pytest.mark.parametrize(
-    ("recent", "asked"),
-    [(True, [0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 2]), (False, [0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4])],
-)
-def test_an_adversary_asks_for_what_was_evicted(recent: bool, asked: list[int]) -> None:
-    # The cache holds three voxels: all six are requested once; after that, each request misses.
-    model = LruModel(np.full(7, 10), 30)
-    found = Adversary(row_of_boxes(7), model, np.array([0.0, 0.0, 0.9]), 1.0)
-    for number, row in enumerate(asked):
-        resident = set(model.resident)
-        pose = found.pose(recent)
-        assert np.allclose(pose[:3, :3], np.eye(3))
-        assert np.allclose(pose[:3, 3], (10.0 * row + 0.5, 0.5, -0.4)), number
-        assert row not in resident
 
 
 def test_a_process_that_ends_before_it_is_ready_says_why(tmp_path: Path) -> None:

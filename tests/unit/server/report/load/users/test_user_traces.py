@@ -42,20 +42,6 @@ def test_the_same_arguments_give_the_same_bits_and_another_seed_others(truth: Sc
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_user_has_thirty_poses_a_second_and_all_are_in_order_of_time(
-    truth: SceneTruth, kind: str
-) -> None:
-    made = trace(truth, kind)
-    assert (np.diff(made.time) >= 0).all()
-    assert np.bincount(made.user).tolist() == [round(SECONDS * 30)] * USERS
-    for user in range(USERS):
-        time = made.time[made.user == user]
-        assert np.allclose(np.diff(time), 1 / 30) and 0 <= time[0] < 1 / 30
-    # The frames of different users are not due at the same time.
-    assert len(np.unique(made.time[:USERS])) == USERS
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_poses_are_upright_on_the_floor_and_within_the_town(truth: SceneTruth, kind: str) -> None:
     made, town = trace(truth, kind), town_paths.make_town_of(truth)
     pose = made.pose

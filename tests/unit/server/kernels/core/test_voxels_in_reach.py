@@ -37,9 +37,7 @@ def listed(reach: VoxelsInReach, pose: int) -> list[int]:
     return reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
 
 
-@pytest.mark.parametrize(
-    ("shift", "scale", "margin"), [(0.0, 1.0, 0.0), (5.6e6, 0.05, 0.1), (0.0, 30.0, 0.0), (-1e8, 1.0, 3.0)]
-)
+@pytest.mark.parametrize(("shift", "scale", "margin"), [(0.0, 1.0, 0.0), (5.6e6, 1.0, 0.1), (-1e8, 1.0, 3.0)])
 def test_no_voxel_in_reach_is_left_out(
     tmp_path: Path, rng: np.random.Generator, shift: float, scale: float, margin: float
 ) -> None:

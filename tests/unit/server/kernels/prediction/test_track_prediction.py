@@ -47,12 +47,12 @@ def walked(places: NDArray[np.float64], rate: float = 30.0) -> NDArray[np.float6
 
 
 @pytest.mark.parametrize("ring", [0.0, 60.0])
-@pytest.mark.parametrize(("side", "count", "reach"), [(2, 20, 15), (6, 700, 40), (40, 900, 400), (3, 300, 0)])
+@pytest.mark.parametrize(("side", "count", "reach"), [(6, 700, 40), (3, 300, 0)])
 def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: float, ring: float) -> None:
     rng = np.random.default_rng([side, count])
     index = scattered(rng, side, count)
     met = 0
-    for turn in range(6 if INTERPRETED and reach > 100 else 40):
+    for turn in range(20):
         way = np.cumsum(rng.normal(0, 1, (9, 3)) * rng.choice([0.0, 5.0, 60.0], (9, 1)), axis=0)
         way += index.low[rng.integers(len(index.low))] + rng.uniform(-20, 20, 3)
         if turn % 5 == 0:

@@ -36,9 +36,9 @@ def around(count: int, distance: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("margin", [0.0, 0.05])
+@pytest.mark.parametrize("margin", [0.05])
 def test_users_pushed_into_one_spot_do_not_overlap(tmp_path: Path, margin: float) -> None:
-    count, frames = (4, 6) if INTERPRETED else (10, 40)
+    count, frames = (4, 6) if INTERPRETED else (6, 20)
     met = 0
     with staged(tmp_path, [*CONTINUOUS, Crowd(margin=margin)]) as stage:
         for number, place in enumerate(around(count, 1.2)):
@@ -59,7 +59,7 @@ def test_users_pushed_into_one_spot_do_not_overlap(tmp_path: Path, margin: float
 @pytest.mark.parametrize("effects", [CONTINUOUS, [Stop()]], ids=["continuous", "discrete"])
 def test_users_who_begin_in_one_spot_get_apart(tmp_path: Path, effects: list[AnyEffect]) -> None:
     """Each wishes to go its own way out; who would come nearer to another's middle waits."""
-    count = 3 if INTERPRETED else 7
+    count = 3 if INTERPRETED else 4
     ways = around(count, 0.06)
     with staged(tmp_path, [*effects, Crowd()]) as stage:
         for number in range(count):
@@ -124,7 +124,7 @@ def _walk(folder: Path, seed: int) -> bytes:
     with staged(folder, [*CONTINUOUS, Crowd(margin=0.01)]) as stage:
         for number in range(4):
             stage.enter(f"c/{number}", SMALL, at(*rng.uniform(-0.6, 0.6, 3)))
-        for _ in range(2 if INTERPRETED else 20):
+        for _ in range(2 if INTERPRETED else 8):
             for name, body in stage.users.items():
                 wish = at(*rng.uniform(-0.5, 0.5, 3), heading=rng.uniform(0, 6))
                 stage.go(name, wish)
@@ -151,14 +151,14 @@ def test_random_frames_never_end_in_a_new_overlap(tmp_path: Path, effects: list[
         models = [SMALL, box(0.5, 0.2, 0.6, 0.06, 0.03), make_avatar(np.zeros((0, 3)), 0.1)]
         for number, place in enumerate(around(6, 1.0)):
             stage.enter(f"c/{number}", models[number % 3], at(*place))
-        for _ in range(60):
+        for _ in range(15):
             for name, body in stage.users.items():
                 wish = at(*rng.normal(size=3) * [0.5, 0.5, 0.1], heading=rng.uniform(0, 6))
                 moved = stage.go(name, wish)
                 stops += bool(moved.touched)
                 assert not np.array_equal(body.pose, wish) or not moved.touched
             assert overlapping(stage) == []
-    assert stops > 50
+    assert stops > 10
 
 
 def test_a_margin_beyond_reason_is_refused(tmp_path: Path) -> None:

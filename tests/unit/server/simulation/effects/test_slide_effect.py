@@ -12,7 +12,7 @@ from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.avatars.avatar_shape import avatar_shape
-from solidcloud.server.kernels.walk.slide_planes import clip_displacement
+from solidcloud.server.kernels.walk.slide_planes import clip as clip_rest
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2
@@ -117,9 +117,8 @@ def test_it_goes_over_the_bumps_of_a_wall(wall: archive_cases.Case, rng: np.rand
 
 def clip(left: np.ndarray, planes: list[np.ndarray]) -> np.ndarray | None:
     """Return the clipped displacement (3,); None if there is none."""
-    way = np.empty(3)
-    found = clip_displacement(left, np.array(planes, np.float64).reshape(-1, 3), way)
-    return way if found else None
+    found, way = clip_rest(tuple(left.tolist()), np.array(planes, np.float64).reshape(-1, 3), len(planes))
+    return np.array(way) if found else None
 
 
 @pytest.mark.interpreted

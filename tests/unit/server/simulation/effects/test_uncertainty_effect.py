@@ -85,7 +85,7 @@ def judged(
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("gap", [0.012, 0.004, 0.0, -0.003, -0.009])
+@pytest.mark.parametrize("gap", [0.004, -0.003])
 def test_two_scans_touch_as_often_as_displaced_ones_do(
     tmp_path: Path, rng: np.random.Generator, gap: float
 ) -> None:
@@ -93,7 +93,7 @@ def test_two_scans_touch_as_often_as_displaced_ones_do(
     height = gap + 0.05 + RADIUS
     with opened(tmp_path, *clouds) as scene:
         found = said(scene, at(height), sigma=sigmas[0], scans={"scan1.ply": sigmas[1]})
-    share, error = judged(rng, clouds, sigmas, height, 4000)
+    share, error = judged(rng, clouds, sigmas, height, 1500)
     assert abs(found.probability - share) <= 4 * error
     assert not found.unknown and sorted(found.scans) == ["scan0.ply", "scan1.ply"]
     both = 1 - (1 - found.scans["scan0.ply"]) * (1 - found.scans["scan1.ply"])

@@ -34,7 +34,6 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
     ("effects", "up"),
     [
         ([Stop(), Sweep(), Slide(), Step(), Ground()], (0.0, 0.0, 1.0)),
-        ([Stop(), Sweep(), Ground()], (0.0, 0.0, 1.0)),
         ([Stop(), Slide(), Ground()], (0.0, 0.0, 1.0)),
         ([Crowd(), Stop(), Sweep(), Slide(), Ground(), Contacts()], (0.0, 0.0, 1.0)),
         ([Stop(), Sweep(), Slide(), Step(), Ground()], (0.02, 0.0, 1.0)),

@@ -21,9 +21,7 @@ pytestmark = pytest.mark.interpreted
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@pytest.mark.parametrize(
-    "angle", [0.0, 1e-9, 0.3, math.pi / 2, 2.0, math.pi, 4.0, 6.2, 17.5, -0.3, -math.pi / 2, -2.0, -40.0]
-)
+@pytest.mark.parametrize("angle", [0.0, 1e-9, math.pi / 2, math.pi, 4.0, -2.0, -40.0])
 def test_rotation_is_that_of_its_angle(angle: float) -> None:
     c, s = math.cos(angle), math.sin(angle)
     found = rotation_matrix(UP, angle)

@@ -25,7 +25,7 @@ def test_points_keep_their_precision_at_map_coordinates() -> None:
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0.2, -0.3, 0.9)])
-@pytest.mark.parametrize("yaw", [-3.0, 0.0, 0.4, np.pi / 2])
+@pytest.mark.parametrize("yaw", [-3.0, np.pi / 2])
 def test_standing_avatar_faces_its_yaw_and_stands_along_up(up: tuple[float, ...], yaw: float) -> None:
     frame = ViewFrame(MAP, up)
     pose = frame.standing(MAP[0], yaw)

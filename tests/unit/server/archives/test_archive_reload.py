@@ -132,15 +132,6 @@ def test_a_path_that_nobody_wants_any_more_holds_nothing(place: Path, begun: boo
         assert not before.take()
 
 
-def test_a_refused_path_holds_nothing(place: Path) -> None:
-    with Scene.open(place) as scene:
-        scene.add_avatar("al", BODY, 0.01)
-        with pytest.raises(BadRequestError):
-            scene.path("al", AT_ALONE, "distance", reach=-1.0)
-        scene.reload()
-        assert scene.archives[0]._before is not None and scene.archives[0]._before.ended.is_set()
-
-
 def truncate(place: Path) -> None:
     shard = next((place / "shards").iterdir())
     shard.write_bytes(shard.read_bytes()[:-1])

@@ -176,24 +176,3 @@ def test_bcf_has_the_structure_of_its_schemas(checked: CheckedPath) -> None:
         Image.open(io.BytesIO(files[f"{folder}/snapshot.png"])).verify()
     assert len(guids) == 6
     assert all(GUID.fullmatch(each) for each in guids)
-
-
-def test_camera_of_bcf_is_the_viewpoint(checked: CheckedPath) -> None:
-    content = bcf_bytes(checked, topics(checked)[:1], "hall", "tour.csv", NOW)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        name = next(name for name in archive.namelist() if name.endswith(".bcfv"))
-        camera = ElementTree.fromstring(archive.read(name)).find("PerspectiveCamera")
-    assert camera is not None
-
-    def vector(tag: str) -> np.ndarray:
-        return np.array([float(camera.findtext(f"{tag}/{axis}", "")) for axis in "XYZ"])
-
-    assert np.array_equal(vector("CameraViewPoint"), VIEW.eye)
-    ahead, up = vector("CameraDirection"), vector("CameraUpVector")
-    assert np.allclose(np.cross(VIEW.target - VIEW.eye, ahead), 0, atol=1e-12)
-    assert ahead @ (VIEW.target - VIEW.eye) > 0
-    assert np.linalg.norm(ahead) == pytest.approx(1)
-    assert np.linalg.norm(up) == pytest.approx(1)
-    assert ahead @ up == pytest.approx(0, abs=1e-12)
-    assert up[2] > 0
-    assert 45 <= float(camera.findtext("FieldOfView", "")) <= 60

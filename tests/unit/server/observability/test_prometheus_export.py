@@ -113,15 +113,6 @@ def test_a_scene_that_cannot_be_asked_does_not_hide_the_others(caplog: pytest.Lo
     assert "cannot read the metrics of scene hall" in caplog.text
 
 
-def test_the_port_is_free_again_after_and_taken_meanwhile() -> None:
-    with metrics_served([], "127.0.0.1", 0) as where:
-        port = int(where.rsplit(":", 1)[1].partition("/")[0])
-        with pytest.raises(SolidcloudError, match=f"--metrics-port {port}: cannot listen on 127.0.0.1"):
-            metrics_served([], "127.0.0.1", port).__enter__()
-    with metrics_served([], "127.0.0.1", port) as again:
-        assert again == where and text_of(again)
-
-
 @pytest.mark.parametrize("port", [-1, 65536])
 def test_a_port_that_is_none_is_refused(port: int) -> None:
     with pytest.raises(BadRequestError, match="--metrics-port"):

@@ -35,16 +35,6 @@ def test_voxels_are_listed_by_the_distance_of_their_boxes(case: archive_cases.Ca
         np.testing.assert_array_equal(near.voxel, every.voxel[:5])
 
 
-def test_the_list_says_what_is_in_memory(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        assert not scene.voxels((0, 0, 0)).resident.any()
-        scene.add_avatar("ball", [[0.0, 0.0, 0.0]], 0.1)
-        scene.collide("ball", np.eye(4))
-        listed = scene.voxels((0, 0, 0))
-        assert listed.resident.sum() == scene.residency.resident > 0
-        assert listed.resident[0]
-
-
 def test_voxels_of_two_archives_are_listed_together(case: archive_cases.Case, tmp_path: Path) -> None:
     file = tmp_path / "scene.toml"
     pose = [[1.0, 0.0, 0.0, 0.25], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

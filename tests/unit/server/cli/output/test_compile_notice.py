@@ -1,17 +1,12 @@
 """Test the lines on standard error while kernels are compiled: only when they are, and counted."""
 
 import os
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.kernels.kernel_files import KernelFiles, default_folder
+from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.server.cli.output import compile_notice
 from solidcloud.server.cli.output.compile_notice import CompileNotice, compile_notices
 
@@ -104,32 +99,3 @@ def test_it_watches_the_folder_that_kernels_are_kept_in(
             said += capsys.readouterr().err
             time.sleep(0.02)
     assert "compiling kernels, once on this machine" in said
-
-
-def cells_and_marks(_: str, names: list[str]) -> list[str]:
-    """Return the kernel of the cells' trees, and what another process is about to rename."""
-    return [n for n in names if ".build_cells-" in n or not n.endswith(".kernel")]
-
-
-@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels compile nothing")
-def test_the_command_says_that_it_compiles_the_first_time_alone(tmp_path: Path) -> None:
-    scan = tmp_path / "scan.xyz"
-    scan.write_text("".join(f"{x / 10} {y / 10} 0\n" for x in range(20) for y in range(20)))
-    # All of a build take half a minute to compile, the cells' trees some seconds.
-    build_archive([scan], tmp_path / "before", BuildConfig(jobs=1))
-    kept = default_folder(os.environ["NUMBA_CACHE_DIR"])
-    folder = shutil.copytree(kept, default_folder(str(tmp_path / "cache")), ignore=cells_and_marks)
-    assert set(os.listdir(kept)) - set(os.listdir(folder))
-    said = []
-    for name in ("first", "second"):
-        command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "build", str(scan)]
-        done = subprocess.run(
-            [*command, "-o", str(tmp_path / name), "--jobs", "1"],
-            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        said.append("compil" in done.stderr)
-    assert said == [True, False]

@@ -15,7 +15,6 @@ from solidcloud.server.cli.output.progress_display import (
     Listener,
     StageProgress,
     count_text,
-    progress_listener,
 )
 
 
@@ -173,32 +172,6 @@ def test_a_bar_shows_how_much_how_fast_and_how_long(clock: Clock) -> None:
     assert any(re.search(r"build +━{20} +123 M points +4\.12 M/s +in 0:30$", line) for line in seen)
     assert any(re.search(r"survey .* 0 of 3 files", line) for line in seen)
     assert any(re.search(r"verify .* 70 voxels +2\.3/s +in 0:30$", line) for line in seen)
-
-
-def test_the_right_one_listens(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def chosen(log_json: bool) -> type[Listener]:
-        with progress_listener(log_json) as listener:
-            return type(listener)
-
-    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "NO_COLOR"):
-        monkeypatch.delenv(name, raising=False)
-    assert chosen(False) is Lines
-    assert chosen(True) is JsonLines
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    assert chosen(False) is Bars
-    assert chosen(True) is JsonLines
-    monkeypatch.setenv("TERM", "dumb")
-    assert chosen(False) is Lines
-    with progress_listener() as listener:
-        listener.made(5, 10)
-        listener.made(10, 10)
-        listener.made(10, 10)
-    captured = capsys.readouterr()
-    assert (
-        captured.err.count("scan: done, 10 points") == captured.err.count("scan: 10") == 1
-        and not captured.out
-    )
 
 
 @pytest.mark.parametrize(

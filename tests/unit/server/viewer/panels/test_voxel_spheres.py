@@ -67,8 +67,3 @@ def test_spheres_of_a_level_are_in_the_frame_of_the_page() -> None:
     reader.asked.clear()
     source.message(scene, (0.0, 0.0, 0.0), 2)
     assert reader.asked == [2, 2], "the depth of each voxel is known"
-
-
-def test_nearest_voxel_is_shown_far_from_all() -> None:
-    header, _ = decoded(SphereSource().message(scene_of(Reader()), (100.0, 0.0, 0.0), 0))
-    assert header["total"] == 2

@@ -57,18 +57,6 @@ def test_poses_are_upright_on_the_floor_and_within_the_town(truth: SceneTruth, k
     assert np.median(height) == pytest.approx(0.03)
 
 
-def test_a_crowd_goes_through_one_door_and_nobody_through_its_jambs(truth: SceneTruth) -> None:
-    made, passed = user_traces.traces("crowd", truth, 6, 150.0, 3), []
-    facade = min(truth.facades, key=lambda f: np.abs(made.pose[:, :2, 3] - f.origin[:2]).sum())
-    door = facade.door("main")
-    for user in range(6):
-        local = one(made, user)[:, :2, 3] - np.asarray(facade.origin[:2])
-        within = (local[:, 1] > door.y_front) & (local[:, 1] < door.y_back)
-        passed.append(within.any())
-        assert (np.abs(local[within, 0]) < door.width / 2 - 0.25).all()
-    assert all(passed)
-
-
 def test_what_cannot_be_traced_is_refused(truth: SceneTruth) -> None:
     with pytest.raises(ValueError, match="expected one of stroll, run"):
         user_traces.traces("adversary", truth, 1, 1.0, 1)

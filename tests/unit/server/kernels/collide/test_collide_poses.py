@@ -92,3 +92,26 @@ def test_an_avatar_whose_front_is_inner_nodes_equals_brute_force(
     expected = case.judge(avatar, 0.002, poses)
     assert archive_cases.ask(case, avatar, 0.002, poses).tolist() == expected.astype(int).tolist()
     assert 5 < expected.sum() < 55
+
+
+@pytest.mark.parametrize("leaf", [1, 32])
+def test_bounds_cover_what_float32_loses_in_a_large_voxel(
+    tmp_path: Path, rng: np.random.Generator, leaf: int
+) -> None:
+    # 2^21 steps from a voxel's corner float32 tells apart quarters of a step, and these spheres have no slack but that.
+    step, steps = 0.25, (1 << 21) - 2
+    points = np.concatenate([np.zeros((1, 3)), rng.integers(steps // 2, steps, (200, 3)) * step])
+    case = archive_cases.build(
+        tmp_path, points, radius=0.0, resolution=step, voxel=step * (1 << 21), leaf=leaf
+    )
+    avatar = np.array([[0.1, 0.2, 0.3]])
+    with Scene.open(case.archive) as scene:
+        origin = scene.info().origin
+        scene.add_avatar("avatar", avatar, 0.0)
+        for pose in archive_cases.near_poses(rng, points[1:], avatar, 300, 3 * step):
+            reach, _ = archive_cases.least_reach(case, avatar, pose, origin, step)
+            verdicts = [
+                int(scene.collide("avatar", pose[None], units * 2.0**-26).verdict[0])
+                for units in (reach - 1, reach)
+            ]
+            assert verdicts == [0, 1], (pose.tolist(), reach)

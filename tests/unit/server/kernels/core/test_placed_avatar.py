@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.kernels.core import node_overlap
 from solidcloud.server.kernels.core import placed_avatar as kernel
 from solidcloud.server.kernels.core.scene_arrays import LANES
 
@@ -140,3 +141,37 @@ def test_a_pair_beyond_any_reach_has_no_square(axis: int, sign: int) -> None:
             assert kernel.pair_square(*pair) < 0 and not kernel.pair_in_reach(*pair, 1 << 30)
         else:
             assert kernel.pair_square(*pair) == square and kernel.pair_in_reach(*pair, 1 << 30)
+
+
+@pytest.mark.parametrize("voxel_steps", [1000, 500_000])
+@pytest.mark.parametrize(
+    ("reach", "extent", "farthest"),
+    [(300.0, 900.0, 3e3), (3.0, 50_000.0, 3e9), (16_000.0, 1.0, 1e12), (2.0, 5.0, 8e14)],
+)
+def test_thresholds_are_outside_the_errors_documented_and_not_far(
+    reach: float, extent: float, farthest: float, voxel_steps: int
+) -> None:
+    """Each term of the docstring weighs in one of the cases; thresholds lie beyond it by less than float32 tells."""
+    units = round(reach * UNITS_PER_STEP)
+    found = node_overlap.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
+    error = 1.1 / UNITS_PER_STEP
+    error += U32 * (extent + 2 * (max(65_536, voxel_steps) + reach)) + farthest * 2.0**-49
+    around = math.sqrt(3) * error
+    below, above = reach * (1 - 2 * U32) - around, reach * (1 + 2 * U32) + around
+    assert found.units == units
+    for limit, least in ((found.reach, reach), (found.error, around)):
+        assert least < float(limit) <= least * (1 + 4 * U32)
+    assert above**2 * (1 + 8 * U32) < float(found.far) <= above**2 * (1 + 14 * U32)
+    if below > 0:
+        assert below**2 * (1 - 14 * U32) <= float(found.near) < below**2 * (1 - 8 * U32)
+    else:
+        assert found.near < 0
+
+
+@pytest.mark.parametrize(
+    ("radius", "steps", "extent"), [(0.0, 1024.0, 9.0), (0.3, 1024.0, 400.0), (2.0, 1e4, 9e5)]
+)
+def test_a_placed_radius_is_wider_than_its_rounding(radius: float, steps: float, extent: float) -> None:
+    found = float(kernel.node_reach(radius, steps, extent))
+    assert found >= radius * steps * (1 + U32) + extent * U32 * math.sqrt(3)
+    assert found <= radius * steps * (1 + 2e-6) + extent * 2e-6

@@ -110,3 +110,20 @@ def test_equal_distances_are_sorted_by_row() -> None:
     tree = make_voxel_tree(low, low + 9, np.zeros((0, 2, 3), np.int64))
     lists = listed(tree, np.ones((1, 3)), np.eye(3)[:1], False, 5.0, 0.0)
     assert lists.rows.tolist() == list(range(50)) and not lists.near.any()
+
+
+@pytest.mark.parametrize("along", [True, False])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_boxes_far_away_are_grown_by_what_rounding_takes(along: bool, sign: float) -> None:
+    """A step and 2^-46 of the largest figure, 17 steps at 2^50: once beside a ray, twice before a point."""
+    far = np.array([[1 << 50, 0, 0]])
+    tree = make_voxel_tree(far, far, np.zeros((0, 2, 3), np.int64))
+    direction = np.array([[0.0, 1.0, 0.0]])
+    for away, found in ((16.5, 1), (17.5, 0)) if along else ((33.5, 1), (34.5, 0)):
+        at = np.array([[float(1 << 50), sign * away, 0.0]])
+        if along:
+            at[0] = [(1 << 50) + 0.0, -5.0, sign * away]
+        units = np.rint(at * 4).astype(np.int64)
+        lists = VoxelLists(np.zeros(2, np.int64), np.full(4, -1), np.zeros(4), np.zeros(1))
+        reach = 40 if along else 0
+        assert list_voxels(tree, units, direction, along, reach, 0, 4.0, NO_STOP.flag, lists) == found

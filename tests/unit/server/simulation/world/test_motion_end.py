@@ -16,7 +16,7 @@ from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame
 
-MOTIONS = 6 if INTERPRETED else 300
+MOTIONS = 6 if INTERPRETED else 80
 
 
 class SweptOnly(World):

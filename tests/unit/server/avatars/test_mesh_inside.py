@@ -85,7 +85,7 @@ def test_every_place_inside_is_within_the_radius_of_a_point(name: str, rng: np.r
     assert len(places) > 100
     tree = cKDTree(np.concatenate([surface, inner]))
     # Places beside the surface too, where a lattice alone would leave holes.
-    beside = surface[rng.integers(len(surface), size=2000)] + rng.normal(size=(600, 3)) * radius / 3
+    beside = surface[rng.integers(len(surface), size=600)] + rng.normal(size=(600, 3)) * radius / 3
     beside = beside[inside(CLOSED[name], beside)]
     assert max(tree.query(places)[0].max(), tree.query(beside)[0].max(initial=0.0)) <= radius
     # Each point inside is inside, or on the surface.

@@ -55,23 +55,6 @@ def test_kernels_that_crash_are_wiped(
 
 @compiled
 @pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
-def test_kernels_that_are_right_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with Scene.open(ARCHIVE) as scene:
-        scene.warm()
-        check_answers(scene)
-    shutil.copytree(kernel_files().folder, tmp_path / "solidcloud-kernels", ignore=MARKS)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    files = KernelFiles(tmp_path / "solidcloud-kernels")
-    before = set(os.listdir(files.folder))
-    rehearse(ARCHIVE, files)
-    assert caplog.records == []
-    assert before <= set(os.listdir(files.folder))  # the trial simulates frames, too
-
-
-@compiled
-@pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
 def test_a_fault_of_a_record_that_a_wrong_kernel_finds_is_the_kernels_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -109,28 +92,6 @@ def no_tree(payload: bytes) -> bytes:
     kernel.compile(signature)
     (result,) = kernel.overloads.values()
     return bytes(dumps((signature, result._reduce())))
-
-
-@compiled
-@pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
-def test_a_record_that_is_damaged_is_not_the_kernels_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    shutil.copytree(ARCHIVE, tmp_path / "archive")
-    with Archive(tmp_path / "archive") as archive:
-        for entry in archive.voxels:
-            with open(archive.shard_path(int(entry["shard"])), "r+b") as file:
-                file.seek(int(entry["frame_offset"][1]) + int(entry["frame_bytes"][1]) // 2)
-                (byte,) = file.read(1)
-                file.seek(-1, os.SEEK_CUR)
-                file.write(bytes([byte ^ 255]))
-    files = kernel_files()
-    monkeypatch.setattr(
-        tempfile, "TemporaryDirectory", partial(nullcontext, str(files.folder.resolve().parent))
-    )
-    rehearse(tmp_path / "archive", files)
-    assert caplog.records == []
-    assert list(files.folder.glob("*.kernel"))
 
 
 @pytest.mark.parametrize("lie", list(Verdict))

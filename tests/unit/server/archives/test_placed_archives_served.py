@@ -142,7 +142,6 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
         scene.drop_client("me")
         with pytest.raises(UnknownAvatarError):
             scene.collide("bo", poses, client="me")
-        scene.warm()
         service = RequestDispatcher([scene], ServerConfig())
         assert service.scenes(None).ok
 

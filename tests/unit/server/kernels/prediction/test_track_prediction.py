@@ -52,7 +52,7 @@ def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: 
     rng = np.random.default_rng([side, count])
     index = scattered(rng, side, count)
     met = 0
-    for turn in range(20):
+    for turn in range(40):
         way = np.cumsum(rng.normal(0, 1, (9, 3)) * rng.choice([0.0, 5.0, 60.0], (9, 1)), axis=0)
         way += index.low[rng.integers(len(index.low))] + rng.uniform(-20, 20, 3)
         if turn % 5 == 0:

@@ -118,27 +118,6 @@ def test_a_thin_body_is_met_at_fifty_metres_a_frame(tmp_path: Path) -> None:
             assert not overlapping(stage)
 
 
-def _walk(folder: Path, seed: int) -> bytes:
-    """Poses of a crowd that jostles, all of them."""
-    rng, found = np.random.default_rng(seed), []
-    with staged(folder, [*CONTINUOUS, Crowd(margin=0.01)]) as stage:
-        for number in range(4):
-            stage.enter(f"c/{number}", SMALL, at(*rng.uniform(-0.6, 0.6, 3)))
-        for _ in range(2 if INTERPRETED else 8):
-            for name, body in stage.users.items():
-                wish = at(*rng.uniform(-0.5, 0.5, 3), heading=rng.uniform(0, 6))
-                stage.go(name, wish)
-                found.append(body.pose.tobytes())
-    return b"".join(found)
-
-
-@pytest.mark.interpreted
-def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    assert _walk(tmp_path / "a", 3) == _walk(tmp_path / "b", 3)
-
-
 @pytest.mark.parametrize(
     "effects",
     [CONTINUOUS, [*CONTINUOUS, Slide()], [Stop()]],

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from movable_objects import AVATARS, CRATE, MOVING, USER, item, where
 from moving_bodies import INTERPRETED, at, room, staged
-from solidcloud.schemas.scene.effect_table import Crowd
 
 
 @pytest.mark.interpreted
@@ -62,23 +61,3 @@ def test_what_moved_is_said_once_a_frame_is_done_and_not_lost_with_one_that_fail
         for expected in ({"door": there}, {}):
             moved = stage.go("c/u", at(0, -1))
             assert moved.objects is not None and moved.objects.poses == expected
-
-
-@pytest.mark.interpreted
-def test_the_same_wishes_give_the_same_poses_bit_for_bit(tmp_path: Path) -> None:
-    found = []
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        rng = np.random.default_rng(4)
-        objects = (item("crate", at(0.6)), item("door", at(0.4, 0.6), avatar="leaf", pushed=False))
-        poses = []
-        with staged(tmp_path / folder, [*MOVING, Crowd()], avatars=AVATARS, objects=objects) as stage:
-            for number in range(2):
-                stage.enter(f"c/{number}", USER, at(-0.5, number))
-            for _ in range(2 if INTERPRETED else 15):
-                stage.bodies.place_objects({"door": at(0.4, 0.6, heading=rng.uniform(0, 1)).tolist()})
-                for name in stage.users:
-                    stage.go(name, at(*rng.uniform(-1, 1, 3) * [1, 1, 0.1]))
-                poses.append(stage.bodies.poses.tobytes())
-        found.append(b"".join(poses))
-    assert found[0] == found[1]

@@ -79,16 +79,3 @@ def state_of(body: Body) -> tuple[object, ...]:
     """Return all that a body keeps between frames."""
     kept = {name: body.effect_state[name].tobytes() for name in body.effect_state if "ground" in name}
     return body.pose.tobytes(), body.fall_speed, body.on_ground, body.clear, body.generations, kept
-
-
-@pytest.mark.interpreted
-def test_poses_and_times_may_have_any_memory_order_and_type(case: archive_cases.Case) -> None:
-    target = effect_rooms.at(-0.48, 0.01, -0.6, 0.3)
-    with effect_rooms.play(case.archive, Stop(), Sweep(), Ground()) as play:
-        answers = []
-        for order, seconds in (("C", 1.0), ("F", 1), ("C", 1)):
-            body = play.body(effect_rooms.person(), effect_rooms.at(-0.5, 0.0, -0.6))
-            body.pose = np.array(body.pose, order=order)  # type: ignore[call-overload]
-            wish = np.array(target, order=order)  # type: ignore[call-overload]
-            answers.append(encode(play.pipeline.run(body, wish, seconds)))
-    assert answers[0] == answers[1] == answers[2]

@@ -1,6 +1,6 @@
 """Test verdicts within a tolerance on production kernels: bounds, and no write beside the columns.
 
-With indices checked LLVM does not vectorise the loop that once wrote beyond a column.
+The unit tests check indices, which changes the loop: LLVM once vectorised it to write beyond a column.
 """
 
 import numpy as np

@@ -2,20 +2,12 @@
 
 import os
 import pickle
-import shutil
 import signal
-import tempfile
-from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
-from types import FunctionType
 from typing import Any
 
-import numba
 import pytest
-from numba.core.serialize import dumps
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.kernels import record_rows
 from solidcloud.schemas.kernels.compiling import kernel_files
 from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.schemas.wire.answers import Verdict
@@ -23,8 +15,6 @@ from solidcloud.server.cli.warming.kernel_rehearsal import check_answers, rehear
 from solidcloud.server.scene import Scene
 
 ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
-# Marks of processes that share the folder at this moment.
-MARKS = shutil.ignore_patterns("*.starting", "*.compiling", "*.tmp")
 compiled = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are not kept"
 )
@@ -51,47 +41,6 @@ def test_kernels_that_crash_are_wiped(
     assert list(files.folder.iterdir()) == []
     (said,) = (record.getMessage() for record in caplog.records)
     assert "SIGSEGV" in said and str(files.folder) in said
-
-
-@compiled
-@pytest.mark.timeout(900)  # alone, with an empty cache, it compiles every kernel of the server
-def test_a_fault_of_a_record_that_a_wrong_kernel_finds_is_the_kernels_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with Archive(ARCHIVE) as archive:
-        archive.open_tree(0)  # compiled or loaded: stored now
-    stored = kernel_files()
-    shutil.copytree(stored.folder, tmp_path / "solidcloud-kernels", ignore=MARKS)
-    files = KernelFiles(tmp_path / "solidcloud-kernels")
-    for path in stored.folder.glob("*.link_rows-*"):
-        files.write(path.name, no_tree(stored.read(path.name) or b""))
-    # The kernels that a child compiles are replaced by those of this process, to save time.
-    monkeypatch.setattr(
-        tempfile, "TemporaryDirectory", partial(nullcontext, str(stored.folder.resolve().parent))
-    )
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    rehearse(ARCHIVE, files)
-    assert list(files.folder.iterdir()) == []
-    (said,) = (record.getMessage() for record in caplog.records)
-    assert "found a fault that newly compiled ones do not find" in said and "do not form a tree" in said
-
-
-def no_tree(payload: bytes) -> bytes:
-    """Return the kernel `link_rows`, compiled for the same signature, with a wrong result."""
-    signature, _ = pickle.loads(payload)
-
-    def link_rows(
-        count: Any, cell_nodes: Any, cell_points: Any, first: Any, is_leaf: Any, cell_of: Any
-    ) -> Any:
-        return -1
-
-    # A child finds the module of compiled code by its name.
-    wrong = FunctionType(link_rows.__code__, vars(record_rows), "link_rows")
-    wrong.__module__ = record_rows.__name__
-    kernel = numba.njit(nogil=True)(wrong)
-    kernel.compile(signature)
-    (result,) = kernel.overloads.values()
-    return bytes(dumps((signature, result._reduce())))
 
 
 @pytest.mark.parametrize("lie", list(Verdict))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from solidcloud.schemas.wire import question_table as questions
-from solidcloud.schemas.wire.answers import ContactsAnswers, ObjectsAnswers, SweepAnswers, Verdict
+from solidcloud.schemas.wire.answers import ObjectsAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel
 from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, ask_until_stopped
@@ -85,31 +85,3 @@ QUESTIONS: dict[str, Callable[[Asked, QueryBudget], Any]] = {
 def gaps(a: Asked, budget: QueryBudget) -> Any:
     """Return `separation_per_scan` of the first pose."""
     return separation_per_scan(with_stop(a.data, budget.stop), a.avatar, a.poses[0], a.reach, 2, budget)
-
-
-def assert_not_wrong(found: Any, truth: Any) -> None:
-    """Assert that an answer that was cut short does not contradict the complete one."""
-    assert type(found) is type(truth) and len(found) == len(truth)
-    known = found.verdict != UNKNOWN
-    assert (found.verdict[known] == truth.verdict[known]).all()
-    if isinstance(found, ObjectsAnswers):
-        said = dict(zip(map(tuple, found.pairs.tolist()), found.pair_verdict.tolist(), strict=True))
-        true = set(map(tuple, truth.pairs.tolist()))
-        assert {pair for pair, verdict in said.items() if verdict == CONTACT} <= true <= set(said)
-        return
-    if isinstance(found, ContactsAnswers):
-        assert (found.pairs_found <= truth.pairs_found).all()
-        assert (found.exact <= truth.exact).all()
-        assert (found.pairs_found[found.exact] == truth.pairs_found[found.exact]).all()
-        assert found.pair_starts[-1] == len(found.signed_distance)
-        return
-    value = next((name for name in ("signed_distance", "distance") if hasattr(found, name)), None)
-    if value is not None:
-        true = getattr(truth, value)
-        assert (found.lower <= np.minimum(true, truth.lower) + 1e-9).all() and (
-            found.upper >= truth.lower - 1e-9
-        ).all()
-        assert (getattr(found, value)[found.exact] == true[found.exact]).all()
-    if isinstance(found, SweepAnswers):
-        first = np.where(truth.verdict == CONTACT, truth.upper, 1.0)
-        assert (found.lower <= first + 1e-9).all() and (found.upper >= truth.lower - 1e-9).all()

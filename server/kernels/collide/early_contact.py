@@ -101,7 +101,7 @@ def write_verdict_bounds(verdict, radii, low, high, early, lower, upper, exact):
     Writes lower, upper (k,) float64 [m], and exact (k,) bool.
 
     No store is conditional: with `if said == EARLY: verdict[i] = CONTACT` LLVM 22.1 vectorised the
-    loop such that it wrote beyond the end of `exact` (test_early_contact.py).
+    loop such that it wrote beyond the end of `exact` (test_verdict_bounds.py).
     """
     for i in range(verdict.shape[0]):
         said = verdict[i]

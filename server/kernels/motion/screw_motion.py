@@ -233,10 +233,3 @@ def pose_at(motion, t, pose):
         pose[r, 3] = first[r, 3] + (t * motion.along[r] + ratio * turned[r])
         pose[3, r] = 0.0
     pose[3, 3] = 1.0
-
-
-@njit_no_refcount
-def poses_on(motion, fractions, poses):
-    """Write M(t) for each of fractions (n,) into poses (n, 4, 4)."""
-    for i in range(fractions.shape[0]):
-        pose_at(motion, fractions[i], poses[i])

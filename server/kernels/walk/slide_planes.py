@@ -2,8 +2,6 @@
 
 import math
 
-import numpy as np
-
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from .walk_vectors import cross, dot, minus, norm, times, vector
@@ -61,12 +59,3 @@ def clip(rest, planes, count):
                 if norm(way) > longest and _is_free(way, planes, count, least):
                     best, longest = way, norm(way)
     return longest >= 0.0, best
-
-
-@nb.njit(nogil=True, cache=True)
-def clip_displacement(rest, planes, way):
-    """Write `clip` of a displacement (3,) by planes (p, 3) to way (3,); return whether there is one."""
-    found, best = clip(vector(rest), planes, planes.shape[0])
-    for r in range(3):
-        way[r] = best[r] if found else np.nan
-    return found

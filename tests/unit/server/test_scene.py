@@ -68,11 +68,6 @@ def test_answers_of_a_scene_are_one_line_and_become_json(scene: Scene) -> None:
         assert json.loads(json.dumps(answers.to_dict(), allow_nan=False)) == answers.to_dict()
 
 
-def test_the_folder_names_the_scene(tmp_path: Path) -> None:
-    with Scene.open(archive_cases.build(tmp_path, np.zeros((1, 3))).archive) as scene:
-        assert scene.name == "archive0"
-
-
 def test_an_unknown_avatar_is_an_error(scene: Scene) -> None:
     with pytest.raises(UnknownAvatarError, match="'al' is not known: add it"):
         scene.collide("al", HERE)
@@ -135,27 +130,6 @@ def test_a_budget_too_small_for_a_voxel_is_refused_and_closes_the_files(tmp_path
 def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no archive here"):
         Scene.open(tmp_path / "nowhere")
-
-
-def test_counters_add_up(scene: Scene, rng: np.random.Generator) -> None:
-    scene.add_avatar("al", BODY, 0.01)
-    poses = archive_cases.near_poses(rng, synthetic_scans.make_scan("corner", 4, 300), BODY, 20, 0.1)
-    first, second = scene.collide("al", poses), scene.collide("al", poses)
-    # Of some voxels it is the cell alone that is in reach: they are read once.
-    assert (first.hits, second.misses) == (0, 0) and first.misses >= second.hits > 0
-    assert first.resident == second.resident == first.misses
-    assert (
-        0 < first.resident_bytes == second.resident_bytes <= 64 * first.resident + scene.info().resident_bytes
-    )
-    assert first.engine_seconds > 0
-    assert first.node_visits.tolist() == second.node_visits.tolist()
-
-
-def test_warming_loads_a_voxel_and_leaves_no_avatar(scene: Scene) -> None:
-    scene.warm()
-    assert scene.residency.resident >= 1
-    with pytest.raises(UnknownAvatarError):
-        scene.collide("warm-up", HERE)
 
 
 def test_a_scan_so_thin_that_its_radius_is_large_answers_every_way(tmp_path: Path) -> None:

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from solidcloud.schemas.archive.index import INDEX_NAME
-from solidcloud.schemas.errors import BadRequestError, BusyError, FormatError, SolidcloudError
-from solidcloud.server.archives import placed_archive
-from solidcloud.server.residency import coarse_bounds
+from solidcloud.schemas.errors import BadRequestError, FormatError, SolidcloudError
 from solidcloud.server.scene import Scene
 
 BODY = np.array([[0.0, 0, 0], [0.1, 0, 0]])
@@ -134,27 +132,6 @@ def test_a_path_that_nobody_wants_any_more_holds_nothing(place: Path, begun: boo
         assert not before.take()
 
 
-def test_a_refused_path_holds_nothing(place: Path) -> None:
-    with Scene.open(place) as scene:
-        scene.add_avatar("al", BODY, 0.01)
-        with pytest.raises(BadRequestError):
-            scene.path("al", AT_ALONE, "distance", reach=-1.0)
-        scene.reload()
-        assert scene.archives[0]._before is not None and scene.archives[0]._before.ended.is_set()
-
-
-def test_a_third_generation_waits_for_the_first(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(placed_archive, "RELOAD_WAIT", 0.01)
-    with Scene.open(place) as scene:
-        scene.add_avatar("al", BODY, 0.01)
-        path = scene.path("al", np.repeat(AT_ALONE, 5000, axis=0))
-        scene.reload()
-        with pytest.raises(BusyError, match="reload later"):
-            scene.reload()
-        assert sum(len(part) for part in path) == 5000
-        scene.reload()
-
-
 def truncate(place: Path) -> None:
     shard = next((place / "shards").iterdir())
     shard.write_bytes(shard.read_bytes()[:-1])
@@ -214,20 +191,6 @@ def test_voxels_in_memory_are_there_after(place: Path, replace: Replace) -> None
         scene.residency.check()
 
 
-def test_only_what_fits_is_loaded_before(place: Path) -> None:
-    with Scene.open(place) as scene:
-        largest = max(scene.residency._sizes)
-    with Scene.open(place, budget_bytes=2 * largest) as scene:
-        scene.add_avatar("al", BODY, 0.01)
-        for point in POINTS[:50]:
-            scene.collide("al", archive_cases.pose_of(np.eye(3), point)[None])
-        last = scene.residency.recent()[-1]
-        scene.reload()
-        assert scene.residency.recent()[-1] == last
-        assert scene.residency.evictions <= 1  # what warming had loaded
-        scene.residency.check()
-
-
 def test_a_closed_scene_says_so(place: Path) -> None:
     scene = Scene.open(place)
     scene.add_avatar("al", BODY, 0.01)
@@ -240,17 +203,3 @@ def test_a_closed_scene_says_so(place: Path) -> None:
     ):
         with pytest.raises(SolidcloudError, match="closed"):
             ask()
-
-
-def test_warming_calls_the_kernel_of_coarse_bounds(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is called only once a load has made coarse bounds; the first request waited for its compilation."""
-    calls, kernel = [], coarse_bounds.copy_unproved_pairs
-
-    def counted(*arguments: object) -> int:
-        calls.append(len(arguments))
-        return int(kernel(*arguments))
-
-    monkeypatch.setattr(coarse_bounds, "copy_unproved_pairs", counted)
-    with Scene.open(place, policy="lru+prefetch") as scene:
-        scene.warm()
-    assert calls

@@ -33,23 +33,6 @@ def rest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(tmp_path_factory.mktemp("left_out") / "rest", parts)
 
 
-def voxel_bytes(archive: Archive) -> dict[int, list[Any]]:
-    """All of every voxel, and what the index says of it, by key."""
-    found = {}
-    base = archive.coordinates * archive.header.lattice.voxel_steps
-    for row in range(len(archive.voxels)):
-        voxel, _ = archive.read_voxel(row)
-        columns = [*voxel.cells, *voxel.nodes, voxel.points, voxel.scan_index, voxel.intensity, voxel.normal]
-        index = [archive.voxels[name][row].tolist() for name in ("rows", "leaves", "low", "high")]
-        found[voxel.key] = [
-            *(c.tobytes() for c in columns),
-            voxel.radius_class.tobytes(),
-            *index,
-            base[row].tolist(),
-        ]
-    return found
-
-
 def assert_same_answers(found: Any, expected: Any, but: tuple[str, ...] = ()) -> None:
     """Every column of the same bytes, costs included."""
     assert type(found) is type(expected)
@@ -110,22 +93,6 @@ def test_verdicts_and_distances_are_those_of_the_naive_judges(whole: Path, rng: 
     assert 0 < judged.sum() < len(judged)
 
 
-@pytest.mark.interpreted
-def test_voxels_are_those_that_a_build_of_the_rest_stores(whole: Path, rest: Path) -> None:
-    boxes = [(box.low, box.high) for box in (DOOR, ROOM)]
-    with MaskedArchive(whole, boxes) as found, Archive(rest) as expected, Archive(whole) as before:
-        served, stored = voxel_bytes(found), voxel_bytes(expected)
-        assert served == stored
-        # Some are rebuilt, one is gone, most are what they were.
-        untouched = {key for key, held in voxel_bytes(before).items() if served.get(key) == held}
-        assert 0 < len(untouched) < len(served) < len(before.voxels)
-        assert found.header.points == before.header.points
-        assert (found.header.low.tolist(), found.header.radius) == (
-            before.header.low.tolist(),
-            before.header.radius,
-        )
-
-
 def test_a_voxel_left_empty_is_gone_and_clear(whole: Path) -> None:
     with open_without(whole, ROOM) as scene, Scene.open(whole) as before:
         assert scene.info().voxels == before.info().voxels - 1
@@ -136,26 +103,6 @@ def test_a_voxel_left_empty_is_gone_and_clear(whole: Path) -> None:
             assert each.collide("ball", pose).verdict.tolist() == [verdict]
         assert scene.collide("ball", pose).misses == 0
         scene.residency.check()
-
-
-def test_a_box_beside_everything_changes_no_byte(whole: Path, rng: np.random.Generator) -> None:
-    outside = ThroughBox("outside", (2.0 + STEP, -9.0, -9.0), (9.0, 9.0, 9.0))
-    # Between two lattice planes: it meets voxels, and holds no point.
-    between = ThroughBox("between", (0.5 + STEP / 4, 0.0, 0.0), (0.5 + STEP / 2, 2.0, 2.0))
-    poses = poses_near(rng, 6)
-    with (
-        MaskedArchive(whole, [(b.low, b.high) for b in (outside, between)]) as found,
-        Archive(whole) as before,
-    ):
-        assert found.voxels.tobytes() == before.voxels.tobytes()
-        frames = [
-            [archive.read_frames(row) for row in range(len(before.voxels))] for archive in (found, before)
-        ]
-        assert frames[0] == frames[1]
-    with open_without(whole, outside, between) as scene, Scene.open(whole, "hall") as expected:
-        assert scene.info() == expected.info()
-        for answer, right in zip(ask_all(scene, poses, None), ask_all(expected, poses, None), strict=True):
-            assert_same_answers(answer, right)
 
 
 @pytest.mark.interpreted
@@ -185,25 +132,6 @@ def test_a_reload_keeps_the_boxes(whole: Path, rng: np.random.Generator) -> None
         assert scene.reload().generation_after == 0
         for again, before in zip(ask_all(scene, poses, None), first, strict=True):
             assert_same_answers(again, before)
-
-
-def test_a_small_cache_answers_the_same(whole: Path, rng: np.random.Generator) -> None:
-    poses = poses_near(rng, 8)
-    with open_without(whole, DOOR, ROOM) as scene:
-        largest, expected = (
-            int(scene.archives[0]._opened.store.sizes.max()),
-            list(ask_all(scene, poses, None)),
-        )
-    for policy, budget in (
-        ("lru", largest + 4096),
-        ("lru+prefetch", largest + 4096),
-        ("lru+prefetch", 64 << 20),
-    ):
-        with open_without(whole, DOOR, ROOM, budget_bytes=budget, policy=policy) as scene:
-            found = list(ask_all(scene, poses, None))
-        # The work depends on what fits at a time, and with it what a budget of visits leaves undone.
-        for answer, right in zip(found[:-1], expected[:-1], strict=True):
-            assert_same_answers(answer, right, ("node_visits", "point_tests", "steps"))
 
 
 @pytest.mark.interpreted

@@ -1,24 +1,18 @@
 """Opening an archive without the points in boxes: what is read, what fails, what is refused, what is corrupt."""
 
 import os
-import subprocess
-import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import archive_cases
 import numpy as np
 import pytest
-from masked_scans import BODY, DOOR, build, in_boxes, open_without, two_scans
+from masked_scans import BODY, DOOR, build, open_without, two_scans
 from numpy.typing import NDArray
-from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError
 from solidcloud.schemas.scene.effect_table import ThroughBox
 from solidcloud.server.archives import masked_archive as left_out
-from solidcloud.server.archives.masked_archive import MaskedArchive
-from solidcloud.server.archives.rigid_transform import transform_points
 from solidcloud.server.scene import Scene
 
 
@@ -116,67 +110,3 @@ def test_what_fails_while_it_is_opened_is_told_and_leaves_no_file_open(
         assert len(os.listdir("/proc/self/fd")) == within
         assert len(scene.collide("al", np.eye(4)[None])) == 1
     assert len(os.listdir("/proc/self/fd")) == before
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize("posed", [False, True])
-def test_voxels_that_lie_in_a_box_whole_are_not_read(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, posed: bool
-) -> None:
-    pose = (
-        archive_cases.pose_of(archive_cases.random_rotation(np.random.default_rng(3)), np.array([5.0, 0, 1]))
-        if posed
-        else None
-    )
-    low, high = (-9.0, -9.0, -9.0), (1.6, 1.6, 1.6)
-    read: list[int] = []
-    read_points = left_out.read_points
-
-    def counted(archive: Archive, row: int) -> Any:
-        read.append(row)
-        return read_points(archive, row)
-
-    with Archive(whole) as before:
-        steps = before.header.lattice.voxel_steps
-        bounds = before.header.lattice.to_world(
-            np.stack([np.zeros_like(before.coordinates), np.full_like(before.coordinates, steps - 1)])
-            + before.coordinates * before.header.lattice.voxel_steps
-        )
-        every = np.concatenate(
-            [
-                before.header.lattice.to_world(
-                    voxel_points(*before.read_voxel(row))
-                    + before.coordinates[row] * before.header.lattice.voxel_steps
-                )
-                for row in range(len(before.voxels))
-            ]
-        )
-    monkeypatch.setattr(left_out, "read_points", counted)
-    if pose is not None:
-        middle = transform_points(pose, np.array([[0.8, 0.8, 0.8]]))[0]
-        low, high = tuple((middle - 0.8).tolist()), tuple((middle + 0.8).tolist())
-    # Another box cuts what lies in the first whole.
-    middle = np.mean([low, high], axis=0) if posed else np.full(3, 0.75)
-    with MaskedArchive(whole, [(low, high), (middle, middle + 0.01)], pose) as archive:
-        rows = archive.voxels["rows"][:, 2].sum()
-    world = every if pose is None else transform_points(pose, every)
-    assert rows == (~in_boxes(world, (ThroughBox("box", low, high),))).sum()
-    # Where a cell's eight corners are in the box, so are its points, whatever the index says of them.
-    corners = np.array([bounds[[i & 1, i >> 1 & 1, i >> 2], :, [0, 1, 2]].T for i in range(8)])
-    carried = (
-        corners if pose is None else transform_points(pose, corners.reshape(-1, 3)).reshape(corners.shape)
-    )
-    inside = ((carried >= low) & (carried <= high)).all(axis=(0, 2))
-    assert inside.any() and read and not set(np.flatnonzero(inside)) & set(read)
-
-
-def test_a_scene_without_boxes_imports_nothing_of_it(whole: Path) -> None:
-    program = (
-        "import sys; from solidcloud.server.scene import Scene; Scene.open(sys.argv[1]).close(); "
-        "names = ('masked_archive', 'masked_voxel', 'voxel_octree', 'through_effect'); "
-        "print(*(m for m in sys.modules if m.endswith(names)))"
-    )
-    done = partial(subprocess.run, capture_output=True, text=True, check=True)(
-        [sys.executable, "-c", program, str(whole)]
-    )
-    assert done.stdout.split() == []

@@ -8,7 +8,6 @@ from solidcloud.schemas.wire.answers import (
     CollideAnswers,
     ContactsAnswers,
     DistanceAnswers,
-    RaycastAnswers,
     SweepAnswers,
     Verdict,
 )
@@ -41,18 +40,6 @@ def test_contact_wins_then_unknown_then_clear() -> None:
     # A contact is exact if one is; what is clear is so by all.
     assert found.exact.tolist() == [True, False, False, True, True, True, False, False, False]
     assert not found.outside.any(), "outside of one alone"
-
-
-def test_counts_are_added_and_do_not_wrap() -> None:
-    most = np.iinfo(np.uint32).max
-    first = answers(CollideAnswers, 2, node_visits=[most, 3], hits=2, misses=1, faults=("a", "b"), late=(7,))
-    second = answers(
-        CollideAnswers, 2, node_visits=[5, 4], hits=3, engine_seconds=0.5, faults=("b",), late=(7, 8)
-    )
-    found = merge_answers([first, second])
-    assert found.node_visits.tolist() == [most, 7]
-    assert (found.hits, found.misses, found.engine_seconds) == (5, 1, 0.5)
-    assert found.faults == ("a", "b") and found.late == (7, 8)
 
 
 def test_the_nearest_is_exact_if_nobody_may_hold_a_nearer_one() -> None:
@@ -132,12 +119,6 @@ def test_a_motion_without_contact_is_clear_or_unknown_from_the_first_doubt_on() 
     )
 
 
-def test_a_ray_that_starts_in_two_spheres_names_one() -> None:
-    columns = {"verdict": [1], "distance": [0.0], "lower": [0.0], "upper": [0.0], "exact": [True]}
-    pair = [answers(RaycastAnswers, 1, **columns, cloud_point=[[x, 0, 0]]) for x in (2.0, 1.0)]
-    assert merge_answers(pair).cloud_point.tolist() == [[1.0, 0, 0]]
-
-
 def listed(depths: list[list[float]], scan: int) -> ContactsAnswers:
     """Contacts of poses, each a cluster of its own."""
     counts = [len(own) for own in depths]
@@ -172,9 +153,3 @@ def test_contacts_are_listed_by_depth_with_the_clusters_they_are_in() -> None:
     assert few.cluster_deepest.tolist() == found.cluster_deepest.tolist()
     assert limit_pairs(found, 0).signed_distance.tolist() == []
     assert limit_pairs(found, 3) is found
-
-
-def test_scans_that_were_not_kept_get_no_number_of_another_archive() -> None:
-    assert answers_in_world(listed([[-3.0]], -1), None, 4).scan_index.tolist() == [-1]
-    alone = listed([[-3.0]], 1)
-    assert merge_answers([alone]) is alone and answers_in_world(alone, None) is alone

@@ -3,14 +3,13 @@
 from collections.abc import Iterator
 from typing import Any
 
-import archive_cases
 import naive
 import numpy as np
 import pytest
 from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.archives.rigid_transform import inverse_pose, transform_points, transform_poses
 from solidcloud.server.scene import Scene
-from split_scans import BODY, COUNT, INTERPRETED, RADIUS, STEP, Built, exact_pose, near, several
+from split_scans import BODY, INTERPRETED, RADIUS, STEP, Built, exact_pose, near, several
 
 # What answers say of the cost, and of bounds, which are each archive's own.
 COSTS = ("node_visits", "point_tests", "voxels_missing", "outside", "steps")
@@ -182,62 +181,6 @@ def test_verdicts_are_those_of_the_naive_judge_of_both(built: Built, rng: np.ran
         judged |= naive.collide(points, origin, STEP, 0.01, BODY, RADIUS, asked)
     assert verdict.tolist() == judged.astype(int).tolist()
     assert 0 < judged.sum() < len(judged)
-
-
-def test_any_rigid_pose_is_within_a_micrometre(built: Built, rng: np.random.Generator) -> None:
-    at = [archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-3, 3, 3)) for _ in range(2)]
-    with several((built.first, at[0]), (built.second, at[1])) as scene:
-        clouds = [points @ m[:3, :3].T + m[:3, 3] for points, m in zip(built.points, at, strict=True)]
-        cloud = np.vstack(clouds)
-        poses = archive_cases.near_poses(rng, cloud, BODY, COUNT, 0.1)
-        found = scene.distance("al", poses, 0.5)
-        for i, pose in enumerate(poses):
-            body = BODY @ pose[:3, :3].T + pose[:3, 3]
-            apart = np.linalg.norm(body[:, None] - cloud, axis=2)
-            assert abs(found.signed_distance[i] - (apart.min() - RADIUS - 0.01)) < 1e-6
-            between = np.linalg.norm(found.witness_avatar[i] - found.witness_cloud[i])
-            assert abs(between - apart.min()) < 1e-6
-            assert np.linalg.norm(cloud - found.witness_cloud[i], axis=1).min() < 1e-6
-            out = (found.witness_avatar[i] - found.witness_cloud[i]) / between
-            assert np.abs(found.normal[i] - out).max() < 1e-6
-        places, ways = poses[:, :3, 3].copy(), poses[:, :3, 0].copy()
-        near_point = np.linalg.norm(places[:, None] - cloud, axis=2).min(axis=1)
-        within = scene.within(places, 4.0)
-        assert np.abs(within.distance - near_point).max() < 1e-6
-        hits = scene.raycast(places, 5.0 * ways, 4.0)
-        touched = hits.verdict == 1
-        assert touched.sum() > 0
-        assert (
-            np.abs(
-                np.linalg.norm(hits.hit - hits.cloud_point, axis=1)[touched & (hits.distance > 0)] - 0.01
-            ).max()
-            < 1e-6
-        )
-        assert np.abs(np.linalg.norm(hits.hit - places, axis=1) - hits.distance)[touched].max() < 1e-6
-        low, high = np.array(scene.info().bounds)
-        assert (cloud >= low - 1e-9).all() and (cloud <= high + 1e-9).all()
-
-
-def test_a_budget_of_visits_is_for_all_archives_together(
-    both: Scene, whole: Scene, built: Built, rng: np.random.Generator
-) -> None:
-    poses = near(rng, np.vstack(built.points), 30)
-    truth = whole.collide("al", poses).verdict
-    clear = np.zeros(len(poses), bool)
-    for budget in (0, 20, 100, 400, 1 << 40):
-        found = both.collide("al", poses, budget_visits=budget, tolerance=1e-4)
-        assert (found.node_visits <= budget + 8).all()
-        assert (truth[found.verdict == 0] == 0).all(), "never clear by mistake"
-        assert (found.verdict[clear] == 0).all(), "what was clear stays clear"
-        clear = found.verdict == 0
-        assert (found.lower <= found.upper).all()
-        distance = both.distance("al", poses, 0.2, budget_visits=budget)
-        true = whole.distance("al", poses, 0.2)
-        assert (distance.lower <= np.minimum(true.signed_distance, 0.2) + 1e-12).all()
-        assert (distance.upper >= true.signed_distance - 1e-12)[np.isfinite(true.signed_distance)].all()
-        same = distance.signed_distance == true.signed_distance
-        assert same[distance.exact].all()
-    assert found.verdict.tolist() == truth.tolist() and found.exact.all() and distance.exact.all()
 
 
 def test_objects_meet_every_archive_and_one_another_once(

@@ -8,15 +8,11 @@ from typing import Any
 import archive_cases
 import numpy as np
 import pytest
-from msgspec import structs
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, FormatError, UnknownAvatarError
 from solidcloud.schemas.wire.key_expressions import public_id
 from solidcloud.server.archives.rigid_transform import (
-    archive_pose,
-    inverse_pose,
     transform_points,
-    transform_poses,
 )
 from solidcloud.server.scene import Scene
 from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
@@ -146,26 +142,8 @@ def test_info_stats_and_reload_speak_of_all_archives(built: Built, rng: np.rando
         scene.drop_client("me")
         with pytest.raises(UnknownAvatarError):
             scene.collide("bo", poses, client="me")
-        scene.warm()
         service = RequestDispatcher([scene], ServerConfig())
         assert service.scenes(None).ok
-
-
-def test_scans_are_numbered_by_the_archives_that_are_asked(
-    built: Built, both: Scene, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
-) -> None:
-    """And not by those that a reload puts there meanwhile, of which `info` speaks already."""
-    first, second = both.archives
-    monkeypatch.setattr(first, "_info", structs.replace(first.info(), sources=first.info().sources * 3))
-    poses = near(rng, built.points[1], 20)
-    found = both.contacts("al", poses)
-    with several((built.first, None)) as alone:
-        own = alone.contacts("al", poses)
-    assert found.pairs_found.sum() > own.pairs_found.sum()
-    assert set(found.scan_index.tolist()) <= {0, 1} and 1 in found.scan_index
-    parts = list(both.path("al", poses, "contacts"))
-    assert np.concatenate([part.scan_index for part in parts]).tobytes() == found.scan_index.tobytes()
-    assert second.info().sources
 
 
 def test_a_reload_that_fails_says_which_archives_are_new(
@@ -206,17 +184,3 @@ def test_what_is_refused_says_why(built: Built, both: Scene) -> None:
         several((built.first, np.diag([2.0, 2, 2, 1])))
     with pytest.raises(BadRequestError, match="without archives"):
         Scene([], "hall")
-
-
-def test_the_inverse_of_a_pose_carries_back(rng: np.random.Generator) -> None:
-    assert archive_pose(np.eye(4)) is None and archive_pose(None) is None
-    for _ in range(20):
-        pose = archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1e3, 1e3, 3))
-        points = rng.uniform(-100, 100, (10, 3))
-        assert (
-            np.abs(transform_points(inverse_pose(pose), transform_points(pose, points)) - points).max()
-            < 1e-11
-        )
-        assert np.abs(transform_poses(inverse_pose(pose), pose[None])[0] - np.eye(4)).max() < 1e-11
-        shift = exact_pose(rng)
-        assert transform_poses(inverse_pose(shift), shift[None])[0].tobytes() == np.eye(4).tobytes()

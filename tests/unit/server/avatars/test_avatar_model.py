@@ -22,7 +22,7 @@ def leaf_points(model: AvatarModel, node: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
-@pytest.mark.parametrize(("shift", "scale"), [(0.0, 1.0), (1e6, 1e-3), (-1e9, 1.0), (0.0, 1e5)])
+@pytest.mark.parametrize(("shift", "scale"), [(1e6, 1e-3), (-1e9, 1.0)])
 def test_every_node_encloses_its_points_exactly(kind: str, shift: float, scale: float) -> None:
     points = np.clip(synthetic_scans.make_scan(kind, 3, 150) * scale + shift, -1e9, 1e9)
     model = make_avatar(points, 0.1)
@@ -64,12 +64,6 @@ def test_a_single_distinct_point_needs_a_radius(count: int) -> None:
     assert make_avatar(points, 0.5).bounding_radius == pytest.approx(0.5, abs=1e-5)
 
 
-def test_an_empty_avatar_is_one() -> None:
-    model = make_avatar(np.empty((0, 3)))
-    assert len(model.points) == 0 and model.radius == model.bounding_radius == 0.0
-    assert model.arrays.points.shape == (0, 3, LANES)
-
-
 @pytest.mark.parametrize(
     ("points", "radius", "message"),
     [
@@ -93,24 +87,3 @@ def test_what_is_refused_says_what_was_expected(points: object, radius: float, m
 def test_too_many_points_are_refused_before_any_work() -> None:
     with pytest.raises(TooLargeError, match="thin it out"):
         make_avatar(np.broadcast_to(np.zeros(3), (MAX_AVATAR_POINTS + 1, 3)), 0.1)
-
-
-def test_the_points_are_the_avatars_own(rng: np.random.Generator) -> None:
-    points = rng.uniform(-1, 1, (10, 3))
-    model = make_avatar(points, 0.1)
-    before = points.copy()
-    points += 5.0
-    assert (model.points == before).all() and (np.abs(leaf_points(model, 0)) <= 1).all()
-
-
-def test_every_lane_knows_the_row_it_is(rng: np.random.Generator) -> None:
-    points = rng.uniform(-1, 1, (300, 3))
-    points[100:150] = points[:50]
-    model = make_avatar(points, 0.1)
-    assert np.array_equal(points[model.rows].transpose(0, 2, 1), model.arrays.points)
-    held = [
-        own[:count] for own, count in zip(model.rows, model.arrays.count[-len(model.rows) :], strict=True)
-    ]
-    assert sorted(np.concatenate(held).tolist()) == list(range(300)), (
-        "coincident points are points of their own"
-    )

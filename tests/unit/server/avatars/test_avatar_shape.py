@@ -2,7 +2,6 @@
 
 import struct
 import sys
-import typing
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,8 @@ import pytest
 import synthetic_scans
 import trimesh
 from msgspec import structs
-from solidcloud.builder.sources.placed_scan import METRES, TURNS
 from solidcloud.builder.synthetic.figure import figure_points, write_figure
 from solidcloud.schemas.errors import BadRequestError, ScanError, TooLargeError
-from solidcloud.schemas.scene.scene_file import AvatarItem
 from solidcloud.server.avatars.avatar_shape import avatar_shape
 from solidcloud.server.client import Client
 from solidcloud.server.scene import Scene
@@ -180,24 +177,6 @@ def test_a_missing_reader_is_named_with_the_extra_to_install(
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ScanError, match=rf"library '{library}'.* pip install 'solidcloud\[readers\]'"):
         avatar_shape(file)
-
-
-def test_stl_glb_and_points_need_no_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for kind in ("stl", "glb"):
-        (tmp_path / f"box.{kind}").write_bytes(BOX.export(file_type=kind))
-    write_figure(tmp_path / "figure.obj", POINTS)
-    for library in ("trimesh", "plyfile", "laspy", "lazrs", "pye57"):
-        monkeypatch.setitem(sys.modules, library, None)
-    assert len(np.asarray(avatar_shape(tmp_path / "box.stl").points)) > 5_000
-    assert len(np.asarray(avatar_shape(tmp_path / "box.glb").points)) > 5_000
-    assert len(np.asarray(avatar_shape(tmp_path / "figure.obj").points)) == 3
-
-
-def test_a_scene_file_takes_the_words_of_scan_lists() -> None:
-    hints = typing.get_type_hints(AvatarItem)
-    for field, known in (("up", TURNS), ("units", METRES)):
-        words = next(each for each in typing.get_args(hints[field]) if each is not type(None))
-        assert set(typing.get_args(words)) == set(known)
 
 
 def refusals(add: Any) -> list[str]:

@@ -5,17 +5,16 @@ import threading
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, TooLargeError, UnknownAvatarError
-from solidcloud.schemas.wire.encoding import avatar_digest
 from solidcloud.server.avatars import client_avatars as avatars_module
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.avatars.client_avatars import Avatars, bytes_of
-from solidcloud.server.scene_interface import EVERYBODY, AvatarLimits, recording_avatars
+from solidcloud.server.scene_interface import EVERYBODY, AvatarLimits
 
 LIMITS = AvatarLimits(bytes=100_000, bytes_by_client=60_000, avatars=10, avatars_by_client=4, clients=3)
 BODY = np.random.default_rng(5).uniform(-1, 1, (500, 3))  # some 29 kB
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 31, 33, 1000, 20_000])
+@pytest.mark.parametrize("count", [0, 1, 33, 1000])
 @pytest.mark.parametrize("kind", ["uniform", "line", "one place"])
 def test_what_is_reserved_is_enough(count, kind):
     points = np.random.default_rng(count).uniform(-1, 1, (count, 3))
@@ -75,14 +74,6 @@ def test_a_clients_avatars_are_limited(limits, what):
     avatars.add("3", BODY[:2], 0.01, "a")
 
 
-def test_the_number_of_all_avatars_is_limited():
-    avatars = Avatars(LIMITS._replace(avatars=2))
-    for client in "ab":
-        avatars.add("al", BODY[:2], 0.01, client)
-    with pytest.raises(TooLargeError, match="2 avatars of all clients"):
-        avatars.add("al", BODY[:2], 0.01, "c")
-
-
 def test_the_number_of_clients_is_limited():
     avatars = Avatars(LIMITS)
     for client in "abc":
@@ -114,51 +105,6 @@ def test_the_same_avatar_again_is_the_same_and_another_is_refused():
         with pytest.raises(BadRequestError, match="other points or another radius"):
             avatars.add("al", points, radius, "a")
     assert avatars.stats().avatars == 2
-
-
-def test_only_a_radius_that_is_not_given_is_made_again_and_in_its_turn(monkeypatch):
-    avatars, made = Avatars(LIMITS), []
-    first = avatars.add("al", BODY, 0.01, "a")
-
-    def making(points, radius, inner_points=0):
-        made.append((radius, avatars._large.locked()))
-        return make_avatar(points, radius)
-
-    monkeypatch.setattr(avatars_module, "make_avatar", making)
-    monkeypatch.setattr(avatars_module, "_LARGE", 100)
-    with pytest.raises(BadRequestError, match="another radius"):
-        avatars.add("al", BODY, 0.02, "a")
-    assert avatars.add("al", BODY, 0.01, "a") is first and made == []
-    with pytest.raises(BadRequestError, match="another radius"):
-        avatars.add("al", BODY, None, "a")
-    assert made == [(None, True)]
-
-
-def test_the_avatars_that_answer_are_noted_as_they_are_handed_out():
-    avatars = Avatars(LIMITS)
-    al = avatars.add("al", BODY, None, "a")
-    avatars.add("own", BODY, 0.01, EVERYBODY)
-    found = []
-    with recording_avatars(found):
-        assert avatars.get("al", "a") is al
-        avatars.drop_client("a")
-        other = avatars.add("al", BODY[:9], 0.5, "a")
-        avatars.get("al", "a"), avatars.get("own", "a")
-    avatars.get("al", "a")
-    assert found == [avatar_digest(BODY, al.radius), avatar_digest(BODY[:9], 0.5)]
-    assert (al.digest, other.digest) == tuple(found)
-
-
-def test_a_client_may_add_one_of_the_scenes_own_avatars_as_it_is():
-    avatars = Avatars(LIMITS)
-    own = avatars.add("own", BODY, 0.01, EVERYBODY)
-    shared = avatars.add("own", BODY, 0.01, "a")
-    assert shared.arrays is own.arrays and own.digest == b"" and avatars.get("own", "a") is shared
-    assert shared.digest == avatar_digest(BODY, 0.01) and avatars.get("own", "b") is own
-    assert avatars.stats().bytes < BODY.nbytes
-    for points, radius in ((BODY[:9], 0.01), (BODY, 0.5)):
-        with pytest.raises(BadRequestError, match="'own' exists with other points or another radius"):
-            avatars.add("own", points, radius, "b")
 
 
 def test_what_is_being_built_counts_and_is_waited_for(monkeypatch):
@@ -207,9 +153,3 @@ def test_unused_avatars_of_clients_without_a_token_are_dropped(monkeypatch):
     assert avatars.stats().clients == 0
     avatars.get("own", "anybody")
     avatars.get("ours", "")
-
-
-def test_nothing_is_limited_in_process():
-    avatars = Avatars()
-    avatars.add("al", np.zeros((5000, 3)), 0.01, "a")
-    assert avatars.stats().max_bytes == 0

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from msgspec import structs
 from naive_sweep import pose_at
-from solidcloud.schemas.errors import BadRequestError, BusyError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.clash import clash_check
 from solidcloud.server.clash.clash_check import Watcher, check_path
 from solidcloud.server.clash.clash_snapshot import draw
 from solidcloud.server.clash.clash_surroundings import surroundings
 from solidcloud.server.clash.clash_viewpoint import find_viewpoint
-from solidcloud.server.clash.path_motions import poses_between
 from solidcloud.server.scene import Scene
 
 RADIUS = 0.05
@@ -177,14 +175,6 @@ class HastyScene:
         return structs.replace(answers, verdict=unknown, stopped="it took too long")
 
 
-def test_check_without_an_answer_fails() -> None:
-    times, poses = path_through(1000)
-    with pytest.raises(BusyError, match="ended early: distance: no answer within 5 s"):
-        check_path(FakeScene(3), "body", times, poses)  # type: ignore[arg-type]
-    with pytest.raises(BadRequestError, match="no poses"):
-        check_path(FakeScene(3), "body", times[:0], poses[:0])  # type: ignore[arg-type]
-
-
 def ball_path(step: float) -> np.ndarray:
     """Return poses of the way through the wall at x = 0, none of which touches it if `step` is large."""
     places = np.arange(-0.35, 0.5, step)
@@ -238,7 +228,7 @@ def test_clashes_at_and_between_poses_are_one_list(case: archive_cases.Case) -> 
     assert shares == sorted(shares)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 def test_clearance_is_at_most_the_least_distance_on_the_motions(case: archive_cases.Case, seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = np.array([
@@ -261,24 +251,6 @@ def test_clearance_is_at_most_the_least_distance_on_the_motions(case: archive_ca
     clear = checked.motions.verdict == Verdict.CLEAR
     assert (checked.motions.clearance[clear] <= np.array(least)[clear]).all()
     assert (checked.motions.clearance[clear] > 0.3 * np.array(least)[clear] - 2e-3).all()
-
-
-def test_poses_on_a_motion_are_those_of_the_sweep() -> None:
-    rng = np.random.default_rng(3)
-    for case in range(200):
-        first, last = (
-            archive_cases.pose_of(archive_cases.random_rotation(rng), rng.normal(size=3)) for _ in range(2)
-        )
-        if case % 4 == 0:
-            last[:3, :3] = first[:3, :3]
-        elif case % 4 == 1:
-            # Half a turn about a random axis: rounding decides about which side it goes.
-            axis = rng.normal(size=3)
-            last[:3, :3] = (2 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)) @ first[:3, :3]
-        fractions = np.array([0.0, 1e-3, 0.4, 1.0])
-        found = poses_between(first[None], last[None], fractions[None])[0]
-        expected = np.array([pose_at(first, last, t) for t in fractions])
-        assert np.allclose(found, expected, atol=1e-12)
 
 
 def test_unknown_motion_makes_a_stretch_unknown(

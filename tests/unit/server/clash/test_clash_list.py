@@ -32,7 +32,7 @@ def groups_of(clusters: list[tuple[int, Found]]) -> set[frozenset[int]]:
     return {frozenset(group) for group in groups}
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(8))
 def test_clashes_are_those_of_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
     total = int(rng.integers(1, 60))

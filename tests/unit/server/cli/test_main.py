@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from importlib import metadata
@@ -14,8 +13,6 @@ from solidcloud.server.cli.main import app, run
 from typer.main import get_command
 
 pytestmark = pytest.mark.interpreted
-
-SCRIPT = Path(sys.executable).with_name("solidcloud")
 
 
 def leaves(command: Any = None, name: str = "") -> dict[str, Any]:
@@ -67,11 +64,8 @@ def test_output_and_overwrite_have_one_spelling() -> None:
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [
-        ("solidcloud ser", ["serve"]),
         ("solidcloud scene ", ["new", "check"]),
-        ("solidcloud export hall --over", ["--overwrite"]),
         ("solidcloud serve hall --policy lru", ["lru", "lru+prefetch"]),
-        ("solidcloud query --op co", ["collide", "contacts"]),
     ],
 )
 def test_a_shell_completes(typed: str, offered: list[str]) -> None:
@@ -88,30 +82,6 @@ def test_a_shell_completes(typed: str, offered: list[str]) -> None:
         env={**os.environ, **said},
     )
     assert done.stdout.split() == offered and done.stderr == ""
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-def test_bash_completes_a_command_that_is_given_by_its_path() -> None:
-    code = (
-        f'eval "$({SCRIPT} --show-completion)"\n'
-        f"COMP_WORDS=({SCRIPT} rel) COMP_CWORD=1\n"
-        '$(complete -p solidcloud | sed "s/.*-F \\([^ ]*\\) .*/\\1/") ' + str(SCRIPT) + "\n"
-        'echo "${COMPREPLY[@]}"'
-    )
-    done = subprocess.run(["bash", "--norc", "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "reload", done.stderr
-
-
-def test_help_says_how_to_run_a_command_that_is_not_on_the_search_path(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("PATH", "/usr/bin:/bin")
-    for verb in ([], ["build"], ["scene", "new"]):
-        assert run([*verb, "--help"]) == 0
-        assert f'export PATH={SCRIPT.parent}:"$PATH"' in capsys.readouterr().out
-    monkeypatch.setenv("PATH", f"{SCRIPT.parent}:/usr/bin:/bin")
-    assert run(["--help"]) == 0
-    assert "export PATH" not in capsys.readouterr().out
 
 
 def test_an_error_names_a_command_as_it_can_be_run(

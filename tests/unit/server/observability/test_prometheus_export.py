@@ -13,7 +13,7 @@ pytest.importorskip("prometheus_client")
 
 from prometheus_client.parser import text_string_to_metric_families
 from solidcloud.schemas.errors import BadRequestError, SolidcloudError
-from solidcloud.schemas.wire.stats import StatsAnswer, Times, UserStats
+from solidcloud.schemas.wire.stats import StatsAnswer, UserStats
 from solidcloud.server.observability.prometheus_export import MAX_USERS_LISTED, metrics_served
 from solidcloud.server.observability.request_stats import Histogram
 from solidcloud.server.zenoh_server.server_config import ServerConfig
@@ -69,10 +69,6 @@ def test_every_count_is_there_under_a_name_as_prometheus_wants_it() -> None:
     assert sum(name.endswith("_total") for name in own) == len(set(FIELDS) - gauges)
 
 
-def test_the_process_is_there_too() -> None:
-    assert {"process_resident_memory_bytes", "process_cpu_seconds_total"} <= {name for name, _, _ in read()}
-
-
 def test_times_are_histograms() -> None:
     histogram = Histogram()
     for seconds in (0.0, 0.0005, 0.0005, 0.004, 300.0):
@@ -117,29 +113,6 @@ def test_a_scene_that_cannot_be_asked_does_not_hide_the_others(caplog: pytest.Lo
     assert "cannot read the metrics of scene hall" in caplog.text
 
 
-def test_every_scrape_asks_anew() -> None:
-    scene = CountedScene("hall", hits=1)
-    with metrics_served([scene], "127.0.0.1", 0) as where:
-        for hits in (1, 5, 9):
-            scene.fields["hits"] = hits
-            assert ("solidcloud_voxel_hits_total", {"scene": "hall"}, hits) in list(samples(text_of(where)))
-
-
-def test_the_port_is_free_again_after_and_taken_meanwhile() -> None:
-    with metrics_served([], "127.0.0.1", 0) as where:
-        port = int(where.rsplit(":", 1)[1].partition("/")[0])
-        with pytest.raises(SolidcloudError, match=f"--metrics-port {port}: cannot listen on 127.0.0.1"):
-            metrics_served([], "127.0.0.1", port).__enter__()
-    with metrics_served([], "127.0.0.1", port) as again:
-        assert again == where and text_of(again)
-
-
-def test_others_reach_the_metrics_only_where_that_is_said() -> None:
-    assert ServerConfig().metrics_port == 0
-    assert ServerConfig(metrics_port=9100).metrics_host == "127.0.0.1"
-    assert ServerConfig(metrics_port=9100, insecure=True).metrics_host == "0.0.0.0"
-
-
 @pytest.mark.parametrize("port", [-1, 65536])
 def test_a_port_that_is_none_is_refused(port: int) -> None:
     with pytest.raises(BadRequestError, match="--metrics-port"):
@@ -158,8 +131,3 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(SolidcloudError, match=r"prometheus_client.*pip install 'solidcloud\[metrics\]'"):
         importlib.import_module("solidcloud.server.observability.prometheus_export")
-
-
-def test_times_that_say_nothing_have_all_buckets() -> None:
-    found = read(CountedScene("hall", load_seconds=Times()))
-    assert sum(name == "solidcloud_load_seconds_bucket" for name, _, _ in found) == 26

@@ -58,7 +58,7 @@ def test_a_corrupt_record_is_unknown_where_it_matters_and_nowhere_else(tmp_path:
 
 
 def test_a_pose_over_the_budget_is_looked_at_in_pieces(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 2, 3000), voxel=0.25, radius=0.01)
+    case = archive_cases.build(tmp_path, synthetic_scans.make_scan("noise", 2, 1000), voxel=0.5, radius=0.01)
     avatar = rng.uniform(
         0, synthetic_scans.SIZE, (8, 3)
     )  # as large as the scan: poses reach nearly every voxel
@@ -105,18 +105,6 @@ def test_the_region_of_a_scan_left_out_is_unknown(tmp_path: Path) -> None:
         point = synthetic_scans.make_scan("plane", 1, 200)[0]
         scene.add_avatar("bar", np.linspace(point, [10.5, 10.5, 10.5], 50), 0.1)
         assert scene.collide("bar", at((0, 0, 0))).verdict.tolist() == [CONTACT]
-
-
-def test_a_scan_of_unknown_extent_leaves_nothing_clear(tmp_path: Path) -> None:
-    good = synthetic_scans.write_ply(tmp_path / "good.ply", synthetic_scans.make_scan("plane", 1, 200))
-    (tmp_path / "broken.e57").write_bytes(b"ASTM-E57" + bytes(100))
-    options = BuildConfig(skip_bad=True, jobs=1, resolution=1e-3, radius=0.01)
-    build_archive([good, tmp_path / "broken.e57"], tmp_path / "archive", options)
-    with Scene.open(tmp_path / "archive") as scene:
-        scene.add_avatar("ball", [[0.0, 0, 0]], 0.1)
-        touching = tuple(synthetic_scans.make_scan("plane", 1, 200)[0])
-        answers = scene.collide("ball", at((0, 0, 900), touching))
-        assert answers.verdict.tolist() == [UNKNOWN, CONTACT]
 
 
 @pytest.fixture(scope="module")
@@ -187,18 +175,6 @@ def test_no_poses_and_no_avatar_are_answered(scene: Scene) -> None:
     answers = scene.collide("nobody", inside, 0.5)
     assert answers.verdict.tolist() == [CLEAR, CLEAR] and not answers.outside.any()
     assert [answer.verdict for answer in scene.collide("ball", inside)] == [CONTACT, CLEAR]
-
-
-def test_poses_of_any_layout_give_the_same_answers(scene: Scene, rng: np.random.Generator) -> None:
-    poses = archive_cases.near_poses(
-        rng, synthetic_scans.make_scan("plane", 1, 100), np.zeros((1, 3)), 30, 0.3
-    )
-    expected = scene.collide("ball", poses).verdict.tolist()
-    frozen = poses.copy()
-    frozen.flags.writeable = False
-    backwards = poses[::-1].copy()[::-1]
-    for same in (poses.tolist(), frozen, backwards, np.asfortranarray(poses), poses.astype(">f8")):
-        assert scene.collide("ball", same).verdict.tolist() == expected
 
 
 def test_a_tolerance_makes_contact_early_by_no_more_and_gives_bounds(tmp_path: Path) -> None:

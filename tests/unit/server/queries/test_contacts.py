@@ -1,8 +1,6 @@
 """`contacts`: what is listed and what a cluster is, what is missing, what is refused, and where it is stopped."""
 
 import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,45 +8,27 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from contact_cases import ScanCase, compare, open_case, tight
+from contact_cases import ScanCase, compare, open_case
 from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, SolidcloudError, TooLargeError
-from solidcloud.schemas.wire.answers import ContactsAnswers, Verdict
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.request_limits import MAX_CONTACTS
 from solidcloud.server.archives.archive_info import describe
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core.scene_arrays import LANES
 from solidcloud.server.queries import contacts as contacts_module
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 from solidcloud.server.queries.context.query_context import make_scene_data
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
 
 CLEAR, CONTACT, UNKNOWN = Verdict
-COST = (
-    "engine_seconds",
-    "wait_seconds",
-    "hits",
-    "misses",
-    "late",
-    "resident",
-    "resident_bytes",
-    "faults",
-    "stopped",
-)
 
 
 def at(*places: tuple[float, float, float]) -> NDArray[np.float64]:
     """Poses that move the avatar without turning it."""
     return np.array([archive_cases.pose_of(np.eye(3), np.array(place)) for place in places])
-
-
-def columns(answers: ContactsAnswers) -> dict[str, list]:
-    """All that is said but the cost of the request."""
-    return {f: getattr(answers, f).tolist() for f in answers.__struct_fields__ if f not in COST}
 
 
 def row_of_points(count: int) -> NDArray[np.float64]:
@@ -178,54 +158,6 @@ def test_where_a_scan_was_left_out_nothing_is_exact(row: ScanCase) -> None:
     assert nobody.verdict.tolist() == [CLEAR] * 4 and nobody.exact.all()
 
 
-class Stops(QueryBudget):
-    """An budget whose time is up at a given look at the clock."""
-
-    looks: Iterator[bool]
-
-    @property
-    def spent(self) -> bool:
-        """Whether this look is too late."""
-        return next(self.looks)
-
-
-def test_a_deadline_leaves_out_and_never_invents(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Stopped at every look at the clock in turn, in one piece and with a pose's voxels held a few at a time."""
-    monkeypatch.setattr(contacts_module, "SLICE_VISITS", 40)
-    case = open_case(tmp_path, synthetic_scans.make_scan("noise", 2, 1500), rng, voxel=0.5)
-    avatar = make_avatar(rng.uniform(0, synthetic_scans.SIZE, (8, 3)), 0.15)
-    poses = np.concatenate(
-        [at((0, 0, 0), (99, 0, 0)), archive_cases.near_poses(rng, case.points, avatar.points, 3, 0.05)]
-    )
-    whole = contacts(case.data, avatar, poses, MAX_CONTACTS)
-    assert (whole.pairs_found[[0, 2, 3, 4]] > 0).all() and whole.pairs_found.sum() > 50
-    for own in (case, tight(case, 2 * int(case.store.sizes.max()))):
-        looks, unfinished = 0, True
-        while unfinished:
-            budget = Stops(deadline=1e300)
-            budget.looks = iter([False] * looks + [True] * 10_000)
-            answers = contacts(own.data, avatar, poses, MAX_CONTACTS, 0.0, None, budget)
-            own.data.residency.check()
-            for i in range(len(poses)):
-                if answers.exact[i]:
-                    assert answers.pairs_found[i] == whole.pairs_found[i]
-                    assert answers.verdict[i] == whole.verdict[i]
-                else:
-                    assert answers.verdict[i] == (CONTACT if answers.pairs_found[i] else UNKNOWN)
-            assert (np.diff(answers.pair_starts) == answers.pairs_found).all()
-            listed = {tuple(p) for p in np.column_stack([answers.avatar_point, answers.cloud_point]).tolist()}
-            assert listed <= {
-                tuple(p) for p in np.column_stack([whole.avatar_point, whole.cloud_point]).tolist()
-            }
-            assert answers.exact[1], "no point in reach of this one"
-            unfinished = not answers.exact.all()
-            looks += 1
-        assert looks > 5
-    assert not contacts(case.data, avatar, poses, budget=make_budget(budget_ms=0.0)).exact[[0, 2, 3, 4]].any()
-
-
 @pytest.mark.interpreted
 @pytest.mark.parametrize("limit", [-1, MAX_CONTACTS + 1, 1.5, "9", None, True, np.float64(3), 1 << 70])
 def test_a_limit_that_is_no_number_of_pairs_is_refused(row: ScanCase, limit: Any) -> None:
@@ -263,65 +195,6 @@ def test_bad_poses_are_refused_as_by_every_question(
         contacts(row.data, BALL, at((0, 0, 0)), 1, 16.1)
     with pytest.raises(TooLargeError, match="split it"):
         contacts(row.data, make_avatar([[0.0, 0, 0], [2e4, 0, 0]], 0.1), at((0, 0, 0)))
-
-
-@pytest.mark.interpreted
-def test_no_poses_and_no_avatar_are_answered(row: ScanCase) -> None:
-    none = contacts(row.data, BALL, np.empty((0, 4, 4)))
-    assert len(none) == 0 and none.pair_starts.tolist() == [0] and none.cluster_starts.tolist() == [0]
-    nobody = contacts(row.data, NOBODY, at((0, 0, 0), (50, 0, 0)), np.int64(5), 0.5)
-    assert nobody.verdict.tolist() == [CLEAR, CLEAR] and nobody.pair_starts.tolist() == [0, 0, 0]
-    huge = contacts(row.data, BALL, at((0.5, 0, 0)), MAX_CONTACTS, 1.0, 1e9)
-    assert huge.cluster_count.tolist() == huge.pairs_found.tolist()
-
-
-def test_threads_and_layouts_of_poses_change_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = open_case(tmp_path, synthetic_scans.make_scan("corner", 3, 3000), rng, voxel=0.4, resolution=1e-3)
-    body = rng.normal(0, 0.2, (200, 3))
-    avatar = make_avatar(body, 0.02)
-    poses = archive_cases.near_poses(rng, case.points, body, 48, 0.05)
-    expected = columns(contacts(case.data, avatar, poses, 20, 0.02))
-    assert sum(expected["pairs_found"]) > 2000 and len(expected["cluster_count"]) > 150
-    frozen = poses.copy()
-    frozen.flags.writeable = False
-    for same in (frozen, np.asfortranarray(poses), poses.astype(">f8"), poses.tolist()):
-        assert columns(contacts(case.data, avatar, same, 20, 0.02)) == expected
-    for threads in (1, 2, 4):
-        own = tight(case, 3 * int(case.store.sizes.max())) if threads == 4 else case
-        with ThreadPoolExecutor(threads) as pool:
-            asked = [pool.submit(contacts, own.data, avatar, poses, 20, 0.02) for _ in range(2 * threads)]
-            assert all(columns(a.result()) == expected for a in asked)
-            parts = list(pool.map(lambda p, d=own.data: contacts(d, avatar, p[None], 20, 0.02), poses))
-        for name in ("verdict", "pairs_found", "signed_distance", "avatar_index", "cluster", "cluster_high"):
-            assert [v for part in parts for v in columns(part)[name]] == expected[name]
-
-
-def test_an_avatar_in_another_order_names_the_same_points(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = open_case(tmp_path, synthetic_scans.make_scan("plane", 4, 2000), rng, leaf=20)
-    body = rng.normal(0, 0.2, (150, 3))
-    order = rng.permutation(len(body))
-    poses = archive_cases.near_poses(rng, case.points, body, 20, 0.05)
-    first = columns(contacts(case.data, make_avatar(body, 0.03), poses, 1000))
-    second = columns(contacts(case.data, make_avatar(body[order], 0.03), poses, 1000))
-    assert len(first["avatar_index"]) > 400
-    second["avatar_index"] = order[second["avatar_index"]].tolist()
-    for name in ("node_visits", "point_tests"):  # of another tree
-        del first[name], second[name]
-    assert first == second
-
-
-def test_more_cells_than_there_may_be_are_refused(row: ScanCase, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each scan point is in a cell of its own; before each voxel there must be room for another LANES."""
-    avatar, poses = make_avatar(row_of_points(1), 5.0), at((0.0, 0.0, 0.0))
-    whole = contacts(row.data, avatar, poses, 0, 0.0, 0.0)
-    assert whole.pairs_found[0] > LANES
-    for name in ("FIRST_CELLS", "MAX_CELLS"):
-        monkeypatch.setattr(contacts_module, name, LANES)
-    with pytest.raises(TooLargeError, match="larger cluster_distance"):
-        contacts(row.data, avatar, poses, 0, 0.0, 0.0)
-    monkeypatch.setattr(contacts_module, "MAX_CELLS", 2 * LANES)
-    assert contacts(row.data, avatar, poses, 0, 0.0, 0.0).pairs_found.tolist() == whole.pairs_found.tolist()
-    row.data.residency.check()
 
 
 def test_more_than_a_request_may_list_is_refused_before_it_is_kept(

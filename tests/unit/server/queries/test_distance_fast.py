@@ -5,13 +5,11 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import pytest
-from solidcloud.schemas.errors import BadTransformError
 from solidcloud.schemas.wire.answers import DistanceAnswers, Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import resident_fast_path as module
-from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.distance import distance
-from solidcloud.server.queries.resident_fast_path import MAX_FAST_REACH, MAX_FAST_VOXELS, distance_fast
+from solidcloud.server.queries.resident_fast_path import distance_fast
 from solidcloud.server.scene import Scene
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
@@ -54,48 +52,12 @@ def test_what_is_resident_is_answered_in_one_call_and_counted_as_used(
 
 
 @pytest.mark.interpreted
-def test_what_one_call_cannot_answer_is_left_to_distance(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left = Left(monkeypatch)
-    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
-    with Scene.open(case.archive) as scene:
-        data = scene._data
-        distance_fast(data, BALL, above(2.0, 0.0), MAX_FAST_REACH)
-        left.count = 0
-        distance_fast(data, BALL, above(2.0, 0.0), MAX_FAST_REACH)
-        assert left.count == 0
-        distance_fast(data, BALL, above(2.0, 0.0), MAX_FAST_REACH + 0.01)
-        assert left.count == 1, "too far to keep others waiting"
-        distance_fast(data, BALL, above(2.0, 0.0), 0.1, QueryBudget(visits=1))
-        assert left.count == 2, "a budget"
-        box = np.array([[[0, 0, 0], [9, 9, 9]]], np.int64)
-        answers = distance_fast(data._replace(unknown=box), BALL, above(2.0, 0.0), 0.1)
-        assert left.count == 3 and answers.exact.tolist() == [True], "a scan left out, elsewhere"
-        answers = distance_fast(data._replace(unknown_everywhere=True), BALL, above(2.0, 0.3), 0.1)
-        assert left.count == 4 and answers.verdict.tolist() == [Verdict.UNKNOWN]
-
-
-@pytest.mark.interpreted
 def test_an_empty_avatar_is_near_nothing(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
     with Scene.open(case.archive) as scene:
         answers = distance_fast(scene._data, make_avatar(np.empty((0, 3))), np.eye(4), 0.5)
     assert answers.verdict.tolist() == [Verdict.CLEAR] and answers.signed_distance.tolist() == [np.inf]
     assert answers.lower.tolist() == [0.5] and np.isnan(answers.normal).all()
-
-
-@pytest.mark.interpreted
-def test_a_pose_that_cannot_be_written_to_is_taken(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
-    pose = above(0.5, 0.3)
-    pose.setflags(write=False)
-    with Scene.open(case.archive) as scene:
-        found = [
-            distance_fast(scene._data, BALL, p, 0.5).signed_distance[0]
-            for p in (pose, np.asfortranarray(pose), pose)
-        ]
-    assert len(set(found)) == 1 and np.isfinite(found[0])
 
 
 @pytest.mark.interpreted
@@ -112,21 +74,3 @@ def test_centres_that_coincide_are_as_distance_says(tmp_path: Path, radius: floa
     assert found.signed_distance[0] == pytest.approx(-2 * radius, abs=1e-7)
     assert found.normal.tolist() == expected.normal.tolist() == [[0.0, 0.0, 0.0]]
     assert found.verdict.tolist() == [Verdict.CONTACT]
-
-
-@pytest.mark.interpreted
-def test_more_voxels_than_one_call_looks_into_are_left_to_distance(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left = Left(monkeypatch)
-    row = np.zeros((MAX_FAST_VOXELS + 1, 3))
-    row[:, 0] = 0.02 + 0.05 * np.arange(MAX_FAST_VOXELS + 1)
-    case = archive_cases.build(tmp_path, row, voxel=0.05, resolution=1e-3)
-    with Scene.open(case.archive) as scene:
-        data = scene._data
-        for reach, calls in ((2.0, 1), (2.0, 2), (1.0, 2)):
-            found = distance_fast(data, BALL, above(1.62, 0.3), reach)
-            assert left.count == calls and found.signed_distance.tolist() == pytest.approx([0.19], abs=1e-3)
-        assert found.hits < MAX_FAST_VOXELS
-        with pytest.raises(BadTransformError):
-            distance_fast(data, BALL, np.diag([1.0, 1, -1, 1]), 0.1)

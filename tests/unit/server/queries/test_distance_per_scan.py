@@ -10,7 +10,7 @@ import pytest
 from effect_frames import flip_a_byte
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import QueryBudget
-from solidcloud.server.queries.distance_per_scan import ANY_SCAN, ScanSeparations, separation_per_scan
+from solidcloud.server.queries.distance_per_scan import ScanSeparations, separation_per_scan
 
 BALL = make_avatar([[0.0, 0, 0], [0.02, 0, 0]], 0.1)
 POSE = archive_cases.pose_of(np.eye(3), np.array([0.5, 0.0, 0.13]))
@@ -61,15 +61,6 @@ def test_what_is_missing_or_not_looked_at_is_not_exact(tmp_path: Path) -> None:
 
 
 @pytest.mark.interpreted
-def test_a_number_that_no_scan_has_harms_nothing(tmp_path: Path) -> None:
-    case = row(tmp_path)
-    with closing(case.store):
-        both = separation_per_scan(case.data, BALL, POSE, 0.15, 2).separations
-        fewer = separation_per_scan(case.data, BALL, POSE, 0.15, 1).separations
-    assert fewer == {0: both[0], ANY_SCAN: both[1]}
-
-
-@pytest.mark.interpreted
 def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform(0, 1, (120, 3)) * [1, 1, 0.05]
@@ -94,31 +85,6 @@ def test_trees_of_several_levels_give_the_gaps_of_all_pairs_at_the_same_cost(tmp
 
 
 @pytest.mark.interpreted
-def test_of_an_avatar_larger_than_nodes_of_the_scan_all_pairs_count_at_the_same_cost(tmp_path: Path) -> None:
-    """A row of spheres along each axis by turns, through a slab of points: the avatar's nodes are opened first."""
-    rng = np.random.default_rng(6)
-    points = rng.uniform(0, 1, (120, 3)) * [1, 1, 0.3]
-    case = contact_cases.open_case(
-        tmp_path, points, rng, scan_count=3, voxel=2.0, leaf=8, cell_points=20, degree=3
-    )
-    visits, tests = [], []
-    with closing(case.store):
-        for axis in range(3):
-            row = np.zeros((130, 3))
-            row[:, axis] = np.linspace(-2, 2, 130)
-            avatar = make_avatar(row, 0.02)
-            pose = archive_cases.pose_of(np.eye(3), np.array([0.4, 0.6, 0.15]))
-            gaps = np.linalg.norm((row + pose[:3, 3])[:, None] - points, axis=2).min(axis=0) - 0.03
-            found = separation_per_scan(case.data, avatar, pose, 0.1, 3)
-            least = {s: gaps[case.numbers == s].min() for s in range(3)}
-            assert found.separations == pytest.approx({s: g for s, g in least.items() if g <= 0.1}, abs=2e-4)
-            assert found.exact
-            visits.append(found.node_visits)
-            tests.append(found.point_tests)
-    assert visits == [81, 77, 86] and tests == [1792, 1248, 800]
-
-
-@pytest.mark.interpreted
 def test_a_voxel_that_cannot_be_read_is_missing_and_the_rest_is_found(tmp_path: Path) -> None:
     points = np.column_stack([np.arange(12) * 0.1, np.zeros(12), np.zeros(12)])
     case = contact_cases.open_case(tmp_path, points, np.random.default_rng(3), voxel=0.5)
@@ -128,24 +94,3 @@ def test_a_voxel_that_cannot_be_read_is_missing_and_the_rest_is_found(tmp_path: 
         assert not found.exact and set(found.separations) == {0, 1}
         away = archive_cases.pose_of(np.eye(3), np.array([0.9, 0.0, 0.13]))
         assert separation_per_scan(case.data, BALL, away, 0.02, 2).exact
-
-
-@pytest.mark.interpreted
-def test_in_voxels_far_along_one_axis_each_scan_is_found_at_the_same_cost(tmp_path: Path) -> None:
-    """Some points near one corner of a voxel, the avatar beside them: its place in the voxel differs by axis."""
-    rng = np.random.default_rng(8)
-    visits, tests = [], []
-    for axis in range(3):
-        at = np.roll([1.9, 0.05, 0.3], axis)
-        points = at + rng.uniform(-0.02, 0.02, (24, 3))
-        case = contact_cases.open_case(tmp_path, points, rng, leaf=4, cell_points=8, degree=2)
-        pose = archive_cases.pose_of(np.eye(3), at + np.array([0.05, 0.08, -0.1]))
-        spheres = (BALL.points + pose[:3, 3])[:, None] - points
-        gaps = np.linalg.norm(spheres, axis=2).min(axis=0) - 0.11
-        with closing(case.store):
-            found = separation_per_scan(case.data, BALL, pose, 0.05, 2)
-        expected = {scan: gaps[case.numbers == scan].min() for scan in (0, 1)}
-        assert found.separations == pytest.approx(expected, abs=2e-4)
-        visits.append(found.node_visits)
-        tests.append(found.point_tests)
-    assert visits == [25, 18, 17] and tests == [256, 384, 416]

@@ -16,7 +16,6 @@ from solidcloud.server.queries.context.query_context import SceneData, make_scen
 from solidcloud.server.queries.objects import SCENE_GROUP, objects
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_store import VoxelStore
-from solidcloud.server.runtime.stop_flag import StopFlag
 
 CLEAR, CONTACT, UNKNOWN = Verdict
 BALL = make_avatar([[0.0, 0, 0]], 0.5)
@@ -52,53 +51,6 @@ def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
     assert objects(data, [BALL, BALL], at(0, 1.5), [1, 1], [1, 1]).pairs_tested == 0
 
 
-class Counting(StopFlag):
-    """A stop that counts how often it is looked at."""
-
-    looks = 0
-
-    def __bool__(self) -> bool:
-        """Count a look."""
-        self.looks += 1
-        return super().__bool__()
-
-
-def test_stopped_only_pairs_that_could_touch_are_listed_and_none_is_looked_for(data: SceneData) -> None:
-    models = [make_avatar([[0.0, 0, 0]], 0.5) for _ in range(40)]
-    places = [0.01 * i for i in range(20)] + [100.0 + 0.01 * i for i in range(20)]
-    groups = np.array([1, 2] * 20, np.uint32)
-    stop = Counting()
-    stop.set("the client is gone")
-    found = objects(data, models, at(*places), groups, groups, budget=QueryBudget(stop=stop))
-    expected = [
-        [i, j] for i in range(40) for j in range(i + 1, 40) if (i - j) % 2 == 0 and (i < 20) == (j < 20)
-    ]
-    assert found.pairs.tolist() == expected and (found.pair_verdict == UNKNOWN).all()
-    assert found.pairs_tested == 0 and found.pairs_filtered == 200
-    assert stop.looks < 100, "180 kinds of pairs are gone through"
-
-
-def test_pairs_cut_off_by_a_budget_are_listed_as_unknown(data: SceneData, rng: np.random.Generator) -> None:
-    shell = rng.normal(size=(2000, 3))
-    model = make_avatar(shell / np.linalg.norm(shell, axis=1)[:, None], 0.001)
-    poses = np.array(
-        [
-            archive_cases.pose_of(np.eye(3), rng.uniform(-1.5, 1.5, 3) + np.array([0, 0, 30]))
-            for _ in range(12)
-        ]
-    )
-    ones = np.ones(12, int)
-    truth = {tuple(pair) for pair in objects(data, [model] * 12, poses, ones, ones).pairs.tolist()}
-    unknown = []
-    for visits in (0, 10, 100, 1000, 10**6):
-        answers = objects(data, [model] * 12, poses, ones, ones, budget=QueryBudget(visits=visits))
-        said = dict(zip(map(tuple, answers.pairs.tolist()), answers.pair_verdict.tolist(), strict=True))
-        assert {pair for pair, verdict in said.items() if verdict == CONTACT} <= truth <= set(said)
-        unknown.append(sum(verdict == UNKNOWN for verdict in said.values()))
-    assert len(truth) < unknown[0] <= answers.pairs_tested and unknown[-1] == 0
-    assert unknown == sorted(unknown, reverse=True) and unknown[0] > unknown[3] > 0
-
-
 def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
     late = QueryBudget(deadline=time.perf_counter() - 1)
     answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], budget=late)
@@ -108,15 +60,6 @@ def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
     soon = QueryBudget(deadline=time.perf_counter() + 600)
     answers = objects(data, [BALL] * 300, np.repeat(at(0), 300, axis=0), [1] * 300, [1] * 300, budget=soon)
     assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
-
-
-def test_a_budget_holds_against_the_scene_too(data: SceneData) -> None:
-    pose = archive_cases.pose_of(np.eye(3), synthetic_scans.make_scan("plane", 1, 50)[0])[None]
-    said = [
-        objects(data, [BALL], pose, [1], [SCENE_GROUP], budget=QueryBudget(visits=visits)).verdict[0]
-        for visits in (0, 10**6)
-    ]
-    assert said == [UNKNOWN, CONTACT]
 
 
 def test_a_tolerance_changes_no_answer(data: SceneData) -> None:

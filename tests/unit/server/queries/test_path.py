@@ -44,16 +44,6 @@ def test_parts_are_all_of_it_in_order(pool, total, ahead):
         assert max(len(part) for part in found) <= path_module.LARGEST_PART
 
 
-def test_parts_take_about_as_long_each(monkeypatch):
-    def sizes(each):
-        return [len(part) for part in path_parts(lambda a, b: answers(a, b, each * (b - a)), 20_000)]
-
-    monkeypatch.setattr(path_module, "PART_SECONDS", 0.01)
-    assert sizes(0.0)[:4] == [64, 256, 1024, 1024]
-    assert sizes(50e-6)[:4] == [64, 200, 200, 200]
-    assert set(sizes(1.0)[1:]) == {1}
-
-
 def test_no_more_than_asked_for_is_computed_ahead(pool):
     begun, lock = [], threading.Lock()
 

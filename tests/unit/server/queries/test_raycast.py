@@ -4,7 +4,6 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -62,11 +60,6 @@ def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Points in 2 m, in voxels of 25 cm."""
     points = synthetic_scans.make_scan("noise", 2, 3000)
     return archive_cases.build(tmp_path_factory.mktemp("noise"), points, voxel=0.25, radius=0.03).archive
-
-
-def free_rays(rng: np.random.Generator, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rays that start in and around the noise."""
-    return rng.uniform(-0.5, 2.5, (count, 3)), rng.normal(size=(count, 3))
 
 
 @pytest.mark.interpreted
@@ -151,44 +144,6 @@ def test_where_all_is_unknown_only_hits_are_said(tmp_path: Path) -> None:
         assert within(data, [(1.0, 1, 9)], 1).verdict.tolist() == [UNKNOWN]
 
 
-@pytest.mark.parametrize("question", ["raycast", "within"])
-def test_budgets_and_tolerances_bound_the_truth(noise: Path, rng: np.random.Generator, question: str) -> None:
-    origins, directions = free_rays(rng, 300)
-
-    def ask(budget: QueryBudget):  # type: ignore[no-untyped-def]
-        if question == "raycast":
-            return raycast(data, origins, directions, 2.0, budget)
-        return within(data, origins, 0.35, budget)
-
-    with opened(noise) as data:
-        truth = ask(QueryBudget())
-        assert 50 < truth.verdict.sum() < 290
-        before = np.full(300, UNKNOWN)
-        for visits in (0, 1, 8, 30, 100, 400, 3000, 10**6):
-            cut = ask(QueryBudget(visits=visits))
-            assert (cut.lower <= np.minimum(truth.distance, truth.lower)).all()
-            assert (cut.upper >= truth.upper).all()
-            assert (cut.distance[cut.exact] == truth.distance[cut.exact]).all()
-            for verdict in (CLEAR, CONTACT):  # what is clear at a small budget stays clear at a larger one
-                assert (cut.verdict[before == verdict] == verdict).all()
-            assert (truth.verdict[cut.verdict == CONTACT] == CONTACT).all()
-            assert (truth.verdict[cut.verdict == CLEAR] == CLEAR).all()
-            assert (cut.node_visits <= visits + 17).all()
-            before = cut.verdict
-            if visits == 0:
-                # Where no voxel is in reach the index alone says so.
-                assert cut.misses == 0 and (cut.verdict == UNKNOWN).sum() > 100
-        assert cut.exact.all()
-        for tolerance in (1e-3, 0.05, 0.5):
-            loose = ask(QueryBudget(tolerance=tolerance))
-            assert (loose.lower <= truth.lower).all() and (loose.upper >= truth.upper).all()
-            assert (loose.verdict == truth.verdict).all()
-            hit = loose.verdict == CONTACT
-            assert (loose.upper - loose.lower)[hit].max() <= tolerance
-            assert (loose.distance[loose.exact] == truth.distance[loose.exact]).all()
-        assert loose.node_visits.sum() < truth.node_visits.sum() and not loose.exact.all()
-
-
 def test_a_deadline_that_has_passed_leaves_all_unknown_and_loads_nothing(noise: Path) -> None:
     with opened(noise) as data:
         late = QueryBudget(deadline=time.perf_counter() - 1)
@@ -214,28 +169,6 @@ def test_what_is_loaded_too_late_is_unknown(beads: Path, monkeypatch: pytest.Mon
         assert (answers.lower[late] <= 0.99).all() and not answers.exact[late].any() and answers.resident <= 1
         data.residency.check()
         assert raycast(data, origins, [Y] * 4, 5).verdict.tolist() == [CONTACT] * 4
-
-
-def test_threads_that_share_a_small_cache_are_answered_alike(noise: Path, rng: np.random.Generator) -> None:
-    origins, directions = free_rays(rng, 200)
-    with opened(noise) as data:
-        expected = raycast(data, origins, directions, 3.0).distance.tobytes()
-        expected_near = within(data, origins, 1.0).distance.tobytes()
-        budget = 3 * max(data.residency.bytes_of([row]) for row in range(len(data.arrays.where)))
-    with opened(noise, budget) as data, ThreadPoolExecutor(4) as pool:
-        for answers in pool.map(lambda _: raycast(data, origins, directions, 3.0), range(6)):
-            assert answers.distance.tobytes() == expected
-            assert answers.resident_bytes <= budget
-        for near in pool.map(lambda _: within(data, origins, 1.0), range(6)):
-            assert near.distance.tobytes() == expected_near
-        data.residency.check()
-        assert data.residency.evictions > 0
-
-
-def test_nothing_asked_is_nothing_answered(noise: Path) -> None:
-    with opened(noise) as data:
-        assert len(raycast(data, np.empty((0, 3)), np.empty((0, 3)), 1)) == 0
-        assert len(within(data, np.empty((0, 3)), 1)) == 0
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 """One motion, one pose in a kernel call: the answers of `sweep` and `collide` to the last bit."""
 
-import os
 from pathlib import Path
-from typing import Any
 
 import archive_cases
 import judged_sweeps
@@ -13,9 +11,6 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE
-from solidcloud.server.kernels.motion import sweep_resident as kernel
-from solidcloud.server.queries import resident_fast_path as module
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import EXACT, QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData
@@ -24,7 +19,6 @@ from solidcloud.server.queries.sweep import sweep
 
 Poses = NDArray[np.float64]
 COUNT = 12
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 
 def same(
@@ -46,18 +40,6 @@ def same(
             assert one.avatar is None and one.cloud is None
         found.append(one)
     return found
-
-
-def recorded_sweeps(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The arguments of each call that the fast path leaves to `sweep` from now on."""
-    calls: list[Any] = []
-
-    def recorded(*arguments: Any, **options: Any) -> Any:
-        calls.append(arguments)
-        return sweep(*arguments, **options)
-
-    monkeypatch.setattr(module, "sweep", recorded)
-    return calls
 
 
 @pytest.mark.interpreted
@@ -124,69 +106,3 @@ def test_the_pose_between_is_the_sweeps(tmp_path: Path, rng: np.random.Generator
             np.testing.assert_allclose(pose, naive_sweep.pose_at(one, other, fraction), atol=1e-12)
         pose, _ = probe.between(np.array([1e6, 0, 0]), one, other, 0.0)
         np.testing.assert_allclose(pose, one, atol=1e-9)
-
-
-@pytest.mark.interpreted
-def test_what_is_resident_rigid_and_short_is_asked_in_one_call(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = synthetic_scans.make_scan("plane", 5, 200)
-    case = archive_cases.build(tmp_path, points)
-    first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
-    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
-    with judged_sweeps.opened(case) as data:
-        same(probe, data, first, last)
-        left = recorded_sweeps(monkeypatch)
-        used = data.residency.stats.hits
-        same(probe, data, first, last)
-        assert not left and data.residency.stats.hits > used
-        turned = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (6, 1, 1))
-        turned[:, 0, 1], turned[:, 1, 0] = -1.0, 1.0
-        turned[:, :3, 3] = first[:, :3, 3]
-        same(probe, data, turned, turned)
-        assert not left
-        # Of a scale that `sweep` takes to be 1 only just: it says whether it is.
-        for size, calls in ((1 + 0.2 * SIMILARITY_TOLERANCE, 0), (1 + 0.4 * SIMILARITY_TOLERANCE, 6)):
-            scaled = first.copy()
-            scaled[:, :3, :3] *= size
-            left.clear()
-            same(probe, data, scaled, scaled)
-            assert len(left) == calls
-
-
-@pytest.mark.interpreted
-def test_a_motion_that_would_keep_others_waiting_is_left_to_sweep(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = synthetic_scans.make_scan("plane", 5, 200)
-    case = archive_cases.build(tmp_path, points)
-    first, last = judged_sweeps.motions(rng, points, np.zeros((1, 3)), 6, 0.3, 0.2, 0.5)
-    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
-    with judged_sweeps.opened(case) as data:
-        looked = [each.visits for each in same(probe, data, first, last)]
-        # Compiled, a kernel has taken the figure up already.
-        monkeypatch.setattr(kernel, "MAX_RESIDENT_PATH_VISITS", 3)
-        left = recorded_sweeps(monkeypatch)
-        same(probe, data, first, last)
-        assert max(looked) > 3 and (len(left) > 0) == INTERPRETED
-
-
-@pytest.mark.interpreted
-def test_a_pose_between_holds_where_the_origin_comes_off_again(rng: np.random.Generator) -> None:
-    probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
-    said = set()
-    for size in (0.1, 1e3, 1e6):
-        for _ in range(20):
-            origin = rng.uniform(-size, size, 3)
-            first, last = judged_sweeps.motions(rng, origin[None], probe.avatar.points, 1, 0.3, 0.5, 0.5)
-            one, other = first[0].copy(), last[0].copy()
-            one[:3, 3] -= origin
-            other[:3, 3] -= origin
-            near, _ = probe.between(np.zeros(3), one, other, 0.3)
-            pose, holds = probe.between(origin, first[0], last[0], 0.3)
-            there = near[:3, 3] + origin
-            np.testing.assert_array_equal(pose[:3, 3], there)
-            assert holds == bool((there - origin == near[:3, 3]).all())
-            for r in range(3):
-                said.add(float(np.sign(there[r] - origin[r] - near[r, 3])))
-    assert said == {-1.0, 0.0, 1.0}

@@ -1,10 +1,9 @@
 """VoxelAllocator: voxels moved together rather than evicted, and nothing lost on the way."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solidcloud.server.residency.allocator import AROUND, VoxelAllocator
+from solidcloud.server.residency.allocator import VoxelAllocator
 from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.eviction import make_policy
@@ -72,44 +71,6 @@ def test_nothing_goes_where_all_that_may_is_too_little() -> None:
     assert filled.gone == [] and filled.room.evictions == 0
     assert filled.make(3) and filled.gone == [0, 1, 2]
     filled.check()
-
-
-def test_only_some_are_left_and_stand_together() -> None:
-    filled = Filled([2, 1, 2, 1, 3], 6)
-    assert all(filled.make(row) for row in range(4))
-    filled.room.evict_all_but({1, 3}, filled.gone.append)
-    assert sorted(filled.gone) == [0, 2]
-    filled.check()
-    assert filled.buffer.free_runs() == [(2 * BLOCK, 4 * BLOCK)]
-
-
-@pytest.mark.parametrize("resident", [500, 4000])
-def test_a_load_costs_the_same_however_many_voxels_are_resident(
-    resident: int, rng: np.random.Generator
-) -> None:
-    """Voxels of 1 to 20 blocks are asked for at random, four times as many as fit."""
-    sizes = rng.integers(1, 21, 4 * resident).tolist()
-    filled = Filled(sizes, resident * 10)
-    room, asked, loads = filled.room, 0, 0
-
-    def may(_: int) -> bool:
-        nonlocal asked
-        asked += 1
-        return True
-
-    for row in rng.integers(0, len(sizes), 6 * resident).tolist():
-        if row in room.offsets:
-            room.policy.used(row, scan=False)
-            continue
-        assert room.allocate(row, may, may, filled.gone.append, scan=False)
-        filled.where[row] = room.offsets[row] // 4
-        loads += 1
-    room.check()
-    assert asked < 8 * AROUND * loads, f"{asked / loads:.0f} runs looked at for a load"
-    assert room.moved_bytes < 100 * BLOCK * loads
-    # Little more goes than the bytes need.
-    assert room.evictions < loads - 0.95 * resident
-    assert room.used_bytes > 0.95 * filled.buffer.total_bytes
 
 
 @given(

@@ -8,17 +8,6 @@ import pytest
 from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer
 
 
-def test_views_share_one_aligned_buffer() -> None:
-    buffer = ArenaBuffer(1000)
-    words, ints, halves = buffer.arena
-    assert buffer.total_bytes == 960 == words.nbytes == ints.nbytes == halves.nbytes
-    assert words.ctypes.data == ints.ctypes.data == halves.ctypes.data
-    assert words.ctypes.data % ALIGNMENT == 0
-    words[3] = np.float32(-2.0)
-    assert ints[3] == np.float32(-2.0).view(np.int32)
-    assert halves[6:8].tobytes() == np.float32(-2.0).tobytes()
-
-
 @pytest.mark.parametrize("budget", [0, 1, 63])
 def test_a_budget_below_a_cache_line_holds_nothing(budget: int) -> None:
     buffer = ArenaBuffer(budget)

@@ -71,20 +71,3 @@ def test_a_stop_and_a_deadline_end_the_wait_and_leave_the_queue(monkeypatch) -> 
     assert said == [None] and not turns._queue
     turns.give_back(None)
     assert turns._current is first
-
-
-def test_many_threads_lose_no_turn() -> None:
-    turns, done = LoadTurns(), []
-
-    def request(number: int) -> None:
-        for _ in range(50):
-            stop = StopFlag()
-            deadline = time.perf_counter() + (0.0005 if number % 3 == 0 else 60.0)
-            turn = turns.take(deadline, stop if number % 2 else NO_STOP)
-            turns.give_back(turn)
-        done.append(number)
-
-    threads = [start(lambda number=number: request(number)) for number in range(12)]
-    for thread in threads:
-        thread.join(60.0)
-    assert sorted(done) == list(range(12)) and turns._current is None and not turns._queue

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.residency.motion_prediction import PredictedVoxels, User
-from solidcloud.server.residency.prefetch import ANSWER_REST, FIRST_ANSWER_SECONDS, Prefetcher
+from solidcloud.server.residency.prefetch import Prefetcher
 from solidcloud.server.residency.voxel_cache import VoxelCache
 
 PATIENCE = 20.0  # [s], for what takes microseconds when it is right
@@ -129,21 +129,6 @@ def test_nothing_is_begun_while_a_request_waits() -> None:
         table.residency.release([0])
 
 
-def test_a_user_who_turns_is_not_loaded_for_where_it_came_from() -> None:
-    table = Table([1] * 8, 8)
-    table.store.gate.clear()
-    table.wishes.wanted = {0: 0.1, 1: 0.2, 2: 0.3}
-    with table.prefetcher:
-        table.see()
-        assert table.store.wait_for_load(0, PATIENCE)
-        table.wishes.wanted = {5: 0.1}
-        table.see()
-        time.sleep(0.06)  # a plan is not made more often than that
-        table.store.gate.set()
-        assert until(lambda: 5 in table.resident())
-        assert table.store.loads.keys() == {0, 5}
-
-
 def test_what_came_too_late_for_a_request_is_loaded_after_it() -> None:
     table = Table([1] * 3, 2, prefetch=False)
     with table.prefetcher:
@@ -153,43 +138,6 @@ def test_what_came_too_late_for_a_request_is_loaded_after_it() -> None:
         counters = table.residency.counters()
         assert (counters.late, counters.prefetched, counters.used) == (2, 0, 0)
     table.residency.check()
-
-
-def test_an_owed_load_that_raises_is_not_prefetched_soon_after() -> None:
-    table = Table([1] * 3, 3)
-    table.store.faults[1] = "out of memory"
-    with table.prefetcher:
-        with table.residency.hold([1], 0.0) as held:
-            assert held.late == (1,)
-        assert until(lambda: table.store.loads[1] == 1 and bool(table.prefetcher._failed))
-        assert list(table.prefetcher._failed) == [1]
-        table.store.faults.clear()
-        table.wishes.wanted = {1: 0.1, 2: 0.2}
-        table.see()
-        assert until(lambda: table.resident() == [2])
-        assert table.store.loads[1] == 1
-    table.residency.check()
-
-
-def test_owed_loads_of_the_level_come_first() -> None:
-    store = FakeStore([1] * 2)
-    level = VoxelCache(store, 2 * BLOCK)  # type: ignore[arg-type]
-    table = Table([1] * 3, 3, level=level)
-    table.store.gate.clear()
-    store.gate.clear()
-    with table.prefetcher:
-        with table.residency.hold([0, 1], -np.inf) as held:
-            assert held.late == (0, 1)
-        assert table.store.wait_for_load(0, PATIENCE)
-        with level.hold([0, 1], -np.inf) as held:
-            assert held.late == (0, 1)
-        table.store.gate.set()
-        assert store.wait_for_load(0, PATIENCE) and table.store.loads == {0: 1}
-        store.gate.set()
-        assert until(lambda: table.resident() == [0, 1] and level.resident == 2)
-    assert table.residency.on_owed is None and level.on_owed is None
-    table.residency.check()
-    level.check()
 
 
 @pytest.mark.parametrize("fault", ["corrupt", "unreadable", "out of memory"])
@@ -242,37 +190,3 @@ def test_after_a_stop_nothing_is_loaded() -> None:
     time.sleep(0.02)
     assert not table.store.loads
     table.prefetcher.stop()
-
-
-def test_the_first_plan_waits_for_the_first_answer_and_no_longer_than_its_limit() -> None:
-    running, now = [True], [0.0]
-    table = Table([1, 1], 4, running_requests=lambda: running[0], clock=lambda: now[0])
-    table.wishes.wanted = {1: 0.0}
-    with table.prefetcher:
-        table.see()
-        assert until(lambda: table.prefetcher.running)
-        time.sleep(0.2)
-        assert not table.wishes.plans
-        running[0], now[0] = False, ANSWER_REST  # it is answered
-        assert until(lambda: table.resident() == [1])
-        running[0], now[0] = True, 10.0
-        table.see()
-        assert until(lambda: table.wishes.plans == 2), "later plans wait for nobody"
-    late = Table([1], 4, running_requests=lambda: True, clock=lambda: now[0])
-    with late.prefetcher:
-        late.see()
-        assert until(lambda: late.prefetcher._first_seen == 10.0)
-        now[0] += FIRST_ANSWER_SECONDS
-        assert until(lambda: late.wishes.plans == 1)
-
-
-def test_a_warm_prefetcher_waits_for_nobody() -> None:
-    table = Table([1], 4, running_requests=lambda: True)
-    other = Table([2], 4)
-    other.wishes.path_distances = other.wishes.leave = lambda *_: None  # type: ignore[attr-defined]
-    table.wishes.without_users = lambda: other.wishes  # type: ignore[attr-defined]
-    with table.prefetcher:
-        table.prefetcher.warm((0.0, 0.0, 0.0), predict=True)
-        assert table.wishes.plans == 0 < other.wishes.plans, "nothing is planned for users"
-        table.see()
-        assert until(lambda: table.wishes.plans > 0)

@@ -7,7 +7,6 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
-from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.residency.coarse_bounds import SLOT_BYTES
 from solidcloud.server.residency.eviction import POLICIES
@@ -74,20 +73,3 @@ def test_a_path_washes_out_no_more_than_its_share(tmp_path: Path, rng: np.random
         assert scene.stats().evicted > 0
         again = scene.collide("al", here)
         assert (again.misses, again.wait_seconds) == (0, 0.0) and again.hits > 0
-
-
-def test_questions_that_are_refused_or_wide_keep_nothing_for_themselves(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
-    """A margin that no question takes, a scale that no pose has: nobody stands in the whole scene for it."""
-    case = archive_cases.build(tmp_path, SCAN, voxel=0.2)
-    avatar = rng.uniform(-0.05, 0.05, (20, 3))
-    here = walk(case.points, 3)[1:2]
-    with Scene.open(case.archive, policy="lru+prefetch") as scene:
-        scene.add_avatar("al", avatar, 0.005)
-        large = here.copy()
-        large[0, :3, :3] *= 1e6
-        for poses, margin in ((here, 1e6), (here, 10**400), (here, float("nan")), (here, -1.0), (large, 0.0)):
-            with pytest.raises((BadRequestError, BadTransformError)):
-                scene.collide("al", poses, margin)
-        assert not scene.archives[0]._opened.prefetcher.running and not scene.residency.kept

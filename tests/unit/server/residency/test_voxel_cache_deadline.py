@@ -12,7 +12,6 @@ from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
 from solidcloud.server.residency.voxel_cache import VoxelCache
 from solidcloud.server.residency.voxel_states import HeldVoxels
-from solidcloud.server.runtime.stop_flag import _LOOK_SECONDS, NO_STOP, StopFlag
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
@@ -74,22 +73,6 @@ def test_who_does_not_wait_is_told_of_faults() -> None:
     residency.check()
 
 
-def test_a_deadline_of_ages_is_waited_for() -> None:
-    """Longer than a lock can be waited for: `budget_ms` has no upper end."""
-    store = FakeStore([1])
-    residency = VoxelCache(store, BLOCK)
-    store.gate.clear()
-    with ThreadPoolExecutor(2) as pool:
-        loader = pool.submit(take, residency, [0])
-        assert store.wait_for_load(0, PATIENCE)
-        other = pool.submit(take, residency, [0], 1e300)
-        while not other.done() and not residency._changed._waiters:  # type: ignore[attr-defined]
-            time.sleep(0.001)
-        store.gate.set()
-        assert loader.result(PATIENCE) == HeldVoxels(0, 1, ())
-        assert other.result(PATIENCE).late == ()
-
-
 def test_a_load_of_another_is_waited_for_until_the_deadline_and_goes_on() -> None:
     store = FakeStore([1])
     residency = VoxelCache(store, BLOCK)
@@ -133,82 +116,6 @@ def test_who_waits_for_room_waits_until_the_deadline() -> None:
         residency.check()
     assert store.loads == {0: 1, 1: 1}
     assert take(residency, [1, 2], soon(PATIENCE)).late == ()
-
-
-def test_a_stopped_request_is_owed_nothing() -> None:
-    """Its client is gone, or the server stops: only a deadline leaves loads to the prefetcher."""
-    residency = VoxelCache(FakeStore([1] * 4), 4 * BLOCK)
-    told: list[str] = []
-    residency.on_owed = lambda: told.append("owed")
-    stop = StopFlag()
-    stop.set("the client is gone")
-    with residency.hold([0, 1], stop=stop) as held:
-        assert held.late == (0, 1)
-    assert residency.take_owed() is None
-    with residency.hold([2], 0.0, stop=stop) as held:
-        assert held.late == (2,)
-    assert residency.take_owed() == 2
-    residency.check()
-
-
-def test_a_load_is_owed_without_the_lock() -> None:
-    """The callback may start a thread, and wait for it."""
-    residency = VoxelCache(FakeStore([1, 1]), 2 * BLOCK)
-    free: list[bool] = []
-
-    def try_the_lock() -> bool:
-        with ThreadPoolExecutor(1) as pool:
-            taken: bool = pool.submit(residency._lock.acquire, timeout=1.0).result()
-            if taken:
-                pool.submit(residency._lock.release).result()
-            return taken
-
-    residency.on_owed = lambda: free.append(try_the_lock())
-    with residency.hold([0], 0.0) as held:
-        assert held.late == (0,)
-    residency._reserve([1], float("inf"), False, NO_STOP)
-    residency._states.pin([1])  # another waits for it
-    residency._abandon([1])
-    residency._states.owed[1] = None
-    residency.release([1])
-    residency.release([1])
-    residency._waiting_requests -= 1
-    assert free == [True, True]
-
-
-def test_who_waits_for_room_tries_again_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    residency = VoxelCache(FakeStore([1, 1, 1]), 2 * BLOCK)
-    tries: list[list[int]] = []
-    allocate = residency._states.allocate_all
-    monkeypatch.setattr(
-        residency._states, "allocate_all", lambda rows, scan: tries.append(rows) or allocate(rows, scan)
-    )
-    stop = StopFlag()
-    with ThreadPoolExecutor(1) as pool:
-        with residency.hold([0, 1]):
-            waiter = pool.submit(lambda: residency.acquire([2], stop=stop))
-            time.sleep(20 * _LOOK_SECONDS)
-            assert tries.count([2]) <= 1
-        assert waiter.result(PATIENCE).late == ()
-    assert tries.count([2]) == 2
-    residency.release([2])
-    with ThreadPoolExecutor(1) as pool, residency.hold([0, 1]):
-        waiter = pool.submit(lambda: residency.acquire([2], stop=stop))
-        time.sleep(4 * _LOOK_SECONDS)
-        stop.set("the client is gone")
-        assert waiter.result(PATIENCE).late == (2,)
-        residency.release([2])
-    residency.check()
-
-
-def test_what_is_corrupt_is_a_fault_and_not_late() -> None:
-    store = FakeStore([1, 1])
-    store.faults[0] = "corrupt"
-    residency = VoxelCache(store, 2 * BLOCK)
-    with residency.hold([0]) as held:
-        assert held.late == () and len(held.faults) == 1
-    with residency.hold([0, 1], 0.0) as held:
-        assert held.late == (1,) and len(held.faults) == 1
 
 
 def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:

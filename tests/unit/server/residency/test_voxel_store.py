@@ -25,15 +25,6 @@ def test_a_folder_without_an_archive_is_refused(tmp_path: Path) -> None:
         VoxelStore(tmp_path)
 
 
-def test_a_load_reads_the_same_at_any_offset(store: VoxelStore) -> None:
-    size = int(store.sizes[0])
-    low, high = ArenaBuffer(size + 64), ArenaBuffer(size + 4096)
-    first = store.load(0, low.arena, 0)
-    second = store.load(0, high.arena, 4096)
-    assert (second - first).tolist() == [1024, 1024, 2048]
-    assert low.arena.halves[: size // 2].tobytes() == high.arena.halves[2048 : 2048 + size // 2].tobytes()
-
-
 def test_a_flipped_byte_is_corrupt_and_named(store: VoxelStore) -> None:
     row = 2
     entry = store.archive.voxels[row]

@@ -1,6 +1,5 @@
 """A deadline: what it left open is given up at once, no load is begun after it, and nothing is clear wrongly."""
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,13 +15,10 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context import anytime_search as bounded
-from solidcloud.server.queries.context import front_to_back as rounds
-from solidcloud.server.queries.context.query_budget import LOAD_SHARE, QueryBudget
+from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.sweep import sweep
-from solidcloud.server.queries.within import within
 
 pytestmark = pytest.mark.interpreted
 CLEAR, CONTACT, UNKNOWN = Verdict
@@ -48,26 +44,6 @@ def near(case: contact_cases.ScanCase, rng: np.random.Generator) -> tuple[Any, N
     return avatar, np.concatenate(
         [archive_cases.near_poses(rng, case.points, avatar.points, 5, 0.05), FAR[None]]
     )
-
-
-@pytest.mark.parametrize("question", ["collide", "distance"])
-def test_what_is_left_when_the_time_is_up_takes_no_kernel(
-    case: contact_cases.ScanCase, rng: np.random.Generator, question: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    avatar, poses = near(case, rng)
-    exact = QUESTIONS[question](case.data, avatar, poses, QueryBudget())
-    truth = distance(case.data, avatar, poses, 15.0).signed_distance
-    assert (exact.verdict[:-1] == CONTACT).any()
-
-    def kernel(*_: Any) -> int:
-        raise AssertionError("searched")
-
-    monkeypatch.setattr(bounded, "resume_search", kernel)
-    late = QUESTIONS[question](case.data, avatar, poses, QueryBudget(deadline=0.0))
-    assert late.verdict.tolist() == [UNKNOWN] * 5 + [CLEAR]
-    assert (late.lower <= truth).all() and np.isinf(late.upper).all()
-    assert late.exact.tolist() == [False] * 5 + [True]
-    assert not late.voxels_missing.any(), "all of them were resident"
 
 
 @pytest.mark.parametrize("question", ["collide", "distance"])
@@ -105,37 +81,3 @@ def test_no_load_is_begun_once_the_time_for_loads_is_up(
     assert found.verdict[-1] == CLEAR and (found.verdict[:-1] != CLEAR).all()
     assert (found.verdict == UNKNOWN).any()
     assert (exact.verdict[found.verdict == CONTACT] == CONTACT).all()
-
-
-class Stops(QueryBudget):
-    """An budget whose time is up after so many looks at the clock."""
-
-    looks: list[int]
-
-    @property
-    def spent(self) -> bool:
-        """Whether this look is too late."""
-        self.looks[0] -= 1
-        return self.looks[0] < 0
-
-
-def test_loose_points_are_looked_at_some_at_a_time(
-    case: contact_cases.ScanCase, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two batches of four, each with a look before it and before its one round; the third comes too late."""
-    monkeypatch.setattr(rounds, "TIMED_BATCH", 4)
-    exact = within(case.data, case.points[:12], 0.2)
-    budget = Stops(deadline=1e300)
-    budget.looks = [4]
-    found = within(case.data, case.points[:12], 0.2, budget)
-    assert exact.verdict.tolist() == [CONTACT] * 12
-    assert found.verdict.tolist() == [CONTACT] * 8 + [UNKNOWN] * 4
-    assert (found.lower <= exact.distance).all()
-
-
-def test_loads_have_half_of_the_time() -> None:
-    begin = time.perf_counter()
-    until = QueryBudget(deadline=begin + 1000.0).loads_until()
-    assert begin + 1000.0 * LOAD_SHARE <= until <= begin + (1000.0 + time.perf_counter() - begin) * LOAD_SHARE
-    assert QueryBudget(visits=1, tolerance=1.0).loads_until() == math.inf
-    assert QueryBudget(deadline=begin - 1.0).loads_until() < begin, "and none where it is past"

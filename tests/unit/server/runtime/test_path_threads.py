@@ -53,16 +53,3 @@ def test_what_waits_when_it_is_closed_is_cancelled():
         threads.of("a").submit(str)
     threads.start()
     assert not any(thread.is_alive() for thread in threads._threads)
-
-
-def test_a_part_that_nobody_wants_is_not_computed():
-    threads, gate, order = PathThreads("hall", 1), threading.Event(), []
-    first = threads.of("a").submit(gate.wait, DEADLINE)
-    while not first.running():
-        assert not first.done()
-    given_up, wanted = (threads.of("a").submit(order.append, number) for number in range(2))
-    assert given_up.cancel()
-    gate.set()
-    wanted.result(DEADLINE)
-    threads.close()
-    assert order == [1]

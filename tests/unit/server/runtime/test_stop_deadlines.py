@@ -56,21 +56,6 @@ def test_flags_that_nobody_has_any_more_are_dropped():
     assert is_set(after) == "after" and not kept
 
 
-def test_entries_of_requests_that_ended_do_not_pile_up():
-    deadlines, now = Deadlines(), time.perf_counter()
-    kept = [StopFlag() for _ in range(10)]
-    for stop in kept:
-        deadlines.add(stop, now + FAR, "kept")
-    ended = StopFlag()
-    ended.set("answered")
-    for _ in range(10_000):
-        deadlines.add(StopFlag(), now + FAR, "gone")
-        deadlines.add(ended, now + FAR, "set")
-    assert len(deadlines._heap) <= 2 * stop_module._LEAST_ENTRIES
-    left = [entry[2]() for entry in deadlines._heap]
-    assert all(any(stop is other for other in left) for stop in kept)
-
-
 def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monkeypatch):
     deadlines, start, failures = Deadlines(), stop_module.start_loop, [1]
 
@@ -86,12 +71,3 @@ def test_a_thread_that_could_not_be_started_is_started_by_the_next_deadline(monk
         deadlines.add(first, time.perf_counter(), "first")
     deadlines.add(second, time.perf_counter(), "second")
     assert (is_set(first), is_set(second)) == ("first", "second")
-
-
-def test_it_is_started_once():
-    deadlines = Deadlines()
-    deadlines.start()
-    thread = deadlines._thread
-    deadlines.start()
-    deadlines.add(StopFlag(), time.perf_counter(), "as such")
-    assert deadlines._thread is thread and thread.is_alive()

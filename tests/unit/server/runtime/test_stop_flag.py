@@ -12,7 +12,6 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.queries import path
-from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.runtime.stop_flag import NO_STOP, StopFlag
 from solidcloud.server.scene import Scene
 
@@ -80,39 +79,16 @@ def ask(scene: Scene, op: str, count: int, **options: Any) -> Any:
 OPS = ("collide", "distance", "contacts", "sweep", "raycast", "within", "objects")
 # So many that each question would take far longer than a test may.
 MANY = {
-    "collide": 20_000, "distance": 20_000, "contacts": 2_000, "sweep": 2_000, "raycast": 2_000_000, "within": 2_000_000,
+    "collide": 20_000, "distance": 20_000, "contacts": 2_000, "sweep": 2_000, "raycast": 400_000, "within": 400_000,
     "objects": 1_500,
 }  # fmt: skip
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize("op", OPS)
-def test_stopped_before_it_begins_all_is_unknown_and_says_why(scene: Scene, op: str) -> None:
-    stop = StopFlag()
-    stop.set(WHY)
-    answers = ask(scene, op, 3, stop=stop)
-    assert answers.stopped == WHY
-    assert (np.asarray(answers.verdict) == UNKNOWN).all()
-    if op == "objects":
-        assert (answers.pair_verdict == UNKNOWN).all() and len(answers.pairs) == 3
-    scene.residency.check()
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize("op", OPS)
-def test_a_flag_that_is_never_set_changes_nothing(scene: Scene, op: str) -> None:
-    count = 3
-    with_flag, without = ask(scene, op, count, stop=StopFlag()), ask(scene, op, count)
-    assert with_flag.stopped == without.stopped == ""
-    for name in ("verdict", "node_visits", "point_tests", "outside"):
-        assert np.array_equal(getattr(with_flag, name), getattr(without, name)), name
 
 
 @pytest.mark.parametrize("op", OPS)
 def test_stopped_at_work_it_ends_soon_and_says_nothing_wrong(scene: Scene, op: str) -> None:
     ask(scene, op, 2)  # compiled
     stop = StopFlag()
-    timer = threading.Timer(0.2, stop.set, [WHY])
+    timer = threading.Timer(0.05, stop.set, [WHY])
     timer.start()
     begin = time.monotonic()
     answers = ask(scene, op, MANY[op], stop=stop)
@@ -143,29 +119,6 @@ def test_a_path_that_is_stopped_is_unknown_to_its_end(scene: Scene, op: str) -> 
     assert sum(len(part) for part in parts) == 200 - (op == "sweep")
     assert all((np.asarray(part.verdict) == UNKNOWN).all() for part in parts[1:])
     scene.residency.check()
-
-
-@pytest.mark.interpreted
-def test_bounds_of_a_stopped_answer_hold(scene: Scene) -> None:
-    stop = StopFlag()
-    stop.set(WHY)
-    exact = ask(scene, "distance", 2)
-    for options in ({}, {"budget_visits": 10}, {"budget_ms": 1e6}):
-        answers = ask(scene, "distance", 2, stop=stop, **options)
-        assert (answers.lower <= exact.signed_distance).all() and (
-            exact.signed_distance <= answers.upper
-        ).all()
-        assert not answers.exact.any()
-
-
-@pytest.mark.interpreted
-def test_contacts_found_before_the_stop_stay(scene: Scene) -> None:
-    """A pose in contact is in contact, however early the request is stopped."""
-    poses = np.concatenate([poses_above(1, RADIUS), poses_above(3)])
-    truth = scene.collide("corner", poses, radius_model=f"fixed:{RADIUS}").verdict
-    assert truth.tolist() == [CONTACT, CLEAR, CLEAR, CLEAR]
-    answers = scene.collide("corner", poses, radius_model=f"fixed:{RADIUS}", stop=StopFlag()).verdict
-    assert answers.tolist() == truth.tolist()
 
 
 @pytest.mark.interpreted
@@ -217,37 +170,3 @@ def test_a_flag_sets_those_of_its_parts() -> None:
     stop.set(WHY)
     assert [part.reason for part in [*parts, stop.part()]] == ["of one part", WHY, WHY]
     assert not NO_STOP.part()
-
-
-@pytest.mark.interpreted
-def test_the_first_reason_is_kept() -> None:
-    stop = StopFlag()
-    assert not stop
-    stop.set("first")
-    stop.set("second")
-    assert stop and stop.reason == "first"
-
-
-def test_nobody_sets_the_flag_of_requests_that_are_not_watched(scene: Scene) -> None:
-    assert not NO_STOP and EXACT.stop is NO_STOP
-    ask(scene, "collide", 2)
-    assert not NO_STOP
-
-
-def test_loads_are_not_waited_for_once_a_request_is_stopped(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A disk that does not answer: the request ends, what was not read is unknown."""
-    stops: list[StopFlag] = []
-    hold = scene.residency.hold
-
-    def watched(_: Any, *what: Any, stop: StopFlag, **options: Any) -> Any:
-        stops.append(stop)
-        return hold(*what, stop=stop, **options)
-
-    monkeypatch.setattr(type(scene.residency), "hold", watched)
-    for op in ("collide", "distance", "contacts", "sweep", "within"):
-        stops.clear()
-        stop = StopFlag()
-        ask(scene, op, 2, stop=stop)
-        assert stops and all(each is stop for each in stops), op

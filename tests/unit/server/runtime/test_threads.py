@@ -9,13 +9,6 @@ from solidcloud.server.runtime import threads
 from solidcloud.server.runtime.threads import start_loop, start_thread
 
 
-def test_a_thread_runs_its_function_under_its_name() -> None:
-    said = []
-    thread = start_thread("hall", lambda *what: said.append((threading.current_thread().name, what)), 1, "b")
-    thread.join()
-    assert said == [("solidcloud-hall", (1, "b"))] and thread.daemon
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="threads have names in /proc on Linux")
 def test_the_system_shows_the_end_of_a_long_name() -> None:
     said = []

@@ -1,15 +1,13 @@
 """Changes of what is resident: they follow the cache exactly, are bounded, and say what is missing."""
 
 import threading
-from pathlib import Path
 
 import archive_cases
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.residency_messages import MAX_CHANGED_VOXELS, Residency, ResidencyChanges
+from solidcloud.schemas.wire.residency_messages import Residency, ResidencyChanges
 from solidcloud.server.residency import change_log
-from solidcloud.server.residency.change_log import ChangeLog
 from solidcloud.server.scene import Scene
 
 AVATAR = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
@@ -80,46 +78,6 @@ def test_changes_follow_the_cache(case: archive_cases.Case) -> None:
         assert not scene.residency._states.logs, "nothing is collected without a reader"
 
 
-def test_without_changes_nothing_is_said(case: archive_cases.Case) -> None:
-    with opened(case) as scene, scene.residency_changes() as changes:
-        assert changes.take() is not None
-        assert changes.take() is None
-        silent = next(iter(changes))  # within half a second
-        assert not len(silent.voxel) and silent.seq == 2 and not silent.lost
-
-
-def test_prefetched_and_wasted_voxels_are_told_apart(case: archive_cases.Case) -> None:
-    with opened(case) as scene, scene.residency_changes() as changes:
-        cache = scene.residency
-        sizes = np.array([cache.bytes_of([row]) for row in range(len(cache.where))])
-        row = int(np.argmin(sizes))
-        cache.load_in_background(row, lambda _: True)
-        message = changes.take(always=True)
-        assert message is not None and message.state.tolist() == [Residency.PREFETCHED]
-        with scene.archives[0].take() as generation:
-            np.testing.assert_array_equal(message.voxel, generation.store.archive.coordinates[[row]])
-        rng = np.random.default_rng(1)
-        states: list[int] = []
-        while cache.stats.wasted == 0 and cache.stats.used == 0:
-            visit(scene, rng)
-        message = changes.take(always=True)
-        assert message is not None
-        states = message.state[
-            (message.voxel == generation.store.archive.coordinates[row]).all(axis=1)
-        ].tolist()
-        assert states == ([Residency.WASTED] if cache.stats.wasted else [])
-
-
-def test_a_log_is_bounded() -> None:
-    log = ChangeLog()
-    for row in range(MAX_CHANGED_VOXELS + 5):
-        log.add(row, Residency.LOADED)
-    log.add(3, Residency.EVICTED)
-    changes, overflowed = log.take()
-    assert len(changes) == MAX_CHANGED_VOXELS and overflowed and changes[3] == Residency.EVICTED
-    assert log.take() == ({}, False)
-
-
 def test_changes_beyond_the_limit_are_said_to_be_lost(
     case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,20 +108,6 @@ def test_a_reload_is_followed(case: archive_cases.Case) -> None:
         assert message is not None and not message.lost
         apply(known, message)
         assert known == resident(scene)
-
-
-def test_archives_are_told_apart(case: archive_cases.Case, tmp_path: Path) -> None:
-    file = tmp_path / "scene.toml"
-    pose = [[1.0, 0.0, 0.0, 50.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-    tables = f'[[archives]]\npath = "{case.archive}"\n'
-    file.write_text(f"format = 1\n{tables}{tables}pose = {pose}\n")
-    with Scene.open(file) as scene, scene.residency_changes() as changes:
-        scene.add_avatar("al", AVATAR, 0.01)
-        there = np.eye(4)
-        there[:3, 3] = 51.0, 1.0, 1.0
-        scene.collide("al", there, margin=0.01)
-        message = changes.take()
-    assert message is not None and set(message.archive.tolist()) == {1} and len(message.voxel)
 
 
 def test_changes_end_with_the_scene_and_with_the_reader(case: archive_cases.Case) -> None:

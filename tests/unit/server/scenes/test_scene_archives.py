@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import (
     BadRequestError,
-    CorruptError,
     FormatError,
     ScanError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ObjectInfo, SceneInfo, SpawnInfo
@@ -24,24 +22,14 @@ from solidcloud.server import scene as scene_module
 from solidcloud.server.archives.placed_archive import PlacedArchive
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files.scene_check import check_scene_file
-from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 from solidcloud.server.scenes import scene_archives
-from solidcloud.server.scenes.scene_archives import (
-    error_location,
-    is_scene_file,
-    normals_asked,
-    share_budget,
-    store_opener,
-)
 
 pytestmark = pytest.mark.interpreted
 
 TOP = 'format = 1\n[[archives]]\npath = "floor"\n'
 BALL = '[[avatars]]\nname = "ball"\nfile = "ball.xyz"\nradius = 0.05\n'
 STOP = '[[effects]]\neffect = "stop"\n'
-# Of points 0.1 m apart: half of that.
-RADIUS = 0.05
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -91,12 +79,6 @@ def test_an_archive_is_itself_and_stop(folder: Path) -> None:
         assert scene.name == "hall"
 
 
-def test_a_scene_file_is_told_by_its_suffix(tmp_path: Path) -> None:
-    (tmp_path / "folder.toml").mkdir()
-    assert is_scene_file(tmp_path / "nowhere.toml") and not is_scene_file(tmp_path / "folder.toml")
-    assert not is_scene_file(tmp_path / "nowhere")
-
-
 def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
     text = (
         'format = 1\nup = [0, 0, 9]\nradius_model = "fixed:0.02"\n' + TOP[11:] + BALL + STOP
@@ -135,49 +117,6 @@ def test_a_scene_has_its_name_its_avatars_and_says_so(write: Write) -> None:
         assert scene.collide("ball", poses[1:], client="one").verdict.tolist() == [Verdict.CLEAR]
 
 
-def test_a_name_that_is_given_goes_before_the_files(write: Write) -> None:
-    file = write('format = 1\nname = "said"\n' + TOP[11:])
-    with Scene.open(file, read_points=read_points) as scene:
-        assert scene.name == scene.info().scene == "said"
-    with Scene.open(file, read_points=read_points, name="given") as scene:
-        assert scene.name == scene.info().scene == "given"
-
-
-def test_a_scene_file_is_opened_with_the_readers_of_scans(write: Write) -> None:
-    with Scene.open(write(TOP + BALL + STOP)) as scene:
-        assert [avatar.name for avatar in scene.info().avatars] == ["ball"]
-        assert scene.collide("ball", at((0, 0, 0)), client="any").verdict.tolist() == [Verdict.CONTACT]
-        with scene.session("ball") as session:
-            state = session.wait(session.wish(at((0, 0, 0.5))))
-            assert state.simulated == ["stop"] and state.verdict == Verdict.CLEAR
-            assert session.wait(session.wish(at((0, 0, 0)))).pose[0, 2, 3] > 0.09
-        info = scene.info()
-        scene.reload()
-        assert scene.info() == info
-    for option in ({"radius_model": "mean"}, {"open_store": VoxelStore}):
-        with pytest.raises(BadRequestError, match=r"hall.toml: a scene file: expected no open_store"):
-            Scene.open(write(TOP), **option)
-
-
-def test_a_scene_moves_as_its_effects_say(write: Write) -> None:
-    begin, end = at((0, 0, 0.5)), at((0, 0, -0.5))
-    for effects, last in (("", -0.5), (STOP + '[[effects]]\neffect = "sweep"\n', 0.1)):
-        # Without a table of effects there is `stop`; a list of none is none.
-        text = TOP + BALL + effects if effects else "format = 1\neffects = []\n" + TOP[11:] + BALL
-        with Scene.open(write(text), read_points=read_points) as scene:
-            moved = scene.move("ball", begin, end, client="any")
-            assert moved.simulated == (["stop", "sweep"] if effects else [])
-            assert last <= moved.pose[0, 2, 3] <= last + 0.01
-
-
-def test_what_is_passed_through_is_not_there(write: Write) -> None:
-    through = '[[effects]]\neffect = "through"\nboxes = [{name = "hole", low = [-0.25, -9, -1], high = [0.25, 9, 1]}]\n'
-    with Scene.open(write(TOP + BALL + STOP + through), read_points=read_points) as scene:
-        assert scene.info().effects == ["through", "stop"]
-        answers = scene.collide("ball", at((0, 0, 0), (0.4, 0, 0)), client="any")
-        assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
-
-
 @pytest.mark.parametrize(
     "second", ["", "pose = [[0, -1, 0, 10], [1, 0, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]\n"]
 )
@@ -189,13 +128,6 @@ def test_several_archives_answer_as_one(write: Write, second: str) -> None:
         answers = scene.collide("ball", at((0.5, 0.5, 0.05), (9.5, 0.5, 2.05)), client="any")
         assert answers.verdict.tolist() == [Verdict.CONTACT, Verdict.CONTACT if second else Verdict.CLEAR]
         assert 0 < scene.stats().budget_bytes <= 64 << 20
-
-
-def test_one_archive_at_a_pose_is_there(write: Write) -> None:
-    pose = "pose = [[1, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
-    with Scene.open(write(TOP + pose + BALL + STOP), read_points=read_points) as scene:
-        answers = scene.collide("ball", at((0, 0, 0), (100, 0, 0)), client="any")
-        assert answers.verdict.tolist() == [Verdict.CLEAR, Verdict.CONTACT]
 
 
 def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write) -> None:
@@ -219,46 +151,6 @@ def test_what_is_passed_through_lies_in_the_world_for_each_archive(write: Write)
     assert checked.left_out == 25 + 9 and not [note for note in checked.notes if "spawn" in note]
     outside = check_scene_file(write(file.read_text().replace("5, 1.5]", "7, 1.5]")), read_points)
     assert [note for note in outside.notes if "spawn lies outside the bounds" in note]
-
-
-def test_a_cache_is_shared_by_what_archives_take() -> None:
-    sizes = [np.array([1000, 3000]), np.array([1000]), np.zeros(0, np.int64)]
-    shares = share_budget(100_000, sizes)
-    assert sum(shares) <= 100_000 and sum(shares) > 100_000 - 3
-    assert shares[0] > 3 * shares[1] > 0 and shares[2] == 0
-    least = [share_budget(5000, sizes[:2])[i] - (3000, 1000)[i] for i in (0, 1)]
-    assert min(least) >= 0
-    assert share_budget(7, sizes[:1]) == [7]
-    with pytest.raises(BadRequestError, match="cache of 3999 bytes: the largest voxels of 2 archives take 4"):
-        share_budget(3999, sizes[:2])
-
-
-@pytest.mark.parametrize(
-    ("effects", "reach"),
-    [
-        ("", None),
-        ('[[effects]]\neffect = "slide"\nnormal_reach = 0.2\n[[effects]]\neffect = "ground"\n', 0.2),
-        ('[[effects]]\neffect = "ground"\n', 0.08),
-    ],
-)
-def test_normals_are_loaded_where_effects_ask_for_them(
-    folder: Path, effects: str, reach: float | None
-) -> None:
-    archive = folder / f"normals-{reach}"
-    keep = [] if reach is None else ["--keep", "normal", "--normal-reach", str(reach)]
-    assert (
-        run(["build", str(folder / "floor.xyz"), "-o", str(archive), "--voxel", "2", "--jobs", "1", *keep])
-        == 0
-    )
-    file = parse_scene((TOP + STOP + effects).encode(), "hall.toml")
-    assert normals_asked(file) == reach
-    store = store_opener(file, 0)(archive)
-    assert store.with_normals == (reach is not None)
-    store.close()
-    if reach is not None:
-        plain = store_opener(parse_scene((TOP + STOP).encode(), "hall.toml"), 0)(archive)
-        assert not plain.with_normals and plain.sizes.sum() < store.sizes.sum()
-        plain.close()
 
 
 @pytest.mark.parametrize(
@@ -289,11 +181,6 @@ def test_a_fault_of_what_is_named_has_the_file_and_the_place(
     with pytest.raises(kind) as checked:
         check_scene_file(file, read_points)
     assert str(checked.value) == str(found.value)
-
-
-def test_a_large_avatar_that_meets_nobody_is_fine(write: Write) -> None:
-    with Scene.open(write(TOP + BALL.replace("0.05", "4.5") + STOP), read_points=read_points) as scene:
-        assert scene.collide("ball", at((0, 0, 4)), client="any").verdict.tolist() == [Verdict.CONTACT]
 
 
 def test_too_small_a_cache_is_told(write: Write) -> None:
@@ -372,14 +259,3 @@ def test_a_reload_finds_where_a_link_points_then(folder: Path, tmp_path: Path) -
         (tmp_path / "current").unlink()
         (tmp_path / "current").symlink_to("second")
         assert scene.reload().points == scene.info().points == 3
-
-
-def test_an_error_keeps_its_kind_and_its_paths() -> None:
-    with pytest.raises(CorruptError) as found, error_location(Path("a.toml"), "$.x"):
-        raise CorruptError("broken", (Path("b.h5"),))
-    assert str(found.value) == "a.toml: $.x: broken" and found.value.paths == (Path("b.h5"),)
-    with (
-        pytest.raises(BadRequestError, match=r"^a.toml: \$.x: .*denied"),
-        error_location(Path("a.toml"), "$.x"),
-    ):
-        raise PermissionError(13, "Permission denied")

@@ -6,24 +6,13 @@ import effect_rooms
 import numpy as np
 import pytest
 from facade_scene import scene_text
-from solidcloud.schemas.scene.effect_table import LEAST_TOLERANCE, MAX_TOLERANCE, Stop, Sweep
-from solidcloud.schemas.scene.scene_file import parse_scene, scene_of, sweep_tolerance
+from solidcloud.schemas.scene.effect_table import MAX_TOLERANCE
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
 
 WALKING = ("stop", "sweep", "slide", "step", "ground")
-
-
-def test_the_files_tolerance_is_the_default_of_its_sweeps() -> None:
-    effects = "[[effects]]\neffect = 'stop'\n[[effects]]\neffect = 'sweep'\n"
-    text = "format = 1\ntolerance = {}\n[[archives]]\npath = 'a'\n" + effects
-    assert sweep_tolerance(scene_of("a")) == LEAST_TOLERANCE
-    for given, expected in ((0, LEAST_TOLERANCE), (0.02, 0.02), (MAX_TOLERANCE, MAX_TOLERANCE)):
-        assert sweep_tolerance(parse_scene(text.format(given).encode(), "a.toml")) == expected
-    own = parse_scene((text.format(0.02) + "tolerance = 0.001\n").encode(), "a.toml")
-    assert own.effects == [Stop(), Sweep(tolerance=0.001)] and sweep_tolerance(own) == 0.001
 
 
 def test_an_avatar_nearer_to_the_floor_than_the_tolerance_walks_and_rests(tmp_path: Path) -> None:

@@ -101,16 +101,6 @@ def test_what_is_no_command_is_refused(scene, command):
         session.wish(**command)
 
 
-@pytest.mark.parametrize("shape", [(4, 4), (1, 4, 4)])
-def test_one_pose_is_a_matrix_or_a_batch_of_one(scene, shape):
-    with scene.session("al") as session:
-        state = session.wait(session.wish(pose_at(0.5).reshape(shape)))
-        assert np.array_equal(state.pose, pose_at(0.5))
-    pose = pose_at(0.5).reshape(shape)
-    moved = scene.simulation.move("al", pose, pose)
-    assert np.array_equal(moved.pose, pose_at(0.5))
-
-
 def test_a_session_may_be_closed_and_begun_again(scene):
     session = scene.session("al")
     with pytest.raises(BadRequestError, match="closed"):

@@ -7,7 +7,7 @@ import pytest
 from solidcloud.schemas.archive.rigid_pose import check_rigid
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.scene.scene_file import Spawn
-from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, MoveRequest, Wish
+from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Wish
 from solidcloud.server.simulation.motion_commands import (
     LONGEST_FRAME,
     LONGEST_PAUSE,
@@ -52,11 +52,6 @@ def test_a_turn_is_about_up_and_at_the_avatars_origin(up):
     assert np.array_equal(there[:3, 3], begin[:3, 3])
     assert np.allclose(there[:3, :3] @ axis, axis, atol=1e-15)
     assert math.isclose(np.trace(there[:3, :3]), 1.0, abs_tol=1e-14), "a quarter turn"
-
-
-def test_positive_turns_are_to_the_left():
-    there = target_pose(wish(velocity=(0.0, 0.0, 0.0), turn=math.pi / 2), np.eye(4), 1.0, UP)
-    assert np.allclose(there[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
 
 
 def test_a_pose_turned_for_long_stays_rigid():
@@ -133,9 +128,3 @@ def test_what_is_not_rigid_is_refused(change, said):
 def test_what_is_no_wish_is_refused(fields):
     with pytest.raises(BadRequestError):
         Wish(seq=0, time=0.0, **fields)
-
-
-@pytest.mark.parametrize("seconds", [-1.0, 10.5, math.nan, math.inf])
-def test_a_frame_that_lasts_for_no_time_there_is_is_refused(seconds):
-    with pytest.raises(BadRequestError, match="seconds"):
-        MoveRequest(avatar="al", pose_from=np.eye(4)[None], pose_to=np.eye(4)[None], seconds=seconds)

@@ -90,12 +90,6 @@ def test_the_same_wishes_give_the_same_poses(log):
     assert codes == {"", "bad_transform", "unknown_avatar", "busy"}
 
 
-def test_a_replay_skips_what_was_skipped_and_nothing_else(log):
-    simulation = simulated()
-    simulation._pipeline.skips = False
-    assert replay(simulation, read_log(log)).different == 0
-
-
 def changed(records, number, edit):
     """Records with one turn's outcome in one frame edited."""
     for record in records:

@@ -1,11 +1,8 @@
 """A simulation, with a stand-in for its effects: whose frame it is, who is there, what is remembered."""
 
-import inspect
-import threading
-
 import numpy as np
 import pytest
-from fake_server import FloorScene, floor_simulation
+from fake_server import floor_simulation
 from solidcloud.schemas.errors import (
     BadRequestError,
     BadTransformError,
@@ -17,12 +14,8 @@ from solidcloud.schemas.scene.effect_table import Ground, Stop
 from solidcloud.schemas.scene.scene_file import SceneFile, Spawn, scene_of
 from solidcloud.schemas.wire.key_expressions import User, public_id
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Moved, State, Wish
-from solidcloud.server.client import Client
-from solidcloud.server.scene import Scene
-from solidcloud.server.scene_interface import EVERYBODY, FrameCommand, ServedScene
-from solidcloud.server.simulation.local_session import LocalSession
+from solidcloud.server.scene_interface import EVERYBODY, FrameCommand
 from solidcloud.server.simulation.simulation import SILENT_SECONDS, Simulation
-from solidcloud.server.zenoh_client.client_session import ClientSession
 
 pytestmark = pytest.mark.interpreted
 
@@ -160,13 +153,6 @@ def test_who_wishes_nothing_for_long_has_left(floor):
     assert floor.users == [BO], "half a second short of it"
 
 
-def test_effects_are_skipped_as_a_recorded_frame_says(floor):
-    outcomes = floor.step(
-        [FrameCommand(AL, wish(1, 0.5)), FrameCommand(BO, wish(1, 0.5))], skips=[["proximity"], []]
-    )
-    assert [outcome.state.skipped for outcome in outcomes] == [["proximity"], []]
-
-
 def test_a_move_is_remembered_by_nobody(floor):
     floor.step([FrameCommand(AL, wish(1, 0.5))])
     moved = floor.move("al", pose_at(0.0), pose_at(-1.0), 0.25, client="a")
@@ -195,30 +181,6 @@ def test_wishes_for_objects_where_there_are_none_are_refused(floor):
     assert isinstance(error, BadRequestError) and "objects" in str(error)
 
 
-def test_the_bodies_that_may_meet_are_kept_up_to_date():
-    class Bodies(dict):
-        restored = 0
-
-        def place_objects(self, poses, stop):
-            self.told = poses
-            return lambda: setattr(self, "restored", self.restored + 1)
-
-    bodies = Bodies()
-    file = SceneFile(format=1, archives=scene_of("floor").archives)
-    stand_in = floor_simulation()
-    simulation = Simulation(stand_in.scene, file, stand_in._pipeline, bodies=bodies)
-    simulation.scene.add_avatar("al", POINTS, 0.125, client="a")
-    objects = {"door": np.eye(4).tolist()}
-    simulation.step([FrameCommand(AL, wish(1, 0.5, objects=objects))])
-    assert list(bodies) == [AL] and np.array_equal(bodies[AL].pose, pose_at(0.5)[0])
-    assert bodies.told == objects and not bodies.restored
-    simulation._pipeline.run = None
-    ((_, error, _),) = simulation.step([FrameCommand(AL, wish(2, 0.5, objects=objects))])
-    assert isinstance(error, InternalError) and bodies.restored == 1
-    simulation.end(AL)
-    assert not bodies
-
-
 def test_the_scenes_own_avatars_are_everybodys():
     stand_in = floor_simulation()
     own = stand_in.scene.add_avatar("guide", POINTS, 0.125, client=EVERYBODY)
@@ -230,67 +192,3 @@ def test_the_scenes_own_avatars_are_everybodys():
     assert simulation.scene.add_avatar("guide", POINTS, 0.125, client="c") == own
     with pytest.raises(BadRequestError):
         simulation.scene.add_avatar("guide", POINTS + 1, 0.125, client="c")
-
-
-def test_warming_simulates_a_frame_and_leaves_nothing(floor):
-    before = floor._pipeline.frames
-    avatars = dict(floor.scene.avatars)
-    floor.warm()
-    assert floor._pipeline.frames > before
-    assert floor.scene.avatars == avatars and floor.users == []
-
-
-def test_frames_come_one_at_a_time(floor):
-    inside, most = [], []
-
-    def run(body, aim, seconds, budget, *, skip=None):
-        inside.append(body.name)
-        most.append(len(inside))
-        threading.Event().wait(0.001)
-        inside.remove(body.name)
-        return Moved(pose=aim[None])
-
-    floor._pipeline.run = run
-    threads = [
-        threading.Thread(
-            target=lambda user=user: [floor.step([FrameCommand(user, wish(seq, 0.5))]) for seq in range(20)]
-        )
-        for user in (AL, BO)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(20.0)
-    assert max(most) == 1 and len(most) == 40
-
-
-# What a client has no use for: it is how a server keeps its memory bounded.
-_OF_THE_SERVER = ("limit_avatars", "drop_unused_avatars")
-
-
-def test_it_has_all_that_a_scene_has():
-    wanted = {
-        name
-        for name, found in inspect.getmembers(ServedScene)
-        if not name.startswith("_") and (callable(found) or isinstance(found, property))
-    }
-    assert {"move", "ask", "simulation", "reload", "path"} <= wanted
-    for kind in (Scene, FloorScene):
-        missing = {name for name in wanted if not hasattr(kind, name)} - {"simulation"}
-        assert not missing, kind
-    asked = {name for name in wanted if name not in ("simulation", "drop_client", "warm", *_OF_THE_SERVER)}
-    assert {name for name in asked if not hasattr(Client, name)} == set()
-    # And the other way round: what a client can do, a scene in this process can.
-    own = {name for name in vars(Client) if not name.startswith("_")} - {"silence"}
-    assert {"session", "add_avatar", "stats"} <= own
-    assert {name for name in own if not hasattr(Scene, name)} == set()
-    sessions = {name for name in vars(ClientSession) if not name.startswith("_")}
-    assert sessions == {name for name in vars(LocalSession) if not name.startswith("_")}
-
-
-def test_a_simulation_has_frames_and_no_questions():
-    public = {name for name in dir(Simulation) if not name.startswith("_")}
-    assert public == {
-        "drop_client", "effect_stats", "end", "end_client", "most_users", "move", "record", "reloaded", "step", "users",
-        "warm", "world",
-    }  # fmt: skip

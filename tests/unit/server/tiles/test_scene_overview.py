@@ -1,24 +1,16 @@
 """Overview: a sample of all points of a scene, from previews, else from some voxels."""
 
 import shutil
-import zlib
 from pathlib import Path
 
 import archive_cases
 import h5py
 import numpy as np
 import pytest
-from coloured_scans import coloured, write_las
 from scipy.spatial import cKDTree
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.edit.seal_archive import seal_archive
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.vtkhdf import PREVIEW_NAME
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.overview_messages import MAX_OVERVIEW_POINTS, OverviewAnswer
-from solidcloud.schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from solidcloud.server.scene import Scene
 from solidcloud.server.tiles import scene_overview
 
@@ -68,31 +60,6 @@ def test_an_overview_is_a_sample_of_the_preview(case: archive_cases.Case) -> Non
         assert scene.residency.resident == 0
 
 
-def test_no_record_is_read_beside_a_preview(
-    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Scene.open(case.archive) as scene:
-        monkeypatch.setattr(Archive, "_read_frame", None)
-        assert len(scene.overview(50).points) == 50
-
-
-def test_the_preview_of_a_sealed_archive_is_not_trusted(case: archive_cases.Case, tmp_path: Path) -> None:
-    folder, key = copied(case, tmp_path), tmp_path / "key"
-    key.write_bytes(KEY)
-    seal_archive(folder, KEY)
-    with Scene.open(folder, archive_key=key) as scene:
-        assert scene.overview(50).previewed.tolist() == [False]
-    with Scene.open(folder) as scene:
-        assert scene.overview(50).previewed.tolist() == [True]
-
-
-def test_few_points_of_an_overview_are_spread(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        some = world(scene.overview(2000))
-    octants = (some > 0) @ [1, 2, 4]
-    assert np.bincount(octants, minlength=8).min() > 150
-
-
 @pytest.mark.parametrize("fault", ["missing", "cut", "stamp", "large", "deflate", "nan"])
 def test_without_a_usable_preview_voxels_are_sampled(
     case: archive_cases.Case, tmp_path: Path, fault: str
@@ -120,15 +87,6 @@ def test_without_a_usable_preview_voxels_are_sampled(
     check_sampled(found, case.points)
 
 
-def test_a_chunk_that_inflates_beyond_its_size_is_refused(case: archive_cases.Case, tmp_path: Path) -> None:
-    folder = copied(case, tmp_path)
-    with h5py.File(folder / PREVIEW_NAME, "r+") as file:
-        bomb = zlib.compress(bytes(64 << 20), 9) + bytes(4)
-        file["VTKHDF/Points"].id.write_direct_chunk((0, 0), bomb)
-    with Scene.open(folder) as scene:
-        assert scene.overview().previewed.tolist() == [False]
-
-
 def test_voxels_are_sampled_up_to_a_number_of_points(
     case: archive_cases.Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,82 +112,8 @@ def test_voxels_are_sampled_up_to_a_number_of_points(
     assert (np.bincount(octants, minlength=8) > 0).sum() >= 6, "the voxels are spread"
 
 
-def test_archives_share_the_limit_by_their_points(case: archive_cases.Case, tmp_path: Path) -> None:
-    small = archive_cases.build(tmp_path, np.random.default_rng(1).uniform(0, 1, (COUNT // 3, 3)))
-    pose = [[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
-    file = tmp_path / "scene.toml"
-    tables = f'[[archives]]\npath = "{case.archive}"\n[[archives]]\npath = "{small.archive}"\npose = {pose}\n'
-    file.write_text(f"format = 1\n{tables}")
-    with Scene.open(file) as scene:
-        found = scene.overview(400)
-    assert found.starts.tolist() == [0, 300, 400]
-    matrix = np.array(pose)
-    moved = small.points @ matrix[:3, :3].T + matrix[:3, 3]
-    apart = np.linalg.norm(world(found, 1)[:, None] - moved, axis=2).min(axis=1)
-    assert apart.max() < 4e-4
-
-
-def test_points_that_a_scene_passes_through_are_not_shown(case: archive_cases.Case, tmp_path: Path) -> None:
-    file = tmp_path / "scene.toml"
-    box = '{name = "all of one side", low = [-9.0, -9.0, -9.0], high = [0.0, 9.0, 9.0]}'
-    effects = f'[[effects]]\neffect = "stop"\n[[effects]]\neffect = "through"\nboxes = [{box}]\n'
-    file.write_text(f'format = 1\n[[archives]]\npath = "{case.archive}"\n{effects}')
-    with Scene.open(file) as scene:
-        found = scene.overview()
-    assert found.previewed[0] and len(found.points) > COUNT // 4
-    assert world(found)[:, 0].min() > -1e-3
-
-
-@pytest.mark.parametrize("is_previewed", [True, False])
-def test_columns_are_those_of_the_points(tmp_path: Path, is_previewed: bool) -> None:
-    truth = coloured(5)
-    scan = write_las(tmp_path / "scan.las", truth)
-    keep = frozenset({"rgb", "intensity", "classification", "scan"})
-    build_archive([scan], tmp_path / "archive", BuildConfig(resolution=1e-3, keep=keep, jobs=1))
-    if not is_previewed:
-        (tmp_path / "archive" / PREVIEW_NAME).unlink()
-    with Scene.open(tmp_path / "archive") as scene:
-        found = scene.overview()
-    assert found.columns == ["rgb", "intensity", "classification", "scan"]
-    assert found.intensities == (0.0, 0.0) and found.classes == sorted(set(truth.classes.tolist()))
-    expected = {
-        (*key, *rgb, c)
-        for key, rgb, c in zip(keys(truth.xyz), truth.rgb.tolist(), truth.classes, strict=True)
-    }
-    shown = zip(keys(world(found)), found.rgb.tolist(), found.classification, strict=True)
-    assert {(*key, *rgb, c) for key, rgb, c in shown} == expected
-    assert (found.scan == 0).all() and len(found.scan) == len(found.points)
-
-
-def keys(points: np.ndarray) -> list[tuple[int, ...]]:
-    """Return coordinates in millimetres."""
-    return [tuple(row) for row in np.rint(points * 1e3).astype(int).tolist()]
-
-
 def test_a_limit_out_of_range_is_refused(case: archive_cases.Case) -> None:
     with Scene.open(case.archive) as scene:
         for limit in (0, -1, MAX_OVERVIEW_POINTS + 1):
             with pytest.raises(BadRequestError, match="limit"):
                 scene.overview(limit)
-
-
-@pytest.mark.parametrize("encoding", [JSON, MSGPACK])
-def test_the_largest_overview_fits_in_a_message(encoding: str) -> None:
-    n = MAX_OVERVIEW_POINTS
-    rng = np.random.default_rng(4)
-    one, three = np.zeros((1, 3)), rng.random((n, 3), np.float32) * np.float32(1e5)
-    columns = (
-        np.full((n, 3), 255, np.uint8),
-        (rng.random(n) * 1e-7).astype(np.float32),
-        np.full(n, 255, np.uint8),
-        np.full(n, 65535, np.uint16),
-    )
-    counts = np.array([n]), np.array([1]), np.array([1])
-    found = OverviewAnswer(
-        n, 0.01, ["rgb"], (0.0, 1.0), [], np.eye(4)[None], np.ones(1), one, one,
-        counts[0].astype("u8"), counts[1].astype("u4"), counts[2].astype("u4"),
-        np.array([0, n], np.uint32), np.ones(1, bool), three, *columns,
-    )  # fmt: skip
-    payload = encode(found, encoding)
-    assert len(payload) < MAX_MESSAGE_BYTES - (1 << 16)
-    np.testing.assert_array_equal(decode_answer(OverviewAnswer, payload, encoding).points, three)

@@ -6,9 +6,6 @@ import archive_cases
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.wire.encoding import JSON, MSGPACK, encode
-from solidcloud.schemas.wire.request_limits import MAX_MESSAGE_BYTES
-from solidcloud.schemas.wire.tile_messages import MAX_LISTED_VOXELS, VoxelsAnswer
 from solidcloud.server.scene import Scene
 
 
@@ -38,16 +35,6 @@ def test_voxels_are_listed_by_the_distance_of_their_boxes(case: archive_cases.Ca
         np.testing.assert_array_equal(near.voxel, every.voxel[:5])
 
 
-def test_the_list_says_what_is_in_memory(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        assert not scene.voxels((0, 0, 0)).resident.any()
-        scene.add_avatar("ball", [[0.0, 0.0, 0.0]], 0.1)
-        scene.collide("ball", np.eye(4))
-        listed = scene.voxels((0, 0, 0))
-        assert listed.resident.sum() == scene.residency.resident > 0
-        assert listed.resident[0]
-
-
 def test_voxels_of_two_archives_are_listed_together(case: archive_cases.Case, tmp_path: Path) -> None:
     file = tmp_path / "scene.toml"
     pose = [[1.0, 0.0, 0.0, 0.25], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -67,15 +54,3 @@ def test_voxels_of_two_archives_are_listed_together(case: archive_cases.Case, tm
 def test_a_place_that_is_none_is_refused(case: archive_cases.Case, place: tuple[float, ...]) -> None:
     with Scene.open(case.archive) as scene, pytest.raises(BadRequestError, match="place"):
         scene.voxels(place)
-
-
-@pytest.mark.parametrize("encoding", [JSON, MSGPACK])
-def test_the_longest_list_fits_in_a_message(encoding: str) -> None:
-    n, rng = MAX_LISTED_VOXELS, np.random.default_rng(3)
-    corners = rng.uniform(-1e9, 1e9, (2, n, 3))
-    found = VoxelsAnswer(
-        n, np.full(n, 65535, np.uint16), np.full((n, 3), -(1 << 20), np.int32), *corners,
-        np.full(n, 1 << 31, np.uint64), np.full(n, 1 << 32, np.uint64), np.zeros(n, bool), np.eye(4)[None],
-        np.ones(1),
-    )  # fmt: skip
-    assert len(encode(found, encoding)) < MAX_MESSAGE_BYTES - (1 << 16)

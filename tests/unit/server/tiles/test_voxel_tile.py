@@ -1,7 +1,6 @@
 """Tiles: the points of a voxel, every so many of them, or the spheres of a level of its hierarchy."""
 
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import archive_cases
@@ -12,9 +11,8 @@ from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.passes import level_pass
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.level import LEVEL_FOLDER, halvings_between
-from solidcloud.schemas.errors import BadRequestError, BusyError, CorruptError, TooLargeError
-from solidcloud.schemas.wire.tile_messages import TileAnswer, TileRequest
+from solidcloud.schemas.errors import BadRequestError, CorruptError, TooLargeError
+from solidcloud.schemas.wire.tile_messages import TileAnswer
 from solidcloud.server.scene import Scene
 from solidcloud.server.tiles import voxel_tile
 
@@ -57,24 +55,6 @@ def test_the_tiles_of_all_voxels_hold_all_points(case: archive_cases.Case) -> No
             np.testing.assert_array_equal(one, other)
         assert len(np.unique(lattice[0], axis=0)) == len(np.unique(lattice[1], axis=0))
         assert scene.residency.resident == 0, "tiles load nothing into memory"
-
-
-def test_a_coarser_detail_is_a_part_of_the_finer_one(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        voxel = scene.voxels((0, 0, 0)).voxel[0]
-        finer = scene.tile(0, voxel)
-        for detail in (1, 2, 8):
-            tile = scene.tile(0, voxel, detail)
-            np.testing.assert_array_equal(tile.points, finer.points[:: 4**detail])
-            assert tile.total == len(finer.points)
-
-
-def test_the_points_of_a_detail_are_spread(case: archive_cases.Case) -> None:
-    with Scene.open(case.archive) as scene:
-        voxel = scene.voxels((0, 0, 0)).voxel[0]
-        every, some = (world(scene.tile(0, voxel, detail)) for detail in (0, 2))
-        apart = np.linalg.norm(every[:, None] - some[None], axis=2).min(axis=1)
-        assert apart.max() < 0.35, "one of 16 points of a square metre"
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, 3, 50])
@@ -139,59 +119,6 @@ def test_coarse_details_are_read_from_the_level(
         monkeypatch.setattr(voxel_tile, "_MAX_LEVEL_POINTS", 3)
         with pytest.raises(TooLargeError, match="level of detail"):
             scene.tile(0, scene.voxels((0, 0, 0)).voxel[0], 3)
-
-
-def test_a_level_voxel_is_found_in_any_division(
-    leveled: tuple[Path, Coloured],
-) -> None:
-    folder, _ = leveled
-    with Archive(folder) as archive, Archive(folder / LEVEL_FOLDER) as level:
-        halvings = halvings_between(level.header.lattice, archive.header.lattice)
-        assert halvings > 0
-        shown = 0
-        for voxel in archive.coordinates:
-            request = TileRequest(0, tuple(voxel.tolist()), 3)
-            places, _, _ = voxel_tile._representatives(request, archive, level)
-            inside = ((level.coordinates >> halvings) == voxel).all(axis=1)
-            count = int(level.voxels["rows"][inside, 2].sum())
-            assert len(places) == -(-count // 2)
-            shown += count
-        assert shown == level.header.points
-
-
-def test_a_large_voxel_has_limits(case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Scene.open(case.archive) as scene:
-        listed = scene.voxels((0, 0, 0))
-        voxel, points = listed.voxel[0], int(listed.points[0])
-        spheres = len(scene.tile(0, voxel, level=50).spheres)
-        with scene.archives[0].take() as opened:
-            monkeypatch.setattr(opened.store.archive, "read_voxel", None)  # nothing is read
-        monkeypatch.setattr(voxel_tile, "MAX_MESSAGE_BYTES", 6 * points - 1)
-        with pytest.raises(TooLargeError, match="less detail"):
-            scene.tile(0, voxel)
-        monkeypatch.setattr(voxel_tile, "_MAX_POINTS", points - 1)
-        with pytest.raises(TooLargeError, match="ask for its spheres"):
-            scene.tile(0, voxel, detail=8)
-        assert len(scene.tile(0, voxel, level=50).spheres) == spheres
-        monkeypatch.setattr(voxel_tile, "_MAX_NODES", spheres - 1)
-        with pytest.raises(TooLargeError, match="nodes"):
-            scene.tile(0, voxel, level=0)
-
-
-def test_large_voxels_are_read_one_at_a_time(
-    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(voxel_tile, "_LARGE_POINTS", 10)
-    monkeypatch.setattr(voxel_tile, "_TURN_SECONDS", 0.01)
-    with Scene.open(case.archive) as scene:
-        voxel = scene.voxels((0, 0, 0)).voxel[0]
-        with voxel_tile._large, pytest.raises(BusyError, match="others are being read"):
-            scene.tile(0, voxel)
-        monkeypatch.setattr(voxel_tile, "_TURN_SECONDS", 60.0)
-        with ThreadPoolExecutor(4) as pool:
-            tiles = list(pool.map(lambda _: scene.tile(0, voxel), range(12)))
-        assert all(np.array_equal(tile.points, tiles[0].points) for tile in tiles)
-        assert not voxel_tile._large.locked()
 
 
 def test_tiles_evict_nothing(case: archive_cases.Case) -> None:

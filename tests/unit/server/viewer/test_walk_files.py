@@ -95,12 +95,6 @@ def test_invalid_file_is_refused_with_its_line(node: Any, name: str, text: str, 
     assert message in said
 
 
-def test_times_that_do_not_ascend_are_replaced(node: Any) -> None:
-    rows = "\n".join("5 0 0 0 0 0 0 1" for _ in range(3))
-    walk = node('return parseWalk("a.tum", values.rows);', rows=rows)
-    assert np.allclose([each["time"] for each in walk], [0, 1 / 30, 2 / 30])
-
-
 def test_recording_is_in_the_world_and_stands_still_in_a_pause(node: Any, rng: np.random.Generator) -> None:
     frame = ViewFrame([[4e5, 5e6, 0], [4e5 + 30, 5e6 + 20, 10]], up=(0.2, 0.9, 0.1))
     world = random_poses(3, rng) - np.array([[0, 0, 0, 3e4], [0, 0, 0, 4e5], [0] * 4, [0] * 4])
@@ -119,29 +113,3 @@ def test_recording_is_in_the_world_and_stands_still_in_a_pause(node: Any, rng: n
     )
     assert np.allclose([each["time"] for each in walk], [0, 0.1, 2 - 1 / 30, 2])
     assert np.allclose([each["place"] for each in walk], world[[0, 1, 1, 2], :3, 3], atol=1e-6)
-
-
-def test_recorded_turns_are_those_of_the_avatar(node: Any, tmp_path: Path, rng: np.random.Generator) -> None:
-    frame = ViewFrame([[0, 0, 0], [30, 20, 10]], up=(0.2, 0.9, 0.1))
-    world = random_poses(20, rng)
-    node(
-        "const recorder = new Recorder(() => {}); recorder.start();"
-        "for (const state of values.states) recorder.take(state, values.origin, values.axes);"
-        'writeFileSync("walk.csv", csvText(recorder.stop()));',
-        states=[{"time": k / 30, "pose": frame.pose(pose).tolist()} for k, pose in enumerate(world)],
-        **frame.description(),
-    )
-    _, found = read_poses(tmp_path / "walk.csv")
-    assert np.allclose(found[:, :3, :3], world[:, :3, :3], atol=1e-12)
-
-
-def test_recording_ends_after_an_hour(node: Any) -> None:
-    pose = np.eye(4).tolist()
-    counts = node(
-        "let ended = 0; const recorder = new Recorder(() => { ended += 1; recorder.stop(); }); recorder.start();"
-        "for (let k = 0; k < 110_000; k += 1)"
-        " recorder.take({ time: k / 30, pose: values.pose }, [0, 0, 0], [[1, 0, 0], [0, 1, 0], [0, 0, 1]]);"
-        "return [ended, recorder.samples.length];",
-        pose=pose,
-    )
-    assert counts == [1, 108_000]

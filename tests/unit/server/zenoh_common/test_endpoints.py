@@ -2,7 +2,7 @@
 
 import pytest
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.server.zenoh_common.endpoints import canonical, check_endpoint, zenoh_words
+from solidcloud.server.zenoh_common.endpoints import canonical, check_endpoint
 
 
 @pytest.mark.parametrize(
@@ -63,11 +63,3 @@ def test_names_of_one_endpoint_are_one():
         "unixsock-stream//tmp/a",
     )
     assert {canonical(endpoint) for endpoint in others} == set(others)
-
-
-def test_the_paths_of_zenohs_build_are_left_out():
-    error = ValueError(
-        "invalid socket address at /root/.cargo/git/zenoh-9c/cc83980/io/zenoh-link-commons/src/lib.rs:62."
-    )
-    assert zenoh_words(error) == "invalid socket address"
-    assert zenoh_words(ValueError()) == "ValueError"

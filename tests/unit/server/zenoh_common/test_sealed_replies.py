@@ -1,15 +1,13 @@
 """Seals: whatever is not as it was sealed has another; the worked example of WIRE.md."""
 
-import hashlib
 import re
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import solidcloud.schemas
 from solidcloud.schemas.wire.encoding import avatar_digest
-from solidcloud.server.zenoh_common.sealed_replies import Sealer, hash_of, is_about
+from solidcloud.server.zenoh_common.sealed_replies import Sealer, hash_of
 
 KEY, NONCE = bytes(range(32)), bytes(range(100, 116))
 NAME = "solidcloud/1/scene/hall/c1/collide"
@@ -37,35 +35,6 @@ def number_of(seal, ok=True, encoding=MSGPACK, payload=PAYLOAD):
     return Sealer(KEY, NONCE, NAME, hash_of(REQUEST)).number_of(seal, ok, encoding, payload)
 
 
-def test_a_seal_is_a_plain_keyed_hash():
-    """As the document has it, without the code."""
-    name, encoding = NAME.encode(), MSGPACK.encode()
-    text = NONCE + hashlib.sha256(REQUEST).digest() + struct.pack("<QBQ", 3, 1, len(name)) + name
-    about = hashlib.sha256(ABOUT).digest()
-    text += hashlib.sha256(PAYLOAD).digest() + about + encoding
-    assert sealed() == struct.pack("<Q", 3) + about + hashlib.blake2b(text, key=KEY, digest_size=32).digest()
-    assert number_of(sealed()) == 3
-
-
-def test_a_seal_says_which_avatars_a_reply_is_about():
-    other = avatar_digest(POINTS, 0.5)
-    assert number_of(sealed(about=other)) == 3, "the seal is right"
-    for about in (b"", ABOUT, other, ABOUT + other, other + ABOUT, ABOUT + ABOUT):
-        seal = sealed(about=about)
-        assert is_about(seal, about) and number_of(seal) == 3
-        assert not [each for each in (b"", ABOUT, other) if each != about and is_about(seal, each)]
-
-
-def test_an_avatars_digest_is_of_its_numbers():
-    numbers = struct.pack("<8d", 0, 0, 0, 0, 0, 1.75, 0.875, 0)
-    assert hashlib.sha256(numbers).digest() == ABOUT
-    assert avatar_digest(np.asfortranarray(-POINTS * -1.0), 0.875) == ABOUT
-    assert avatar_digest(POINTS * [1.0, -1.0, 1.0], 0.875) == ABOUT, "a zero has no sign"
-    assert avatar_digest(np.empty((0, 3)), -0.0) == hashlib.sha256(bytes(16)).digest()
-    assert ABOUT not in (avatar_digest(POINTS[::-1], 0.875), avatar_digest(POINTS, np.nextafter(0.875, 1)))
-    assert avatar_digest(POINTS, 0.875, 1) != ABOUT, "a point inside is no part of the surface"
-
-
 @pytest.mark.parametrize(
     "other",
     [
@@ -83,13 +52,6 @@ def test_an_avatars_digest_is_of_its_numbers():
 )
 def test_what_is_not_as_it_was_sealed_has_no_number(other):
     assert number_of(sealed(**other)) == -1
-
-
-def test_a_seal_that_is_damaged_has_no_number():
-    seal = sealed()
-    for at in range(len(seal)):
-        assert number_of(seal[:at] + bytes([seal[at] ^ 1]) + seal[at + 1 :]) == -1
-    assert number_of(seal[:-1]) == number_of(b"") == number_of(seal + b"\0") == -1
 
 
 def test_the_example_of_the_document():

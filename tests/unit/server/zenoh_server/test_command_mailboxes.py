@@ -1,7 +1,6 @@
 """Mailboxes: the latest wish wins, what is dropped is counted. Frames: states go to who wished, errors too."""
 
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -114,19 +113,6 @@ def test_who_leaves_has_its_wishes_dropped_and_may_count_from_the_start_again():
     assert len(boxes) == 1
 
 
-def test_who_says_a_thousand_times_that_it_leaves_is_remembered_once():
-    boxes = Mailboxes(8)
-    boxes.put(AL, wish(1))
-    for number in range(1000):
-        boxes.leave(AL)
-        boxes.leave(User("stranger", str(number)))
-        boxes.leave_client("a")
-        boxes.put(BO, wish(number))
-    post = boxes.take()
-    assert (post.left, post.gone) == ([AL], ["a"])
-    assert [(turn.user, turn.wish.seq) for turn in post.turns] == [(BO, 999)]
-
-
 def test_who_takes_waits_until_something_came_or_all_is_over():
     boxes, got = Mailboxes(8), []
     thread = threading.Thread(target=lambda: [got.append(taken(boxes)), got.append(boxes.take())])
@@ -137,14 +123,6 @@ def test_who_takes_waits_until_something_came_or_all_is_over():
     boxes.close()
     thread.join(DEADLINE)
     assert got == [[(AL, 1, 0)], None]
-
-
-def test_what_waits_when_it_is_closed_is_still_taken():
-    boxes = Mailboxes(8)
-    boxes.put(AL, wish(1))
-    boxes.close()
-    assert taken(boxes) == [(AL, 1, 0)]
-    assert boxes.take() is None
 
 
 @pytest.fixture
@@ -194,18 +172,6 @@ def test_what_is_no_wish_is_refused_and_changes_nothing(floor):
     assert floor.users == [BO]
 
 
-def test_a_wish_that_is_too_large_is_refused_unread(floor):
-    sent = []
-    frames = FrameLoop(floor, lambda user, answer: sent.append((user, answer)))
-    frames.wish(AL, b"\xc1" * ((512 << 10) + 1), None)
-    frames.wish(
-        BO, encode(wish(1, objects={f"{n:064}": np.eye(4).tolist() for n in range(2048)}), JSON), JSON
-    )
-    run(frames)
-    assert [said(answer).code for _, answer in sent] == ["too_large", "bad_request"]
-    assert "524289 bytes" in said(sent[0][1]).message and "has no objects" in said(sent[1][1]).message
-
-
 def test_a_user_too_many_is_busy_and_the_others_go_on(floor):
     sent = []
     frames = FrameLoop(floor, lambda user, answer: sent.append((user, answer)))
@@ -246,49 +212,6 @@ def test_a_state_that_cannot_be_sent_stops_nobody(floor, caplog):
     frames.wish(BO, encode(wish(1)), None)
     run(frames)
     assert sent == [BO] and "the link is gone" in caplog.text
-
-
-class LongFrames:
-    """A simulation whose frames last until they are stopped. reasons: why each one was."""
-
-    most_users, users = 2, ()
-
-    def __init__(self):
-        self.begun, self.reasons = threading.Event(), []
-
-    def step(self, turns, now, *, stops):
-        self.begun.set()
-        deadline = time.monotonic() + DEADLINE
-        while not stops[0]:
-            assert time.monotonic() < deadline, "nobody stopped it"
-            time.sleep(0.001)
-        self.reasons.append(stops[0].reason)
-        return []
-
-
-def test_wishes_that_wait_are_given_up_too():
-    simulation = LongFrames()
-    frames = FrameLoop(simulation, lambda user, answer: None)
-    frames.wish(AL, encode(wish(1)), None)
-    thread = threading.Thread(target=frames.run)
-    thread.start()
-    assert simulation.begun.wait(DEADLINE)
-    frames.wish(BO, encode(wish(1)), None)
-    simulation.begun.clear()
-    frames.close()
-    assert simulation.begun.wait(DEADLINE), "what waited when it was closed is still simulated"
-    frames.give_up()
-    thread.join(DEADLINE)
-    assert not thread.is_alive() and simulation.reasons == ["the server stops"] * 2
-
-
-def test_a_frame_that_begins_after_all_is_given_up_is_stopped():
-    simulation = LongFrames()
-    frames = FrameLoop(simulation, lambda user, answer: None)
-    frames.wish(AL, encode(wish(1)), None)
-    frames.give_up()
-    run(frames)
-    assert simulation.reasons == ["the server stops"]
 
 
 def test_whatever_bytes_come_each_is_answered(floor, caplog):

@@ -52,17 +52,6 @@ def test_a_client_whose_token_comes_late_leaves_the_shared_turn():
     assert len(queues) == 0
 
 
-def test_a_client_that_has_begun_stays_in_the_shared_turn():
-    queues = make(workers=2)
-    running, _ = offered(queues, "a", "a0", turn=ANONYMOUS)
-    other, _ = offered(queues, "b", "b0", turn=ANONYMOUS)
-    waiting, _ = offered(queues, "a", "a1", turn=ANONYMOUS)
-    assert queues.give_own_turn("a") == queues.give_own_turn("nobody") == []
-    assert queues.finished(running) == [other]
-    assert queues.finished(other) == [waiting]
-    assert queues.give_own_turn("a") == queues.finished(waiting) == []
-
-
 def test_clients_take_turns():
     queues = make(workers=1)
     ticket, _ = offered(queues, "a", "a0")
@@ -146,53 +135,6 @@ def test_slow_requests_are_bounded():
     assert len(queues) == 0
 
 
-def test_a_request_that_is_slow_from_the_start_takes_no_worker():
-    queues = make(workers=1, slow=1)
-    first, offer = offered(queues, "a", 1, slow=True)
-    assert offer is Offer.START and first.left
-    second, offer = offered(queues, "b", 2, slow=True)
-    assert offer is Offer.WAIT
-    quick, offer = offered(queues, "c", 3)
-    assert offer is Offer.RUN
-    assert queues.finished(first) == [second]
-    assert queues.finished(quick) == queues.finished(second) == []
-
-
-def test_what_is_put_back_comes_before_what_its_client_asked_after():
-    queues = make(workers=1, slow=1)
-    slow, _ = offered(queues, "a", 1, slow=True)
-    heavy, _ = offered(queues, "b", 2)
-    after, _ = offered(queues, "b", 3)
-    assert queues.put_back(heavy) == []
-    [again] = queues.finished(slow)
-    assert again.request == 2 and queues.finished(again) == [after]
-    assert after.state is TicketState.WORKING
-
-
-def test_an_answer_on_its_way_holds_neither_worker_nor_slow_place():
-    queues = make(workers=1, slow=1, waits=2)
-    first, _ = offered(queues, "a", 1)
-    assert queues.move_to_waiting(first) == []
-    second, _ = offered(queues, "b", 2, slow=True)
-    third, _ = offered(queues, "c", 3, slow=True)
-    assert queues.move_to_waiting(second) == [third]
-    assert queues.move_to_waiting(third) is None, "bounded"
-    assert offered(queues, "a", 4)[1] is Offer.WAIT, "the turn is kept"
-    assert [ticket.request for ticket in queues.finished(first)] == [4]
-
-
-def test_a_request_that_waited_takes_a_slow_place_once_it_computes():
-    queues = make(workers=1, slow=1)
-    first, _ = offered(queues, "a", 1)
-    assert queues.move_to_waiting(first) == []
-    assert queues.move_to_slow(first) == [] and first.state is TicketState.SLOW
-    second, _ = offered(queues, "b", 2)
-    assert queues.move_to_waiting(second) == []
-    assert queues.move_to_slow(second) is None, "no place"
-    assert queues.put_back(second) == [] and second.left, "whoever carried it out has no worker"
-    assert [ticket.request for ticket in queues.finished(first)] == [2]
-
-
 def test_clients_that_share_a_turn_are_answered_one_at_a_time():
     queues = make(by_turn=3)
     first, offer = offered(queues, "x", 1, turn="")
@@ -205,16 +147,6 @@ def test_clients_that_share_a_turn_are_answered_one_at_a_time():
     assert queues.finished(first) == [second]
 
 
-def test_a_client_stays_in_its_turn_while_it_has_requests_in_flight():
-    queues = make()
-    first, _ = offered(queues, "x", 1, turn="")
-    second, offer = offered(queues, "x", 2)
-    assert offer is Offer.WAIT and second.turn == ""
-    assert queues.finished(first) == [second]
-    assert queues.finished(second) == []
-    assert offered(queues, "x", 3)[0].turn == "x"
-
-
 def test_waiting_requests_of_a_client_that_is_gone_are_dropped():
     queues = make(workers=1, slow=1)
     first, _ = offered(queues, "x", 1, turn="")
@@ -225,15 +157,6 @@ def test_waiting_requests_of_a_client_that_is_gone_are_dropped():
     waiting, _ = offered(queues, "z", 5)
     assert queues.drop("z") == ([waiting], []), "with nothing at work"
     assert queues.finished(other) == [] and len(queues) == 0
-
-
-def test_what_waited_behind_a_dropped_request_begins():
-    queues = make(workers=1, slow=1)
-    slow, _ = offered(queues, "a", 1, slow=True)
-    first, _ = offered(queues, "x", 2, turn="", slow=True)
-    second, _ = offered(queues, "y", 3, turn="")
-    assert queues.drop("x") == ([first], [second]) and second.state is TicketState.WORKING
-    assert queues.finished(second) == queues.finished(slow) == []
 
 
 def test_a_detached_request_takes_up_neither_a_worker_nor_its_clients_turn():
@@ -261,17 +184,3 @@ def test_clients_with_a_token_have_a_turn_and_all_others_share_one():
     tokens.gone("a")
     tokens.gone("nobody")
     assert tokens.turn("a") == ANONYMOUS and not tokens.heeded
-
-
-def test_so_many_tokens_are_heeded_and_the_next_once_one_goes():
-    tokens = LivelinessTokens(2)
-    for client in "abcdefg":
-        tokens.here(client)
-    assert tokens.heeded == {"a", "b"} and tokens.turn("c") == ANONYMOUS
-    tokens.gone("d")
-    tokens.gone("a")
-    assert tokens.heeded == {"b", "c"}
-    tokens.gone("b")
-    assert tokens.heeded == {"c"}, "e came when as many waited as are remembered"
-    tokens.here("e")
-    assert tokens.turn("e") == "e"

@@ -149,7 +149,7 @@ class AnyOrder(RuleBasedStateMachine):
         assert not self.queues._turns and not self.queues._clients
 
 
-AnyOrder.TestCase.settings = settings(max_examples=200, stateful_step_count=60, deadline=None)
+AnyOrder.TestCase.settings = settings(max_examples=60, stateful_step_count=60, deadline=None)
 
 
 TestAnyOrder = AnyOrder.TestCase

@@ -3,7 +3,6 @@
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError, FormatError
@@ -31,11 +30,9 @@ from solidcloud.schemas.wire.scene_messages import (
     SceneInfo,
     ScenesAnswer,
 )
-from solidcloud.schemas.wire.warming_parts import PARTS
 from solidcloud.server.runtime.stop_flag import StopFlag
 from solidcloud.server.scene_interface import LimitReached
 from solidcloud.server.zenoh_server import request_dispatcher as dispatcher_module
-from solidcloud.server.zenoh_server import warming
 from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
@@ -149,19 +146,6 @@ def test_a_move_is_asked_of_the_scene(service, scene, encoding):
     assert error(ask(service, "move", request, encoding, client="d"), encoding).code == "unknown_avatar"
 
 
-@pytest.mark.parametrize("poses", [POSES[:0], POSES[:2], np.full((1, 4, 4), np.nan)])
-def test_a_move_of_other_than_one_pose_is_refused(service, poses):
-    fields = {"avatar": "al", "pose_from": POSES[:1].tobytes(), "pose_to": poses.tobytes()}
-    answer = service.answer(key("move"), msgspec.msgpack.encode(fields), MSGPACK)
-    assert error(answer).code == "bad_request" and "pose_to" in error(answer).message
-
-
-def test_a_scene_that_simulates_nothing_has_no_sessions(service, scene):
-    assert service.frames("floor", lambda user, answer: None) is None
-    service.client_gone("floor", "c")
-    assert scene.gone == ["c"]
-
-
 def test_the_sessions_of_a_client_that_is_gone_end():
     scene = floor_simulation()
     service = RequestDispatcher([scene.scene], ServerConfig())
@@ -175,12 +159,6 @@ def test_the_sessions_of_a_client_that_is_gone_end():
     frames.close()
     frames.run()
     assert sent == [(User("d", "al"), True)] and scene.users == [User("d", "al")]
-
-
-def test_warming_warms_the_frames_too(scene):
-    simulation = floor_simulation()
-    RequestDispatcher([simulation.scene], ServerConfig()).warming.run()
-    assert simulation.scene.warmed == len(PARTS) and simulation._pipeline.frames > 0
 
 
 @pytest.mark.parametrize("encoding", [MSGPACK, JSON])
@@ -230,11 +208,6 @@ def test_every_list_has_a_cap(service, request_):
     assert error(ask(service, operation, request_)).code == "too_large"
 
 
-def test_without_a_stated_encoding_it_is_messagepack(service):
-    answer = service.answer(key("info"), b"", None)
-    assert decode_answer(SceneInfo, answer.payload).scene == "floor"
-
-
 def test_an_unknown_encoding_is_bad_request(service):
     assert error(service.answer(key("info"), b"", "text/plain")).code == "bad_request"
     assert error(service.scenes("text/plain")).code == "bad_request"
@@ -257,11 +230,6 @@ def test_refusals_come_as_codes_in_the_encoding_of_the_question(service, encodin
         assert error(ask(service, operation, request, encoding), encoding).code == code
 
 
-def test_over_the_caps_is_too_large(service):
-    assert error(ask(service, "collide", CollideRequest("al", np.zeros((6, 4, 4))))).code == "too_large"
-    assert error(ask(service, "add_avatar", AddAvatarRequest("al", np.zeros((5, 3))))).code == "too_large"
-
-
 def test_an_internal_error_tells_no_more_than_its_kind(service, caplog):
     ask(service, "add_avatar", AddAvatarRequest("crash", POINTS))
     reply = error(ask(service, "collide", CollideRequest("crash", np.eye(4)[None])))
@@ -279,10 +247,6 @@ def test_keys_that_are_no_question_are_bad_request(service, path):
     assert error(service.answer(path, b"", MSGPACK)).code == "bad_request"
 
 
-def test_info_takes_no_payload(service):
-    assert error(service.answer(key("info"), b"x", MSGPACK)).code == "bad_request"
-
-
 def test_avatars_are_their_clients(service, scene):
     ask(service, "add_avatar", AddAvatarRequest("al", POINTS), client="one")
     pose = CollideRequest("al", np.eye(4)[None])
@@ -290,14 +254,6 @@ def test_avatars_are_their_clients(service, scene):
     assert error(ask(service, "collide", pose, client="two")).code == "unknown_avatar"
     service.client_gone("floor", "one")
     assert error(ask(service, "collide", pose, client="one")).code == "unknown_avatar"
-
-
-def test_warming_warms_every_scene(service, scene, monkeypatch):
-    """It starts the deadlines' thread too: a slow request that started it would give it its low priority."""
-    started = []
-    monkeypatch.setattr(warming, "start_deadlines", lambda: started.append(1))
-    service.warming.run()
-    assert scene.warmed == len(PARTS) and not scene.avatars and started == [1]
 
 
 def test_busy_says_how_many(service):
@@ -340,15 +296,3 @@ def test_a_reload_that_fails_says_why(service, scene, caplog):
     scene.refuses = RuntimeError("a secret of the server's own")
     (answer,) = list(service.answer(key("reload"), b"", MSGPACK))
     assert error(answer).code == "internal" and "secret" not in error(answer).message
-
-
-def test_a_reload_takes_no_payload_and_a_scene_that_is_served(service):
-    assert "reload with a payload" in error(service.answer(key("reload"), b"x", MSGPACK)).message
-    assert error(service.answer(key("reload", scene="attic"), b"", MSGPACK)).code == "unknown_scene"
-
-
-def test_all_scenes_are_reloaded_where_one_cannot_be():
-    scenes = [FloorScene("cellar"), FloorScene("floor"), FloorScene("attic")]
-    scenes[1].refuses = FormatError("no archive here")
-    RequestDispatcher(scenes, ServerConfig()).reload()
-    assert [scene.reloaded for scene in scenes] == [1, 0, 1]

@@ -1,21 +1,17 @@
 """The threads of a lane, without zenoh: queries come from a queue; queries and dispatcher are fakes."""
 
-import os
 import queue
-import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
 
-import pytest
 from solidcloud.schemas.wire.encoding import MSGPACK
 from solidcloud.server.runtime.threads import start_thread
 from solidcloud.server.scene_interface import EncodedReply, LimitReached
 from solidcloud.server.zenoh_server import request_lanes as lanes_module
-from solidcloud.server.zenoh_server.fair_queues import LivelinessTokens, Offer, Ticket
-from solidcloud.server.zenoh_server.request_lanes import Lane, ReceivedRequest
+from solidcloud.server.zenoh_server.fair_queues import LivelinessTokens
+from solidcloud.server.zenoh_server.request_lanes import Lane
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from solidcloud.server.zenoh_server.watchdog import lower_priority
 
 DEADLINE = 20.0
 ANSWER = EncodedReply(b"", MSGPACK, True)
@@ -189,68 +185,3 @@ def test_a_path_of_a_client_without_a_token_ends_after_a_while():
         assert not known.ended.is_set()
         gate.set()
         assert known.ended.wait(DEADLINE)
-
-
-def test_a_request_that_is_made_slow_while_it_is_put_back_leaves_no_worker_behind():
-    """The watchdog finds a slow place for a request at the moment at which its thread puts it back."""
-    hall = Hall(lambda *_: ANSWER)
-    lane = hall.lane
-    ticket = Ticket("a", ReceivedRequest(Query("a"), b""), 0)
-    assert lane._queues.offer(ticket) is Offer.RUN
-    put_back = lane._queues.put_back
-
-    def late(ticket):
-        assert lane._queues.move_to_slow(ticket) == []
-        return put_back(ticket)
-
-    lane._queues.put_back = late
-
-    def again(request, job):
-        job.again = True
-
-    lane._answer = again
-    left, started = lane._carry_out(ticket, True)
-    assert left, "its place as a worker was given to another thread"
-    [ticket] = started
-    assert lane._queues.finished(ticket) == []
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads")
-def test_what_a_slow_request_starts_has_the_usual_priority():
-    """A path that is slow to check is checked at a low priority; its parts are sent at the usual one."""
-    usual, found = os.getpriority(os.PRIO_PROCESS, 0), []
-
-    def priority():
-        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-
-    def answers(client, operation, stop):
-        lower_priority(threading.get_native_id())
-        found.append(priority())
-
-        def parts():
-            found.append(priority())
-            yield ANSWER
-
-        return parts()
-
-    hall = Hall(answers)
-    with hall.running():
-        assert hall.ask("a", "path").ended.wait(DEADLINE)
-    assert found == [min(19, usual + 10), usual]
-
-
-def test_a_thread_that_cannot_be_started_is_started_later():
-    failures = [RuntimeError("can't start new thread")] * 3
-
-    def start(name, run, *arguments):
-        if name.endswith("-parts") and failures:
-            raise failures.pop()
-        return start_thread(name, run, *arguments)
-
-    gate = threading.Event()
-    gate.set()
-    hall = Hall(paths(gate), start)
-    with hall.running():
-        path = hall.ask("a", "path")
-        assert path.ended.wait(DEADLINE)
-    assert len(path.replies) == 2 and not failures

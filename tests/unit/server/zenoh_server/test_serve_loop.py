@@ -10,13 +10,6 @@ from solidcloud.server.zenoh_server.serve_loop import _signalled
 NUMBERS = (signal.SIGTERM, signal.SIGHUP)
 
 
-def test_work_is_done_in_another_thread():
-    threads = []
-    with _signalled(*NUMBERS) as signals:
-        assert signals.come_after(lambda: threads.append(threading.current_thread()))
-    assert threads and threads[0] is not threading.main_thread()
-
-
 def test_an_error_of_the_work_is_raised():
     def fails():
         raise CorruptError("record 7")

@@ -84,14 +84,6 @@ def test_a_state_waits_for_its_query_for_a_while(clock):
     assert opened(streams, "b")[0].replies == []
 
 
-def test_no_more_states_wait_than_there_is_room_for(clock):
-    streams = StateStreams(2)
-    for client in "abc":
-        streams.send(User(client, "al"), said(client))
-    assert opened(streams, "a")[0].replies == [], "it was there first"
-    assert opened(streams, "c")[0].replies == [b"c"]
-
-
 def test_a_query_of_the_same_user_takes_the_place_of_the_one_before(clock):
     streams = StateStreams(2)
     first, _ = opened(streams, "a")

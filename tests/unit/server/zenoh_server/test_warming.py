@@ -1,11 +1,10 @@
 """Test the warming of a server's scenes: what is refused meanwhile, and in which order."""
 
-import threading
 from collections.abc import Callable
 
 import pytest
 from solidcloud.schemas.errors import BusyError, CorruptError
-from solidcloud.schemas.wire.warming_parts import BUDGETS, MOTION, PARTS, needed_parts
+from solidcloud.schemas.wire.warming_parts import BUDGETS, PARTS
 from solidcloud.server.zenoh_server.warming import Warming
 
 REST = list(PARTS[1:])
@@ -56,22 +55,6 @@ def test_nothing_is_refused_where_nothing_is_compiled():
     assert warming.compiling == []
 
 
-def test_what_was_asked_for_comes_next():
-    asked, go_on = threading.Event(), threading.Event()
-    scene = WarmedScene("hall", {MOTION: lambda: (asked.set(), go_on.wait(10))})
-    warming = made(scene)
-    warming.run_first()
-    thread = threading.Thread(target=warming.run_rest)
-    thread.start()
-    assert asked.wait(10)
-    for part in ("sweep", "within", "sweep"):
-        with pytest.raises(BusyError):
-            warming.check(part)
-    go_on.set()
-    thread.join(10)
-    assert scene.parts[:4] == ["collide", MOTION, "sweep", "within"] and sorted(scene.parts) == sorted(PARTS)
-
-
 def test_a_part_that_cannot_be_warmed_is_not_refused_for_ever(caplog):
     def fails():
         raise CorruptError("record 7")
@@ -82,24 +65,3 @@ def test_a_part_that_cannot_be_warmed_is_not_refused_for_ever(caplog):
     assert "cannot warm distance" in caplog.text and "record 7" in caplog.text
     with pytest.raises(CorruptError, match="record 7"):
         made(WarmedScene("hall", {"collide": fails})).run_first()
-
-
-def test_an_end_leaves_the_rest():
-    warming = made(WarmedScene("hall", {MOTION: lambda: warming.end()}))
-    warming.run_first()
-    assert not warming.run_rest() and warming.compiling == REST[1:]
-
-
-@pytest.mark.parametrize(
-    ("operation", "options", "parts"),
-    [
-        ("collide", {}, ("collide",)),
-        ("collide", {"tolerance": 0.1, "budget_ms": None}, ("collide",)),
-        ("collide", {"budget_ms": 0.0}, ("collide", BUDGETS)),
-        ("sweep", {"budget_visits": 0}, ("sweep", BUDGETS)),
-        ("move", {}, (MOTION,)),
-        ("add_avatar", {}, ()),
-    ],
-)
-def test_parts_that_a_request_needs(operation, options, parts):
-    assert needed_parts(operation, options) == parts

@@ -1,12 +1,9 @@
 """The thread that looks at what is at work."""
 
-import os
-import sys
 import threading
 import time
 
-import pytest
-from solidcloud.server.zenoh_server.watchdog import Watchdog, cpu_seconds, lower_priority
+from solidcloud.server.zenoh_server.watchdog import Watchdog
 
 DEADLINE = 20.0
 
@@ -60,34 +57,3 @@ def test_a_look_that_raises_does_not_end_it():
     watchdog.close()
     thread.join(DEADLINE)
     assert not thread.is_alive()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads")
-def test_the_priority_of_one_thread_is_lowered():
-    go, found = threading.Event(), []
-
-    def run():
-        found.append(threading.get_native_id())
-        assert go.wait(DEADLINE)
-        found.append(os.getpriority(os.PRIO_PROCESS, 0))
-
-    before = os.getpriority(os.PRIO_PROCESS, 0)
-    thread = threading.Thread(target=run)
-    thread.start()
-    eventually(lambda: found)
-    lower_priority(found[0])
-    go.set()
-    thread.join(DEADLINE)
-    assert found[1] == min(19, before + 10) and os.getpriority(os.PRIO_PROCESS, 0) == before
-    lower_priority(2**22 + 1)  # of no thread
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="times of threads")
-def test_the_processor_time_of_a_thread_is_told():
-    before = cpu_seconds(threading.get_native_id())
-    begin = time.thread_time()
-    while time.thread_time() < begin + 0.05:
-        pass
-    assert 0.04 < cpu_seconds(threading.get_native_id()) - before < DEADLINE
-    assert abs(cpu_seconds(threading.get_native_id()) - time.thread_time()) < 1.0
-    assert cpu_seconds(2**22 + 1) == float("inf")

@@ -4,9 +4,7 @@ import errno
 import json
 import os
 import re
-import shlex
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,6 @@ from solidcloud.schemas.process.new_file import is_temporary
 from solidcloud.schemas.scene.scene_file import parse_scene, read_scene
 from solidcloud.server.cli.main import run
 from solidcloud.server.cli.scene_files import scene_new
-from solidcloud.server.scenes.scene_archives import is_scene_file
 
 pytestmark = pytest.mark.interpreted
 
@@ -78,13 +75,6 @@ def test_a_new_scene_has_what_was_asked_for(folder: Path) -> None:
     assert [(item.name, item.file) for item in found.avatars] == [("visitor", "visitor.xyz")]
     assert found.name == "both"
     assert {type(effect).__name__ for effect in found.effects} == {"Stop", "Slide", "Sweep", "Proximity"}
-
-
-def test_a_new_scene_may_have_no_effects(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert new(folder, "--effects", "") == 0
-    assert read_scene(folder / "hall.toml").effects == []
-    assert run(["scene", "check", str(folder / "hall.toml")]) == 0
-    assert "none: nothing stops an avatar" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("avatar", [True, False])
@@ -161,14 +151,6 @@ def test_what_cannot_be_written_is_one_line(
     assert (folder / "new.toml").exists() == (code == 0)
 
 
-def test_a_scene_called_by_no_name_is_not_written(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = folder / "my hall.toml"
-    arguments = ["scene", "new", str(folder / "scans/hall"), "-o", str(out)]
-    assert run(arguments) == 2
-    assert "give the scene a `name`" in one_error(capsys) and not out.exists()
-    assert run([*arguments, "--name", "hall"]) == 0
-
-
 def test_check_says_what_runs_in_which_order(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     effects = ["ground", "proximity", "step", "crowd", "slide", "contacts", "sweep", "stop"]
     text = TOP + VISITOR + "".join(f'[[effects]]\neffect = "{name}"\n' for name in effects)
@@ -181,27 +163,6 @@ def test_check_says_what_runs_in_which_order(folder: Path, capsys: pytest.Captur
     assert len(re.findall("^note ", said, re.M)) == 1 and "stores no normals of reach 0.08 m" in " ".join(
         said.split()
     )
-
-
-def test_check_says_the_same_to_a_program(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert check(folder, TOP + VISITOR + STOP + '[[effects]]\neffect = "sweep"\n', "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["name"] == "hall" and found["order"] == ["stop", "sweep"] and found["notes"] == []
-    assert found["archives"] == [{"folder": str(folder / "scans/hall"), "points": 444, "voxels": 5}]
-    assert found["avatars"][0]["points"] == 3
-    assert found["scene"]["limits"]["users"] == 64
-
-
-def test_check_counts_what_is_passed_through(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(["info", str(folder / "scans/hall"), "--json"])
-    low, high = json.loads(capsys.readouterr().out)["bounds"]
-    middle = [(low[0] + high[0]) / 2, high[1] + 1, high[2] + 1]
-    box = f'boxes = [{{name = "half", low = {[v - 1 for v in low]}, high = {middle}}}]\n'
-    assert check(folder, TOP + STOP + '[[effects]]\neffect = "through"\n' + box, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert 0 < found["left_out"] < 444 and found["order"] == ["through", "stop"]
-    assert check(folder, (folder / "hall.toml").read_text()) == 0
-    assert f"through: half; {found['left_out']} points left out" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(
@@ -278,63 +239,3 @@ def test_serve_refuses_a_scene_file_that_is_wrong(
     assert run(["serve", str(folder / name)]) == 2
     said = "`slide` requires `stop`" if name == "hall.toml" else "No such file or directory: expected a scene"
     assert f"{name}: " in (error := one_error(capsys)) and said in error
-
-
-def test_names_with_spaces_are_fine(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(folder / "scans/hall", folder / "my scans/great hall")
-    (folder / "my visitor.xyz").write_text("0 0 0\n0.1 0 0\n")
-    (folder / "my scenes").mkdir()
-    file = folder / "my scenes/hall.toml"
-    arguments = [
-        str(folder / "my scans/great hall"),
-        "-o",
-        str(file),
-        "--avatar",
-        str(folder / "my visitor.xyz"),
-    ]
-    assert run(["scene", "new", *arguments]) == 0
-    line = capsys.readouterr().out.split("then: ")[1]
-    *_, scene, verb, path = shlex.split(line)
-    assert (scene, verb, path) == ("scene", "check", str(file))
-    assert read_scene(file).avatars[0].name == "my-visitor"
-    assert subprocess.run(line, shell=True, capture_output=True, check=False).returncode == 0
-
-
-def test_a_new_scene_in_place_of_another_finds_its_archives_through_links(folder: Path) -> None:
-    (folder / "deep/down").mkdir(parents=True)
-    (folder / "deep/down/old.toml").write_text("old")
-    (folder / "hall.toml").symlink_to(folder / "deep/down/old.toml")
-    assert new(folder) == 2 and new(folder, "--overwrite") == 0
-    assert run(["scene", "check", str(folder / "hall.toml")]) == 0
-    assert (folder / "deep/down/old.toml").read_text() == "old"
-    assert sorted(path.name for path in folder.glob("*.toml*")) == ["hall.toml"]
-
-
-def test_what_serve_does_not_take_for_a_scene_file_check_refuses(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("hall.TOML", "hall", "visitor.xyz"):
-        path = folder / name
-        path.write_text(TOP)
-        assert not is_scene_file(path)
-        assert run(["scene", "check", str(path)]) == 2
-        assert f"{name}: expected a scene file, with a name that ends in .toml" in one_error(capsys)
-
-
-def test_a_scan_given_as_a_scene_file_is_not_read_whole(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with open(folder / "scan.toml", "wb") as file:
-        file.truncate(1 << 40)  # a sparse file: no machine has that much memory
-    assert run(["scene", "check", str(folder / "scan.toml")]) == 2
-    assert "scan.toml: more than 4,194,304 bytes" in one_error(capsys)
-
-
-@pytest.mark.parametrize("place", ["path", "file"])
-def test_a_path_that_no_file_has_is_told(
-    folder: Path, capsys: pytest.CaptureFixture[str], place: str
-) -> None:
-    text = TOP + VISITOR
-    name = {"path": "scans/hall", "file": "visitor.xyz"}[place]
-    assert check(folder, text.replace(f'{place} = "{name}"', f'{place} = "a\\u0000b"')) == 2
-    assert f'[0].{place}: found "a\\u0000b": expected a path' in one_error(capsys)

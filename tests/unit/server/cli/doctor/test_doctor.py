@@ -2,19 +2,16 @@
 
 import json
 import os
-import resource
 import subprocess
-import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.builder import build_limits
 from solidcloud.server.cli.doctor import check_list, installation_checks, machine_checks, self_test_run
 from solidcloud.server.cli.doctor.check import Check, Status
-from solidcloud.server.cli.doctor.kernel_cache_check import check_compiler, check_kernel_cache
+from solidcloud.server.cli.doctor.kernel_cache_check import check_kernel_cache
 from solidcloud.server.cli.doctor.self_test import brute_force, compare
 from solidcloud.server.cli.main import run
 
@@ -48,13 +45,6 @@ def test_a_sound_machine_passes(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.interpreted
-def test_it_is_a_list_for_people_too(quick: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["doctor"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("ok       solidcloud") and "checks, no fault" in lines[-1]
-
-
-@pytest.mark.interpreted
 def test_a_fault_says_what_to_do_and_is_the_exit_code(
     quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -70,20 +60,6 @@ def test_a_fault_says_what_to_do_and_is_the_exit_code(
 
 
 @pytest.mark.interpreted
-def test_the_kernel_cache_is_counted_and_left_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    (empty,) = check_kernel_cache()
-    assert empty.status is Status.OK and "no kernel compiled yet" in empty.text
-    folder = tmp_path / "solidcloud-kernels"
-    (folder / "a.kernel").write_bytes(bytes(2048))
-    (one,) = check_kernel_cache()
-    assert "1 compiled kernels, 2.0 kB" in one.text and str(folder) in one.text
-    assert [path.name for path in folder.iterdir()] == ["a.kernel"]
-
-
-@pytest.mark.interpreted
 def test_a_kernel_cache_that_others_may_write_is_a_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,23 +68,6 @@ def test_a_kernel_cache_that_others_may_write_is_a_fault(
     (tmp_path / "solidcloud-kernels").chmod(0o777)
     (found,) = check_kernel_cache()
     assert found.status is Status.FAULT and "mode 777" in found.text and found.advice.startswith("set NUMBA")
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize(
-    ("version", "wanted", "fits"),
-    [
-        ("0.68.1", ">=0.68,<0.69", True),
-        ("0.69.0", "<0.69,>=0.68", False),
-        ("0.67.9", ">=0.68,<0.69", False),
-        ("2.1", ">=2.1.0", True),
-        ("14.0.0rc1", ">=14", True),
-        ("3.9", ">=3.16", False),
-        ("1.0", "", True),
-    ],
-)
-def test_versions_are_compared(version: str, wanted: str, fits: bool) -> None:
-    assert installation_checks._fits(version, wanted) == fits
 
 
 @pytest.mark.interpreted
@@ -137,27 +96,6 @@ def test_an_extra_that_is_missing_is_a_note(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.interpreted
-def test_every_extra_is_known() -> None:
-    declared = metadata.metadata("solidcloud").get_all("Provides-Extra") or []
-    assert set(installation_checks.EXTRAS) == set(declared) - {"test", "dev"}
-    required = installation_checks.requirements()
-    assert all(required[extra] for extra in ("", *installation_checks.EXTRAS))
-
-
-@pytest.mark.interpreted
-def test_limits_of_the_machine_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert machine_checks.MAX_SHARDS == build_limits.MAX_SHARDS
-    monkeypatch.setattr(
-        machine_checks, "_read", lambda path: "MemTotal: 2000000 kB\nMemAvailable: 900000 kB\n"
-    )
-    (memory,) = machine_checks.check_memory()
-    assert memory.status is Status.WARNING and "--cache 128MB" in memory.advice
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 4096))
-    (files,) = machine_checks.check_open_files()
-    assert files.status is Status.WARNING and files.advice == "ulimit -n 712"
-
-
-@pytest.mark.interpreted
 def test_the_limits_of_a_container_count(monkeypatch: pytest.MonkeyPatch) -> None:
     files = {
         "meminfo": "MemTotal: 64000000 kB\nMemAvailable: 50000000 kB\n",
@@ -177,15 +115,6 @@ def test_the_limits_of_a_container_count(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.interpreted
-def test_interpreted_kernels_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    (found,) = check_compiler()
-    assert found.status is Status.WARNING and found.advice == "unset NUMBA_DISABLE_JIT"
-    monkeypatch.delenv("NUMBA_DISABLE_JIT")
-    assert list(check_compiler()) == []
-
-
-@pytest.mark.interpreted
 def test_a_check_that_fails_is_a_fault_and_the_others_follow(monkeypatch: pytest.MonkeyPatch) -> None:
     def check_moon() -> Any:
         raise OSError("out of reach")
@@ -194,16 +123,6 @@ def test_a_check_that_fails_is_a_fault_and_the_others_follow(monkeypatch: pytest
     monkeypatch.setattr(check_list, "CHECKS", (check_moon, machine_checks.check_cpu))
     first, *others = check_list.all_checks()
     assert first == Check("moon", Status.FAULT, "the check failed: OSError: out of reach") and others
-
-
-@pytest.mark.interpreted
-def test_no_temporary_folder_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none() -> str:
-        raise FileNotFoundError(2, "No usable temporary directory found")
-
-    monkeypatch.setattr(tempfile, "gettempdir", none)
-    (found,) = machine_checks.check_temporary_folder()
-    assert found.status is Status.FAULT and found.advice.startswith("set TMPDIR")
 
 
 def answer(**changes: Any) -> str:
@@ -231,22 +150,6 @@ def test_the_self_test_is_judged(
     (found,) = self_test_run.check_self_test()
     assert found.status == status and said in found.text
     assert ("remove the compiled kernels" in found.advice) == (status == "fault")
-
-
-@pytest.mark.interpreted
-def test_the_time_of_compilation_is_shown_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = tmp_path / "solidcloud-kernels"
-    folder.mkdir()
-
-    def compiles(*_: Any, **__: Any) -> Any:
-        (folder / "new.kernel").touch()
-        return subprocess.CompletedProcess([], 0, answer(first_seconds=42.9), "")
-
-    monkeypatch.setattr(self_test_run.subprocess, "run", compiles)
-    test, compilation = self_test_run.check_self_test()
-    assert test.status is Status.OK and compilation.status is Status.NOTE
-    assert "compiled 1 kernels, which are kept: 42 s" in compilation.text
 
 
 @pytest.mark.interpreted

@@ -71,12 +71,6 @@ def test_the_text_of_any_editor_is_read(name: str, code: str, tmp_path: Path) ->
     ]
 
 
-def test_quaternion_near_unit_length_is_normalised(tmp_path: Path) -> None:
-    """Test NUMERICS.md, case 4."""
-    (tmp_path / "a.csv").write_text(HEADER + "0,0,0,0,1.0000009,0,0,0\n")
-    assert np.array_equal(read_poses(tmp_path / "a.csv")[1][0], np.eye(4))
-
-
 @pytest.mark.parametrize(
     ("line", "said"),
     [
@@ -105,11 +99,6 @@ def test_columns_may_stand_in_any_order_but_must_be_these(tmp_path: Path) -> Non
     (tmp_path / "c.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ScanError, match=r"c\.csv"):
         read_poses(tmp_path / "c.csv")
-
-
-def test_file_without_poses_gives_none(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(HEADER)
-    assert read_poses(tmp_path / "a.csv")[1].shape == (0, 4, 4)
 
 
 def test_suffix_selects_the_format_of_a_path(tmp_path: Path) -> None:

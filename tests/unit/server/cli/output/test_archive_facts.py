@@ -62,17 +62,6 @@ def test_info_says_it_in_json(archive: Path, capsys: pytest.CaptureFixture[str])
     assert said["preview"] is None and said["sealed"] is False
 
 
-def test_info_says_that_there_is_a_seal(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seal = archive / "index.hmac"
-    seal.write_bytes(bytes(32))
-    assert run(["info", str(archive)]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "validate --archive-key FILE` checks it" in said
-    assert run(["info", str(archive), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["sealed"] is True
-    seal.unlink()
-
-
 def test_info_says_it_in_words(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["info", str(archive)]) == 0
     words = " ".join(capsys.readouterr().out.split())

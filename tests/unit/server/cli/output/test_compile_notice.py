@@ -1,21 +1,12 @@
 """Test the lines on standard error while kernels are compiled: only when they are, and counted."""
 
-import logging
 import os
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
-from operator import attrgetter
 from pathlib import Path
 
 import pytest
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.run.executor import ProcessExecutor
-from solidcloud.schemas.kernels import compile_progress
-from solidcloud.schemas.kernels.kernel_files import KernelFiles, default_folder
+from solidcloud.schemas.kernels.kernel_files import KernelFiles
 from solidcloud.server.cli.output import compile_notice
 from solidcloud.server.cli.output.compile_notice import CompileNotice, compile_notices
 
@@ -94,12 +85,6 @@ def test_a_mark_that_a_killed_process_left_is_no_compilation(folder: Path) -> No
     assert lines == []
 
 
-def test_no_folder_is_no_compilation(tmp_path: Path) -> None:
-    lines, after = watched(tmp_path / "nowhere")
-    after(2.0)
-    assert lines == [] and not (tmp_path / "nowhere").exists()
-
-
 def test_it_watches_the_folder_that_kernels_are_kept_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,46 +99,3 @@ def test_it_watches_the_folder_that_kernels_are_kept_in(
             said += capsys.readouterr().err
             time.sleep(0.02)
     assert "compiling kernels, once on this machine" in said
-
-
-def cells_and_marks(_: str, names: list[str]) -> list[str]:
-    """Return the kernel of the cells' trees, and what another process is about to rename."""
-    return [n for n in names if ".build_cells-" in n or not n.endswith(".kernel")]
-
-
-@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels compile nothing")
-def test_the_command_says_that_it_compiles_the_first_time_alone(tmp_path: Path) -> None:
-    scan = tmp_path / "scan.xyz"
-    scan.write_text("".join(f"{x / 10} {y / 10} 0\n" for x in range(20) for y in range(20)))
-    # All of a build take half a minute to compile, the cells' trees some seconds.
-    build_archive([scan], tmp_path / "before", BuildConfig(jobs=1))
-    kept = default_folder(os.environ["NUMBA_CACHE_DIR"])
-    folder = shutil.copytree(kept, default_folder(str(tmp_path / "cache")), ignore=cells_and_marks)
-    assert set(os.listdir(kept)) - set(os.listdir(folder))
-    said = []
-    for name in ("first", "second"):
-        command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "build", str(scan)]
-        done = subprocess.run(
-            [*command, "-o", str(tmp_path / name), "--jobs", "1"],
-            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        said.append("compil" in done.stderr)
-    assert said == [True, False]
-
-
-def test_messages_of_this_process_are_replaced() -> None:
-    own = logging.getLogger(compile_progress.__name__)
-    with compile_notices():
-        assert not own.isEnabledFor(logging.WARNING)
-    assert own.isEnabledFor(logging.WARNING)
-
-
-def test_messages_of_worker_processes_are_replaced() -> None:
-    with compile_notices(), ProcessExecutor(2) as executor:
-        assert executor.submit(attrgetter("level"), compile_progress.log).result() == logging.ERROR
-    with ProcessExecutor(2) as executor:
-        assert executor.submit(attrgetter("level"), compile_progress.log).result() == logging.NOTSET

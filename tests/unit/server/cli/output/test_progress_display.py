@@ -8,16 +8,13 @@ from itertools import count
 
 import pytest
 from rich.console import Console
-from solidcloud.server.cli.output import progress_display as progress
 from solidcloud.server.cli.output.progress_display import (
     Bars,
     JsonLines,
     Lines,
     Listener,
     StageProgress,
-    clock_text,
     count_text,
-    progress_listener,
 )
 
 
@@ -58,26 +55,6 @@ def test_a_rate_is_of_late_and_the_time_left_runs_down(clock: Clock) -> None:
     assert pace.seconds == 70
 
 
-def test_what_an_interrupted_build_had_done_is_no_rate(clock: Clock) -> None:
-    pace = StageProgress("build", 1_000_000, "points", clock)
-    pace.advance(900_000)  # listed in the journal
-    assert (pace.done, pace.rate, pace.left) == (900_000, None, None)
-    clock.now += 10
-    pace.advance(10_000)
-    assert pace.rate == pytest.approx(1000) and pace.left == pytest.approx(90)
-    pace.end()
-    assert pace.rate == pytest.approx(1000)
-
-
-def test_many_small_steps_are_few_samples(clock: Clock) -> None:
-    pace = StageProgress("survey", 10**6, "points", clock)
-    for _ in range(100_000):
-        clock.now += 0.001
-        pace.advance(10)
-    assert len(pace._samples) < 10 + 10 * progress.RATE_SECONDS
-    assert pace.rate == pytest.approx(10_000)
-
-
 def test_units_of_known_cost_give_a_measured_time_left(clock: Clock) -> None:
     """The first setting of `accuracy` compiles for minutes: 58 more of its kind would be hours."""
     costs = [1.0] * 10 + [5.0] * 10  # the later settings each build an archive
@@ -105,14 +82,6 @@ def test_units_of_known_cost_give_a_measured_time_left(clock: Clock) -> None:
     assert pace.left == 0 and pace.done == 20
 
 
-def test_a_unit_without_cost_and_more_units_than_announced(clock: Clock) -> None:
-    pace = StageProgress("doors made", 3, "façades", clock, [0.0, 1.0, 1.0])
-    for _ in range(5):
-        clock.now += 1
-        pace.advance(1)
-        assert pace.left is None or pace.left >= 0
-
-
 def work(listener: Listener, clock: Clock, stages: tuple[tuple[str, int, str, int], ...]) -> None:
     """Run stages of ten steps, each of 3 s."""
     for stage, total, unit, step in stages:
@@ -129,29 +98,6 @@ STAGES = (
     ("build", 123_456_789, "points", 12_345_678),
     ("verify", 0, "voxels", 7),
 )
-
-
-def test_lines_where_no_terminal_is(clock: Clock) -> None:
-    stream = io.StringIO()
-    with Lines(clock, stream) as lines:
-        work(lines, clock, STAGES[1:2])
-    assert stream.getvalue().splitlines() == [
-        "spool: 100,000,000 points",
-        "spool: 40%, 40,000,000 of 100,000,000 points, 3.33 M points/s, 0:18 left",
-        "spool: 80%, 80,000,000 of 100,000,000 points, 3.33 M points/s, 0:06 left",
-        "spool: done, 100,000,000 points in 0:30, 3.33 M points/s",
-    ]
-
-
-def test_lines_of_a_stage_without_a_total_or_without_work(clock: Clock) -> None:
-    stream = io.StringIO()
-    with Lines(clock, stream) as lines:
-        work(lines, clock, (("verify", 0, "voxels", 7), ("survey", 3, "files", 0)))
-    said = stream.getvalue().splitlines()
-    assert said[1] == "verify: 28 voxels, 2.3 voxels/s"
-    assert said[3] == "verify: done, 70 voxels in 0:30, 2.3 voxels/s"
-    assert said[5] == "survey: 0%, 0 of 3 files"
-    assert said[7] == "survey: done, 0 files in 0:30"
 
 
 def test_json_lines_are_objects_with_the_same_names(clock: Clock) -> None:
@@ -174,38 +120,6 @@ def test_json_lines_are_objects_with_the_same_names(clock: Clock) -> None:
     assert all(set(each) == set(said[0]) for each in said)
     assert (said[5]["done"], said[5]["rate"], said[5]["eta"]) == (50_000_000, 3333333.333, 15.0)
     assert (said[-1]["done"], said[-1]["eta"]) == (100_000_000, 0.0)
-
-
-def test_json_says_at_most_every_second(clock: Clock) -> None:
-    stream = io.StringIO()
-    with JsonLines(clock, stream) as lines:
-        lines.start("build", 1000, "points")
-        for _ in range(1000):
-            clock.now += 0.01
-            lines.advance(1)
-        lines.finish()
-    assert 10 <= len(stream.getvalue().splitlines()) <= 12
-
-
-def test_json_says_what_failed_and_where(clock: Clock) -> None:
-    stream = io.StringIO()
-    with pytest.raises(OSError, match="No space"), JsonLines(clock, stream) as lines:
-        lines.start("spool", 1000, "points")
-        clock.now += 2
-        try:
-            lines.advance(300)
-            raise OSError(28, "No space left on device", "a.run")
-        finally:
-            lines.finish()  # as the builder's stages do
-    last = [json.loads(line) for line in stream.getvalue().splitlines()][-1]
-    assert (last["event"], last["stage"], last["done"], last["total"]) == ("failed", "spool", 300, 1000)
-    assert "No space left on device: 'a.run'" in last["message"]
-
-    stream = io.StringIO()
-    with pytest.raises(KeyboardInterrupt), JsonLines(clock, stream):
-        raise KeyboardInterrupt
-    last = json.loads(stream.getvalue())
-    assert (last["event"], last["stage"], last["message"]) == ("failed", None, "KeyboardInterrupt")
 
 
 def test_a_stage_that_fails_is_not_said_to_be_done(clock: Clock) -> None:
@@ -260,78 +174,6 @@ def test_a_bar_shows_how_much_how_fast_and_how_long(clock: Clock) -> None:
     assert any(re.search(r"verify .* 70 voxels +2\.3/s +in 0:30$", line) for line in seen)
 
 
-def test_bars_of_several_stages_do_not_flicker(clock: Clock) -> None:
-    sent = drawn(100, clock)
-    # Only one line is redrawn; the cursor never moves up to the lines of completed stages.
-    assert not re.search(r"\x1b\[\d*A", sent)
-    assert sent.count("\x1b[?25l") == sent.count("\x1b[?25h") == 1
-    for stage, *_ in STAGES:
-        finished = [line for line in frames(sent) if line.startswith(stage) and " in 0:30" in line]
-        assert len(finished) == 1
-    # The columns have fixed positions, whatever the figures.
-    seen = frames(sent)
-    assert {len(line) for line in seen} == {79}
-    assert {line[8] + line[29] + line[56] + line[66] for line in seen} == {"    "}
-
-
-def test_bars_fit_a_narrow_terminal(clock: Clock) -> None:
-    sent = drawn(60, clock)
-    assert max(map(len, frames(sent))) <= 60
-    assert not re.search(r"\x1b\[\d*A", sent)
-
-
-def test_what_others_print_stands_above_the_bar(clock: Clock) -> None:
-    terminal = Console(file=io.StringIO(), force_terminal=True, width=100, color_system=None)
-    with Bars(clock, terminal) as bars:
-        bars.start("build", 10, "points")
-        terminal.print("cluster: worker died")
-        bars.advance(10)
-        bars.finish()
-    assert isinstance(terminal.file, io.StringIO)
-    seen = frames(terminal.file.getvalue())
-    assert "cluster: worker died" in [line.strip() for line in seen]
-
-
-def test_a_bar_that_failed_is_left_as_it_stood(clock: Clock) -> None:
-    terminal = Console(file=io.StringIO(), force_terminal=True, width=100, color_system=None)
-    with pytest.raises(ValueError, match="bad"), Bars(clock, terminal) as bars:
-        bars.start("build", 10, "points")
-        try:
-            clock.now += 1
-            bars.advance(3)
-            raise ValueError("bad")
-        finally:
-            bars.finish()
-    assert isinstance(terminal.file, io.StringIO)
-    assert "3 of 10 points" in frames(terminal.file.getvalue())[-1]
-
-
-def test_the_right_one_listens(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def chosen(log_json: bool) -> type[Listener]:
-        with progress_listener(log_json) as listener:
-            return type(listener)
-
-    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "NO_COLOR"):
-        monkeypatch.delenv(name, raising=False)
-    assert chosen(False) is Lines
-    assert chosen(True) is JsonLines
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    assert chosen(False) is Bars
-    assert chosen(True) is JsonLines
-    monkeypatch.setenv("TERM", "dumb")
-    assert chosen(False) is Lines
-    with progress_listener() as listener:
-        listener.made(5, 10)
-        listener.made(10, 10)
-        listener.made(10, 10)
-    captured = capsys.readouterr()
-    assert (
-        captured.err.count("scan: done, 10 points") == captured.err.count("scan: 10") == 1
-        and not captured.out
-    )
-
-
 @pytest.mark.parametrize(
     ("number", "text"),
     [
@@ -342,7 +184,3 @@ def test_the_right_one_listens(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 )  # fmt: skip
 def test_counts_are_short(number: float, text: str) -> None:
     assert count_text(number) == text
-
-
-def test_times_are_as_on_a_clock() -> None:
-    assert [clock_text(s) for s in (0.4, 7, 59.6, 754, 3723)] == ["0:00", "0:07", "1:00", "12:34", "1:02:03"]

@@ -12,9 +12,7 @@ from solidcloud.server.cli.output import top_display as top
 from solidcloud.server.cli.output.top_display import (
     MAX_USERS_SHOWN,
     Sample,
-    budget_line,
     rate,
-    rate_text,
     seconds_text,
     watch,
 )
@@ -77,26 +75,6 @@ def test_a_rate_is_what_a_count_rose_a_second() -> None:
     assert rate(now, now, "hits") is None
 
 
-def test_one_look_has_no_rates() -> None:
-    text = shown([hall(requests=1234, policy="lru", generation=2)], once=True)
-    assert "hall, generation 2, policy lru" in text
-    assert line(text, "requests ", 0)[:2] == ["1,234", "prefetched"]
-
-
-def test_rates_come_with_the_second_look() -> None:
-    text = shown([hall(requests=1000, misses=7), hall(requests=1450, misses=8)])
-    assert line(text, "requests ", 0)[:2] == ["1,000", "prefetched"]
-    assert line(text, "requests ", 1)[:2] == ["1,450", "450"]
-    assert line(text, "misses ", 1)[:2] == ["8", "1"]
-
-
-def test_on_a_terminal_one_table_is_drawn_over_and_the_cursor_comes_back() -> None:
-    text = shown([hall(requests=1000), hall(requests=1450)], terminal=True)
-    hide, show = "\x1b[?25l", "\x1b[?25h"
-    assert text.count(hide) == 1 and text.index(hide) < text.index("1,000") < text.index("1,450")
-    assert text.rindex(show) > text.index("1,450")
-
-
 def test_every_count_is_shown() -> None:
     counted = {
         name: 1001 + number
@@ -133,14 +111,6 @@ def test_users_have_rates_of_their_own_and_the_last_are_counted() -> None:
     assert line(text, "new al")[:2] == ["5", "0"], "no rate yet: the next is the misses"
 
 
-def test_a_bar_is_of_the_budget() -> None:
-    assert budget_line(hall(budget_bytes=1000, resident_bytes=400, coarse_bytes=100)).startswith(
-        "█" * 15 + "░" * 15 + " 50%  500 bytes of 1000 bytes, 100 bytes coarse"
-    )
-    assert budget_line(hall(budget_bytes=1000, resident_bytes=1000)).startswith("█" * 30 + " 100%")
-    assert budget_line(hall()).startswith("░" * 30 + " 0%  0 bytes of 0 bytes")
-
-
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [
@@ -159,16 +129,6 @@ def test_times_for_a_reader(seconds: float, text: str) -> None:
     assert seconds_text(seconds) == text
 
 
-def test_rates_for_a_reader() -> None:
-    assert [rate_text(value) for value in (None, 0.0, 0.25, 9.5, 12.4, 45000.0)] == [
-        "", "0", "0.25", "9.5", "12", "45,000",
-    ]  # fmt: skip
-
-
 def test_names_cannot_move_the_cursor() -> None:
     text = shown([hall(users=[UserStats("c\x1b[2J", "[red]x\x1b")])], once=True)
     assert "\x1b" not in text and r"c\x1b[2J [red]x\x1b" in text
-
-
-def test_a_scene_without_users_or_budget_is_shown_too() -> None:
-    assert "policy ?" in shown([hall()], once=True)

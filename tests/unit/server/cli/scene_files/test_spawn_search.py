@@ -92,15 +92,3 @@ def test_where_nobody_can_stand_the_file_says_so(tmp_path: Path, capsys: pytest.
     assert "#[spawn]" in said
     assert "no place to stand was found" in capsys.readouterr().err
     assert run(["scene", "check", str(tmp_path / "hall.toml")]) == 0
-
-
-def test_a_gallery_of_narrow_beams_is_no_floor(tmp_path: Path) -> None:
-    beams: list[Box] = [((x, 0, 0), (x + 0.12, 5, 0)) for x in np.arange(0, 6, 1.5).tolist()]
-    assert propose(tmp_path, beams) is None
-
-
-def test_the_top_of_an_arch_in_the_middle_is_no_floor(tmp_path: Path) -> None:
-    floors: list[Box] = [((0, 0, 0), (3, 5, 0)), ((12, 0, 0), (15, 5, 0))]
-    arch: Box = ((7, 2, 4), (8, 3, 4))
-    at = propose(tmp_path, [*floors, arch])
-    assert at is not None and 0.03 <= at[2] < 0.2

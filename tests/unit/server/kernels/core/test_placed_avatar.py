@@ -44,63 +44,10 @@ def lattice(seed: int = 1) -> Lattice:
     )  # fmt: skip
 
 
-# --- thresholds -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("voxel_steps", [1000, 500_000])
-@pytest.mark.parametrize(
-    ("reach", "extent", "farthest"),
-    [(300.0, 900.0, 3e3), (3.0, 50_000.0, 3e9), (16_000.0, 1.0, 1e12), (2.0, 5.0, 8e14)],
-)
-def test_thresholds_are_outside_the_errors_documented_and_not_far(
-    reach: float, extent: float, farthest: float, voxel_steps: int
-) -> None:
-    """Each term of the docstring weighs in one of the cases; thresholds lie beyond it by less than float32 tells."""
-    units = round(reach * UNITS_PER_STEP)
-    found = node_overlap.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
-    error = 1.1 / UNITS_PER_STEP
-    error += U32 * (extent + 2 * (max(65_536, voxel_steps) + reach)) + farthest * 2.0**-49
-    around = math.sqrt(3) * error
-    below, above = reach * (1 - 2 * U32) - around, reach * (1 + 2 * U32) + around
-    assert found.units == units
-    for limit, least in ((found.reach, reach), (found.error, around)):
-        assert least < float(limit) <= least * (1 + 4 * U32)
-    assert above**2 * (1 + 8 * U32) < float(found.far) <= above**2 * (1 + 14 * U32)
-    if below > 0:
-        assert below**2 * (1 - 14 * U32) <= float(found.near) < below**2 * (1 - 8 * U32)
-    else:
-        assert found.near < 0
-
-
-def test_nothing_is_certainly_near_where_the_error_is_as_large_as_the_reach() -> None:
-    assert node_overlap.make_thresholds(0, UNITS_PER_STEP, 10.0, 10.0, VOXEL_STEPS).near < 0
-    assert node_overlap.make_thresholds(5, UNITS_PER_STEP, 10.0, 1e15, VOXEL_STEPS).near < 0
-
-
-def test_each_class_has_the_thresholds_of_its_own_reach() -> None:
-    drop = np.array([0, 1000, 70_000, 5, 0, 9, 11, 123_456])
-    found = node_overlap.make_class_thresholds(drop)
-    node_overlap.set_class_thresholds(found, drop, 1_000_000, UNITS_PER_STEP, 30.0, 1e4, VOXEL_STEPS)
-    for c, less in enumerate(drop.tolist()):
-        own = node_overlap.make_thresholds(1_000_000 - less, UNITS_PER_STEP, 30.0, 1e4, VOXEL_STEPS)
-        assert (found.near[c], found.far[c], found.units[c]) == (own.near, own.far, own.units)
-        assert found.threshold[c] == own.reach + own.error
-    assert found.mask == 7
-
-
-@pytest.mark.parametrize(
-    ("radius", "steps", "extent"), [(0.0, 1024.0, 9.0), (0.3, 1024.0, 400.0), (2.0, 1e4, 9e5)]
-)
-def test_a_placed_radius_is_wider_than_its_rounding(radius: float, steps: float, extent: float) -> None:
-    found = float(kernel.node_reach(radius, steps, extent))
-    assert found >= radius * steps * (1 + U32) + extent * U32 * math.sqrt(3)
-    assert found <= radius * steps * (1 + 2e-6) + extent * 2e-6
-
-
 # --- places ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e5, 0.25), (3e6, 4.0)])
+@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (3e6, 1.0)])
 def test_an_avatar_is_placed_where_the_formula_says(
     rng: np.random.Generator, far: float, scale: float
 ) -> None:
@@ -194,3 +141,37 @@ def test_a_pair_beyond_any_reach_has_no_square(axis: int, sign: int) -> None:
             assert kernel.pair_square(*pair) < 0 and not kernel.pair_in_reach(*pair, 1 << 30)
         else:
             assert kernel.pair_square(*pair) == square and kernel.pair_in_reach(*pair, 1 << 30)
+
+
+@pytest.mark.parametrize("voxel_steps", [1000, 500_000])
+@pytest.mark.parametrize(
+    ("reach", "extent", "farthest"),
+    [(300.0, 900.0, 3e3), (3.0, 50_000.0, 3e9), (16_000.0, 1.0, 1e12), (2.0, 5.0, 8e14)],
+)
+def test_thresholds_are_outside_the_errors_documented_and_not_far(
+    reach: float, extent: float, farthest: float, voxel_steps: int
+) -> None:
+    """Each term of the docstring weighs in one of the cases; thresholds lie beyond it by less than float32 tells."""
+    units = round(reach * UNITS_PER_STEP)
+    found = node_overlap.make_thresholds(units, UNITS_PER_STEP, extent, farthest, voxel_steps)
+    error = 1.1 / UNITS_PER_STEP
+    error += U32 * (extent + 2 * (max(65_536, voxel_steps) + reach)) + farthest * 2.0**-49
+    around = math.sqrt(3) * error
+    below, above = reach * (1 - 2 * U32) - around, reach * (1 + 2 * U32) + around
+    assert found.units == units
+    for limit, least in ((found.reach, reach), (found.error, around)):
+        assert least < float(limit) <= least * (1 + 4 * U32)
+    assert above**2 * (1 + 8 * U32) < float(found.far) <= above**2 * (1 + 14 * U32)
+    if below > 0:
+        assert below**2 * (1 - 14 * U32) <= float(found.near) < below**2 * (1 - 8 * U32)
+    else:
+        assert found.near < 0
+
+
+@pytest.mark.parametrize(
+    ("radius", "steps", "extent"), [(0.0, 1024.0, 9.0), (0.3, 1024.0, 400.0), (2.0, 1e4, 9e5)]
+)
+def test_a_placed_radius_is_wider_than_its_rounding(radius: float, steps: float, extent: float) -> None:
+    found = float(kernel.node_reach(radius, steps, extent))
+    assert found >= radius * steps * (1 + U32) + extent * U32 * math.sqrt(3)
+    assert found <= radius * steps * (1 + 2e-6) + extent * 2e-6

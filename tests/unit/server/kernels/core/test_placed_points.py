@@ -49,68 +49,6 @@ def test_a_rotation_is_rigid_whatever_its_rounding(rng: np.random.Generator) -> 
         assert units == naive.reach_units(pose, 0.01, 0.0, 0.0) + 5
 
 
-@pytest.mark.parametrize("factor", [1e-3, 0.02, 0.999, 1 + 1e-8, 7.5, 1e3])
-def test_a_uniform_scale_scales_the_radius(rng: np.random.Generator, factor: float) -> None:
-    pose = archive_cases.pose_of(factor * archive_cases.random_rotation(rng), np.zeros(3))
-    fault, scale, units = check(pose, node_radius=0.01, radius=0.003)
-    assert fault == pose_checks.VALID and scale == pytest.approx(factor, rel=1e-12)
-    assert units == naive.reach_units(pose, 0.003, 0.0, 0.0) + 5
-
-
-def entry(row: int, column: int, value: float) -> NDArray[np.float64]:
-    """The identity with one entry changed."""
-    pose = np.eye(4)
-    pose[row, column] = value
-    return pose
-
-
-@pytest.mark.parametrize(
-    ("pose", "fault"),
-    [
-        (entry(0, 0, np.nan), pose_checks.NOT_FINITE),
-        (entry(3, 3, np.nan), pose_checks.NOT_FINITE),
-        (entry(1, 3, np.inf), pose_checks.NOT_FINITE),
-        (entry(3, 0, 1e-300), pose_checks.BAD_LAST_ROW),
-        (entry(3, 3, 1.0 + 2.0**-52), pose_checks.BAD_LAST_ROW),
-        (entry(2, 2, -1.0), pose_checks.MIRRORED),
-        (np.diag([-1.0, -1.0, -1.0, 1.0]), pose_checks.MIRRORED),
-        (entry(0, 1, 1.0), pose_checks.SHEARED),
-        (entry(0, 1, 3e-9), pose_checks.SHEARED),
-        (entry(1, 1, 1.0 + 4e-9), pose_checks.SHEARED),
-        (np.diag([0.0, 0.0, 0.0, 1.0]), pose_checks.BAD_SCALE),
-        (np.diag([1001.0, 1001.0, 1001.0, 1.0]), pose_checks.BAD_SCALE),
-        (np.diag([9e-4, 9e-4, 9e-4, 1.0]), pose_checks.BAD_SCALE),
-        (entry(0, 0, 1e300), pose_checks.BAD_SCALE),
-        (entry(0, 3, 1.0000001e9), pose_checks.TOO_FAR),
-    ],
-)
-def test_what_is_no_similarity_is_refused(pose: NDArray[np.float64], fault: int) -> None:
-    assert check(pose)[0] == fault
-
-
-def test_a_departure_within_the_tolerance_is_admitted() -> None:
-    assert check(entry(0, 1, 0.9e-9))[:2] == (pose_checks.VALID, 1.0)
-    assert check(np.diag([1 + 0.9e-9] * 3 + [1.0]))[:2] == (pose_checks.VALID, 1.0)
-    # Beyond it a scale is a scale.
-    assert check(np.diag([1 + 2e-9] * 3 + [1.0]))[1] == pytest.approx(1 + 2e-9, abs=1e-12)
-
-
-def test_reach_and_extent_are_bounded() -> None:
-    assert check(np.eye(4), radius=15.99)[0] == pose_checks.VALID
-    assert check(np.eye(4), radius=16.01)[0] == pose_checks.LONG_REACH
-    assert check(np.eye(4), radius=1e300)[0] == pose_checks.LONG_REACH
-    # 2^23 steps of 0.1 mm are 838.9 m, of which the voxel takes 8.
-    assert check(np.eye(4), node_radius=830.0)[0] == pose_checks.VALID
-    assert check(np.eye(4), node_radius=831.0)[0] == pose_checks.LARGE_AVATAR
-
-
-def test_the_first_bad_pose_is_named() -> None:
-    poses = np.stack([np.eye(4), entry(0, 1, 1.0), entry(0, 0, np.nan)])
-    scales, units = np.empty(3), np.empty(3, np.int64)
-    fault, index, _ = pose_checks.check_poses(poses, np.empty(0), 0.0, 0, SCENE, scales, units)
-    assert (fault, index) == (pose_checks.SHEARED, 1)
-
-
 def test_placing_is_the_formula_of_the_definition(rng: np.random.Generator) -> None:
     origin = np.array([5e5, 5.6e6, -3.25])
     for _ in range(200):

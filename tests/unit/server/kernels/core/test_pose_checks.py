@@ -6,7 +6,6 @@ import archive_cases
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.server.kernels.core import placed_avatar as placing
 from solidcloud.server.kernels.core import voxels_in_reach as pose_checks
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
@@ -95,26 +94,6 @@ def test_a_shear_is_told_by_its_size(row: int, column: int) -> None:
     assert check(entry(row, column, value + most))[0] == pose_checks.SHEARED
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_a_scale_at_the_border_is_admitted_rounding_included(scale: float) -> None:
-    sign = 1 if scale > 1 else -1
-    for by, fault in ((0.0, pose_checks.VALID), (0.9e-9, pose_checks.VALID), (1.1e-9, pose_checks.BAD_SCALE)):
-        given = scale * (1 + sign * by)
-        pose = np.diag([given] * 3 + [1.0])[None]
-        assert check(pose, 1e-3)[0] == fault
-    assert check(pose)[2] == pytest.approx(given, rel=1e-12)
-
-
-def test_radii_scale_and_are_rounded_once() -> None:
-    scales, units = np.empty(3), np.empty(3, np.int64)
-    poses = np.stack([np.diag([s, s, s, 1.0]) for s in (1.0, 0.5, 3.0)])
-    radius = (2**20 + 0.75) / UNITS
-    said = pose_checks.check_poses(poses, np.ones(1), radius, 7, LATTICE, scales, units)
-    assert said == (pose_checks.VALID, 0, 0.0)
-    assert scales.tolist() == [1.0, 0.5, 3.0]
-    assert units.tolist() == [round(s * (2**20 + 0.75)) + 7 for s in (1.0, 0.5, 3.0)]
-
-
 def test_the_reach_ends_at_sixteen_metres_to_the_unit() -> None:
     assert check(np.eye(4)[None], radius=15.0, others=1 << 26)[0] == pose_checks.VALID
     said = check(np.eye(4)[None], radius=15.0, others=(1 << 26) + 1)
@@ -135,10 +114,3 @@ def test_an_avatar_ends_where_float32_does_to_the_step() -> None:
     scales, units = np.empty(1), np.empty(1, np.int64)
     said = pose_checks.check_poses(np.eye(4)[None], np.empty(0), 1.0, 0, LATTICE, scales, units)
     assert said == (pose_checks.VALID, 0, 0.0), "an avatar without nodes has no extent but its reach"
-
-
-def test_the_largest_term_is_that_of_the_row_with_the_largest_sum(rng: np.random.Generator) -> None:
-    for _ in range(30):
-        pose, shift, point = rng.normal(size=(4, 4)), rng.normal(size=3) * 3, rng.normal(size=3) * 2
-        rows = [sum(abs(pose[r, c] * point[c]) for c in range(3)) + abs(shift[r]) for r in range(3)]
-        assert placing.largest_term(pose, shift, *point) == pytest.approx(max(rows), rel=1e-15)

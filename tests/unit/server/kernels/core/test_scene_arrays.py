@@ -10,7 +10,6 @@ import synthetic_scans
 from served_nodes import row_encloses
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
-from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES
 from solidcloud.server.kernels.core.scene_arrays import (
     BLOCK_WORDS,
     COUNT,
@@ -31,7 +30,6 @@ pytestmark = pytest.mark.interpreted
     [
         ("noise", 4.0, 1e-3, {"cell_points": 16, "leaf": 5, "degree": 3}),
         ("plane", 2.0, 1e-6, {"cell_points": 64}),  # 2 * 10^6 steps: the top BSH has a unit above a step
-        ("one point", 0.5, 1e-3, {}),
         ("noise", 1.0, 1e-3, {"leaf": 7, "keep": frozenset({"scan"})}),
         ("duplicates", 0.5, 1e-3, {"with_slab": False, "leaf": 1}),
     ],
@@ -100,12 +98,6 @@ def _points_below(node: int, links: object, count: np.ndarray) -> list[int]:
     if is_leaf[node]:
         return list(range(first[node], first[node] + count[node]))
     return [p for i in range(first[node], first[node] + count[node]) for p in _points_below(i, links, count)]
-
-
-def test_a_lane_each_is_room_for_a_figure_a_class() -> None:
-    # kernels/nearest/best_first_search.py keeps thresholds by radius class in a scratch of as many
-    # floats as a block has lanes.
-    assert RADIUS_CLASSES <= LANES
 
 
 def test_a_node_without_a_normal_is_cut_by_no_slab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,9 +85,3 @@ def test_the_largest_and_the_least() -> None:
         (LARGEST, root + 1),
     ):
         check(square, radius, 0, 0)
-
-
-def test_with_one_radius_the_squares_alone_tell() -> None:
-    for square in (0, 1, (1 << 60) - 1, LARGEST):
-        assert check(square, 7, square, 7) == 0
-    assert check(LARGEST - 1, 7, LARGEST, 7) == -1

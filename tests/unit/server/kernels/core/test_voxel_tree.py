@@ -9,7 +9,7 @@ from solidcloud.server.runtime.stop_flag import NO_STOP
 pytestmark = pytest.mark.interpreted
 
 UNITS = 1024.0  # exact units a step
-BOXES = [0, 1, 2, FAN, FAN + 1, 70, 600]
+BOXES = [0, 1, FAN + 1, 70]
 
 
 def boxes(rng: np.random.Generator, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -69,7 +69,7 @@ def listed(
         room = needed if room else 3
 
 
-@pytest.mark.parametrize("reach", [0.0, 30.0, 900.0])
+@pytest.mark.parametrize("reach", [0.0, 30.0])
 @pytest.mark.parametrize("count", BOXES)
 @pytest.mark.parametrize("along", [True, False])
 def test_lists_hold_what_is_reached_nearest_first(along: bool, count: int, reach: float) -> None:
@@ -105,6 +105,13 @@ def test_lists_hold_what_is_reached_nearest_first(along: bool, count: int, reach
         assert lists.unseen[i] / UNITS == pytest.approx(least, abs=1e-9)
 
 
+def test_equal_distances_are_sorted_by_row() -> None:
+    low = np.zeros((50, 3), np.int64)
+    tree = make_voxel_tree(low, low + 9, np.zeros((0, 2, 3), np.int64))
+    lists = listed(tree, np.ones((1, 3)), np.eye(3)[:1], False, 5.0, 0.0)
+    assert lists.rows.tolist() == list(range(50)) and not lists.near.any()
+
+
 @pytest.mark.parametrize("along", [True, False])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_boxes_far_away_are_grown_by_what_rounding_takes(along: bool, sign: float) -> None:
@@ -120,22 +127,3 @@ def test_boxes_far_away_are_grown_by_what_rounding_takes(along: bool, sign: floa
         lists = VoxelLists(np.zeros(2, np.int64), np.full(4, -1), np.zeros(4), np.zeros(1))
         reach = 40 if along else 0
         assert list_voxels(tree, units, direction, along, reach, 0, 4.0, NO_STOP.flag, lists) == found
-
-
-def test_equal_distances_are_sorted_by_row() -> None:
-    low = np.zeros((50, 3), np.int64)
-    tree = make_voxel_tree(low, low + 9, np.zeros((0, 2, 3), np.int64))
-    lists = listed(tree, np.ones((1, 3)), np.eye(3)[:1], False, 5.0, 0.0)
-    assert lists.rows.tolist() == list(range(50)) and not lists.near.any()
-
-
-def test_levels_are_boxes_of_eight() -> None:
-    low, high = boxes(np.random.default_rng(3), 70)
-    tree = make_voxel_tree(low, high, np.zeros((0, 2, 3), np.int64))
-    assert tree.levels.tolist() == [0, 70, 79, 81, 82]
-    for level in range(3):
-        below = slice(tree.levels[level], tree.levels[level + 1])
-        for group, row in enumerate(range(tree.levels[level + 1], tree.levels[level + 2])):
-            own = slice(group * FAN, (group + 1) * FAN)
-            assert np.array_equal(tree.low[row], tree.low[below][own].min(axis=0))
-            assert np.array_equal(tree.high[row], tree.high[below][own].max(axis=0))

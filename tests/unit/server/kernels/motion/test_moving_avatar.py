@@ -25,7 +25,7 @@ class Lattice(NamedTuple):
 SCENE = Lattice(np.array([7.0, -50.0, 300.0]), STEP)
 
 
-@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e4, 0.25), (1e6, 4.0)])
+@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e6, 1.0)])
 @pytest.mark.parametrize(("way", "more"), [(0.0, 0.0), (0.05, 0.0), (3.0, 2.0)])
 @pytest.mark.parametrize("turns", [True, False])
 def test_an_avatar_is_placed_at_both_ends(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from solidcloud.server.kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE
-from solidcloud.server.kernels.motion.screw_motion import make_motion, poses_on, sine_cosine
+from solidcloud.server.kernels.motion.screw_motion import make_motion, pose_at, sine_cosine
 
 FRACTIONS = np.array([0.0, 1e-18, 1e-9, 0.1, 0.25, 0.5, 0.7, 1 - 1e-9, 1 - 2.0**-53, 1.0])
 ORIGIN = np.zeros(3)
@@ -39,7 +39,9 @@ def motions(rng: np.random.Generator) -> list[tuple[NDArray[np.float64], NDArray
 def along(first: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:
     """The kernel's poses at FRACTIONS."""
     poses = np.empty((len(FRACTIONS), 4, 4))
-    poses_on(make_motion(first, last, np.zeros((2, 3)), ORIGIN), FRACTIONS, poses)
+    motion = make_motion(first, last, np.zeros((2, 3)), ORIGIN)
+    for fraction, pose in zip(FRACTIONS, poses, strict=True):
+        pose_at(motion, fraction, pose)
     return poses
 
 

@@ -1,7 +1,6 @@
 """Voxels that are not resident are bounded: by their boxes, and more closely by their coarse bounds."""
 
 import math
-from pathlib import Path
 
 import archive_cases
 import numpy as np
@@ -9,15 +8,10 @@ import pytest
 from coarse_tops import ROOM, Made, build_scattered, open_made, rows_of
 from numpy.typing import NDArray
 from solidcloud.builder.voxel.record_points import voxel_points
-from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 from solidcloud.server.kernels.core.voxels_in_reach import VoxelsInReach
 from solidcloud.server.kernels.nearest.missing_voxels import split_missing
-from solidcloud.server.queries.context.anytime_search import collide_bounded, distance_bounded
-from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.residency.coarse_bounds import CoarseBounds
-from solidcloud.server.runtime.stop_flag import StopFlag
-from solidcloud.server.scene import Scene
 
 REACH = 3 << 26  # exact units
 
@@ -102,56 +96,3 @@ def test_bounds_hold_and_coarse_bounds_are_closer(made: Made, rng: np.random.Gen
     assert (boxes <= closer).all() and (closer <= true).all()
     known = counts > 0
     assert (closer > boxes)[known].any(), "the nodes lie within the box"
-
-
-@pytest.mark.interpreted
-def test_once_stopped_nothing_is_known_of_what_was_not_examined(made: Made) -> None:
-    body, stop = make_avatar(np.zeros((1, 3)), 0.01), StopFlag()
-    poses = np.array([archive_cases.pose_of(np.eye(3), np.array([x, 1.0, 1.0])) for x in (0.5, 1.0, 1.5)])
-    stop.set("enough")
-    stopped = made._replace(arrays=made.arrays._replace(stop=stop.flag))
-    reach = made.reach(body, poses, REACH)
-    starts, rows = np.empty_like(reach.starts), np.empty_like(reach.rows)
-    bound, counts = np.full(3, math.inf), np.zeros((3, 3), np.uint32)
-    split_missing(
-        poses, body.arrays, stopped.arrays, made.broad, made.coarse.arrays, reach, np.arange(3), starts, rows,
-        bound, counts,
-    )  # fmt: skip
-    assert (bound == 0.0).all() and starts.tolist() == [0] * 4
-    assert counts[0].tolist() == np.diff(reach.starts).tolist() and counts[0].min() > 0
-
-
-def test_without_time_to_load_answers_have_the_bounds_of_nodes(tmp_path: Path) -> None:
-    """A floor and a wall fill the box of a voxel; a body between them is clear of both, known without a load."""
-    side = np.stack(np.meshgrid(*[np.linspace(0.05, 3.95, 160)] * 2), axis=-1).reshape(-1, 2)
-    flat = np.column_stack([side, np.full(len(side), 0.05)])
-    scan = np.concatenate([flat, np.roll(flat, 1, axis=1), flat + np.array([8.0, 0.0, 0.0])])
-    case = archive_cases.build(tmp_path, scan, voxel=4.0, radius=0.02, resolution=1e-3)
-    pose = archive_cases.pose_of(np.eye(3), np.array([2.0, 2.0, 1.0]))[None]
-    body = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3))
-    lower, verdicts = {}, {}
-    for policy in ("lru", "lru+prefetch"):
-        with Scene.open(case.archive, policy=policy) as scene:
-            sizes = [scene.residency.bytes_of([row]) for row in range(scene.info().voxels)]
-        budget = int(1.2 * max(sizes))
-        with Scene.open(case.archive, policy=policy, budget_bytes=budget) as scene:
-            scene.add_avatar("body", body, 0.01)
-            true = scene.distance("body", pose, 2.0)
-            # The other voxel takes the first one's place.
-            far = pose.copy()
-            far[0, 0, 3] += 8.0
-            scene.distance("body", far, 2.0)
-            assert [scene.residency.is_resident(row) for row in range(2)] == [False, True]
-            # Without the stop flag of `budget_ms`, which compilation would set off.
-            late = QueryBudget(deadline=0.0)
-            found = distance_bounded(scene._data, scene.avatar("body", ""), pose, 2.0, late)
-            assert found.lower[0] <= true.signed_distance[0] <= found.upper[0]
-            lower[policy] = float(found.lower[0])
-        with Scene.open(case.archive, policy=policy, budget_bytes=budget) as scene:
-            scene.add_avatar("body", body, 0.01)
-            scene.distance("body", pose, 2.0)
-            scene.distance("body", far, 2.0)
-            touch = collide_bounded(scene._data, scene.avatar("body", ""), pose, 0.0, late)
-            verdicts[policy] = int(touch.verdict[0])
-    assert lower["lru"] < 0.0 and lower["lru+prefetch"] > 0.5
-    assert verdicts == {"lru": Verdict.UNKNOWN, "lru+prefetch": Verdict.CLEAR}

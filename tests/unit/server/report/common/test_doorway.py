@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import archive_cases
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.builder.synthetic.figure import figure_points
 from solidcloud.builder.synthetic.truth import DoorTruth, FacadeTruth
-from solidcloud.schemas.errors import BadRequestError
 from solidcloud.server.report.common import doorway
 from solidcloud.server.report.common.doorway import doorway_error
 from solidcloud.server.scene import Scene
@@ -84,47 +82,3 @@ def test_narrowest_door_is_that_of_brute_force(
     assert judged - missed - 1e-4 <= found.narrowest <= judged + 2 * doorway.FINEST
     assert found.width == pytest.approx(np.ptp(FIGURE[:, 0]) + 2 * own, abs=1e-12)
     assert found.error == pytest.approx(1000 * (found.narrowest - found.width), abs=1e-9)
-
-
-def test_jambs_without_noise_cost_their_spheres_and_no_more(tmp_path: Path) -> None:
-    """Test points so dense that each side of the figure hits one squarely: the error is two radii."""
-    points = jambs(np.random.default_rng(7), 0.008, 0.0)
-    archive = archive_cases.build(tmp_path, points + ORIGIN, voxel=8.0, radius=RADIUS).archive
-    with Scene.open(archive) as scene:
-        assert doorway_error(scene, "figure", TRUTH).error == pytest.approx(2000 * RADIUS, abs=1.0)
-
-
-def test_tolerance_makes_the_door_narrower_by_at_most_itself_a_side(
-    dense: tuple[Scene, NDArray[np.float64]],
-) -> None:
-    """Test both searches: the exact one, which a tolerance ends early, and that of a budget, never spent here."""
-    scene, _ = dense
-    exact = doorway_error(scene, "figure", TRUTH).error
-    loose = doorway_error(scene, "figure", TRUTH, tolerance=0.02, budget_visits=1 << 40).error
-    early = doorway_error(scene, "figure", TRUTH, tolerance=0.02).error
-    assert exact <= early <= exact + 2 * 20 + 0.5
-    assert exact + 1.0 < loose <= exact + 2 * 20 + 0.5
-
-
-def test_figure_that_is_stopped_in_the_middle_needs_an_infinite_door(
-    dense: tuple[Scene, NDArray[np.float64]],
-) -> None:
-    scene, _ = dense
-    found = doorway_error(scene, "figure", TRUTH, radius_model="fixed:0.2")
-    assert math.isinf(found.narrowest) and math.isinf(found.error)
-    # Unknown is not clear.
-    assert math.isinf(doorway_error(scene, "figure", TRUTH, budget_visits=1).error)
-
-
-def test_figure_that_meets_nothing_slips_as_far_as_is_looked(tmp_path: Path) -> None:
-    far = np.array([[50.0, 0.0, 0.0], [50.5, 0.0, 0.0]])
-    archive = archive_cases.build(tmp_path, far + ORIGIN, voxel=8.0, radius=RADIUS).archive
-    with Scene.open(archive) as scene:
-        assert doorway_error(scene, "figure", TRUTH).error == pytest.approx(-2000 * doorway.INSIDE, abs=0.5)
-
-
-def test_another_figure_of_that_name_is_refused(dense: tuple[Scene, NDArray[np.float64]]) -> None:
-    scene, _ = dense
-    scene.add_avatar("child", figure_points(100), 0.02)
-    with pytest.raises(BadRequestError, match="'child' exists"):
-        doorway_error(scene, "child", TRUTH)

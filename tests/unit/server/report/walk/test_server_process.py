@@ -4,7 +4,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 
 import pytest
@@ -39,16 +38,6 @@ def test_server_that_hangs_is_stopped_and_no_error_of_it_is_claimed(monkeypatch:
         _wait_ready(process, Path("hall"), "serving ")
     assert "the server of hall was stopped" in str(caught.value)
     assert "see its error" not in str(caught.value)
-
-
-@pytest.mark.usefixtures("impatient")
-def test_server_that_compiles_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    number = count()
-    monkeypatch.setattr(server_process, "_kernels", lambda: frozenset({str(next(number))}))
-    # Longer than some looks at the kernels.
-    with child("import time; time.sleep(0.5); print('serving hall at x')") as process:
-        _wait_ready(process, Path("hall"), "serving ")
-    assert next(number) > 1
 
 
 def test_server_that_ends_has_an_error_of_its_own() -> None:

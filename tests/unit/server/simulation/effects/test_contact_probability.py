@@ -6,8 +6,6 @@ import statistics
 import numpy as np
 import pytest
 from solidcloud.server.simulation.effects.uncertainty_effect import (
-    MAX_SIGMAS,
-    OMITTED_PROBABILITY,
     combined_probability,
     contact_probability,
     single_probabilities,
@@ -51,16 +49,6 @@ def test_scans_are_independent(rng: np.random.Generator) -> None:
         assert combined_probability(alone.values()) == pytest.approx(expected, abs=1e-14)
         assert list(alone) == sorted(gaps)
         assert max(alone.values()) <= combined_probability(alone.values()) <= min(1.0, sum(alone.values()))
-
-
-def test_what_is_farther_than_four_deviations_is_left_out_and_adds_less_than_said() -> None:
-    sigma = 0.01
-    at, beyond = MAX_SIGMAS * sigma, np.nextafter(MAX_SIGMAS * sigma, 1.0)
-    assert single_probabilities({0: at}, {0: sigma}) == {0: pytest.approx(OMITTED_PROBABILITY)}
-    assert single_probabilities({0: float(beyond)}, {0: sigma}) == {}
-    assert 3.1e-5 < OMITTED_PROBABILITY < 3.2e-5
-    # Of each scan its own.
-    assert list(single_probabilities({0: at, 1: at}, {0: sigma, 1: sigma / 2})) == [0]
 
 
 def test_more_noise_or_less_gap_never_lessens_the_probability_of_what_is_clear(

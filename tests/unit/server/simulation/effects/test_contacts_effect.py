@@ -8,12 +8,11 @@ import pytest
 import synthetic_scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
-from solidcloud.schemas.scene.effect_table import Contacts, Proximity
+from solidcloud.schemas.scene.effect_table import Contacts
 from solidcloud.schemas.wire.motion_messages import ContactsReport
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects import contacts_effect as contacts
-from solidcloud.server.simulation.effects import proximity_effect as proximity
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 ROW = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])
@@ -52,44 +51,6 @@ def test_clusters_are_those_of_the_question(tmp_path: Path, rng: np.random.Gener
 
 
 @pytest.mark.interpreted
-def test_where_nothing_is_near_the_question_is_not_asked(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
-    runner, body = contacts.make(Contacts(margin=0.01), None), body_of(BALL)
-    with Scene.open(case.archive, "scene") as scene:
-        world = world_of(scene)
-        for height in (1.0, 0.5, 0.2, 0.125):
-            assert report(runner, world, body, at(2.0, 0, height)) == ContactsReport()
-        assert world.asked["contacts"] == 0
-        # In the margin, and touching: 10 cm, and 1 cm of the scan point's.
-        near = report(runner, world, body, at(2.0, 0, 0.115))
-        assert near.total == len(near.clusters) == 1 and near.clusters[0].deepest == pytest.approx(
-            0.005, abs=1e-3
-        )
-        assert report(runner, world, body, at(2.0, 0, 0.1)).clusters[0].deepest < 0
-        assert world.asked["contacts"] == 2
-        assert world.asked["distance"] <= 6
-
-
-@pytest.mark.interpreted
-def test_beside_proximity_it_looks_no_second_time(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
-    runners = proximity.make(Proximity(reach=0.5), None), contacts.make(Contacts(margin=0.01), None)
-    said = []
-    with Scene.open(case.archive, "scene") as scene:
-        for together in (False, True):
-            world, body, alone = world_of(scene), body_of(BALL), body_of(BALL)
-            for height in (0.3, 0.13, 0.115, 0.05, 0.115, 0.4):
-                own = report(runners[0], world, body, at(2.0, 0, height)) if together else None
-                asked = world.asked["distance"]
-                said.append(report(runners[1], world, body if together else alone, at(2.0, 0, height)))
-                if together:
-                    assert world.asked["distance"] == asked
-                    assert own.distance == pytest.approx(height - 0.11, abs=1e-3)
-    assert said[:6] == said[6:]
-    assert [found.total for found in said[:6]] == [0, 0, 1, 1, 1, 0]
-
-
-@pytest.mark.interpreted
 def test_what_could_not_be_read_is_unknown(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
     flip_a_byte(case.archive, (1, 0, 0))
@@ -103,29 +64,3 @@ def test_what_could_not_be_read_is_unknown(tmp_path: Path) -> None:
         # The voxel's cell is from z = 0 to 1; where in it the points are, an index alone does not prove.
         assert report(runner, world, body, at(1.5, 0, 0.5)).unknown
         assert report(runner, world, body, at(1.5, 0, 1.2)) == ContactsReport()
-
-
-@pytest.mark.interpreted
-def test_of_several_archives_the_deepest_come_first(tmp_path: Path, rng: np.random.Generator) -> None:
-    case = archive_cases.build(tmp_path, ROW, voxel=1.0, resolution=1e-3)
-    there = archive_cases.pose_of(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([2.0, -2.0, 0.02]))
-    runner = contacts.make(Contacts(margin=0.0, limit=3, cluster_distance=0.0), None)
-    with Scene.open(case.archive, "scene") as one, Scene.open(case.archive, "other") as two:
-        world = world_of(one, two, poses=[None, there])
-        found = report(runner, world, body_of(make_avatar([[0.0, 0, 0]], 0.15)), at(2.0, 0, 0.1))
-        single = report(runner, world_of(one), body_of(make_avatar([[0.0, 0, 0]], 0.15)), at(2.0, 0, 0.1))
-    assert found.total > single.total > 0 and len(found.clusters) == 3
-    deepest = [cluster.deepest for cluster in found.clusters]
-    assert deepest == sorted(deepest) and deepest[0] == pytest.approx(0.08 - 0.16, abs=1e-3)
-    assert found.clusters[0].cloud == pytest.approx((2.0, 0.0, 0.02), abs=1e-6), "in the world"
-
-
-@pytest.mark.interpreted
-def test_without_a_margin_it_is_asked_once_a_frame_whether_anything_is_near(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, ROW)
-    runner, body = contacts.make(Contacts(margin=0.0), None), body_of(BALL)
-    with Scene.open(case.archive, "scene") as scene:
-        world = world_of(scene)
-        for step in range(5):
-            assert report(runner, world, body, at(0.1 * step, 0, 0.3)) == ContactsReport()
-        assert world.asked == {"distance": 5, "contacts": 0}

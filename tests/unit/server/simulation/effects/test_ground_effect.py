@@ -44,7 +44,7 @@ def level(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("effects", [(Stop(), Ground()), (Stop(), Sweep(), Ground()), ALL])
+@pytest.mark.parametrize("effects", [(Stop(), Ground()), ALL])
 def test_who_falls_lands_and_stands(
     level: archive_cases.Case, effects: tuple[Stop | Sweep | Slide | Step | Ground, ...]
 ) -> None:
@@ -71,7 +71,7 @@ def test_who_falls_lands_and_stands(
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("speed", [5.0, 50.0])
+@pytest.mark.parametrize("speed", [50.0])
 def test_no_fall_is_so_fast_that_it_passes_a_floor(level: archive_cases.Case, speed: float) -> None:
     with play(level.archive, *ALL) as game:
         body = game.body(PERSON, at(0.02, 0.03, 3.0))
@@ -83,19 +83,7 @@ def test_no_fall_is_so_fast_that_it_passes_a_floor(level: archive_cases.Case, sp
 
 
 @pytest.mark.interpreted
-def test_up_and_down_are_nobodys_wish(level: archive_cases.Case) -> None:
-    with play(level.archive, *ALL) as game:
-        body = game.body(PERSON, at(0, 0, 0.2))
-        settled(game, body)
-        height = body.pose[2, 3]
-        for way in ((0.05, 0, 0.5), (-0.05, 0, -0.5)):
-            game.go(body, way)
-            assert abs(body.pose[2, 3] - height) < DIPS + 1e-3 and body.on_ground
-        assert abs(body.pose[0, 3]) < 1e-12
-
-
-@pytest.mark.interpreted
-@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 2, 2)])
+@pytest.mark.parametrize("up", [(0, 1, 0), (1, 2, 2)])
 def test_up_may_be_any_direction(tmp_path: Path, up: tuple[float, float, float]) -> None:
     unit = np.array(up) / np.linalg.norm(up)
     side = np.linalg.svd(unit[None])[2][1:]
@@ -118,7 +106,7 @@ def ramp(degrees: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("degrees", [10, 30, 40])
+@pytest.mark.parametrize("degrees", [10, 40])
 def test_slopes_are_stood_on_and_walked_up(tmp_path: Path, degrees: float) -> None:
     case = effect_rooms.build(tmp_path, ramp(degrees))
     with play(case.archive, *ALL) as game:
@@ -140,7 +128,7 @@ def test_slopes_are_stood_on_and_walked_up(tmp_path: Path, degrees: float) -> No
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("degrees", [55, 70])
+@pytest.mark.parametrize("degrees", [55])
 def test_what_is_too_steep_is_slid_down_and_not_climbed(tmp_path: Path, degrees: float) -> None:
     case = effect_rooms.build(tmp_path, ramp(degrees))
     with play(case.archive, *ALL) as game:
@@ -153,7 +141,7 @@ def test_what_is_too_steep_is_slid_down_and_not_climbed(tmp_path: Path, degrees:
         assert (np.diff(heights) < 1e-9).all() and heights[-1] < heights[0] - 0.05
 
 
-@pytest.mark.parametrize(("degrees", "slope"), [(40.0, 20.0), (40.0, 30.0), (44.0, 30.0)])
+@pytest.mark.parametrize(("degrees", "slope"), [(40.0, 30.0)])
 def test_who_is_pushed_at_a_slope_that_is_too_steep_stands_at_its_foot(
     tmp_path: Path, degrees: float, slope: float
 ) -> None:
@@ -187,8 +175,7 @@ def stairs(riser: float, tread: float = 0.3, count: int = 3) -> NDArray[np.float
     return np.unique(np.round(np.concatenate(parts), 6), axis=0)
 
 
-@pytest.mark.parametrize("pace", [0.015, 0.045])
-@pytest.mark.parametrize("riser", [0.1, 0.17])
+@pytest.mark.parametrize(("riser", "pace"), [(0.1, 0.045), (0.17, 0.03)])
 def test_stairs_are_climbed_and_descended(tmp_path: Path, riser: float, pace: float) -> None:
     case = effect_rooms.build(tmp_path, stairs(riser))
     with play(case.archive, *ALL) as game:
@@ -235,7 +222,7 @@ def test_a_ledge_higher_than_a_step_is_fallen_from(tmp_path: Path) -> None:
         assert fell > 1.0 and body.on_ground and body.pose[2, 3] == pytest.approx(STANDS, abs=0.02)
 
 
-@pytest.mark.parametrize(("snap", "falls"), [(0.0, True), (0.1, True), (0.25, False), (None, False)])
+@pytest.mark.parametrize(("snap", "falls"), [(0.1, True), (0.25, False), (None, False)])
 def test_lower_ground_is_followed_as_far_as_it_snaps(
     tmp_path: Path, snap: float | None, *, falls: bool
 ) -> None:
@@ -283,11 +270,3 @@ def test_nobody_falls_into_what_cannot_be_read(tmp_path: Path) -> None:
         assert moved.verdict == Verdict.UNKNOWN and body.pose[2, 3] > 0.0 and body.fall_speed == 0.0
         assert any(touched.unknown for touched in moved.touched)
         assert game.world.collide(PERSON, body.pose) == Verdict.CLEAR
-
-
-@pytest.mark.interpreted
-def test_a_frame_of_no_time_moves_nobody_down(level: archive_cases.Case) -> None:
-    with play(level.archive, *ALL) as game:
-        body = game.body(PERSON, at(0, 0, 1.0))
-        game.go(body, (0, 0, 0), seconds=0.0)
-        np.testing.assert_array_equal(body.pose, at(0, 0, 1.0))

@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 from movable_objects import AVATARS, CRATE, LEAF, MOVING, USER, free_of, item, where
-from moving_bodies import INTERPRETED, at, ball, staged, touch
+from moving_bodies import INTERPRETED, at, staged, touch
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Objects, Slide, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.runtime.stop_flag import StopFlag as Ending
 from solidcloud.server.runtime.stop_flag import StoppedError
 from solidcloud.server.simulation.world.bodies import Bodies
-from solidcloud.server.simulation.world.frame import Body
 
 
 @pytest.mark.interpreted
@@ -82,16 +80,6 @@ def test_a_stopped_frame_leaves_what_it_pushed_where_it_stood(
 
 
 @pytest.mark.interpreted
-def test_fifty_metres_a_frame_push_the_crate_no_farther_than_the_wall(tmp_path: Path) -> None:
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
-        body = stage.enter("c/u", USER, at(-3))
-        stage.go("c/u", at(47))
-        assert 1.65 < where(stage, "crate")[0, 3] < 2.0
-        assert 1.2 < body.pose[0, 3] < where(stage, "crate")[0, 3] - 0.3
-        assert free_of(stage, "crate")
-
-
-@pytest.mark.interpreted
 def test_a_crate_is_not_pushed_through_another_nor_into_a_user_nor_pulled_nor_pressed_down(
     tmp_path: Path,
 ) -> None:
@@ -114,14 +102,6 @@ def test_a_crate_is_not_pushed_through_another_nor_into_a_user_nor_pulled_nor_pr
         stage.step("c/u", (0, 5, 0))
         assert 0.1 < where(stage, "crate")[1, 3] < 1.0, "the user who stands there is not pushed"
         assert free_of(stage, "crate") and np.array_equal(stage.users["c/still"].pose, at(0.6, 1.0))
-
-
-@pytest.mark.interpreted
-def test_a_move_of_which_nothing_is_remembered_pushes_nothing(tmp_path: Path) -> None:
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=(item("crate", at(1.0)),)) as stage:
-        moved = stage.pipeline.run(Body("c/u", USER, at(0)), at(3))
-        assert np.array_equal(where(stage, "crate"), at(1.0))
-        assert [each.what for each in moved.touched] == ["crate"] and moved.pose[0, 0, 3] < 0.7
 
 
 @pytest.mark.interpreted
@@ -234,36 +214,3 @@ def test_wishes_for_objects_that_cannot_be_granted_are_refused_and_nothing_moves
             with pytest.raises(error, match=text):
                 stage.bodies.place_objects({**good, name: pose})
             assert np.array_equal(where(stage, "door"), at(0)), name
-
-
-@pytest.mark.interpreted
-def test_what_a_wish_told_is_restore_where_the_wish_is_refused(tmp_path: Path) -> None:
-    objects = (
-        item("door", at(0), avatar="leaf", pushed=False),
-        item("gate", at(0, 1), avatar="leaf", pushed=False),
-    )
-    with staged(tmp_path, MOVING, avatars=AVATARS, objects=objects) as stage:
-        body = stage.enter("c/u", USER, at(0.4, -0.5))
-        stage.bodies.place_objects({"gate": at(0, 1.5).tolist()})
-        restore = stage.bodies.place_objects({"door": at(0, -0.5).tolist(), "gate": at(0, 2).tolist()})
-        restore()
-        assert np.array_equal(where(stage, "door"), at(0)) and np.array_equal(
-            where(stage, "gate"), at(0, 1.5)
-        )
-        moved = stage.go("c/u", body.pose.copy())
-        assert moved.verdict == Verdict.CLEAR and moved.objects is not None
-        assert moved.objects.poses["door"] == at(0).tolist()
-
-
-def test_objects_that_cannot_begin_are_refused_each_time_and_not_once() -> None:
-    """Once refused, and the next frame walked through what was missing."""
-
-    def begin(bodies: Bodies) -> None:
-        bodies.add_object("small", ball(), at(5.0), pushed=False)
-        bodies.add_object("large", make_avatar([[0.0, 0, 0]], 4.5), at(0.0), pushed=False)
-
-    bodies = Bodies(np.zeros(3), np.array([0.0, 0, 1]), begin)
-    for _ in range(2):
-        with pytest.raises(BadRequestError, match="at most 4 m with crowd or objects"):
-            bodies.begin()
-        assert not bodies.names and not len(bodies.poses)

@@ -29,7 +29,7 @@ def floor(noise: float = 0.0, wall: float | None = None) -> NDArray[np.float64]:
 
 @pytest.mark.interpreted
 @pytest.mark.parametrize("noise", [0.0, 0.002])
-@pytest.mark.parametrize("above", [-0.008, -0.001, 0.0, 0.0015, 0.004])
+@pytest.mark.parametrize("above", [-0.008, 0.0015])
 def test_an_object_that_touches_the_floor_is_pushed_along_it(
     tmp_path: Path, above: float, noise: float
 ) -> None:

@@ -10,13 +10,11 @@ import synthetic_scans
 from effect_frames import body_of, flip_a_byte, report, world_of
 from numpy.typing import NDArray
 from solidcloud.schemas.scene.effect_table import Proximity
-from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.motion_messages import ProximityReport
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.queries.context.query_budget import QueryBudget
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.effects.proximity_effect import make
-from solidcloud.server.simulation.world.separation_cache import CACHE_KEY, displacement_bound
+from solidcloud.server.simulation.world.separation_cache import CACHE_KEY
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 GRID = np.stack(np.meshgrid(np.arange(0, 1, 0.05), np.arange(0, 1, 0.05), [0.0]), axis=-1).reshape(-1, 3)
@@ -49,14 +47,6 @@ def test_the_report_is_that_of_distance(tmp_path: Path, rng: np.random.Generator
     assert 5 < met < 20
 
 
-@pytest.mark.interpreted
-def test_nothing_in_reach_is_an_empty_report(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, GRID)
-    with Scene.open(case.archive, "scene") as scene:
-        found = report(make(Proximity(reach=0.2), None), world_of(scene), body_of(BALL), at(0.5, 0.5, 0.5))
-    assert found == ProximityReport(None, None, None, None, False)
-
-
 def test_what_is_remembered_changes_no_report(tmp_path: Path, rng: np.random.Generator) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 3, 500), voxel=0.5)
     avatar = make_avatar(rng.uniform(-0.2, 0.2, (20, 3)), 0.01)
@@ -84,23 +74,6 @@ def test_what_is_remembered_changes_no_report(tmp_path: Path, rng: np.random.Gen
 
 
 @pytest.mark.interpreted
-def test_far_away_and_at_rest_nothing_is_searched(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, GRID)
-    runner, body = make(Proximity(reach=0.2), None), body_of(BALL)
-    with Scene.open(case.archive, "scene") as scene:
-        world = world_of(scene)
-        for height in np.arange(4.0, 3.0, -0.01):
-            assert report(runner, world, body, at(0.5, 0.5, height)).distance is None
-        assert world.asked["distance"] <= 10
-        # Two frames tell that nothing is near, and how far at least; then none is needed for 20 cm.
-        assert world.reaches[0] == 0.2 and set(world.reaches[1:]) == {0.4}
-        before = world.asked["distance"]
-        near = [report(runner, world, body, at(0.5, 0.5, 0.25)) for _ in range(5)]
-        assert near[0].distance == pytest.approx(0.14, abs=1e-3) and near.count(near[0]) == 5
-        assert world.asked["distance"] <= before + 2
-
-
-@pytest.mark.interpreted
 def test_what_could_not_be_read_is_unknown_and_never_remembered(tmp_path: Path) -> None:
     row = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])
     case = archive_cases.build(tmp_path, row, voxel=1.0, resolution=1e-3)
@@ -121,15 +94,6 @@ def test_what_could_not_be_read_is_unknown_and_never_remembered(tmp_path: Path) 
         for height in (1.9, 1.6, 1.5, 1.45):
             assert report(runner, world, body, at(1.5, 0, height)) == ProximityReport()
         assert report(runner, world, body, at(1.5, 0, 1.4)) == ProximityReport(unknown=True)
-
-
-@pytest.mark.interpreted
-def test_a_budget_that_is_too_small_is_unknown(tmp_path: Path) -> None:
-    case = archive_cases.build(tmp_path, GRID)
-    with Scene.open(case.archive, "scene") as scene:
-        runner, world = make(Proximity(reach=0.2), None), world_of(scene)
-        found = report(runner, world, body_of(BALL), at(0.5, 0.5, 0.2), QueryBudget(visits=0))
-        assert found.unknown
 
 
 @pytest.mark.interpreted
@@ -162,28 +126,6 @@ def test_witnesses_of_an_archive_at_a_pose_are_in_the_world(tmp_path: Path, rng:
     for said, expected in zip((found.avatar, found.cloud, found.normal), turned, strict=True):
         assert said == pytest.approx((there @ expected)[:3].tolist(), abs=1e-7)
     assert found.distance == pytest.approx(plain.distance, abs=1e-7)
-
-
-@pytest.mark.interpreted
-def test_no_sphere_goes_farther_than_is_said(rng: np.random.Generator) -> None:
-    for far in (0.0, 1e6, 1e9):
-        points = rng.normal(size=(50, 3))
-        avatar = make_avatar(points, 0.05)
-        for size in (0.0, 1e-6, 0.1, 2.0):
-            first = archive_cases.pose_of(archive_cases.random_rotation(rng), rng.normal(size=3) + far)
-            turn = np.linalg.qr(first[:3, :3] + size * rng.normal(size=(3, 3)))[0]
-            second = archive_cases.pose_of(turn, first[:3, 3] + size * rng.normal(size=3))
-            moved = np.linalg.norm(points @ (second - first)[:3, :3].T + (second - first)[:3, 3], axis=1)
-            assert moved.max() <= displacement_bound(first.tolist(), second.tolist(), avatar)
-            # Not by much: bounds that are loose spare no search.
-            assert displacement_bound(first.tolist(), first.tolist(), avatar) < 1e-4
-
-
-def test_a_scene_file_says_how_far() -> None:
-    file = parse_scene(
-        b'format = 1\n[[archives]]\npath = "a"\n[[effects]]\neffect = "proximity"\nreach = 0.25\n', "f"
-    )
-    assert file.effects == [Proximity(reach=0.25)]
 
 
 @pytest.mark.interpreted

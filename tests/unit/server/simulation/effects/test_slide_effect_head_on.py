@@ -11,11 +11,11 @@ from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 # Spacing of the wall's points and their noise [m].
-SPACINGS = [(0.01, 0.0), (0.01, 0.002), (0.04, 0.0)]
-STEP, SETTLING, FRAMES, STILL_FRAMES = 1 / 30, 10, 45, 300
+SPACINGS = [(0.01, 0.002), (0.04, 0.0)]
+STEP, SETTLING, FRAMES, STILL_FRAMES = 1 / 30, 10, 45, 120
 
 
-@pytest.fixture(scope="module", params=SPACINGS, ids=["fine", "noise of 2 mm", "coarse"])
+@pytest.fixture(scope="module", params=SPACINGS, ids=["noise of 2 mm", "coarse"])
 def wall(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Play]:
     """A wall at x = 0."""
     apart, noise = request.param
@@ -39,16 +39,16 @@ def pushed(game: Play, avatar: AvatarModel, start: float, degrees: float, frames
     return np.array(places)
 
 
-@pytest.mark.parametrize("degrees", [2.0, 3.0, 4.0, 5.0, 5.9, -2.5])
+@pytest.mark.parametrize("degrees", [2.0, 5.9, -2.5])
 def test_nearly_head_on_the_avatar_slides_by_the_tangential_part(wall: Play, degrees: float) -> None:
-    for start in (-0.61, -0.2, 0.117):
+    for start in (-0.61, 0.117):
         y = pushed(wall, BALL, start, degrees, FRAMES)[SETTLING:, 1]
         share = (y[-1] - y[0]) / ((len(y) - 1) * STEP * np.sin(np.radians(degrees)))
         assert 0.9 < share < 1.1, (start, share)
 
 
 def test_head_on_the_avatar_does_not_creep(wall: Play) -> None:
-    for start in (-0.61, -0.2, 0.117):
+    for start in (-0.61, 0.117):
         places = pushed(wall, BALL, start, 0.0, STILL_FRAMES)
         assert np.abs(places[:, 1] - start).max() < 1e-3, start
-        assert np.abs(np.diff(places[-100:], axis=0)).max() == 0.0
+        assert np.abs(np.diff(places[-60:], axis=0)).max() == 0.0

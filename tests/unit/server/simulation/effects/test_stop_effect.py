@@ -40,8 +40,8 @@ def test_alone_it_is_there_or_stays(wall: archive_cases.Case) -> None:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("skin", [0.0, 0.002, 0.05])
-@pytest.mark.parametrize("way", [0.8, 3.0, 50.0])
+@pytest.mark.parametrize("skin", [0.0, 0.05])
+@pytest.mark.parametrize("way", [0.8, 50.0])
 def test_a_motion_ends_a_skin_before_what_it_meets(wall: archive_cases.Case, skin: float, way: float) -> None:
     with play(wall.archive, Stop(skin=skin), Sweep()) as game:
         body = game.body(BALL, at(-1, 0, 0))
@@ -53,14 +53,6 @@ def test_a_motion_ends_a_skin_before_what_it_meets(wall: archive_cases.Case, ski
         before = body.pose.tobytes()
         game.go(body, (way, 0, 0))
         assert body.pose.tobytes() == before
-
-
-def test_grazing_a_wall_keeps_the_skin_as_far_as_a_way_back_of_four(wall: archive_cases.Case) -> None:
-    with play(wall.archive, Stop(skin=0.01), Sweep()) as game:
-        body = game.body(BALL, at(-TOUCH - 0.05, -0.6, 0))
-        game.go(body, (0.2, 0.4, 0))
-        clear = -body.pose[0, 3] - TOUCH
-        assert 0.005 < clear < 0.03 and not game.touches(body)
 
 
 @pytest.mark.interpreted
@@ -107,7 +99,7 @@ def test_who_cannot_get_free_stays_and_is_told(
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("effects", [(Stop(),), (Stop(), Sweep()), (Stop(), Sweep(), Slide())])
+@pytest.mark.parametrize("effects", [(Stop(),), (Stop(), Sweep(), Slide())])
 def test_what_cannot_be_read_stops_and_is_said(
     tmp_path: Path, effects: tuple[Stop | Sweep | Slide, ...]
 ) -> None:

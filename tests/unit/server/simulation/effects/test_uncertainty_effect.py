@@ -4,7 +4,6 @@ import math
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import archive_cases
@@ -18,13 +17,10 @@ from numpy.typing import NDArray
 from solidcloud.builder.config import BuildConfig
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_table import Uncertainty
-from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.motion_messages import UncertaintyReport
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects import uncertainty_effect as module
-from solidcloud.server.simulation.effects.uncertainty_effect import check, make, scan_names
+from solidcloud.server.simulation.effects.uncertainty_effect import check, make
 
 RADIUS = 0.01
 BODY = np.array([[x, 0.0, z] for x in (-0.1, 0.0, 0.1) for z in (0.0, 0.2)])
@@ -89,7 +85,7 @@ def judged(
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("gap", [0.012, 0.004, 0.0, -0.003, -0.009])
+@pytest.mark.parametrize("gap", [0.004, -0.003])
 def test_two_scans_touch_as_often_as_displaced_ones_do(
     tmp_path: Path, rng: np.random.Generator, gap: float
 ) -> None:
@@ -97,7 +93,7 @@ def test_two_scans_touch_as_often_as_displaced_ones_do(
     height = gap + 0.05 + RADIUS
     with opened(tmp_path, *clouds) as scene:
         found = said(scene, at(height), sigma=sigmas[0], scans={"scan1.ply": sigmas[1]})
-    share, error = judged(rng, clouds, sigmas, height, 4000)
+    share, error = judged(rng, clouds, sigmas, height, 1500)
     assert abs(found.probability - share) <= 4 * error
     assert not found.unknown and sorted(found.scans) == ["scan0.ply", "scan1.ply"]
     both = 1 - (1 - found.scans["scan0.ply"]) * (1 - found.scans["scan1.ply"])
@@ -132,19 +128,6 @@ def test_deep_inside_it_is_certain_and_far_away_nothing_is_asked(tmp_path: Path)
 
 
 @pytest.mark.interpreted
-def test_with_hardly_any_noise_it_is_the_verdict(tmp_path: Path) -> None:
-    with opened(tmp_path, floor(0.0), floor(-0.004)) as scene:
-        scene.add_avatar("body", BODY, 0.05)
-        seen = set()
-        for gap in (0.01, 1e-4, 1e-6, -1e-6, -1e-4, -0.01):
-            pose = at(gap + 0.05 + RADIUS - 4.5e-5)  # the nearest points are 3 mm beside
-            verdict = int(scene.collide("body", pose[None]).verdict[0])
-            assert said(scene, pose, sigma=1e-12).probability == (verdict == Verdict.CONTACT)
-            seen.add(verdict)
-    assert seen == {Verdict.CLEAR, Verdict.CONTACT}
-
-
-@pytest.mark.interpreted
 def test_what_could_not_be_read_is_unknown(tmp_path: Path) -> None:
     with opened(tmp_path, floor(0.0), floor(-0.004)) as scene:
         folder = tmp_path / "archive"
@@ -153,38 +136,6 @@ def test_what_could_not_be_read_is_unknown(tmp_path: Path) -> None:
         assert not near.unknown and near.probability == 0.0, "out of reach of what is missing"
         found = said(scene, at(0.06), sigma=0.005)
     assert found.unknown
-
-
-@pytest.mark.interpreted
-def test_a_frame_whose_distance_is_not_exact_is_unknown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No voxel is missing; the search of one of two archives ended before the nearest point was known."""
-    ask = module.distance_fast
-    monkeypatch.setattr(
-        module,
-        "distance_fast",
-        lambda *asked: structs.replace(ask(*asked), exact=np.zeros(1, bool)),
-    )
-    for name in ("one", "other"):
-        (tmp_path / name).mkdir()
-    with (
-        opened(tmp_path / "one", floor(0.0)) as scene,
-        opened(tmp_path / "other", floor(-0.004)) as other,
-    ):
-        world = world_of(scene, other)
-        runner, body = make(Uncertainty(sigma=0.005), world), body_of(MODEL)
-        world._world.begin(NO_STOP)
-        found = report(runner, world, body, at(0.06))
-        assert found.unknown and world._world.unknown
-
-
-@pytest.mark.interpreted
-def test_without_the_scan_of_each_point_there_is_one(tmp_path: Path) -> None:
-    with opened(tmp_path, floor(0.0), floor(0.0, 0.01), keep=False) as scene:
-        found = said(scene, at(0.062), sigma=0.005)
-        assert found.scans == {} and 0.2 < found.probability < 0.5
-        assert said(scene, at(0.062), sigma=0.005, scans={"scan1.ply": 0.01}) == found, "one sigma for all"
 
 
 @pytest.mark.interpreted
@@ -221,20 +172,6 @@ def test_a_name_that_no_scan_has_is_refused_when_the_scene_is_opened(tmp_path: P
     many = [structs.replace(info.sources[0], path=f"s{number}.e57") for number in range(20)]
     with pytest.raises(BadRequestError, match="and 12 more"):
         check(Uncertainty(scans={"hall.e57": 0.01}), structs.replace(info, sources=many))
-
-
-def test_sources_are_called_by_as_little_as_tells_them_apart() -> None:
-    sources: Any = [
-        SimpleNamespace(path=path, index=index, fault="")
-        for path, index in (
-            ("a/hall.e57", 0),
-            ("a/hall.e57", 1),
-            ("a/yard.las", 0),
-            ("b/yard.las", 0),
-            ("b/x.ply", 0),
-        )
-    ]
-    assert scan_names(sources) == ["a/hall.e57:0", "a/hall.e57:1", "a/yard.las", "b/yard.las", "x.ply"]
 
 
 @pytest.mark.interpreted

@@ -1,7 +1,5 @@
 """Several archives as one, asked about one avatar: where they lie, which is met first, and what is held."""
 
-import gc
-import weakref
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
@@ -121,22 +119,6 @@ def test_of_two_archives_at_the_same_distance_the_least_witness_is_named(
 
 
 @pytest.mark.interpreted
-def test_avatars_that_were_dropped_are_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    monkeypatch.setattr("solidcloud.server.simulation.world.avatar_probes._MAX_PROBED_POINTS", 100)
-    with Scene.open(case.archive) as scene:
-        world, points = world_of((scene, None)), []
-        for count in (1, 40, 40, 40, 200, 200, 3, 1):
-            avatar = make_avatar(np.linspace([0.0, 0, 0], [0.1, 0, 0], count), 0.2)
-            points.append(weakref.ref(avatar.points))
-            for x, verdict in ((1.0, Verdict.CLEAR), (0.0, Verdict.CONTACT), (1.0, Verdict.CLEAR)):
-                assert world.collide(avatar, at(x, 0, 0)) == verdict
-        del avatar
-        gc.collect()
-        assert [len(kept()) for kept in points if kept() is not None] == [3, 1]
-
-
-@pytest.mark.interpreted
 def test_what_is_held_stays_through_a_reload_and_no_longer(tmp_path: Path) -> None:
     case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
     with Scene.open(case.archive) as scene:
@@ -166,15 +148,3 @@ def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_loo
             world.begin(NO_STOP)
             world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
             assert world.unknown == unknown
-
-
-@pytest.mark.interpreted
-def test_visits_add_up(tmp_path: Path) -> None:
-    case = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.4, -0.4), (0, 0.4, 0.4)))
-    with Scene.open(case.archive) as scene:
-        world = world_of((scene, None))
-        before = world.visits
-        swept = world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
-        assert world.visits == before + swept.visits and swept.visits > 0
-        world.collide(BALL, at(0.1, 0, 0))
-        assert world.visits > before + swept.visits

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from effect_rooms import INTERPRETED, Play
 from solidcloud.schemas.scene.effect_table import AnyEffect, Contacts, Crowd, Ground, Slide, Step, Stop, Sweep
-from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
-from solidcloud.server.simulation.world import frame_walk, walk_call
+from solidcloud.server.simulation.world import walk_call
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 
-FRAMES = 12 if INTERPRETED else 250
+FRAMES = 12 if INTERPRETED else 130
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +34,6 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> archive_cases.Case:
     ("effects", "up"),
     [
         ([Stop(), Sweep(), Slide(), Step(), Ground()], (0.0, 0.0, 1.0)),
-        ([Stop(), Sweep(), Ground()], (0.0, 0.0, 1.0)),
-        ([Stop(), Slide(), Ground()], (0.0, 0.0, 1.0)),
         ([Crowd(), Stop(), Sweep(), Slide(), Ground(), Contacts()], (0.0, 0.0, 1.0)),
         ([Stop(), Sweep(), Slide(), Step(), Ground()], (0.02, 0.0, 1.0)),
     ],
@@ -82,51 +79,3 @@ def state_of(body: Body) -> tuple[object, ...]:
     """Return all that a body keeps between frames."""
     kept = {name: body.effect_state[name].tobytes() for name in body.effect_state if "ground" in name}
     return body.pose.tobytes(), body.fall_speed, body.on_ground, body.clear, body.generations, kept
-
-
-@pytest.mark.interpreted
-def test_poses_and_times_may_have_any_memory_order_and_type(case: archive_cases.Case) -> None:
-    target = effect_rooms.at(-0.48, 0.01, -0.6, 0.3)
-    with effect_rooms.play(case.archive, Stop(), Sweep(), Ground()) as play:
-        answers = []
-        for order, seconds in (("C", 1.0), ("F", 1), ("C", 1)):
-            body = play.body(effect_rooms.person(), effect_rooms.at(-0.5, 0.0, -0.6))
-            body.pose = np.array(body.pose, order=order)  # type: ignore[call-overload]
-            wish = np.array(target, order=order)  # type: ignore[call-overload]
-            answers.append(encode(play.pipeline.run(body, wish, seconds)))
-    assert answers[0] == answers[1] == answers[2]
-
-
-def test_only_frames_without_a_budget_run_effects_together(case: archive_cases.Case) -> None:
-    effects = [Stop(), Sweep(), Ground()]
-    with effect_rooms.play(case.archive, *effects, limits=SceneLimits(frame_visits=10**6)) as play:
-        assert [len(group) for group in play.pipeline._groups] == [1, 1, 1]
-        assert play.go(play.body(effect_rooms.person(), effect_rooms.at(0, 0, 0)), (0, 0, 0)).simulated
-    with effect_rooms.play(case.archive, *effects) as play:
-        assert [len(group) for group in play.pipeline._groups] == [1, 2]
-
-
-def test_time_is_divided_between_sweep_and_ground(case: archive_cases.Case) -> None:
-    effects = [Stop(), Sweep(), Slide(), Step(), Ground()]
-    with effect_rooms.play(case.archive, *effects) as play:
-        body = play.body(effect_rooms.person(), effect_rooms.at(-0.5, 0.0, -0.6))
-        for _ in range(40):
-            answer = play.go(body, (0.01, 0.0, 0.0))
-            assert answer.simulated == ["stop", "sweep", "slide", "step", "ground"]
-        stats = {each.effect: each for each in play.pipeline.times.stats()}
-    assert [each.frames for each in stats.values()] == [40] * 5
-    assert min(stats[name].seconds for name in ("stop", "sweep", "ground")) > 0.0
-
-
-def test_the_kernel_is_compiled_when_a_scene_opens(
-    case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
-    run = frame_walk.Walker.run
-    monkeypatch.setattr(
-        frame_walk.Walker, "run", lambda self, frame, parts: calls.append(parts) or run(self, frame, parts)
-    )
-    with effect_rooms.play(case.archive, Stop(), Sweep(), Ground()):
-        assert calls == [0]
-    with effect_rooms.play(case.archive, Contacts()):
-        assert calls == [0]

@@ -82,17 +82,3 @@ def test_a_walk_at_map_coordinates_differs_by_the_rounding_of_its_positions(
     assert 0.0 < drift <= (FRAMES + 2 * motions) * ROUNDING
     assert drift < 1e-7
     assert np.ptp(here, axis=0)[:2].min() > (0.0 if INTERPRETED else 0.5), "it walks through the room"
-
-
-@pytest.mark.interpreted
-def test_a_walk_that_float64_holds_exactly_at_map_coordinates_is_the_same_bit_for_bit(
-    room: archive_cases.Case,
-) -> None:
-    """Nothing but the rounding of positions makes the difference."""
-    ways = np.zeros((FRAMES, 3))
-    ways[:, 0] = np.where(np.arange(FRAMES) // 4 % 2, -(2.0**-5), 2.0**-5)
-    ways[:, 1] = np.where(np.arange(FRAMES) // 6 % 2, -(2.0**-6), 2.0**-6)
-    here, _ = walk(room.archive, np.zeros(3), ways)
-    there, _ = walk(room.archive, MAP, ways)
-    assert np.array_equal(here[:, :2], there[:, :2])
-    assert np.abs(here[:, 2] - there[:, 2]).max() <= 10 * np.spacing(MAP[2]), "a fall of ten frames"

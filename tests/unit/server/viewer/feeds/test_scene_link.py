@@ -7,7 +7,7 @@ import pytest
 from solidcloud.schemas.errors import BusyError
 from solidcloud.schemas.wire.warming_parts import MOTION
 from solidcloud.server.viewer.feeds import scene_link
-from solidcloud.server.viewer.feeds.scene_link import SceneLink, may_enter
+from solidcloud.server.viewer.feeds.scene_link import SceneLink
 
 
 def info(compiling: list[str], points: int = 9) -> Any:
@@ -62,11 +62,3 @@ def test_page_is_told_that_kernels_are_compiled() -> None:
     assert "2 of 9 parts are left" in link.status.message
     link._show(info([]), reader, reader)
     assert link.status.message == ""
-
-
-def test_users_enter_once_motion_and_rays_are_compiled() -> None:
-    assert may_enter(info([]))
-    assert may_enter(info(["sweep"]))
-    assert not may_enter(info(["raycast"]))
-    assert not may_enter(info([MOTION]))
-    assert not may_enter(info([], points=0))

@@ -43,11 +43,6 @@ def test_rates_and_mean_times_of_effects_in_a_frame() -> None:
     assert made["memory"]["voxels"] == 300 and made["memory"]["budget"] == 1000
 
 
-def test_without_frames_effects_took_no_time() -> None:
-    made = sample(reading(1.0), reading(2.0))
-    assert made is not None and [seconds for _, seconds, _, _ in made["effects"]] == [0.0, 0.0]
-
-
 @pytest.mark.parametrize(
     ("before", "after"),
     [
@@ -98,11 +93,3 @@ def test_browsers_are_given_the_minute_and_each_later_sample() -> None:
     # Nothing is counted across the question without an answer: 2 to 4.
     hits = [each["samples"][0]["totals"]["hits"] for each in got[1:4]]
     assert hits == [2, 5, 6]
-
-
-def test_nothing_is_asked_without_browsers() -> None:
-    reader = Reader(busy=set())
-    scene: Any = SimpleNamespace(reader=reader)
-    with StatisticsFeed(lambda: scene, interval=0.001) as feed:
-        feed._thread.join(0.05)
-    assert reader.asked == 0

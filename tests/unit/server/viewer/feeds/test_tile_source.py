@@ -71,11 +71,6 @@ def test_tile_is_in_the_frame_of_the_page_with_its_columns() -> None:
     assert set(arrays["points"][:5, 0].tolist()) == {0, 4, 8, 12, 16}
 
 
-def test_colours_that_no_scan_had_are_left_out() -> None:
-    _, arrays = decoded(source_of(Reader(tile(20, colours=False)), 1 << 20).tile((0, 0, 0, 0, 0)) or b"")
-    assert "rgb" not in arrays
-
-
 def test_tile_is_read_once_and_the_oldest_is_dropped_beyond_the_budget() -> None:
     reader = Reader(tile(1000))
     size = len(source_of(reader, 1 << 20).tile((0, 0, 0, 0, 0)) or b"")
@@ -86,9 +81,3 @@ def test_tile_is_read_once_and_the_oldest_is_dropped_beyond_the_budget() -> None
     assert reader.asked == 3  # 0 was used again, so that 1 was dropped for 2
     source.tile((0, 1, 0, 0, 0))
     assert reader.asked == 4
-
-
-def test_nothing_is_read_without_a_scene() -> None:
-    source = TileSource(lambda: None)
-    assert source.tile((0, 0, 0, 0, 0)) is None
-    assert source.voxels((0.0, 0.0, 0.0)) is None

@@ -24,13 +24,8 @@ def test_points_keep_their_precision_at_map_coordinates() -> None:
     assert np.allclose(frame.to_world(frame.points(place).astype(np.float32)), place, rtol=0, atol=5e-6)
 
 
-def test_unbounded_scene_has_the_world_as_its_frame() -> None:
-    frame = ViewFrame([[np.inf] * 3, [-np.inf] * 3])
-    assert np.array_equal(frame.points([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
-
-
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0.2, -0.3, 0.9)])
-@pytest.mark.parametrize("yaw", [-3.0, 0.0, 0.4, np.pi / 2])
+@pytest.mark.parametrize("yaw", [-3.0, np.pi / 2])
 def test_standing_avatar_faces_its_yaw_and_stands_along_up(up: tuple[float, ...], yaw: float) -> None:
     frame = ViewFrame(MAP, up)
     pose = frame.standing(MAP[0], yaw)
@@ -39,19 +34,6 @@ def test_standing_avatar_faces_its_yaw_and_stands_along_up(up: tuple[float, ...]
     assert np.allclose(pose[:3, 2], np.array(up) / np.linalg.norm(up))
     assert frame.yaw(pose) == pytest.approx(yaw)
     assert np.allclose(frame.pose(pose)[:3, 3], frame.points(MAP[0]))
-
-
-def test_box_encloses_the_corners_of_a_posed_one(rng: np.random.Generator) -> None:
-    frame = ViewFrame(MAP, (0.2, -0.3, 0.9))
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, MAP[0]
-    low, high = np.array([[-1.0, 2.0, 3.0]]), np.array([[1.0, 5.0, 3.5]])
-    box_low, box_high = frame.boxes(pose[None], low, high)
-    picks = np.array(np.meshgrid(*[[0, 1]] * 3)).reshape(3, -1).T
-    corners = np.where(picks, high, low) @ turn.T + pose[:3, 3]
-    assert np.allclose(frame.points(corners).min(axis=0), box_low[0])
-    assert np.allclose(frame.points(corners).max(axis=0), box_high[0])
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0.2, -0.3, 0.9)])

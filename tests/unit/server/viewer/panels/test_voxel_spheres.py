@@ -7,7 +7,7 @@ import numpy as np
 from page_arrays import decoded
 from solidcloud.schemas.wire.tile_messages import MAX_SPHERE_LEVEL, TileAnswer, VoxelsAnswer
 from solidcloud.server.viewer.page.view_frame import ViewFrame
-from solidcloud.server.viewer.panels.voxel_spheres import SphereSource, nearest
+from solidcloud.server.viewer.panels.voxel_spheres import SphereSource
 
 DEPTH = 3
 
@@ -67,15 +67,3 @@ def test_spheres_of_a_level_are_in_the_frame_of_the_page() -> None:
     reader.asked.clear()
     source.message(scene, (0.0, 0.0, 0.0), 2)
     assert reader.asked == [2, 2], "the depth of each voxel is known"
-
-
-def test_nearest_voxel_is_shown_far_from_all() -> None:
-    header, _ = decoded(SphereSource().message(scene_of(Reader()), (100.0, 0.0, 0.0), 0))
-    assert header["total"] == 2
-
-
-def test_the_nearest_spheres_are_kept_large_ones_first() -> None:
-    centers = np.array([[0.0, 0, 0], [5, 0, 0], [9, 0, 0], [1, 0, 0]])
-    radii = np.array([0.1, 4.5, 0.1, 0.2])
-    assert nearest(centers, radii, np.zeros(3), 3).tolist() == [1, 3, 0]
-    assert nearest(centers, radii, np.zeros(3), 9).tolist() == [1, 3, 0, 2]

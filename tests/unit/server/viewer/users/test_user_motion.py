@@ -68,15 +68,6 @@ def test_stuck_user_goes_along_the_wall_and_off_it_for_a_while() -> None:
         assert speed[1] == 1.0
 
 
-def test_way_off_is_that_of_the_wall_and_not_of_the_bump_where_the_user_sticks() -> None:
-    against = (math.sqrt(0.5), -math.sqrt(0.5), 0.0)
-    slides = [state(0.05 * k, X) for k in range(10)]
-    found = commands([*slides, *[state(0.45, against)] * 5])
-    speed, is_off = found[-1]
-    assert is_off
-    assert np.allclose(speed / speed[1], (0.2, 1.0, 0.0))
-
-
 @pytest.mark.parametrize(
     "states",
     [
@@ -90,7 +81,3 @@ def test_other_users_go_where_they_want(states: list[State]) -> None:
     for speed, is_off in commands(states):
         assert not is_off
         assert np.array_equal(speed, WANTED)
-
-
-def test_user_who_stands_does_not_step_off() -> None:
-    assert not any(is_off for _, is_off in commands([state(0.0, X)] * 20, np.zeros(3)))

@@ -1,13 +1,10 @@
 """Test `solidcloud inspect --stray`: its text, its JSON, lists, and broken scans."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic_scans
-from scan_campaign import edit_list
-from solidcloud.builder.sources.scan_list import read_scan_list
 from solidcloud.server.cli.main import run
 
 DUST = np.array([[0.5, 0.5, 1.0], [0.52, 0.52, 1.0], [0.2, 0.8, 0.5]])
@@ -40,50 +37,3 @@ def test_a_scan_with_hanging_points_has_a_line(folder: Path, capsys: pytest.Capt
     ]
     assert said(capsys, "a.ply", "--stray").splitlines()[-1] == "no points hang in the air above floors"
     assert "hang" not in said(capsys, "a.ply", "b.ply")
-
-
-def test_json_has_the_same_fields(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    clean, dusty = json.loads(said(capsys, "a.ply", "b.ply", "--stray", "--json"))
-    assert clean["stray"] == {
-        "points": 0, "share": 0.0, "groups": 0, "largest": None, "outliers": None, "left_out": 0,
-        "lost": 0, "moving": None,
-    }  # fmt: skip
-    assert dusty["stray"] == {
-        "points": 3, "share": 3 / 628, "groups": 2, "largest": {"points": 2, "place": [0.55, 0.55, 1.05]},
-        "outliers": "0.1,2", "left_out": 3, "lost": 0, "moving": "0.1,1",
-    }  # fmt: skip
-    (plain,) = json.loads(said(capsys, "b.ply", "--json"))
-    assert plain["stray"] is None
-
-
-def test_a_list_is_read_as_edited(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said(capsys, "a.ply", "b.ply")
-    edit_list(folder / "scans.toml", {"units": "mm"}, 1)
-    before = (folder / "scans.toml").read_bytes()
-    assert "no points hang" in said(capsys, "scans.toml", "--stray")
-    assert (folder / "scans.toml").read_bytes() == before
-    edit_list(folder / "scans.toml", {"scale": 1000.0}, 1)
-    assert "b.ply: 3 points" in said(capsys, "scans.toml", "--stray")
-    edit_list(folder / "scans.toml", {"use": False}, 1)
-    assert "no points hang" in said(capsys, "scans.toml", "--stray", "-o", "more.toml")
-    entries = read_scan_list(folder / "more.toml")
-    assert [(entry.units, entry.scale, entry.use) for entry in entries] == [
-        ("m", 1.0, True),
-        ("mm", 1000.0, False),
-    ]
-    edit_list(folder / "scans.toml", {"index": 3}, 0)
-    assert run(["inspect", "scans.toml", "--stray"]) == 3
-    assert "holds 1 scans, expected one of index 3" in capsys.readouterr().err
-    assert run(["inspect", "scans.toml", "b.ply"]) == 2
-    assert "named twice" in capsys.readouterr().err
-
-
-def test_a_scan_that_breaks_behind_its_header_is_named(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (folder / "c.xyz").write_text("0 0 0\n" * 200 + "1 2\n")
-    assert run(["inspect", "a.ply", "c.xyz", "-o", "plain.toml"]) == 0
-    assert run(["inspect", "a.ply", "b.ply", "c.xyz", "--stray"]) == 3
-    printed = capsys.readouterr()
-    assert "c.xyz" in printed.err and "b.ply: 3 points" in printed.out
-    assert [bool(entry.fault) for entry in read_scan_list(folder / "scans.toml")] == [False, False, True]

@@ -5,8 +5,6 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-import pytest
-from picture_checks import alike_in_grey, covered, drawn_figures, overlaps, share_of_figure
 from solidcloud.server.report.accuracy.measurement.accuracy_results import (
     ColdRow,
     FieldRow,
@@ -17,9 +15,9 @@ from solidcloud.server.report.accuracy.measurement.accuracy_results import (
     WalkRow,
 )
 from solidcloud.server.report.accuracy.measurement.pose_classes import CLASSES
-from solidcloud.server.report.accuracy.page.accuracy_charts import draw_charts, length_name
+from solidcloud.server.report.accuracy.page.accuracy_charts import draw_charts
 from solidcloud.server.report.accuracy.page.accuracy_page import write_page
-from solidcloud.server.report.accuracy.page.accuracy_texts import answer, choices, findings, saved, size_name
+from solidcloud.server.report.accuracy.page.accuracy_texts import answer
 
 FACTS = {
     "scene": "generated <façade>",
@@ -126,67 +124,3 @@ def test_the_page_begins_with_the_answer_fetches_nothing_and_holds_every_result(
     assert page.count("<img") == len(charts) == 7
     for data in re.findall(r"data:image/png;base64,([^\"]+)", page):
         assert base64.b64decode(data).startswith(b"\x89PNG")
-
-
-def test_a_scene_without_truth_has_no_radius_models(tmp_path: Path) -> None:
-    made = report()._replace(radii=[], fields=[])
-    charts = draw_charts(made, tmp_path)
-    write_page(made, charts, tmp_path / "accuracy.html")
-    page = (tmp_path / "accuracy.html").read_text(encoding="utf-8")
-    assert "radii" not in charts and "4. Radius" not in page and "Euclidean" not in page
-
-
-def test_every_chart_is_legible_in_grey_and_nothing_overlaps(tmp_path: Path) -> None:
-    with drawn_figures() as figures:
-        charts = draw_charts(report(), tmp_path)
-    assert len(figures) == len(charts)
-    for figure in figures:
-        assert alike_in_grey(figure) == [] and overlaps(figure) == [] and covered(figure) == []
-        assert share_of_figure(figure) > 0.5
-        # Shown 400 pixels wide, the smallest text is still 8 pixels high.
-        texts = figure.findobj(lambda artist: hasattr(artist, "get_fontsize") and bool(artist.get_text()))
-        assert min(text.get_fontsize() for text in texts) / 72 * 400 / figure.get_size_inches()[0] >= 8.0
-    assert 10_000 < charts["main"].stat().st_size < 150_000
-
-
-def test_the_sentences_follow_from_the_results() -> None:
-    made = report()
-    assert answer(made) == (
-        "With the scene in memory, an error of 3 cm saves 32 % of the time where a pose touches or is that "
-        "near, and saves none of the time elsewhere; with nothing in memory, 10 cm saves 98 % of the wait and saves "
-        "99 % of the bytes."
-    )
-    said = " ".join(findings(made))
-    assert "with 0.001 of the scene in memory, by bounds: 0 of 900 frames over 33 ms, 0 wrongly clear" in said
-    assert "at 0.2 % of the places with one radius for all points" in said
-    assert "cells of 2 cm takes 3.3 times as long" in said and "4 GB for the whole scene" in said
-    assert "with a tolerance of 10 cm for its sweeps it takes 0.60 times as long" in said
-    bare = made._replace(fields=[], cold=[], walks=[], radii=[], frames=[])
-    assert len(findings(bare)) == 2
-
-
-def test_the_three_settings_are_priced_from_the_results() -> None:
-    exact, near, coarse = choices(report())
-    assert (exact.error, near.error) == ("none", "contact up to 3 cm early, never late")
-    assert (exact.near, near.near, exact.elsewhere) == ("2.8 µs", "1.9 µs", "1.8 µs")
-    assert (exact.wait, near.wait, coarse.wait) == ("200.0 ms", "", "5.0 ms")
-    assert coarse.read == "50 kB" and "memory" in coarse.choose
-
-
-@pytest.mark.parametrize(
-    ("ratio", "said"),
-    [
-        (1.0, "saves none of the wait"),
-        (0.96, "saves none of the wait"),
-        (0.5, "saves 50 % of the wait"),
-        (1.2, "adds 20 % to the wait"),
-    ],
-)
-def test_ratios_near_one_are_not_told_apart(ratio: float, said: str) -> None:
-    assert saved(ratio, "wait") == said
-
-
-def test_lengths_and_sizes_are_named_as_people_say_them() -> None:
-    assert [length_name(x) for x in (0.0, 1e-5, 2e-3, 0.05)] == ["exact", "10 µm", "2 mm", "5 cm"]
-    sizes = [size_name(x) for x in (0, 999, 5_092_520, 3.9e9, 2e14)]
-    assert sizes == ["0 bytes", "999 bytes", "5.09 MB", "3.9 GB", "200 TB"]

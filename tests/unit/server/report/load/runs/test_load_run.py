@@ -1,17 +1,13 @@
 """Test the parts of a load test: the clock of frames, adversaries, processes. Nothing is timed."""
 
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from solidcloud.server.report.load.runs import load_run, load_server
 from solidcloud.server.report.load.users import frame_clock
-from solidcloud.server.report.load.users.adversary_user import Adversary, LruModel
-from solidcloud.server.report.load.users.archive_voxels import Voxels
 from solidcloud.server.report.load.users.frame_outcomes import ANSWERED
 from solidcloud.server.report.load.users.user_traces import Trace
 
@@ -51,94 +47,11 @@ def test_a_late_frame_delays_no_other_but_those_due_meanwhile() -> None:
     assert acted == [(0, 0.0), (1, 1.0), (2, 3.5), (3, 3.5), (4, 4.0)]
 
 
-def test_no_frame_is_asked_before_its_time_though_sleep_ends_early() -> None:
-    acted = Clock(early=0.01).run([0.1, 0.2], lambda _: 0.0)
-    assert [number for number, _ in acted] == [0, 1]
-    assert all(0 <= at - due < 0.01 for (_, at), due in zip(acted, (0.1, 0.2), strict=True))
-
-
 def test_a_frame_stalls_when_its_answer_is_later_than_the_next_frame_or_never() -> None:
     due = np.array([1.0, 2.0, 3.0, 4.0])
     done = np.array([1.033, 2.034, np.nan, 4.0])
     assert frame_clock.stalled(due, done).tolist() == [False, True, True, False]
     assert frame_clock.stalled(due, done, 0.1).tolist() == [False, False, True, False]
-
-
-def test_the_first_second_is_that_of_each_user() -> None:
-    user = np.array([0, 2, 0, 2, 0])
-    due = np.array([5.0, 5.5, 5.9, 6.4, 6.0])
-    assert frame_clock.after_first(user, due).tolist() == [False, False, False, False, True]
-    assert frame_clock.after_first(user, due, 0.9).tolist() == [False, False, True, True, True]
-    assert frame_clock.after_first(user[:0], due[:0]).tolist() == []
-
-
-def test_the_model_evicts_as_a_list_does() -> None:
-    rng = np.random.default_rng(1)
-    sizes = rng.integers(1, 40, 30)
-    model, order, gone = LruModel(sizes, 150), list[int](), list[int]()
-    for _ in range(400):
-        wanted = sorted(set(rng.integers(0, 30, 3).tolist()))
-        model.use(wanted)
-        gone = [row for row in gone if row not in wanted]
-        order = [row for row in order if row not in wanted] + wanted
-        while sizes[order].sum() > 150 and len(order) > len(wanted):
-            gone.append(order.pop(0))
-        assert list(model.resident) == order and list(model.evicted) == gone
-        assert model.bytes == sizes[order].sum()
-
-
-def row_of_boxes(count: int) -> NDArray[np.float64]:
-    """Return boxes of 1 m along x, with gaps of 9 m."""
-    low = np.column_stack([np.arange(count) * 10.0, np.zeros(count), np.zeros(count)])
-    return np.stack([low, low + 1.0], axis=1)
-
-
-@pytest.mark.parametrize(
-    ("recent", "asked"),
-    [(True, [0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 2]), (False, [0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4])],
-)
-def test_an_adversary_asks_for_what_was_evicted(recent: bool, asked: list[int]) -> None:
-    # The cache holds three voxels: all six are requested once; after that, each request misses.
-    model = LruModel(np.full(7, 10), 30)
-    found = Adversary(row_of_boxes(7), model, np.array([0.0, 0.0, 0.9]), 1.0)
-    for number, row in enumerate(asked):
-        resident = set(model.resident)
-        pose = found.pose(recent)
-        assert np.allclose(pose[:3, :3], np.eye(3))
-        assert np.allclose(pose[:3, 3], (10.0 * row + 0.5, 0.5, -0.4)), number
-        assert row not in resident
-
-
-def test_an_adversary_of_a_cache_that_holds_all_goes_round() -> None:
-    found = Adversary(row_of_boxes(3), LruModel(np.full(3, 10), 100), np.zeros(3), 1.0)
-    assert [round(found.pose(True)[0, 3] - 0.5) for _ in range(7)] == [0, 10, 20, 0, 10, 20, 0]
-
-
-def test_an_adversary_knows_what_else_its_pose_needs() -> None:
-    found = Adversary(row_of_boxes(4), LruModel(np.full(4, 10), 30), np.zeros(3), 10.0)
-    assert found.needed(0) == [0, 1] and found.needed(2) == [1, 2, 3]
-
-
-def test_a_policy_is_named_only_where_one_is_given() -> None:
-    command = load_server.serve_command(Path("a.scd"), "tcp/127.0.0.1:1", 1000, None)
-    assert command[-2:] == ["--cache", "1000"] and "--policy" not in command
-    assert load_server.serve_command(Path("a"), "e", 1000, "lru")[-2:] == ["--policy", "lru"]
-
-
-@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="the system does not say")
-def test_memory_of_a_process_is_seen() -> None:
-    watcher = load_server.Watcher(os.getpid())
-    watcher.look(True)
-    held = np.ones(1 << 25, np.uint8)
-    watcher.look(False)
-    memory = watcher.stop()
-    assert len(memory.rss) == 3 and len(memory.pss) == 2
-    assert memory.peak() >= max(memory.rss) >= held.nbytes and 0 < memory.pss[-1] <= memory.peak()
-
-
-def test_the_most_memory_is_read_from_a_status() -> None:
-    assert load_server.parse_high("VmPeak:\t 9 kB\nVmHWM:\t    21 kB\nVmRSS: 1 kB\n") == 21 * 1024
-    assert load_server.parse_high("VmRSS: 1 kB\n") == 0
 
 
 def test_a_process_that_ends_before_it_is_ready_says_why(tmp_path: Path) -> None:
@@ -159,8 +72,3 @@ def test_users_in_processes_ask_every_frame_of_a_trace_and_hear_of_each(tmp_path
     assert made.user.tolist() == user.tolist() and (made.status == ANSWERED).all() and not found.faults
     assert np.allclose(made.due - made.due[0], asked.time) and (made.due <= made.sent).all()
     assert (made.sent <= made.done).all() and (np.diff(made.due) >= 0).all()
-
-
-def test_rows_are_found_by_key_and_strangers_left_out() -> None:
-    voxels = Voxels(np.array([3, 8, 9], np.uint64), row_of_boxes(3), np.full(3, 10), 0.01)
-    assert voxels.rows(np.array([9, 4, 3, 77], np.uint64)).tolist() == [2, 0] and voxels.decoded == 30

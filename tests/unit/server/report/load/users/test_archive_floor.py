@@ -21,17 +21,6 @@ def slope() -> ArchiveFloor:
     return make_floor(xy, 0.1 * xy[:, 0])
 
 
-def test_heights_are_interpolated_and_unknown_squares_filled() -> None:
-    floor = slope()
-    xy = np.array([(0.5, 0.5), (10.0, 5.0), (7.25, 3.3), (19.5, 9.5), (-5.0, 5.0), (50.0, 50.0)])
-    assert floor.floor(xy) == pytest.approx([0.05, 1.0, 0.725, 1.95, 0.05, 1.95])
-    holes = np.arange(len(floor.places)) % 3 > 0
-    sparse = make_floor(floor.places[holes], 0.1 * floor.places[holes, 0])
-    assert sparse.floor(floor.places) == pytest.approx(0.1 * floor.places[:, 0], abs=1e-6)
-    one = make_floor(np.zeros((1, 2)), np.array([2.5]))
-    assert one.floor(np.array([(0.0, 0.0), (9.0, -9.0)])).tolist() == [2.5, 2.5]
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [1, 200], ids=["one place", "a hall"])
 def test_users_of_every_kind_walk_on_any_floor(kind: str, size: int) -> None:
@@ -98,8 +87,3 @@ def test_a_file_that_is_no_walk_is_named(tmp_path: Path, name: str, text: str, s
     (tmp_path / name).write_text(text)
     with pytest.raises(BadRequestError, match=said):
         read_walk(tmp_path / name)
-
-
-def test_poses_without_times_come_thirty_times_a_second(tmp_path: Path) -> None:
-    (tmp_path / "walk.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + "0,1,2,3,1,0,0,0\n" * 31)
-    assert read_walk(tmp_path / "walk.csv").time[-1] == pytest.approx(1.0)

@@ -1,4 +1,7 @@
-"""What verdicts within a tolerance say about the distance; nothing is written beside the columns."""
+"""Test verdicts within a tolerance on production kernels: bounds, and no write beside the columns.
+
+The unit tests check indices, which changes the loop: LLVM once vectorised it to write beyond a column.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +18,7 @@ BESIDE = 128
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("k", [0, 1, 7, 8, 31, 57, 64, 65, 513, 1200])
+@pytest.mark.parametrize("k", [0, 1, 7, 8, 31, 57, 64, 65, 513])
 def test_verdicts_become_bounds_and_nothing_else_is_written(k: int) -> None:
     rng = np.random.default_rng(k)
     types = (np.uint8, np.int64, np.float64, np.float64, np.bool_)
@@ -34,8 +37,8 @@ def test_verdicts_become_bounds_and_nothing_else_is_written(k: int) -> None:
 
 
 @pytest.mark.interpreted
-@pytest.mark.parametrize("units", [0, 1, 1 << 20, 1 << 30])
-@pytest.mark.parametrize("tolerance", [1, 1000, 1 << 26, 1 << 30])
+@pytest.mark.parametrize("units", [0, 1 << 20])
+@pytest.mark.parametrize("tolerance", [1, 1 << 26])
 def test_a_pair_is_sure_only_below_what_all_errors_leave(units: int, tolerance: int) -> None:
     early, per_step = np.empty(2, np.float32), 2.0**-14 * 2.0**26
     for error in (0.0, 0.01, 3.0):

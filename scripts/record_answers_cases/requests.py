@@ -93,12 +93,16 @@ def _group(
         return Group(name, query, "", (places, aims), {"reach": 30.0, **more})
     poses = near_poses(points, avatars[role], dice, count)
     if query == "sweep":
-        ends = near_poses(points, avatars[role], dice, count)
-        # A third of the motions are translations, a third turn, a third may lead anywhere.
-        ends[0::3, :3, :3] = poses[0::3, :3, :3]
+        # Motions end near scan points. A third are translations, a third turn too, and a third come from
+        # anywhere. Most begin farther away than they reach, every fifth near a scan point.
+        starts = near_poses(points, avatars[role], dice, count)
+        starts[0::3, :3, :3] = poses[0::3, :3, :3]
         for k in (0, 1):
-            ends[k::3, :3, 3] = _rounded(poses[k::3, :3, 3] + dice.integers(-2048, 2049, len(ends[k::3]), 3) / 1024)
-        return Group(name, query, role, (poses, ends), {"margin": margin, **more})
+            starts[k::3, :3, 3] = poses[k::3, :3, 3] + dice.integers(-3072, 3073, len(starts[k::3]), 3) / 1024
+        starts[2::3, :3, 3] += dice.integers(-3072, 3073, len(starts[2::3]), 3) / 1024
+        starts[::5, :3, 3] = poses[::5, :3, 3] + dice.integers(-256, 257, len(starts[::5]), 3) / 1024
+        starts[:, :3, 3] = _rounded(starts[:, :3, 3])
+        return Group(name, query, role, (starts, poses), {"margin": margin, **more})
     if query == "objects":
         others = near_poses(points, avatars[role], dice, count * OBJECTS).reshape(count, OBJECTS, 4, 4)
         # The objects of a request stand close together.
@@ -123,9 +127,10 @@ def near_poses(points: Floats, avatar: Avatar, dice: Dice, count: int) -> Floats
     quaternions[(quaternions == 0).all(axis=1)] = [1, 0, 0, 0]
     turns = rotations(quaternions)
     own = avatar.points[dice.integers(0, len(avatar.points), count)]
-    # Offsets up to 1/8 m, every fourth up to 2 m; every tenth puts the two points on each other.
+    # Offsets up to 1/8 m, 1/4 m and 2 m; every tenth puts the two points on each other.
     offsets = dice.integers(-512, 513, count, 3) / 4096
-    offsets[::4] *= 16
+    offsets[1::3] *= 2
+    offsets[::3] *= 16
     offsets[::10] = 0
     return poses_of(turns, _rounded(points[dice.integers(0, len(points), count)] - turned(turns, own) + offsets))
 

@@ -133,13 +133,13 @@ def make_sessions(walk: Integers) -> list[Session]:
                 (User("person", begin((-8.9, -10.0, 0.04)) + towards((30, ahead, 0.0), (50, right, 0.0))),)),
         Session("two archives", both, f"{ALL} {reports}",
                 (User("person", begin((-3.0, -13.0, 0.3)) + towards((90, (-0.7, -1.2, 0.0), 0.2), (60, ahead, 0.0))),)),
-        Session("two archives, uncertainty", both, "stop sweep slide uncertainty",
-                (User("figure", begin((-1.0, -12.0, 0.6)) + towards((90, (-0.5, -1.0, 0.0), 0.0))),)),
+        Session("two archives, uncertainty", both, "stop sweep slide uncertainty:sigma=0.03",
+                (User("figure", begin((-1.0, -12.0, 0.2)) + towards((90, (-0.5, -1.0, 0.0), 0.0))),)),
         Session("a small cache", facade, ALL, (User("person", door),), small_cache=True),
         Session("in a town", town, f"{ALL} {reports} uncertainty:sigma=0.01",
                 (User("person", begin((20.1, -5.0, 0.2)) + towards((130, ahead, 0.0), (40, right, 0.0))),)),
         Session("ties in a grid", grid, f"{ALL} {reports}",
-                (User("box", begin((1.0, 1.0, 0.5)) + towards((40, (0.8, 0.4, 0.0), 0.0), (60, (1.0, 1.0, 0.0), 0.3))),)),
+                (User("box", begin((2.75, 2.5, 0.5)) + towards((60, (1.0, 1.0, 0.0), 0.0), (60, (0.5, 1.0, 0.0), 0.3))),)),
     ]  # fmt: skip
 
 

@@ -74,7 +74,20 @@ def run(*arguments: str | Path) -> None:
 def build(scans: Path, archive: Path, voxel: float, radius: str) -> None:
     """Build an archive with one job. voxel: [m].  radius: the models to store."""
     keep = "scan,intensity"
-    run("build", scans, "-o", archive, "--voxel", str(voxel), "--radius", radius, "--keep", keep, "--jobs", "1")
+    run(
+        "build",
+        scans,
+        "-o",
+        archive,
+        "--voxel",
+        str(voxel),
+        "--radius",
+        radius,
+        "--keep",
+        keep,
+        "--jobs",
+        "1",
+    )
 
 
 def read_content(archive: Path) -> Content:

@@ -84,7 +84,9 @@ def _group(
     margin, reach = MARGINS[number % len(MARGINS)], REACHES[number % len(REACHES)]
     if query in ("raycast", "within"):
         far = 8192 if query == "raycast" else 1024
-        places = _rounded(points[dice.integers(0, len(points), count)] + dice.integers(-far, far, count, 3) / 2048)
+        places = _rounded(
+            points[dice.integers(0, len(points), count)] + dice.integers(-far, far, count, 3) / 2048
+        )
         if query == "within":
             return Group(name, query, "", (places,), {"reach": reach, **more})
         # Every second ray aims at a scan point, the others anywhere.
@@ -106,7 +108,9 @@ def _group(
     if query == "objects":
         others = near_poses(points, avatars[role], dice, count * OBJECTS).reshape(count, OBJECTS, 4, 4)
         # The objects of a request stand close together.
-        others[:, :, :3, 3] = _rounded(poses[:, None, :3, 3] + dice.integers(-512, 513, count, OBJECTS, 3) / 1024)
+        others[:, :, :3, 3] = _rounded(
+            poses[:, None, :3, 3] + dice.integers(-512, 513, count, OBJECTS, 3) / 1024
+        )
         return Group(name, query, role, (others,), {"margin": margin, **more})
     options: dict[str, Any] = {"margin": margin}
     if query == "distance":
@@ -132,7 +136,9 @@ def near_poses(points: Floats, avatar: Avatar, dice: Dice, count: int) -> Floats
     offsets[1::3] *= 2
     offsets[::3] *= 16
     offsets[::10] = 0
-    return poses_of(turns, _rounded(points[dice.integers(0, len(points), count)] - turned(turns, own) + offsets))
+    return poses_of(
+        turns, _rounded(points[dice.integers(0, len(points), count)] - turned(turns, own) + offsets)
+    )
 
 
 def _rounded(places: Floats) -> Floats:

@@ -68,7 +68,9 @@ def begin(place: tuple[float, float, float], heading: tuple[int, int] = (1, 0)) 
     return [{"pose": upright(np.array([place]), heading)}]
 
 
-def through(corners: list[tuple[float, float, float]], step: float, heading: tuple[int, int] = (1, 0)) -> list[Command]:
+def through(
+    corners: list[tuple[float, float, float]], step: float, heading: tuple[int, int] = (1, 0)
+) -> list[Command]:
     """Return commands of poses along straight lines between corners, at most `step` [m] apart."""
     return [{"pose": pose[None]} for pose in upright(along(corners, step), heading)]
 
@@ -119,7 +121,7 @@ def make_sessions(walk: Integers) -> list[Session]:
                 (User("figure", begin((-4.6, -7.0, 0.05)) + towards((60, ahead, 0.3), (60, right, -1.0))),)),
         Session("a fall", facade, f"{ALL} {reports}",
                 (User("person", begin((-3.0, -9.0, 4.0)) + towards((60, (0.2, 0.1, 0.0), 0.0))),)),
-        Session("down the stairs", facade, f"stop sweep slide step:height=0.25 ground:slope=50.0;snap=0.3",
+        Session("down the stairs", facade, "stop sweep slide step:height=0.25 ground:slope=50.0;snap=0.3",
                 (User("person", begin((0.3, 0.6, 0.48)) + towards((110, back, 0.0), (20, left, 0.0))),)),
         Session("a crowd at the door", facade, f"{ALL} crowd:margin=0.1", crowd),
         Session("objects pushed and moved", facade, f"{ALL} objects", (User("person", pushing), User("person", moving)), objects),
@@ -145,8 +147,24 @@ def make_sessions(walk: Integers) -> list[Session]:
 
 def make_real_sessions() -> list[Session]:
     """Return the sessions in the real scan `atrium`: a two-storey building, y up, its floor at y = -1.32."""
-    corridor = [(-14.04, 1.5), (-12.8, 1.85), (-11.1, 2.05), (-9.9, 2.75), (-8.5, 3.25), (-6.7, 3.35), (-3.0, 3.5)]
-    passage = [(-3.0, 3.5), (-3.84, 3.15), (-2.74, 2.6), (-1.94, 1.75), (-0.69, 1.35), (0.21, 2.1), (1.31, 2.65)]
+    corridor = [
+        (-14.04, 1.5),
+        (-12.8, 1.85),
+        (-11.1, 2.05),
+        (-9.9, 2.75),
+        (-8.5, 3.25),
+        (-6.7, 3.35),
+        (-3.0, 3.5),
+    ]
+    passage = [
+        (-3.0, 3.5),
+        (-3.84, 3.15),
+        (-2.74, 2.6),
+        (-1.94, 1.75),
+        (-0.69, 1.35),
+        (0.21, 2.1),
+        (1.31, 2.65),
+    ]
     # A quarter turn about x, which takes the avatar's z to y.
     rise = rotations(np.array([[1, -1, 0, 0]]))[0]
 
@@ -158,10 +176,16 @@ def make_real_sessions() -> list[Session]:
     for name, corners, effects in (
         ("real corridor", corridor, ALL),
         ("real passage", passage, f"{ALL} proximity contacts:margin=0.02"),
-        ("real walls", [(-14.0, 1.5), (-14.0, -0.4), (-13.0, 2.9), (-12.0, 3.9)], "stop sweep slide uncertainty"),
+        (
+            "real walls",
+            [(-14.0, 1.5), (-14.0, -0.4), (-13.0, 2.9), (-12.0, 3.9)],
+            "stop sweep slide uncertainty",
+        ),
     ):
         commands = route(corners, -1.25)
         archives = (("atrium", None),)
-        sessions.append(Session(name, archives, effects, (User("person", commands),), head="up = [0.0, 1.0, 0.0]"))
+        sessions.append(
+            Session(name, archives, effects, (User("person", commands),), head="up = [0.0, 1.0, 0.0]")
+        )
     assert np.allclose(turned(rise, np.array([0.0, 0.0, 1.0])), [0.0, 1.0, 0.0])
     return sessions

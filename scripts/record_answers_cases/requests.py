@@ -63,7 +63,7 @@ def make_groups(
         dice = Dice(number, 1000 + p)
         places = points[dice.integers(0, len(points), 4)]
         middle = [places[0] + (places[1] - places[0]) * (k / PATH_POSES) for k in range(PATH_POSES)]
-        turn = np.repeat(rotations(dice.integers(-9, 10, 1, 4) + [[30, 0, 0, 0]]), PATH_POSES, axis=0)
+        turn = np.repeat(rotations(2 * dice.integers(-9, 9, 1, 4) + 1), PATH_POSES, axis=0)
         poses = poses_of(turn, _rounded(np.array(middle)))
         groups.append(Group(f"{scene} path {op}", "path", ROLES[p], (poses,), {"op": op}))
     return groups
@@ -91,7 +91,7 @@ def _group(
             return Group(name, query, "", (places,), {"reach": reach, **more})
         # Every second ray aims at a scan point, the others anywhere.
         aims = points[dice.integers(0, len(points), count)] - places
-        aims[1::2] = dice.integers(-100, 101, len(aims[1::2]), 3) + [0, 0, 1000]
+        aims[1::2] = 2 * dice.integers(-50, 50, len(aims[1::2]), 3) + 1
         return Group(name, query, "", (places, aims), {"reach": 30.0, **more})
     poses = near_poses(points, avatars[role], dice, count)
     if query == "sweep":

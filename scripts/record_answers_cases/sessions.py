@@ -1,4 +1,4 @@
-"""Twenty sessions: a scene file each, and the motion commands of its users.
+"""The sessions: a scene file each, and the motion commands of its users.
 
 Places are in metres. The façade's door is at x = 0, y = 0 to 1.2, behind three steps up from
 y = -2.1; its forecourt lies at z = 0 and its nave at z = 0.45. `truth.py` of the generated façade
@@ -13,6 +13,7 @@ import numpy as np
 from .plain_numbers import UNIT, Floats, Integers, along, poses_of, rotations, turned, upright
 
 Command = dict[str, Any]
+Archives = tuple[tuple[str, Floats | None], ...]
 ALL = "stop sweep slide step ground"
 # Feet above the floor [m].
 FEET = 0.03
@@ -34,7 +35,7 @@ class Session(NamedTuple):
     """
 
     name: str
-    archives: tuple[tuple[str, Floats | None], ...]
+    archives: Archives
     effects: str
     users: tuple[User, ...]
     more: str = ""
@@ -58,21 +59,20 @@ class Session(NamedTuple):
 AVATARS = {"person": 0.07, "figure": 0.03, "box": 0.06}
 
 
-def towards(*legs: tuple[int, tuple[float, float, float], float]) -> list[Command]:
-    """Return commands of velocities: (frames, velocity [m/s], turn [rad/s]) one after another."""
-    return [{"velocity": speed, "turn": turn} for frames, speed, turn in legs for _ in range(frames)]
-
-
-def begin(place: tuple[float, float, float], heading: tuple[int, int] = (1, 0)) -> list[Command]:
-    """Return the command that puts a user at a place."""
-    return [{"pose": upright(np.array([place]), heading)}]
-
-
-def through(
-    corners: list[tuple[float, float, float]], step: float, heading: tuple[int, int] = (1, 0)
+def walk_of(
+    place: tuple[float, float, float], *legs: tuple[int, tuple[float, float, float], float]
 ) -> list[Command]:
-    """Return commands of poses along straight lines between corners, at most `step` [m] apart."""
-    return [{"pose": pose[None]} for pose in upright(along(corners, step), heading)]
+    """Return commands: begin at a place, then (frames, velocity [m/s], turn [rad/s]) one after another."""
+    first: Command = {"pose": upright(np.array([place]))}
+    return [
+        first,
+        *({"velocity": speed, "turn": turn} for frames, speed, turn in legs for _ in range(frames)),
+    ]
+
+
+def line_of(begin: tuple[float, float, float], end: tuple[float, float, float], step: float) -> list[Command]:
+    """Return commands of poses along a straight line, at most `step` [m] apart."""
+    return [{"pose": pose[None]} for pose in upright(along([begin, end], step))]
 
 
 def make_sessions(walk: Integers) -> list[Session]:
@@ -80,13 +80,15 @@ def make_sessions(walk: Integers) -> list[Session]:
 
     walk: (k, 5) a walk through the façade: place [UNIT], and (w, z) of the quaternion.
     """
-    facade, town, grid = (("facade", None),), (("town", None),), (("grid", None),)
-    both = (("facade", None), ("town", BESIDE))
+    facade: Archives = (("facade", None),)
+    town: Archives = (("town", None),)
+    grid: Archives = (("grid", None),)
+    both: Archives = (("facade", None), ("town", BESIDE))
     quaternions = np.stack([walk[:, 3], 0 * walk[:, 3], 0 * walk[:, 3], walk[:, 4]], axis=1)
     walked = [{"pose": pose[None]} for pose in poses_of(rotations(quaternions), walk[:, :3] * UNIT)]
     ahead, back, right, left = (0.0, 1.4, 0.0), (0.0, -1.4, 0.0), (1.4, 0.0, 0.0), (-1.4, 0.0, 0.0)
-    door = begin((0.2, -4.0, FEET)) + towards((130, ahead, 0.0), (30, right, 0.5), (40, back, 0.0))
-    jamb = begin((1.0, -4.0, FEET)) + towards((140, ahead, 0.0))
+    door = walk_of((0.2, -4.0, FEET), (130, ahead, 0.0), (30, right, 0.5), (40, back, 0.0))
+    jamb = walk_of((1.0, -4.0, FEET), (140, ahead, 0.0))
     objects = "".join(
         f'[[objects]]\nname = "{name}"\navatar = "box"\nkind = "{kind}"\npose = {pose.tolist()}\n'
         for (name, kind), pose in zip(
@@ -96,52 +98,63 @@ def make_sessions(walk: Integers) -> list[Session]:
         )
     )
     gates = upright(along([(2.2, -7.0, 0.2), (0.8, -7.0, 0.2), (0.8, -5.0, 0.2)], 0.04), (20, 1))
-    pushing = begin((0.0, -10.0, FEET)) + towards((150, (0.0, 1.1, 0.0), 0.0), (40, (0.7, 0.7, 0.0), 0.2))
-    moving = begin((2.4, -9.4, FEET)) + [
-        command | {"objects": {"gate": gate}}
-        for command, gate in zip(towards((len(gates), (0.0, 0.9, 0.0), 0.0)), gates, strict=True)
+    pushing = walk_of((0.0, -10.0, FEET), (150, (0.0, 1.1, 0.0), 0.0), (40, (0.7, 0.7, 0.0), 0.2))
+    moving = walk_of((2.4, -9.4, FEET), (len(gates), (0.0, 0.9, 0.0), 0.0))
+    moving[1:] = [
+        command | {"objects": {"gate": gate}} for command, gate in zip(moving[1:], gates, strict=True)
     ]
     boxes = 'through:boxes=[{name="jamb",low=[0.5,-1.6,0.3],high=[1.7,1.6,3.2]}]'
-    apart = [begin((x, y, z)) for x, y, z in ((0.2, -4.2, FEET), (0.9, -5.0, FEET), (-0.8, -5.2, FEET))]
     crowd = tuple(
-        User("person", [*first, *towards((110, way, 0.0), (40, back, 0.3))])
-        for first, way in zip(apart, (ahead, (-0.3, 1.6, 0.0), (0.4, 1.5, 0.0)), strict=True)
+        User("person", walk_of(place, (110, way, 0.0), (40, back, 0.3)))
+        for place, way in (
+            ((0.2, -4.2, FEET), ahead),
+            ((0.9, -5.0, FEET), (-0.3, 1.6, 0.0)),
+            ((-0.8, -5.2, FEET), (0.4, 1.5, 0.0)),
+        )
     )
     reports = "proximity:reach=0.4 contacts:margin=0.03;limit=5"
-    wide = "slide:normal_reach=0.2"
+    wide, coarse = "slide:normal_reach=0.2", "sweep:tolerance=0.001"
+    steep = "step:height=0.25 ground:slope=50.0;snap=0.3"
+    pushers = User("person", pushing), User("person", moving)
+    wall = line_of((1.2, -4.0, 0.1), (3.0, -0.2, 0.6), 0.06)
+    cloister = walk_of((-8.2, -14.0, 0.05), (120, (-0.6, 1.3, 0.0), 0.4))
+    column = walk_of((-4.6, -7.0, 0.05), (60, ahead, 0.3), (60, right, -1.0))
+    fall = walk_of((-3.0, -9.0, 4.0), (60, (0.2, 0.1, 0.0), 0.0))
+    down = walk_of((0.3, 0.6, 0.48), (110, back, 0.0), (20, left, 0.0))
+    inside = walk_of((-8.9, -10.0, 0.04), (30, ahead, 0.0), (50, right, 0.0))
+    beside = walk_of((-3.0, -13.0, 0.3), (90, (-0.7, -1.2, 0.0), 0.2), (60, ahead, 0.0))
+    above = walk_of((-1.0, -12.0, 0.2), (90, (-0.5, -1.0, 0.0), 0.0))
+    street = walk_of((20.1, -5.0, 0.2), (130, ahead, 0.0), (40, right, 0.0))
+    corner = walk_of((2.75, 2.5, 0.5), (60, (1.0, 1.0, 0.0), 0.0), (60, (0.5, 1.0, 0.0), 0.3))
+
+    def alone(
+        name: str, archives: Archives, effects: str, body: str, commands: list[Command], **more: Any
+    ) -> Session:
+        return Session(name, archives, effects, (User(body, commands),), **more)
+
     return [
-        Session("walk at a wall, stop alone", facade, "stop", (User("figure", through([(1.2, -4, 0.1), (3, -0.2, 0.6)], 0.06)),)),
-        Session("generated walk", facade, ALL, (User("person", walked),)),
-        Session("generated walk, reports", facade, f"stop sweep slide {reports}", (User("figure", walked),)),
-        Session("through the door", facade, f"{ALL} {reports}", (User("person", door),)),
-        Session("off the jamb", facade, f"stop sweep {wide} step ground", (User("person", jamb),)),
-        Session("along the cloister", facade, "stop:skin=0.005 sweep:tolerance=0.001 slide:surfaces=2",
-                (User("person", begin((-8.2, -14.0, 0.05)) + towards((120, (-0.6, 1.3, 0.0), 0.4))),)),
-        Session("turning at a column", facade, f"stop sweep {wide}",
-                (User("figure", begin((-4.6, -7.0, 0.05)) + towards((60, ahead, 0.3), (60, right, -1.0))),)),
-        Session("a fall", facade, f"{ALL} {reports}",
-                (User("person", begin((-3.0, -9.0, 4.0)) + towards((60, (0.2, 0.1, 0.0), 0.0))),)),
-        Session("down the stairs", facade, "stop sweep slide step:height=0.25 ground:slope=50.0;snap=0.3",
-                (User("person", begin((0.3, 0.6, 0.48)) + towards((110, back, 0.0), (20, left, 0.0))),)),
+        alone("walk at a wall, stop alone", facade, "stop", "figure", wall),
+        alone("generated walk", facade, ALL, "person", walked),
+        alone("generated walk, reports", facade, f"stop sweep slide {reports}", "figure", walked),
+        alone("through the door", facade, f"{ALL} {reports}", "person", door),
+        alone("off the jamb", facade, f"stop sweep {wide} step ground", "person", jamb),
+        alone("along the cloister", facade, f"stop:skin=0.005 {coarse} slide:surfaces=2", "person", cloister),
+        alone("turning at a column", facade, f"stop sweep {wide}", "figure", column),
+        alone("a fall", facade, f"{ALL} {reports}", "person", fall),
+        alone("down the stairs", facade, f"stop sweep slide {steep}", "person", down),
         Session("a crowd at the door", facade, f"{ALL} crowd:margin=0.1", crowd),
-        Session("objects pushed and moved", facade, f"{ALL} objects", (User("person", pushing), User("person", moving)), objects),
-        Session("objects and a crowd", facade, f"{ALL} objects crowd {reports}",
-                (User("person", pushing), *crowd[1:]), objects),
-        Session("through a box", facade, f"{ALL} {boxes}", (User("person", jamb),)),
-        Session("local radii", facade, ALL, (User("person", door),), head='radius_model = "local"'),
-        Session("border radii, uncertainty", facade, f"{ALL} uncertainty:sigma=0.02", (User("person", jamb),),
-                head='radius_model = "local+border:1.2"'),
-        Session("in contact at first", facade, ALL,
-                (User("person", begin((-8.9, -10.0, 0.04)) + towards((30, ahead, 0.0), (50, right, 0.0))),)),
-        Session("two archives", both, f"{ALL} {reports}",
-                (User("person", begin((-3.0, -13.0, 0.3)) + towards((90, (-0.7, -1.2, 0.0), 0.2), (60, ahead, 0.0))),)),
-        Session("two archives, uncertainty", both, "stop sweep slide uncertainty:sigma=0.03",
-                (User("figure", begin((-1.0, -12.0, 0.2)) + towards((90, (-0.5, -1.0, 0.0), 0.0))),)),
-        Session("a small cache", facade, ALL, (User("person", door),), small_cache=True),
-        Session("in a town", town, f"{ALL} {reports} uncertainty:sigma=0.01",
-                (User("person", begin((20.1, -5.0, 0.2)) + towards((130, ahead, 0.0), (40, right, 0.0))),)),
-        Session("ties in a grid", grid, f"{ALL} {reports}",
-                (User("box", begin((2.75, 2.5, 0.5)) + towards((60, (1.0, 1.0, 0.0), 0.0), (60, (0.5, 1.0, 0.0), 0.3))),)),
+        Session("objects pushed and moved", facade, f"{ALL} objects", pushers, objects),
+        Session("objects and a crowd", facade, f"{ALL} objects crowd {reports}", (pushers[0], *crowd[1:]), objects),
+        alone("through a box", facade, f"{ALL} {boxes}", "person", jamb),
+        alone("local radii", facade, ALL, "person", door, head='radius_model = "local"'),
+        alone("border radii, uncertainty", facade, f"{ALL} uncertainty:sigma=0.02", "person", jamb,
+              head='radius_model = "local+border:1.2"'),
+        alone("in contact at first", facade, ALL, "person", inside),
+        alone("two archives", both, f"{ALL} {reports}", "person", beside),
+        alone("two archives, uncertainty", both, "stop sweep slide uncertainty:sigma=0.03", "figure", above),
+        alone("a small cache", facade, ALL, "person", door, small_cache=True),
+        alone("in a town", town, f"{ALL} {reports} uncertainty:sigma=0.01", "person", street),
+        alone("ties in a grid", grid, f"{ALL} {reports}", "box", corner),
     ]  # fmt: skip
 
 

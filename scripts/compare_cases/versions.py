@@ -14,8 +14,6 @@ DEFAULT_CASES = (
     "collide", "single", "distance", "contacts", "sweep", "raycast", "within", "frame", "round_trip", "session",
 )  # fmt: skip
 CASES = (*DEFAULT_CASES, "build")
-# Fields of answers that are not compared: durations, and the memory that the cache holds.
-VOLATILE = frozenset({"engine_seconds", "wait_seconds", "resident", "resident_bytes"})
 EFFECTS = ("stop", "sweep", "slide", "step", "ground")
 
 

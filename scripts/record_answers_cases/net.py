@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,8 +23,8 @@ REAL_SCAN = Path(SCANS or ".", "indoor_atrium.laz")
 # Edge of a voxel [m]: each scan then has dozens of voxels.
 VOXEL = 4.0
 LARGE = 1 << 30
-# Room for a few voxels of the archive: bytes of decoded voxels.
-SMALL = {"facade": 2_000_000, "town": 1_000_000, "grid": 1_000_000, "pair": 3_000_000, "atrium": 8_000_000}
+# Room for the largest voxel and a few others, decoded [bytes].
+SMALL = {"facade": 250_000, "town": 50_000, "grid": 50_000, "pair": 350_000, "atrium": 1_500_000}
 RADII = {"facade": "mean,local,border", "town": "mean,local", "grid": "0.03", "atrium": "mean,local,border"}
 MODELS: dict[str, Sequence[str | None]] = {
     "facade": (None, "mean:1.5", "local", "border", "local+border", "local:0.7", "fixed:0.05"),
@@ -60,6 +61,7 @@ class Net:
     """Archives and scenes in a folder, and the answers about them.
 
     contents: digests of the content of the archives that were built, by name.
+    loads: voxels loaded by scene and pass: in a small cache, some are loaded many times.
     """
 
     def __init__(self, folder: Path, recorded: Recorded, voxel: float = VOXEL) -> None:
@@ -68,6 +70,7 @@ class Net:
         self._paths: dict[str, str] = {}
         self._points: dict[str, Floats] = {}
         self.contents: dict[str, str] = {}
+        self.loads: Counter[tuple[str, str]] = Counter()
         with np.load(INPUTS / "inputs.npz") as inputs:
             self._walk, figure = inputs["walk"].astype(np.int64), inputs["figure"].astype(np.int64)
         self._avatars = make_avatars(figure)
@@ -80,19 +83,19 @@ class Net:
         if name == "grid":
             write_grid(scans)
         archive = self._folder / name
-        build(scans, archive, self._voxel, RADII[name])
+        build(scans, archive, self._voxel / (4 if name == "grid" else 1), RADII[name])
         content = read_content(archive)
         self._paths[name], self._points[name] = str(archive), content.lattice * content.step
         self.contents[name] = content_digest(content.lattice, *content.columns.values())
 
-    def ask(self, scene: str, stride: int = 1, least: str = "") -> Iterator[Result]:
-        """Yield the results of a scene's requests, every `stride`-th: in batches, singly, and in a small cache."""
+    def ask(self, scene: str) -> Iterator[Result]:
+        """Yield the results of a scene's groups: in batches, then some requests alone and in a small cache."""
         points = self._pair() if scene == "pair" else self._points[scene]
         groups = make_groups(scene, points, self._avatars, MODELS[scene], REQUESTS)
         for passed, cache, every, batch in (
-            ("batches", LARGE, stride, BATCH),
-            ("single", LARGE, stride * STRIDE, 1),
-            ("small cache", SMALL[scene], stride * STRIDE, BATCH),
+            ("batches", LARGE, 1, BATCH),
+            ("single", LARGE, STRIDE, 1),
+            ("small cache", SMALL[scene], STRIDE, BATCH),
         ):
             with ExitStack() as stack:
                 product = Product(Path(self._paths[scene]), cache, stack)
@@ -101,6 +104,7 @@ class Net:
                     asked = group.rows(every)
                     step = 1 if asked.size == group.size else every
                     yield self._compared(scene, passed, group.name, product.ask(asked, batch), step)
+                self.loads[scene, passed] = product.loads()
 
     def sessions(self, real: bool) -> list[Session]:
         """Return the sessions in generated scans, or those in the real scan."""
@@ -113,7 +117,9 @@ class Net:
         path.write_text(session.scene_file(self._paths))
         with ExitStack() as stack:
             product = Product(path, SMALL[session.archives[0][0]] if session.small_cache else LARGE, stack)
-            return self._compared(scene, "session", session.name, product.walk(session), 1)
+            result = self._compared(scene, "session", session.name, product.walk(session), 1)
+            self.loads[scene, "session"] += product.loads()
+            return result
 
     def _pair(self) -> Floats:
         """Write the scene of two archives; return points of both, world [m]."""

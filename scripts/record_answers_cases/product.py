@@ -127,6 +127,10 @@ class Product:
         for name, avatar in avatars.items():
             self._scene.add_avatar(name, avatar.points, avatar.radius)
 
+    def loads(self) -> int:
+        """Return how many voxels were loaded so far."""
+        return int(self._scene.stats().misses)
+
     def ask(self, group: Group, batch: int) -> Iterator[Item]:
         """Yield the compared fields of the answer to each request of a group, `batch` requests a call."""
         options = dict(group.options)

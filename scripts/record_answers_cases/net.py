@@ -182,9 +182,9 @@ def make_inputs() -> None:
 
     They are stored because generated scans differ between processors: rays are cast in float32.
     """
-    for name, points in (("facade", 100_000), ("town", 25_000)):
+    for name, count in (("facade", 100_000), ("town", 25_000)):
         shutil.rmtree(INPUTS / name, ignore_errors=True)
-        run("make", name, "--points", str(points), "-o", INPUTS / name)
+        run("make", name, "--points", str(count), "-o", INPUTS / name)
     truth = INPUTS / "facade.truth.json"
     figure, walk = INPUTS / "figure.ply", INPUTS / "walk.csv"
     run("make", "figure", "--points", "300", "-o", figure)

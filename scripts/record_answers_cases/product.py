@@ -136,7 +136,7 @@ class Product:
         options = dict(group.options)
         if group.method == "path":
             op = options.pop("op")
-            for part in self._scene.path(group.avatar, *group.arrays, op=op, **options):
+            for part in self._scene.path(group.avatar, group.arrays[0], op, **options):
                 yield from self._items(op, part)
             return
         method, subject = getattr(self._scene, group.method), [group.avatar] if group.avatar else []

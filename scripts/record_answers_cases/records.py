@@ -60,7 +60,8 @@ def canonical(value: Any) -> bytes:
 
 def answered(items: Iterable[dict[str, Any]], expected: Sequence[int] = ()) -> Answered:
     """Return the digests of answers. expected: their digests; the first requests that differ are kept."""
-    digests, verdicts, numbers, kept = [], [], [], {}
+    digests, verdicts, numbers = [], [], []
+    kept: dict[int, dict[str, Any]] = {}
     fields: dict[str, Any] = {}
     for number, item in enumerate(items):
         whole = blake2b(digest_size=8)
@@ -70,7 +71,7 @@ def answered(items: Iterable[dict[str, Any]], expected: Sequence[int] = ()) -> A
             fields.setdefault(name, blake2b(digest_size=8)).update(data)
         digests.append(int.from_bytes(whole.digest(), "little"))
         verdicts.append(int(np.max(item["verdict"], initial=0)))
-        values = next((np.ravel(item[name]) for name in NUMBERS if name in item), [])
+        values: Any = next((np.ravel(item[name]) for name in NUMBERS if name in item), [])
         numbers.append(float(values[0]) if len(values) else 0.0)
         if number < len(expected) and expected[number] != digests[-1] and len(kept) < 3:
             kept[number] = item
@@ -89,7 +90,7 @@ def write(path: Path, recorded: Recorded) -> None:
     groups = {name: {"requests": len(g.digests), "fields": g.fields} for name, g in recorded.groups.items()}
     about = {"archives": recorded.archives, "groups": groups}
     path.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n")
-    columns = {
+    columns: dict[str, Any] = {
         name: np.concatenate([getattr(group, name) for group in recorded.groups.values()])
         for name in ("digests", "verdicts", "numbers")
     }

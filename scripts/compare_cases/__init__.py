@@ -1,1 +1,1 @@
-"""Parts of scripts/compare and scripts/compare_answers, which run the same cases in two versions."""
+"""Parts of scripts/compare, which runs the same cases in two versions."""

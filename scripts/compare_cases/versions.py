@@ -15,8 +15,6 @@ DEFAULT_CASES = (
     "frame", "crowd", "round_trip", "session",
 )  # fmt: skip
 CASES = (*DEFAULT_CASES, "build")
-# Fields of answers that are not compared: durations, and the memory that the cache holds.
-VOLATILE = frozenset({"engine_seconds", "wait_seconds", "resident", "resident_bytes"})
 EFFECTS = ("stop", "sweep", "slide", "step", "ground")
 
 

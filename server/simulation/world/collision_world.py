@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
@@ -21,6 +20,7 @@ from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, 
 from ...archives.placed_archive import PlacedArchive
 from ...archives.rigid_transform import rotate_vectors, transform_points
 from ...avatars.avatar_model import AvatarModel
+from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import with_stop

@@ -86,11 +86,11 @@ def test_the_kept_columns_and_no_others_are_stored(keep: set[str], tmp_path: Pat
     assert np.array_equal(table(read_archive(tmp_path / "a")), table(expected))
 
 
-def test_radius_classes_and_normals_stand_beside_colours(tmp_path: Path) -> None:
+def test_radius_classes_stand_beside_colours(tmp_path: Path) -> None:
     truth = coloured(2)
     models = frozenset({"mean", "local", "border"})
     write_las(tmp_path / "a.las", truth)
-    build([tmp_path / "a.las"], tmp_path / "a", keep=KEEP | {"normal"}, models=models, **GRID)
+    build([tmp_path / "a.las"], tmp_path / "a", keep=KEEP, models=models, **GRID)
     assert verify_archive(tmp_path / "a", deep=True).faults == ()
     assert np.array_equal(table(read_archive(tmp_path / "a")), table(truth))
 

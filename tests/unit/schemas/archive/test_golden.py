@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import naive_classes
-import naive_normals
 import numpy as np
 import pytest
 from solidcloud.builder.config import BuildConfig
@@ -16,14 +15,12 @@ from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.radius_model import RADIUS_CLASSES, RIM_BIT
-from solidcloud.schemas.kernels.normal_codes import LINE, THICK, decode_normal
 
 GOLDEN = Path(__file__).resolve().parents[3] / "golden"
 
 
 # The archives of each format version, and how many of the scans went into them.
-SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-4": 3, "archive-5": 4}
-NORMAL_REACH = {"archive-4": 0.3}
+SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-5": 4}
 
 
 @pytest.fixture(params=SCANS)
@@ -47,7 +44,6 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
         assert list(header.models) == expected.get("models", ["mean"])
         assert header.radius_counts.tolist() == expected.get("radius_counts", [0] * RADIUS_CLASSES)
         assert header.radius_capped == expected.get("radius_capped", 0)
-        assert header.normal_reach == NORMAL_REACH.get(name, 0.0)
         now = header.radius_now
         assert header.generation == expected.get("generation", 0)
         assert (
@@ -77,7 +73,6 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
             assert links.height == voxel["height"]
             cells = np.column_stack([data.cells.low, data.cells.log2_size])
             assert cells.tolist() == voxel["cells"]
-            assert (None if data.normal is None else data.normal.tolist()) == voxel.get("normals")
             assert (None if data.rgb is None else data.rgb.tolist()) == voxel.get("rgb")
             assert (None if data.classification is None else data.classification.tolist()) == voxel.get(
                 "classes"
@@ -123,29 +118,6 @@ def test_the_golden_archive_holds_the_radius_classes_of_its_points(name: str) ->
     assert classes == {point: found.local + RIM_BIT * found.rim for point, found in judged.items()}
 
 
-def test_the_golden_archive_holds_the_normals_of_its_points() -> None:
-    square, found = 300**2, 0
-    with Archive(GOLDEN / "archive-4") as archive:
-        assert archive.header.lattice.step == 0.001
-        for row in range(len(archive.voxels)):
-            voxel, links = archive.read_voxel(row)
-            points = voxel_points(voxel, links)
-            assert voxel.normal is not None
-            for at, code in zip(points, voxel.normal.tolist(), strict=True):
-                judged = naive_normals.find(points, at, square)
-                few = judged is None or judged.count < 3
-                if (
-                    few
-                    or judged.values[1] <= LINE * judged.values[2]
-                    or judged.values[0] > THICK * judged.values[1]
-                ):
-                    assert code == 0
-                    continue
-                assert naive_normals.angle(np.array(decode_normal(code)), judged.normal) < 0.56
-                found += 1
-    assert found > 100
-
-
 def test_the_golden_archive_holds_the_points_of_its_scans(name: str, expected: dict[str, Any]) -> None:
     built = 2 if name == "archive-3" else SCANS[name]  # before any was added: they make the origin
     tables, lows = [], []
@@ -175,8 +147,6 @@ def test_a_build_today_gives_the_golden_points_and_cells(
     )  # fmt: skip
     if name == "archive-5":
         config = replace(config, keep=config.keep | {"rgb", "classification"})
-    if name in NORMAL_REACH:
-        config = replace(config, keep=config.keep | {"normal"}, normal_reach=NORMAL_REACH[name])
     scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]
     if name == "archive-3":
         build_archive(scans[1::-1], tmp_path / "a", config)

@@ -39,7 +39,7 @@ def voxel_bytes(archive: Archive) -> dict[int, list[Any]]:
     base = archive.coordinates * archive.header.lattice.voxel_steps
     for row in range(len(archive.voxels)):
         voxel, _ = archive.read_voxel(row)
-        columns = [*voxel.cells, *voxel.nodes, voxel.points, voxel.scan_index, voxel.intensity, voxel.normal]
+        columns = [*voxel.cells, *voxel.nodes, voxel.points, voxel.scan_index, voxel.intensity]
         index = [archive.voxels[name][row].tolist() for name in ("rows", "leaves", "low", "high")]
         found[voxel.key] = [
             *(c.tobytes() for c in columns),

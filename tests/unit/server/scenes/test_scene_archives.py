@@ -16,7 +16,6 @@ from solidcloud.schemas.errors import (
     ScanError,
     UnknownAvatarError,
 )
-from solidcloud.schemas.scene.scene_file import parse_scene
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import JSON, MSGPACK, decode_answer, encode
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ObjectInfo, SceneInfo, SpawnInfo
@@ -30,9 +29,7 @@ from solidcloud.server.scenes import scene_archives
 from solidcloud.server.scenes.scene_archives import (
     error_location,
     is_scene_file,
-    normals_asked,
     share_budget,
-    store_opener,
 )
 
 pytestmark = pytest.mark.interpreted
@@ -231,34 +228,6 @@ def test_a_cache_is_shared_by_what_archives_take() -> None:
     assert share_budget(7, sizes[:1]) == [7]
     with pytest.raises(BadRequestError, match="cache of 3999 bytes: the largest voxels of 2 archives take 4"):
         share_budget(3999, sizes[:2])
-
-
-@pytest.mark.parametrize(
-    ("effects", "reach"),
-    [
-        ("", None),
-        ('[[effects]]\neffect = "slide"\nnormal_reach = 0.2\n[[effects]]\neffect = "ground"\n', 0.2),
-        ('[[effects]]\neffect = "ground"\n', 0.08),
-    ],
-)
-def test_normals_are_loaded_where_effects_ask_for_them(
-    folder: Path, effects: str, reach: float | None
-) -> None:
-    archive = folder / f"normals-{reach}"
-    keep = [] if reach is None else ["--keep", "normal", "--normal-reach", str(reach)]
-    assert (
-        run(["build", str(folder / "floor.xyz"), "-o", str(archive), "--voxel", "2", "--jobs", "1", *keep])
-        == 0
-    )
-    file = parse_scene((TOP + STOP + effects).encode(), "hall.toml")
-    assert normals_asked(file) == reach
-    store = store_opener(file, 0)(archive)
-    assert store.with_normals == (reach is not None)
-    store.close()
-    if reach is not None:
-        plain = store_opener(parse_scene((TOP + STOP).encode(), "hall.toml"), 0)(archive)
-        assert not plain.with_normals and plain.sizes.sum() < store.sizes.sum()
-        plain.close()
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.warming.kernel_rehearsal import check_answers, rehearse
 from solidcloud.server.scene import Scene
 
-ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
+ARCHIVE = Path(__file__).parents[4] / "golden" / "archive"
 # Marks of processes that share the folder at this moment.
 MARKS = shutil.ignore_patterns("*.starting", "*.compiling", "*.tmp")
 compiled = pytest.mark.skipif(

@@ -12,7 +12,7 @@ from solidcloud.server.cli.warming import parallel_warming
 from solidcloud.server.cli.warming.parallel_warming import main, warmed_in_parallel
 from solidcloud.server.scene import Scene
 
-ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
+ARCHIVE = Path(__file__).parents[4] / "golden" / "archive"
 
 
 @pytest.fixture

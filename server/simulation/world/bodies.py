@@ -58,7 +58,7 @@ class Shape(NamedTuple):
         """Return a unit normal (3,) of the surface at a point, of either sign, avatar frame.
 
         Return None if the points form no surface. The normal is computed as for a scan
-        (schemas/kernels/normal_codes.py), with exact units as the lattice.
+        (kernels/core/normal_codes.py), with exact units as the lattice.
         """
         if point not in self.normals:
             points = self.model.points

@@ -15,7 +15,7 @@ touches an edge, this is the body's normal, as for the contact of a vertex with 
 
 The border of a scan is not recognized from the scan alone, as by Bendels et al. 2006 (Detecting
 Holes in Point Set Surfaces): a body that stands flat against a sheet beside its edge keeps the
-sheet's normal, and uneven spacing or the boundary of a voxel is not taken for a border.
+sheet's normal, and uneven spacing is not taken for a border.
 """
 
 import numpy as np

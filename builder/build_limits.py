@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.archive.codec import point_dtype
-from ..schemas.errors import BadRequestError, SolidcloudError
+from ..schemas.errors import SolidcloudError
 from .config import BuildConfig
 
 # The points of a record are numbered by int32 (schemas/archive/voxel.py).
@@ -103,19 +103,6 @@ def is_dense(points: int, config: BuildConfig) -> bool:
     return points > DENSE_POINTS and config.cells == "octree"
 
 
-def check_normals(counts: NDArray[np.int64], config: BuildConfig) -> None:
-    """Refuse normals if a voxel is built in parts, because neighbours may be in another part.
-
-    counts: (v,) points of each voxel.
-    """
-    most = int(counts.max(initial=0))
-    if "normal" in config.keep and is_dense(most, config):
-        raise BadRequestError(
-            f"--keep normal: a voxel holds {most} points, too many to be held in memory: give a "
-            "smaller --voxel, or build without `--keep normal`: a server estimates normals"
-        )
-
-
 def jobs_that_fit(jobs: int, config: BuildConfig) -> int:
     """Return how many of `jobs` processes the memory bound allows, at least one."""
     room = config.memory_bytes + OVER_BYTES - BUILDER_BYTES
@@ -138,7 +125,6 @@ def record_bytes_a_point(config: BuildConfig) -> int:
         scan_index="scan" in config.keep,
         intensity="intensity" in config.keep,
         radius_class=config.models != {"mean"},
-        normal="normal" in config.keep,
         rgb="rgb" in config.keep,
         classification="classification" in config.keep,
     )

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..schemas.archive.normal_reach import MAX_NORMAL_REACH, NORMAL_REACH
 from ..schemas.archive.radius_model import MAX_RADIUS, STORED_MODELS
 from ..schemas.archive.voxel import MAX_DEGREE, MAX_LEAF, MIN_DEGREE
 from ..schemas.errors import BadRequestError
@@ -17,7 +16,7 @@ DEFAULT_CELL_POINTS = 1024
 MAX_CELL_POINTS = 1 << 20
 # Columns of the points that a build can keep; the last are those that the scans may have.
 SCAN_COLUMNS = ("intensity", "rgb", "classification")
-KEPT_COLUMNS = ("scan", "normal", *SCAN_COLUMNS)
+KEPT_COLUMNS = ("scan", *SCAN_COLUMNS)
 CELL_KINDS = ("octree", "balanced")
 
 
@@ -100,8 +99,6 @@ class BuildConfig:
     passes.
     level: also write a level of detail (schemas/archive/level.py).
     keep: extra columns, among KEPT_COLUMNS.
-    normal_reach: radius of the neighbourhood from which a normal is estimated [m]
-    (schemas/kernels/normal_codes.py), if normals are kept.
     strict: a point that is not finite, or beyond 1e9 m, fails the build.
     skip_bad: leave out scans that cannot be read and mark their region as unknown.
     overwrite: replace an archive of the same name, once the new one is complete.
@@ -133,7 +130,6 @@ class BuildConfig:
     memory_bytes: int = 2 << 30
     level: bool = True
     keep: frozenset[str] = field(default_factory=frozenset)
-    normal_reach: float = NORMAL_REACH
     strict: bool = False
     skip_bad: bool = False
     overwrite: bool = False
@@ -189,11 +185,6 @@ class BuildConfig:
                 f"--keep {','.join(sorted(self.keep))}",
                 f"{', '.join(KEPT_COLUMNS)}, separated by commas",
             ),
-            (
-                0 < self.normal_reach <= MAX_NORMAL_REACH,
-                f"--normal-reach {self.normal_reach}",
-                f"a length above 0, at most {MAX_NORMAL_REACH:g} m",
-            ),
             (self.thin is None or 0 < self.thin < math.inf, f"--thin {self.thin}", "a positive distance"),
             (
                 _is_rule(self.outliers),
@@ -241,7 +232,6 @@ class BuildConfig:
             **({} if self.cells == "octree" else {"cells": self.cells}),
             **({} if self.leaf_cells is None else {"leaf_cells": self.leaf_cells}),
             **({} if self.models == {"mean"} else {"models": ",".join(self.stored_models())}),
-            **({"normal_reach": self.normal_reach} if "normal" in self.keep else {}),
             **({} if self.thin is None else {"thin": self.thin}),
             **({} if self.outliers is None else {"outliers": "{!r},{}".format(*self.outliers)}),
             **({} if self.moving is None else {"moving": "{!r},{}".format(*self.moving)}),

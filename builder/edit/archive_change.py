@@ -150,7 +150,7 @@ def config_of(header: Header, target: Path, jobs: int, memory_bytes: int) -> Bui
     Raise BadRequestError for options under which no scan can be added later.
     """
     stored = dict(header.options)
-    known = set(BuildConfig().identity()) | {"cells", "leaf_cells", "models", "normal_reach", "drop_classes"}
+    known = set(BuildConfig().identity()) | {"cells", "leaf_cells", "models", "drop_classes"}
     if others := sorted(set(stored) - known):
         raise BadRequestError(
             f"{target}: built with {', '.join(others)}, which depend on all scans together: build again"

@@ -20,7 +20,6 @@ from ..build_limits import (
     DENSE_POINTS,
     RADIUS_SAMPLE,
     SCRATCH_BYTES_A_POINT,
-    check_normals,
 )
 from ..passes.build_shards import Shard, ShardUnit, build_shard, max_neighbours, plan_shards
 from ..passes.point_spacing import archive_mean
@@ -251,7 +250,6 @@ def _gather(
 def _build(change: Change, header: Header, spool: Spool, wanted: set[int]) -> list[Shard]:
     """Build the voxels of `wanted` that hold points, into new shards in the hidden folder."""
     which = np.isin(spool.keys, np.array(sorted(wanted), np.uint64))
-    check_normals(spool.counts[which], change.config)
     units = [
         ShardUnit(
             number, header.generation, keys, points, spool, header.lattice, change.config, max_neighbours(change.share),

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive_writer import write_shard
 from ...schemas.archive.codec import encode_voxel
 from ...schemas.archive.index import SHARD_FOLDER, VOXEL_DTYPE, shard_name
-from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.archive.voxel_grid import Lattice
 from ...schemas.process.interrupts import check_interrupt
-from ..build_limits import VOXEL_BYTES_A_POINT, check_normals, is_dense, shard_points
+from ..build_limits import VOXEL_BYTES_A_POINT, is_dense, shard_points
 from ..config import BuildConfig
 from ..resume.kept_work import BuildDirectory, ShardIntact, Work, run_unfinished
 from ..resume.transaction import Transaction
@@ -115,7 +114,7 @@ def build_shard(unit: ShardUnit) -> Shard:
     """Gather, build, compress and write the voxels of one shard, one at a time."""
     classes = None if unit.config.models == {"mean"} else _ClassCounts(unit)
     path = unit.folder / shard_name(unit.number, unit.generation)
-    version = 4 if "normal" in unit.config.keep else 1 if classes is None else 2
+    version = 1 if classes is None else 2
     if unit.config.keep & {"rgb", "classification"}:
         version = 5
     rows, checksum = write_shard(path, unit.number, unit.archive_id, _voxels(unit, classes), version=version)
@@ -137,13 +136,6 @@ def _voxels(unit: ShardUnit, classes: _ClassCounts | None) -> Iterator[BuiltVoxe
         low, high = (edge(points.local, axis=0).astype(np.int64) for edge in (np.min, np.max))
         if classes is not None:
             points = points._replace(radius_class=classes.find(key, points.local))
-        if "normal" in unit.config.keep:
-            from ..voxel.point_normals import (
-                voxel_normals,
-            )  # imported here, because most builds do not need its kernels
-
-            square = squared_reach(unit.config.normal_reach, unit.lattice.step, len(points.local))
-            points = points._replace(normal=voxel_normals(points.local, square))
         voxel = build_voxel(key, points, unit.lattice.voxel_steps, unit.config)
         del points
         yield BuiltVoxel(voxel, encode_voxel(voxel, unit.archive_id), low, high)
@@ -161,7 +153,6 @@ def build_shards(
     build: Transaction,
 ) -> list[Shard]:
     """Run the third pass: build every voxel and write the shards. The largest are built first."""
-    check_normals(spool.counts, build.config)
     folder = build_dir.archive / SHARD_FOLDER
     most = max_neighbours(build.share)
     plans = plan_shards(spool.keys, spool.counts)

@@ -78,7 +78,6 @@ def make_header(
         ),
         unknown=np.array(boxes, np.int64).reshape(-1, 2, 3),
         unknown_everywhere=any(s.region is None for s in lost),
-        normal_reach=config.normal_reach if "normal" in config.keep else 0.0,
         rgb="rgb" in config.keep,
         classification="classification" in config.keep,
     )

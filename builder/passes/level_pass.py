@@ -146,7 +146,6 @@ def _level_header(header: Header, steps: int, rows: NDArray, counts: list[NDArra
         sources=(source,),
         generation=0,
         radius_now=None,
-        normal_reach=0.0,
         is_level=True,
         is_sealed=False,
     )

@@ -12,7 +12,6 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import DecompressedRecord
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header
 from ...schemas.archive.level import LEVEL_FOLDER, open_level
-from ...schemas.archive.normal_reach import squared_reach
 from ...schemas.archive.radius_model import RADIUS_CLASSES
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ...schemas.process.interrupts import check_interrupt
@@ -20,7 +19,7 @@ from ..kernels.points.content_hash import SEEDS
 from ..kernels.points.voxel_records import last_unenclosing_node, measure_points, position_hash_sum
 from ..run.executor import Executor, Progress, Silent, jobs_of, run_units, voxel_ranges, worker_count
 from ..voxel.exact_enclosure import loose_nodes, sample_nodes
-from ..voxel.record_points import leaves_of, spheres_of, voxel_points
+from ..voxel.record_points import leaves_of, spheres_of
 from .level_pass import check_level
 from .preview import preview_faults
 
@@ -212,18 +211,14 @@ def _verify_rows(unit: _Unit) -> _Found:
             known = len(faults)
             check_interrupt()
             try:
-                record = archive.open_voxel(row, columns=("radius_class", "normal"))
+                record = archive.open_voxel(row, columns=("radius_class",))
                 with archive.locating(row):
                     faults += voxel_faults(archive, row, record, unit.deep)
                     counted = record.class_counts()
-                    if archive.header.normals:
-                        record.check_normals()
                 if unit.summed:
                     corner = archive.coordinates[row] * record.voxel_steps
                     places += int(position_hash_sum(leaves_of(record), corner, SEEDS[0]))
                 del record
-                if unit.deep and archive.header.normals:
-                    faults += normal_faults(archive, row)
                 if unit.asked is not None:
                     loose = loose_nodes(*archive.read_voxel(row), unit.asked[i].tolist())
                     faults += [_loose(archive, row, node) for node in loose]
@@ -266,23 +261,6 @@ def voxel_faults(archive: Archive, row: int, record: DecompressedRecord, deep: b
         if node >= 0:
             faults.append(_loose(archive, row, node))
     return faults
-
-
-def normal_faults(archive: Archive, row: int) -> list[str]:
-    """Return the fault of a voxel whose normals are not those of its points.
-
-    All points with all their columns are held in memory.
-    """
-    from ..voxel.point_normals import voxel_normals  # most archives have no normals
-
-    header = archive.header
-    voxel, links = archive.read_voxel(row)
-    square = squared_reach(header.normal_reach, header.lattice.step, len(voxel.points))
-    found = voxel_normals(voxel_points(voxel, links).astype(np.int32), square)
-    wrong = int(np.count_nonzero(found != voxel.normal))
-    if not wrong:
-        return []
-    return [f"{archive.where(row)}: {wrong} normals are not those of the points: rebuild the archive"]
 
 
 def level_faults(archive: Archive, executor: Executor | None, *, deep: bool) -> tuple[list[str], list[str]]:

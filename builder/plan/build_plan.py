@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 from ...schemas.archive.units import MAX_SCANS
 from ...schemas.archive.voxel_grid import KEY_BIAS, voxel_edge
 from ..build_limits import (
-    DENSE_POINTS,
     MAX_PREVIEW_POINTS,
     PREVIEW_PART,
     RANGE_POINTS,
@@ -182,7 +181,7 @@ def estimate(scene: SceneStats, config: BuildConfig, rates: Rates, target: Path 
     pitch = math.sqrt(scene.area / scene.points)
     voxels = _voxels(scene, voxel_edge(config.voxel, step), rates)
     jobs = jobs_that_fit(worker_count(config.jobs, scene.points), config)
-    bytes_of = {"scan": 0.2, "intensity": 2.0, "normal": 1.2, "rgb": 2.5, "classification": 0.2}
+    bytes_of = {"scan": 0.2, "intensity": 2.0, "rgb": 2.5, "classification": 0.2}
     measured = set() if scene.packed is None else {"scan", "intensity"}
     columns = sum(bytes_of[name] for name in config.keep - measured) + (config.models != {"mean"})
     each = columns + (rates.bytes_a_point(pitch / step) if scene.packed is None else scene.packed)
@@ -290,8 +289,6 @@ def _assumed(config: BuildConfig, jobs: int) -> tuple[str, ...]:
         said.append(
             "radius classes: their bytes are included, their time (2.5 µs a point of one core) is not"
         )
-    if "normal" in config.keep:
-        said.append("normals: their bytes are included, their time (1.6 µs a point of one core) is not")
     if config.thin is not None or config.outliers is not None or config.moving is not None:
         said.append(
             "filters leave out no point; their time (0.3 to 3 µs a point of one core) is not included"
@@ -332,10 +329,6 @@ def _limits(
                 "build in parts",
             )
         )
-    if "normal" in config.keep:
-        most = Limit("points of the densest voxel, with --keep normal", plan.points_a_voxel * DENSEST, DENSE_POINTS,
-                     "points", "give a smaller --voxel, or leave normals out")  # fmt: skip
-        found.append(most)
     if target is not None:
         free = shutil.disk_usage(next(p for p in (target, *target.absolute().parents) if p.exists())).free
         found.insert(

@@ -2,8 +2,7 @@
 
 A server uses them for the effect `through` (server/archives/masked_archive.py). The remaining
 points keep their stored columns. A radius class in particular remains that of the whole scan,
-because the classes of the rest alone would be larger at its border. Normals are computed from the
-remaining points, as when a server estimates them.
+because the classes of the rest alone would be larger at its border.
 """
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.codec import OPTIONAL_COLUMNS, encode_voxel
 from ...schemas.archive.index import Header
-from ...schemas.archive.normal_reach import squared_reach
 from ..config import BuildConfig
 from .record_points import voxel_points
 from .voxel_octree import BuiltVoxel, VoxelPoints, build_voxel
@@ -37,11 +35,6 @@ def build_masked_voxel(header: Header, key: int, points: VoxelPoints, stays: NDA
     by part (dense_voxel.py), the result is the same, row for row.
     """
     left = VoxelPoints._make(None if column is None else column[stays] for column in points)
-    if header.normals:
-        from .point_normals import voxel_normals  # most archives have no normals
-
-        square = squared_reach(header.normal_reach, header.lattice.step, len(left.local))
-        left = left._replace(normal=voxel_normals(left.local, square))
     voxel = build_voxel(key, left, header.lattice.voxel_steps, _config(header))
     low, high = left.local.min(axis=0).astype(np.int64), left.local.max(axis=0).astype(np.int64)
     return BuiltVoxel(voxel, encode_voxel(voxel, header.archive_id), low, high)

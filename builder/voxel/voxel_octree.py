@@ -26,15 +26,14 @@ class VoxelPoints(NamedTuple):
 
     local: (n, 3) int32 [voxel steps].  scan_index: (n,) uint16 or None.  intensity: (n,) float32 or
     None.
-    radius_class: (n,) uint8 or None.  normal: (n,) uint16 or None. These two are the same for equal
-    points.  rgb: (n, 3) uint8 or None.  classification: (n,) uint8 or None.
+    radius_class: (n,) uint8 or None, the same for equal points.  rgb: (n, 3) uint8 or None.
+    classification: (n,) uint8 or None.
     """
 
     local: NDArray[np.int32]
     scan_index: NDArray[np.uint16] | None = None
     intensity: NDArray[np.float32] | None = None
     radius_class: NDArray[np.uint8] | None = None
-    normal: NDArray[np.uint16] | None = None
     rgb: NDArray[np.uint8] | None = None
     classification: NDArray[np.uint8] | None = None
 

@@ -63,7 +63,6 @@ _COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "scan_index": ("<u2", ()),
     "intensity": ("<f4", ()),
     "radius_class": ("u1", ()),
-    "normal": ("<u2", ()),
     "rgb": ("u1", (3,)),
     "classification": ("u1", ()),
 }
@@ -261,23 +260,6 @@ class DecompressedRecord(NamedTuple):
                 "the index counts no points of this class"
             )
 
-    def read_normals(self, lanes: NDArray[np.uint16]) -> None:
-        """Write normal into lanes (b, MAX_LEAF), as `read_points` does.
-
-        The record must have the column.
-        Raises CorruptError for an invalid code (kernels/normal_codes.py).
-        """
-        self.check_normals()
-        at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
-        leaf_column(self.planes[at : at + 2], self.tree, self.nodes.count, lanes)
-
-    def check_normals(self) -> None:
-        """Check that both bytes of every normal's code are 0, or neither. Raises CorruptError."""
-        at = self.dtype.fields["normal"][1]  # type: ignore[index]  # its dtype has fields
-        low, high = self.planes[at : at + 2]
-        if wrong := int(np.count_nonzero((low == 0) != (high == 0))):
-            raise CorruptError(f"voxel {self.key:#x}: {wrong} invalid normal codes, expected none")
-
     def class_counts(self) -> NDArray[np.int64]:
         """Return the number of points in each radius class, (RADIUS_CLASSES,).
 
@@ -295,8 +277,7 @@ class DecompressedRecord(NamedTuple):
     def decode(self) -> tuple[VoxelData, Links]:
         """Return the whole voxel, with its points in rows, and its links.
 
-        Raises CorruptError if a point lies outside its cell, or for an invalid radius class or
-        normal.
+        Raises CorruptError if a point lies outside its cell, or for an invalid radius class.
         """
         lanes = np.empty((self.leaves, 3, MAX_LEAF), np.uint16)
         self.read_points(lanes)
@@ -309,8 +290,6 @@ class DecompressedRecord(NamedTuple):
         }
         if "radius_class" in kept:
             self.class_counts()
-        if "normal" in kept:
-            self.check_normals()
         cells, nodes = transpose_columns(self.cells), transpose_columns(self.nodes)
         voxel = VoxelData(self.key, top_shift(self.voxel_steps), cells, nodes, points, **kept)
         return voxel, self.links

@@ -27,7 +27,7 @@ SHARD_FOLDER = "shards"
 SHARD_NAME = re.compile(r"[0-9]{1,9}-[0-9]{1,9}\.h5")
 DATASETS = ("cells", "nodes", "points")
 # Versions that this software reads. It writes the lowest version that can represent the header.
-FORMAT_VERSIONS = (1, 2, 3, 4, 5)
+FORMAT_VERSIONS = (1, 2, 3, 5)
 
 # The dataset that a seal adds, whose values are no function of the header; and the version it needs.
 RECORD_DIGEST, SEALED_VERSION = "record_digest", 5
@@ -127,8 +127,7 @@ class Header:
     generation: how often scans were added or removed since the build.
     radius_now: `radius` as measured over the points of this generation; None in generation 0, where
     it equals `radius`, and if the radius was given.
-    normal_reach: points within this distance determine a normal [m] (kernels/normal_codes.py); 0:
-    no normals are stored.  is_level: whether the points and classes are those of a level (level.py).
+    is_level: whether the points and classes are those of a level (level.py).
     rgb, classification: whether the points have these columns.  is_sealed: whether the index has
     digests of its records (seal.py).
     """
@@ -157,7 +156,6 @@ class Header:
     unknown_everywhere: bool
     generation: int = 0
     radius_now: RadiusNow | None = None
-    normal_reach: float = 0.0
     is_level: bool = False
     rgb: bool = False
     classification: bool = False
@@ -169,18 +167,12 @@ class Header:
         return self.models != ("mean",) or self.is_level
 
     @property
-    def normals(self) -> bool:
-        """Return True if the points have a normal, or the code for "no normal"."""
-        return self.normal_reach > 0
-
-    @property
     def point_dtype(self) -> np.dtype:
         """Return the row dtype of the points dataset."""
         return point_dtype(
             scan_index=self.scan_index,
             intensity=self.intensity,
             radius_class=self.radius_class,
-            normal=self.normals,
             rgb=self.rgb,
             classification=self.classification,
         )
@@ -190,8 +182,6 @@ class Header:
         """Return the lowest format version that can represent this header."""
         if self.is_level or self.rgb or self.classification or self.is_sealed:
             return 5
-        if self.normals:
-            return 4
         if self.generation:
             return 3
         return 2 if self.radius_class else 1
@@ -226,9 +216,9 @@ def _texts(header: Header) -> bytes:
 def _point_columns(header: Header) -> list[bool]:
     """Return a flag for each optional column of the points (`columns` in FORMAT.md)."""
     classes = ["local" in header.models, "border" in header.models]
-    flags = [header.scan_index, header.intensity, *classes, header.normals, header.rgb, header.classification]
+    flags = [header.scan_index, header.intensity, *classes, False, header.rgb, header.classification]
     # As many as are needed, so that archives without the later columns keep their bytes.
-    return flags[: next((n for n, last in ((7, flags[5:]), (5, flags[4:5]), (4, classes)) if any(last)), 2)]
+    return flags[: next((n for n, last in ((7, flags[5:]), (4, classes)) if any(last)), 2)]
 
 
 def _radius_now(header: Header) -> list[float]:
@@ -270,7 +260,6 @@ INDEX_COLUMNS = {
     "columns": IndexColumn(_U1, (-1,), _point_columns),
     "radius_counts": IndexColumn(_U8, (RADIUS_CLASSES,), lambda header: header.radius_counts, "radius_class"),
     "radius_capped": IndexColumn(_U8, (1,), lambda header: header.radius_capped, "radius_class"),
-    "normal_reach": IndexColumn(_F8, (1,), lambda header: header.normal_reach, "normals"),
     "level": IndexColumn(_U1, (1,), lambda header: header.is_level, "is_level"),
     "generation": IndexColumn(_U4, (1,), lambda header: header.generation, "generation"),
     "radius_now": IndexColumn(_F8, (3,), _radius_now, "generation"),
@@ -368,7 +357,6 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         unknown_everywhere=bool(columns["unknown_everywhere"][0]),
         generation=generation,
         radius_now=now,
-        normal_reach=float(columns["normal_reach"][0]) if "normal_reach" in columns else 0.0,
         is_level="level" in columns,
         rgb=held[5],
         classification=held[6],

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from .codec import CELL_DTYPE, CELL_EXPANSION, NODE_DTYPE, NODE_EXPANSION
 from .index import COLUMN_FLAGS, INDEX_COLUMNS, RECORD_DIGEST, SEALED_VERSION
-from .normal_reach import MAX_NORMAL_REACH
 from .voxel import MAX_DEGREE, MAX_LEAF, MAX_LEVELS, MIN_DEGREE
 from .voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, voxel_coordinates
 from .zstd_frame import ANY_EXPANSION
@@ -108,13 +107,11 @@ def _check_lattice(columns: dict[str, NDArray]) -> None:
 def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
     """Check the point columns, the datasets that they require, and the resulting format version."""
     kept = _numbers(columns, "columns", 0, 1)
-    classes, normals, later = any(kept[2:4]), any(kept[4:5]), "generation" in columns
+    classes, later = any(kept[2:4]), "generation" in columns
     colours, is_level = any(kept[5:]), "level" in columns
-    if len(kept) != (COLUMN_FLAGS if colours else 5 if normals else 4 if classes else 2):
-        _refuse(
-            "columns", kept, "2 flags, 4 with radius classes, 5 with normals, 7 with rgb or classification"
-        )
-    if is_level and (kept[0] or classes or normals or columns["level"][0] != 1):
+    if any(kept[4:5]) or len(kept) != (COLUMN_FLAGS if colours else 4 if classes else 2):
+        _refuse("columns", kept, "2 flags, 4 with radius classes, 7 with rgb or classification, the fifth 0")
+    if is_level and (kept[0] or classes or columns["level"][0] != 1):
         _refuse(
             "level and columns",
             [*columns["level"].tolist(), *kept],
@@ -124,25 +121,12 @@ def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
     held = {
         "is_sealed": is_sealed,
         "radius_class": classes or is_level,
-        "normals": normals,
         "generation": later,
         "is_level": is_level,
     }
     if any((name in columns) != held[requires] for name, requires in _OPTIONAL.items()):
         _refuse("datasets", [name for name in _OPTIONAL if name in columns], f"those of columns {kept}")
-    if normals and not 0 < (reach := float(columns["normal_reach"][0])) <= MAX_NORMAL_REACH:
-        _refuse("normal_reach", reach, f"above 0, at most {MAX_NORMAL_REACH:g}")
-    expected = (
-        SEALED_VERSION
-        if is_level or colours or is_sealed
-        else 4
-        if normals
-        else 3
-        if later
-        else 2
-        if classes
-        else 1
-    )
+    expected = SEALED_VERSION if is_level or colours or is_sealed else 3 if later else 2 if classes else 1
     if version != expected:
         _refuse("format_version", version, f"{expected}, from the datasets")
     degree, leaf = columns["tree"].tolist()

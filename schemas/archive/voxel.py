@@ -79,7 +79,6 @@ class VoxelData(NamedTuple):
     points: (p, 3) uint16 x, y, z from their leaf node's block_low, in leaf-node order [steps].
     scan_index: (p,) uint16 or None.  intensity: (p,) float32 or None.
     radius_class: (p,) uint8 below RADIUS_CLASSES, or None.
-    normal: (p,) uint16, codes of kernels/normal_codes.py, or None.
     rgb: (p, 3) uint8, red, green, blue, or None.  classification: (p,) uint8 or None.
     """
 
@@ -91,7 +90,6 @@ class VoxelData(NamedTuple):
     scan_index: NDArray[np.uint16] | None = None
     intensity: NDArray[np.float32] | None = None
     radius_class: NDArray[np.uint8] | None = None
-    normal: NDArray[np.uint16] | None = None
     rgb: NDArray[np.uint8] | None = None
     classification: NDArray[np.uint8] | None = None
 

@@ -183,8 +183,8 @@ ORDER = (
 # gives other poses from the same motion commands increases it. 2: normals of contacts at edges
 # (server/kernels/walk/contact_normal.py). 3: nearly head-on pushes at flat walls, pushed objects on
 # floors, and avatars wedged under slopes. 4: motions of avatars in contact, and motion commands
-# that last for more than a frame.
-MOTION_VERSION = 4
+# that last for more than a frame. 5: normals count the points of all voxels.
+MOTION_VERSION = 5
 # Effects needed for safety: never skipped, whatever a frame's budget.
 NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})
 

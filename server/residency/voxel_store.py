@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.codec import OPTIONAL_COLUMNS
 from ...schemas.archive.level import NODE_CLASS
 from ...schemas.archive.voxel import top_shift
 from ..kernels.core.node_boxes import lay_boxes
@@ -18,7 +17,6 @@ from ..kernels.core.scene_arrays import (
     lay_classes,
     lay_node_class,
     lay_out,
-    normal_run,
     resident_bytes,
     scan_run,
 )
@@ -28,24 +26,16 @@ class VoxelStore:
     """Voxels of an archive by index row.
 
     archive: see schemas/archive/archive.py.  sizes: (v,) int64, bytes of each decoded voxel.
-    with_normals: whether the decoded voxels include normals.
     """
 
     def __init__(
         self,
         folder: str | Path,
         open_archive: Callable[[str | Path], Archive] = Archive,
-        normals: float | None = None,
     ) -> None:
-        """Open the archive in `folder` with `open_archive`. Raise FormatError or CorruptError.
-
-        normals: reach of the normals that queries will need [m]. They are loaded with the voxels if
-        the archive contains normals of this reach.
-        """
+        """Open the archive in `folder` with `open_archive`. Raise FormatError or CorruptError."""
         self.archive = open_archive(folder)
         rows, header = self.archive.voxels, self.archive.header
-        self.with_normals = header.normals and header.normal_reach == normals
-        self._columns = [name for name in OPTIONAL_COLUMNS if name != "normal" or self.with_normals]
         # Nodes of a level enclose points that the level does not hold; an archive without slabs has the
         # paper's spheres alone, for comparison.
         self._with_boxes = bool(header.options.get("with_slab", True)) and not header.is_level
@@ -54,7 +44,6 @@ class VoxelStore:
             rows["leaves"].astype(np.int64),
             with_scan=header.scan_index,
             with_class=header.radius_class,
-            with_normal=self.with_normals,
         )
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
@@ -72,7 +61,7 @@ class VoxelStore:
 
         Return the offsets of its runs (3,) int64. Raise CorruptError.
         """
-        record = self.archive.open_voxel(row, frames, self._columns)
+        record = self.archive.open_voxel(row, frames)
         leaves = record.leaves
         where = np.empty(3, np.int64)
         shift = np.int64(top_shift(record.voxel_steps))
@@ -95,10 +84,6 @@ class VoxelStore:
         if header.scan_index:
             scans = arena.halves[scan_run(where[None], 0, words) :]
             record.read_scans(scans[: leaves * LANES].reshape(leaves, LANES))
-        if self.with_normals:
-            normals = arena.halves[normal_run(where[None], 0, words, header.scan_index) :]
-            with self.archive.locating(row):
-                record.read_normals(normals[: leaves * LANES].reshape(leaves, LANES))
         return where
 
     def close(self) -> None:

@@ -15,11 +15,10 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from ...schemas.archive.archive import Archive
-from ...schemas.archive.normal_reach import NORMAL_REACH
 from ...schemas.archive.radius_model import class_radii
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError
-from ...schemas.scene.effect_table import Crowd, Ground, Objects, Slide, Through, Uncertainty
+from ...schemas.scene.effect_table import Crowd, Objects, Through, Uncertainty
 from ...schemas.scene.scene_file import SUFFIX, SceneFile
 from ...schemas.wire.requests import make_positions
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
@@ -44,14 +43,12 @@ class FoundArchive(NamedTuple):
 
     info: its description.  sizes: (v,) int64, decoded size of each voxel [bytes].
     keeps_scan: whether it stores the scan of each point.
-    normal_reach: reach of the stored normals [m]; 0: no normals are stored.
     """
 
     folder: Path
     info: SceneInfo
     sizes: NDArray[np.int64]
     keeps_scan: bool
-    normal_reach: float
 
 
 class FoundAvatar(NamedTuple):
@@ -77,16 +74,14 @@ def find_archives(file: SceneFile, path: Path, key: bytes | None = None) -> list
     found = []
     for number, item in enumerate(file.archives):
         with error_location(path, f"$.archives[{number}].path"):
-            store = sealed_store(key)(_resolve_relative(path, item.path), normals=normals_asked(file))
+            store = sealed_store(key)(_resolve_relative(path, item.path))
         try:
             header = store.archive.header
             if file.radius_model is not None:
                 with error_location(path, f"$.radius_model: {store.archive.folder}"):
                     class_radii(file.radius_model, header.radius, header.models)
             info = describe(store, store.archive.folder.name)
-            found.append(
-                FoundArchive(store.archive.folder, info, store.sizes, header.scan_index, header.normal_reach)
-            )
+            found.append(FoundArchive(store.archive.folder, info, store.sizes, header.scan_index))
         finally:
             store.close()
     _check_noise(file, path, found)
@@ -127,24 +122,14 @@ def sealed_store(key: bytes | None) -> Callable[..., VoxelStore]:
 def store_opener(file: SceneFile, number: int, key: bytes | None = None) -> OpenStore:
     """Return the function that opens the folder of archive `number`.
 
-    It loads normals if effects need them, and leaves out the points that the effect `through`
-    removes.
+    It leaves out the points that the effect `through` removes.
     """
-    reach = normals_asked(file)
     for effect in file.effects:
         if isinstance(effect, Through):
             from ..simulation.effects.through_effect import store_without
 
-            return store_without(effect, file.archives[number].pose, reach, key)
-    return partial(sealed_store(key), normals=reach)
-
-
-def normals_asked(file: SceneFile) -> float | None:
-    """Return the reach of the normals that a scene's effects need [m]; None if they need none."""
-    for effect in file.effects:
-        if isinstance(effect, Slide):
-            return effect.normal_reach
-    return NORMAL_REACH if any(isinstance(effect, Ground) for effect in file.effects) else None
+            return store_without(effect, file.archives[number].pose, key)
+    return sealed_store(key)
 
 
 def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:

@@ -11,7 +11,7 @@ import pytest
 from floor import DEADLINE, eventually
 from solidcloud.server.cli.warming import kernel_rehearsal, parallel_warming
 
-ARCHIVE = Path(__file__).parents[1] / "golden" / "archive-4"
+ARCHIVE = Path(__file__).parents[1] / "golden" / "archive"
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/task").exists() or len(os.sched_getaffinity(0)) < 2,

@@ -63,10 +63,10 @@ GOOD = ("refused", "found", "right", "bounds found by validate --deep")
 
 
 def make_template(folder: Path, classes: bool) -> Template:
-    """Build an archive of six scans in several voxels; with `classes`, radius classes and normals."""
+    """Build an archive of six scans in several voxels; with `classes`, scan numbers and radius classes."""
     folder.mkdir(parents=True)
     files = [write_xyz(folder / f"{i}.xyz", make_scan(kind, i, 150)) for i, kind in enumerate(WITH_POINTS)]
-    more = {"keep": frozenset({"scan", "normal"}), "models": frozenset({"mean", "local"})} if classes else {}
+    more = {"keep": frozenset({"scan"}), "models": frozenset({"mean", "local"})} if classes else {}
     build(files, folder / "archive", radius=RADIUS, **more)
     archive = folder / "archive"
     rng = np.random.default_rng(7)

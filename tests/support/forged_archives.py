@@ -53,12 +53,11 @@ def forge(folder: Path, change: Callable[[Columns], None]) -> None:
 
 def row_types(columns: Columns) -> tuple[np.dtype, np.dtype, np.dtype]:
     """Return the row types of the cells, nodes and points of an archive."""
-    scan, intensity, local, border, normal, rgb, classes = np.pad(columns["columns"], (0, 7))[:7].tolist()
+    scan, intensity, local, border, _, rgb, classes = np.pad(columns["columns"], (0, 7))[:7].tolist()
     points = point_dtype(
         scan_index=bool(scan),
         intensity=bool(intensity),
         radius_class="level" in columns or bool(local or border),
-        normal=bool(normal),
         rgb=bool(rgb),
         classification=bool(classes),
     )

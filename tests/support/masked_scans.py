@@ -21,7 +21,7 @@ STEP = archive_cases.BINARY_STEP
 # Voxels of half a metre, points from 0 to 2 m on each axis: 0.5 and 1 are borders between voxels.
 OPTIONS: dict[str, Any] = {
     "voxel": 0.5, "resolution": STEP, "radius": 0.01, "jobs": 1, "leaf": 8, "degree": 3, "cell_points": 24,
-    "models": frozenset({"mean", "local", "border"}), "keep": frozenset({"scan", "intensity", "normal"}),
+    "models": frozenset({"mean", "local", "border"}), "keep": frozenset({"scan", "intensity"}),
 }  # fmt: skip
 BODY = np.array([[0.0, 0, 0], [0.11, 0, 0], [0.0, 0.21, 0], [0.05, 0.05, 0.1]])
 # These points give every archive the same lattice and bounds, whatever is left out between them.

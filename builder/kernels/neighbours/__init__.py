@@ -1,4 +1,4 @@
-"""Kernels over neighbouring points: spacing, radius classes, normals, filters.
+"""Kernels over neighbouring points: spacing, radius classes, filters.
 
 May import builder.kernels.points, builder.kernels.trees, schemas.
 Begin with nearest_neighbours.py.

@@ -17,7 +17,6 @@ from ...scenes.scene_archives import (
     ReadPoints,
     error_location,
     find_archives,
-    normals_asked,
     read_avatars,
     store_opener,
 )
@@ -147,13 +146,6 @@ def _notes(file: SceneFile, archives: list[FoundArchive], left_out: int) -> Iter
     names = {effect_name(effect) for effect in file.effects}
     if "stop" in names and "sweep" not in names:
         yield "`stop` without `sweep`: an avatar may pass through anything thinner than its motion in one frame"
-    reach = normals_asked(file)
-    for found in archives:
-        if reach is not None and found.normal_reach != reach:
-            yield (
-                f"{found.folder} stores no normals of reach {reach:g} m, which effects need (build --keep normal "
-                f"--normal-reach {reach:g}): they are estimated when first needed"
-            )
     if file.spawn is not None:
         low, high = _bounds(file, archives)
         standing = _STANDING_HEIGHT * np.array(file.up) / np.linalg.norm(file.up)

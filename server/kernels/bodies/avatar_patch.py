@@ -13,7 +13,6 @@ from ..core.kernel_decorators import njit_no_refcount
 # Steps per metre of the differences that are summed for a normal: with a reach of a metre, the sums
 # over eight million points fit 63 bits.
 PATCH_STEPS = 1 << 20
-SUMS = 10
 # Nodes still to examine: an avatar's tree has at most eight children a node.
 _STACK = 8 * MAX_LEVELS
 # A node farther than the reach by this share has no point in reach, whatever was rounded.
@@ -50,7 +49,7 @@ def lowest_heights(body, order, surface, point, reach, directions, heights, sums
     point: (3,) a place on it, avatar frame [m].  reach: inclusive [m].
     directions: (k, 3) unit, avatar frame.  heights: (k,), set to the least height over the points
     within reach, relative to `point` [m]; 0 if there are none.
-    sums: (10,) int64, set to the sums for `normal_code` (schemas/kernels/normal_codes.py), in
+    sums: (SUMS,) int64, set to the sums for `normal_code` (kernels/core/normal_codes.py), in
     1 / PATCH_STEPS of a metre.
     """
     avatar = body.avatar

@@ -11,11 +11,11 @@ import math
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import STACK
+from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class
-from .avatar_patch import SUMS, add_difference
+from .avatar_patch import add_difference
 
 # More than float64 loses at 10^7 m from the origin, and less than any skin [m].
 SLACK = 1e-7

@@ -1,8 +1,7 @@
 """Arrays of a scene that the kernels read: the layout of a voxel in the arena, and the stop flag.
 
 The arena is one buffer with three views: float32 words, int32 words and uint16 halfwords. A voxel
-takes three runs. It takes a fourth run where the archive keeps scan numbers (`--keep scan`), and
-another one where a scene requests normals:
+takes three runs. It takes a fourth run where the archive keeps scan numbers (`--keep scan`):
 
 - rows: (n, 12) words, one row a node: center x, y, z, radius [voxel steps], the slab's normal x, y,
   z, its length, least and greatest dot(normal, point - center), or a box in their place
@@ -16,8 +15,6 @@ another one where a scene requests normals:
   last point is repeated to the end, which lets a test of all lanes work without a mask;
 - scans: (b, LANES) halfwords, the scan each point came from (`scan_run`); absent where the archive
   does not keep it;
-- normals: (b, LANES) halfwords, the code of each point's normal (`normal_run`); present only where
-  the archive has normals and a scene requests them.
 
 For the façade this is 8.7 bytes a point, 6 of them the points (scripts/bench_engine --only memory).
 Scans take 2 more and radius classes 1.1 more, where kept.
@@ -112,14 +109,13 @@ def resident_bytes(
     *,
     with_scan: bool = False,
     with_class: bool = False,
-    with_normal: bool = False,
 ) -> NDArray[np.int64]:
     """Return the bytes (v,) that voxels take in the arena, multiples of 16.
 
     nodes, leaves: the number of nodes of each voxel, and how many of them are leaf nodes.
-    with_scan, with_class, with_normal: whether scan numbers, radius classes and normals are kept.
+    with_scan, with_class: whether scan numbers and radius classes are kept.
     """
-    halves = LANES * (3 + with_scan + with_normal)
+    halves = LANES * (3 + with_scan)
     return 4 * ROW_WORDS * nodes + 4 * block_words(with_class) * leaves + 2 * halves * leaves
 
 
@@ -131,16 +127,6 @@ def scan_run(where, voxel, block_words):
     """
     leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
     return where[voxel, 2] + leaves * 3 * LANES
-
-
-@nb.njit(nogil=True, cache=True)
-def normal_run(where, voxel, block_words, with_scan):
-    """Return the offset of a resident voxel's normals [halves], where they are kept.
-
-    They follow its scans (its lanes where there are no scans), LANES a block.
-    """
-    leaves = (where[voxel, 2] // 2 - where[voxel, 1]) // block_words
-    return where[voxel, 2] + leaves * LANES * (4 if with_scan else 3)
 
 
 @njit_no_refcount

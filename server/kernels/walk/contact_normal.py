@@ -15,14 +15,14 @@ touches an edge, this is the body's normal, as for the contact of a vertex with 
 
 The border of a scan is not recognized from the scan alone, as by Bendels et al. 2006 (Detecting
 Holes in Point Set Surfaces): a body that stands flat against a sheet beside its edge keeps the
-sheet's normal, and uneven spacing or the boundary of a voxel is not taken for a border.
+sheet's normal, and uneven spacing is not taken for a border.
 """
 
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
-from ..bodies.avatar_patch import SUMS, lowest_heights
+from ..bodies.avatar_patch import lowest_heights
+from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..motion.sweep_resident import POINT
 from .walk_normals import hit_normal, scan_heights
 from .walk_queries import pair_of
@@ -88,7 +88,7 @@ def _lowest(walk, hit, out, apart, normals, lowest, sums):
     """Find the least height of the avatar's patch over the plane of each normal (k, 3).
 
     A plane touches the scan's sphere.  out: from the touched sphere to the touching one, `apart`
-    long [m].  lowest: (k,), set [m].  sums: (10,) int64, set as `normal_code` takes them.
+    long [m].  lowest: (k,), set [m].  sums: (SUMS,) int64, set as `normal_code` takes them.
     """
     pose, directions = pose_now(walk), np.empty((normals.shape[0], 3))
     for n in range(normals.shape[0]):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
 from ....schemas.kernels import compiling as nb
+from ..core.normal_codes import MAX_NORMAL_REACH
 from .contact_normal import contact_normal
 from .slide_planes import ROUNDING, clip, limit_displacement
 from .walk_motions import advance, keep_rest, move_to

@@ -51,8 +51,7 @@ def walk_frame(
     `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
     may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies
     are obstacles.  least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
-    squares: (5,) int64, the normal reach, thrice and nine times that, squared [steps^2], or 0 if it is
-    invalid; that of stored normals, and whether scan numbers are in memory.
+    squares: (3,) int64, the normal reach, thrice and nine times that, squared [steps^2]; 0 if invalid.
     standing: the bodies that may be in the way, see walk_bodies.py; None in a scene without `crowd`.
     own: the avatar's row of them, -1 if it has none; ASKS if Python answers about bodies.
     """

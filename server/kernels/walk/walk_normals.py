@@ -3,8 +3,8 @@
 import numpy as np
 
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal
-from ..rays.stored_normals import code_at, find_voxel, highest_near, stored_code_at
+from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
+from ..rays.near_points import add_near, voxels_near
 from .walk_queries import ask_at, pair_of
 from .walk_state import (
     ARCHIVE,
@@ -22,35 +22,36 @@ from .walk_vectors import dot, minus, times, vector
 
 
 @nb.njit(nogil=True, cache=True)
-def _voxel_at(walk, place):
-    """Return the lattice point of a place (3,) [m], and the row of its voxel.
+def _add_near(walk, place, level, sums, directions, heights):
+    """Add the scan points within reach of a place (3,) [m], as `add_near` does; return whether that is known.
 
-    -1: there is no voxel; -2: it is not in memory. Rounds half to even, as `Lattice.to_lattice`.
+    It is unknown unless all voxels within reach are in memory. level: as for `scan_normal`.
     """
-    scene = walk.held.scene
+    memory, scene, square = walk.memory, walk.held.scene, walk.squares[level]
+    if not walk.native or square == 0:
+        return False
+    # Rounds half to even, as `Lattice.to_lattice`.
     x = np.int64(np.rint((place[0] - scene.origin[0]) / scene.step))
     y = np.int64(np.rint((place[1] - scene.origin[1]) / scene.step))
     z = np.int64(np.rint((place[2] - scene.origin[2]) / scene.step))
-    row = find_voxel(walk.held.index.keys, scene.voxel_steps, x, y, z)
-    if row >= 0:
-        if scene.where[row, 0] < 0:
-            return x, y, z, -2
-        walk.memory.rows[0] = row
-        use_voxels(walk.memory, 1)
-    return x, y, z, row
+    count = voxels_near(walk.held, x, y, z, square, memory.rows)
+    if count > memory.rows.shape[0]:
+        return False
+    voxels = memory.rows[:count]
+    for voxel in voxels:
+        if scene.where[voxel, 0] < 0:
+            return False
+    use_voxels(memory, count)
+    add_near(walk.held, voxels, x, y, z, square, sums, directions, heights)
+    return True
 
 
 @nb.njit(nogil=True, cache=True)
-def _code(walk, x, y, z, row, level):
-    """Return the code of the normal at a lattice point of a voxel in memory. level: as for `scan_normal`."""
-    if row < 0:
-        return NO_NORMAL
-    square = walk.squares[level]
-    if square == walk.squares[3]:
-        code, _ = stored_code_at(walk.held, row, x, y, z, walk.squares[4] != 0)
-        return code
-    code, _, _ = code_at(walk.held, row, x, y, z, square, np.empty(0, np.uint16))
-    return code
+def _code(walk, place, level):
+    """Return whether the normal at a place is known, and its code. level: as for `scan_normal`."""
+    sums = np.zeros(SUMS, np.int64)
+    known = _add_near(walk, place, level, sums, np.empty((0, 3)), np.empty(0))
+    return known, normal_code(sums)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -64,17 +65,14 @@ def scan_normal(walk, archive, cloud, toward, level):
     memory = walk.memory
     row = next_row(memory)
     if row >= memory.log[KNOWN]:
-        x, y, z, voxel = np.int64(0), np.int64(0), np.int64(0), np.int64(-2)
-        if walk.native and walk.squares[0] > 0:
-            x, y, z, voxel = _voxel_at(walk, cloud)
-        if voxel == -2:
+        known, code = _code(walk, cloud, level)
+        if known and code == NO_NORMAL:
+            known, code = _code(walk, cloud, level + 1)
+        if not known:
             for r in range(3):
                 memory.asked[3 + r] = toward[r]
             memory.asked[6], memory.asked[7] = np.float64(archive), np.float64(level)
             ask_at(walk, NORMAL_AT, cloud)
-        code = _code(walk, x, y, z, voxel, level)
-        if code == NO_NORMAL:
-            code = _code(walk, x, y, z, voxel, level + 1)
         memory.tape[row, HAS_NORMAL] = 0.0 if code == NO_NORMAL else 1.0
         if code != NO_NORMAL:
             found = decode_normal(code)
@@ -106,22 +104,20 @@ def scan_heights(walk, hit, directions, level):
     row = next_row(memory)
     if row >= memory.log[KNOWN]:
         archive, (_, cloud) = memory.tape[hit, ARCHIVE], pair_of(walk, hit)
-        count = directions.shape[0]
-        x, y, z, voxel = np.int64(0), np.int64(0), np.int64(0), np.int64(-2)
-        if walk.native and walk.squares[0] > 0:
-            x, y, z, voxel = _voxel_at(walk, cloud)
-        if voxel == -2:
+        count, heights, sums = (
+            directions.shape[0],
+            memory.tape[row, HEIGHTS : HEIGHTS + 3],
+            np.zeros(SUMS, np.int64),
+        )
+        for n in range(3):
+            heights[n] = 0.0
+        if not _add_near(walk, cloud, level, sums, directions, heights[:count]):
             memory.asked[3], memory.asked[4], memory.asked[5] = archive, np.float64(level), np.float64(count)
             for n in range(count):
                 for r in range(3):
                     memory.asked[6 + 3 * n + r] = directions[n, r]
             ask_at(walk, HIGHEST, cloud)
-        heights = memory.tape[row, HEIGHTS : HEIGHTS + 3]
-        for n in range(3):
-            heights[n] = 0.0
-        if voxel >= 0:
-            highest_near(walk.held, voxel, x, y, z, walk.squares[level], directions, heights[:count])
-            for n in range(count):
-                heights[n] *= walk.held.scene.step
+        for n in range(count):
+            heights[n] *= walk.held.scene.step
         memory.log[KNOWN] = row + 1
     return vector(memory.tape[row, HEIGHTS : HEIGHTS + 3])

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ....schemas.archive.rigid_pose import rigid_pose
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import BadRequestError
-from ....schemas.kernels.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies.body_pairs import CONTACT, bound_body, touch_pairs
 from ...kernels.bodies.moving_bodies import make_body_scratch
+from ...kernels.core.normal_codes import NO_NORMAL, decode_normal, normal_code
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.core.scene_arrays import NO_LIMIT
 from ...kernels.walk.walk_bodies import refer_to_bodies
@@ -58,7 +58,7 @@ class Shape(NamedTuple):
         """Return a unit normal (3,) of the surface at a point, of either sign, avatar frame.
 
         Return None if the points form no surface. The normal is computed as for a scan
-        (schemas/kernels/normal_codes.py), with exact units as the lattice.
+        (kernels/core/normal_codes.py), with exact units as the lattice.
         """
         if point not in self.normals:
             points = self.model.points

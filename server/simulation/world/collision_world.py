@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
@@ -21,6 +20,7 @@ from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, 
 from ...archives.placed_archive import PlacedArchive
 from ...archives.rigid_transform import rotate_vectors, transform_points
 from ...avatars.avatar_model import AvatarModel
+from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...queries.context.query_context import with_stop
@@ -348,7 +348,11 @@ class World:
     def normal_at(
         self, archive: int, cloud: Vec, toward: Vec, reach: float, budget: QueryBudget = EXACT
     ) -> Vec | None:
-        """Return `normal` at a scan point (3,) of an archive, on the side of a direction (3,)."""
+        """Return `normal` at a scan point (3,) of an archive, on the side of a direction (3,).
+
+        Return None too if a voxel within reach cannot be read, or is not in memory and the budget
+        does not wait: the frame is then `unknown`.
+        """
         held = self._held
         with self as seen:
             each = seen[archive]
@@ -366,7 +370,7 @@ class World:
             except StoppedError:
                 if waits or held.stop:
                     raise
-                budget.lacked(1)  # it was evicted since it was touched
+                budget.lacked(1)
                 held.unknown = True
                 return None
             return found if found is None or pose is None else rotate_vectors(pose, found[None])[0]
@@ -376,8 +380,8 @@ class World:
     ) -> NDArray[np.float64]:
         """Return how high the scan points around a touched one lie along directions (k,) [m].
 
-        hit: of the scan.  directions: (k, 3) unit.  reach, budget: as for `normal`. Return 0 where the
-        points are not in memory, or cannot be read.
+        hit: of the scan.  directions: (k, 3) unit.  reach, budget: as for `normal`. Return 0 if
+        a voxel within reach is not in memory, or cannot be read.
         """
         assert hit.cloud is not None
         held, waits = self._held, budget.late is None

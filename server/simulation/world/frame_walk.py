@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ....schemas.archive.normal_reach import MAX_NORMAL_REACH
 from ....schemas.scene.effect_table import Crowd, Ground, Slide, Step, Stop, Sweep
 from ....schemas.scene.scene_file import SceneFile, sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ...kernels.core.array_references import Held
+from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...kernels.walk import walk_state as state
 from ...kernels.walk.slide_along import FLAT_REACH_FACTOR
 from ...kernels.walk.walk_frame import walk_frame
@@ -25,9 +25,9 @@ from .walk_call import FrameMemory, WalkCall
 
 # Parts of a frame that effects run.
 FOLLOW, SLIDE, STEP, GROUND = state.FOLLOW, state.SLIDE, state.STEP, state.GROUND
-_NO_SQUARES = np.zeros(5, np.int64)
-# Points within this distance of the touched point determine the ground's normal [m]. With `slide`, its
-# distance is used instead, because an archive stores normals for one distance.
+_NO_SQUARES = np.zeros(3, np.int64)
+# Points within this distance of the touched point determine the ground's normal [m], unless `slide`
+# names another.
 _NORMAL_REACH = 0.08
 # The first search for ground extends this many clearances down.
 _NEAR_CLEARANCES = 2.0

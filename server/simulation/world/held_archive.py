@@ -33,7 +33,7 @@ def normals_of(seen: HeldArchive) -> Any:
         # Imported here: only some effects need normals.
         from ...queries.surface_normals import Normals
 
-        normals = kept.setdefault("normals", Normals(seen.opened.store, seen.data))
+        normals = kept.setdefault("normals", Normals(seen.data, seen.opened.store.archive))
     return normals
 
 

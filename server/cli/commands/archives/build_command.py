@@ -59,16 +59,8 @@ def build(
     ] = None,
     keep: Annotated[
         str,
-        typer.Option(
-            help="Columns to keep, separated by commas: scan, intensity, rgb, classification, normal."
-        ),
+        typer.Option(help="Columns to keep, separated by commas: scan, intensity, rgb, classification."),
     ] = "",
-    normal_reach: Annotated[
-        float,
-        typer.Option(
-            help="Radius [m] of the neighbourhood from which a normal is estimated, with --keep normal."
-        ),
-    ] = 0.08,
     radius: Annotated[
         str,
         typer.Option(
@@ -157,7 +149,6 @@ def build(
         spacing=spacing,
         keep=frozenset(filter(None, keep.split(","))),
         level=not no_level,
-        normal_reach=normal_reach,
         radius=fixed,
         models=models,
         strict=strict,

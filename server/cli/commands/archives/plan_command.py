@@ -40,9 +40,7 @@ def plan(
     memory: Annotated[str, typer.Option(help="Memory bound of the build, all processes together.")] = "2GB",
     keep: Annotated[
         str,
-        typer.Option(
-            help="Columns to keep, separated by commas: scan, intensity, rgb, classification, normal."
-        ),
+        typer.Option(help="Columns to keep, separated by commas: scan, intensity, rgb, classification."),
     ] = "",
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave out broken scans.")] = False,
     measure: Annotated[

@@ -21,8 +21,7 @@ GOLDEN = Path(__file__).resolve().parents[3] / "golden"
 
 
 # The archives of each format version, and how many of the scans went into them.
-SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-4": 3, "archive-5": 4}
-NORMAL_REACH = {"archive-4": 0.3}
+SCANS = {"archive": 2, "archive-2": 3, "archive-3": 3, "archive-5": 4}
 
 
 @pytest.fixture(params=SCANS)
@@ -46,7 +45,6 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
         assert list(header.models) == expected.get("models", ["mean"])
         assert header.radius_counts.tolist() == expected.get("radius_counts", [0] * RADIUS_CLASSES)
         assert header.radius_capped == expected.get("radius_capped", 0)
-        assert header.normal_reach == NORMAL_REACH.get(name, 0.0)
         now = header.radius_now
         assert header.generation == expected.get("generation", 0)
         assert (
@@ -76,7 +74,6 @@ def test_the_golden_archive_holds_what_is_written_beside_it(name: str, expected:
             assert links.height == voxel["height"]
             cells = np.column_stack([data.cells.low, data.cells.log2_size])
             assert cells.tolist() == voxel["cells"]
-            assert (None if data.normal is None else data.normal.tolist()) == voxel.get("normals")
             assert (None if data.rgb is None else data.rgb.tolist()) == voxel.get("rgb")
             assert (None if data.classification is None else data.classification.tolist()) == voxel.get(
                 "classes"
@@ -151,8 +148,6 @@ def test_a_build_today_gives_the_golden_points_and_cells(
     )  # fmt: skip
     if name == "archive-5":
         config = replace(config, keep=config.keep | {"rgb", "classification"})
-    if name in NORMAL_REACH:
-        config = replace(config, keep=config.keep | {"normal"}, normal_reach=NORMAL_REACH[name])
     scans = [Path(f"scan-{number}.xyz") for number in range(SCANS[name])]
     if name == "archive-3":
         build_archive(scans[1::-1], tmp_path / "a", config)

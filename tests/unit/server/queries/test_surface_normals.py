@@ -1,4 +1,4 @@
-"""Surface normals of an archive as it is served: those of the definition, in whatever order they are asked."""
+"""Surface normals of an archive as it is served: those of all points within reach, whatever voxels hold them."""
 
 import math
 import os
@@ -17,12 +17,13 @@ import pytest
 import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
-from solidcloud.schemas.kernels.normal_codes import LINE, NO_NORMAL, THICK, decode_normal
 from solidcloud.server.archives.archive_generation import ArchiveGeneration
 from solidcloud.server.archives.masked_archive import MaskedArchive
-from solidcloud.server.kernels.rays.stored_normals import code_at, find_voxel, stored_code_at
+from solidcloud.server.kernels.core.normal_codes import LINE, THICK
+from solidcloud.server.kernels.rays.near_points import voxels_in_box
 from solidcloud.server.queries.context.query_context import with_stop
-from solidcloud.server.queries.surface_normals import Normals, warm
+from solidcloud.server.queries.surface_normals import Normals
+from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import StopFlag, StoppedError
 
@@ -31,28 +32,21 @@ pytestmark = pytest.mark.interpreted
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 COUNT = 150 if INTERPRETED else 1500
 REACH = 0.4 if INTERPRETED else 0.15
-VISITS = [3024, 3396, 4343]
 COARSE = 0.56  # of codes [degrees]
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @contextmanager
-def serving(archive: Path, budget_bytes: int = 1 << 24) -> Iterator[ArchiveGeneration]:
-    """An archive, open."""
-    opened = ArchiveGeneration(VoxelStore(archive), budget_bytes)
-    try:
-        yield opened
-    finally:
-        opened.release()
-
-
-@contextmanager
 def asked(
-    archive: Path, budget_bytes: int = 1 << 24, most_bytes: int | None = None
+    archive: Path, budget_bytes: int = 1 << 24, store: VoxelStore | None = None
 ) -> Iterator[tuple[ArchiveGeneration, Normals]]:
     """An archive, open, and its normals."""
-    with serving(archive, budget_bytes) as opened:
-        yield opened, Normals(opened.store, opened.data, most_bytes)
+    opened = ArchiveGeneration(store or VoxelStore(archive), budget_bytes)
+    try:
+        yield opened, Normals(opened.data, opened.store.archive)
+        opened.data.residency.check()
+    finally:
+        opened.release()
 
 
 def build(tmp_path: Path, kind: str, count: int = COUNT, **options: object) -> archive_cases.Case:
@@ -62,36 +56,38 @@ def build(tmp_path: Path, kind: str, count: int = COUNT, **options: object) -> a
 
 
 def largest(archive: Path) -> int:
-    """Bytes of the largest voxel once decoded."""
+    """Bytes that the largest voxel takes in a cache."""
     store = VoxelStore(archive)
     store.close()
-    return int(store.sizes.max())
+    return ArenaBuffer.rounded(int(store.sizes.max()))
 
 
-def judged(
+def lattice_points(
     opened: ArchiveGeneration, points: NDArray[np.float64]
-) -> list[tuple[NDArray[np.float64], int, naive_normals.Found | None]]:
-    """Each source point as it is stored, world [m], its voxel's row, and what numpy finds there."""
-    header = opened.store.archive.header
-    lattice = naive.lattice_of(points, header.lattice.origin, header.lattice.step)
-    voxel = lattice // header.lattice.voxel_steps
+) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
+    """Source points as they are stored: on the lattice, and in the world [m]; and the reach squared."""
+    lattice = opened.store.archive.header.lattice
+    stored = naive.lattice_of(points, lattice.origin, lattice.step)
+    return stored, lattice.to_world(stored), int(np.rint((REACH / lattice.step) ** 2))
+
+
+def voxels_of(opened: ArchiveGeneration, lattice: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The index row of the voxel of each lattice point."""
     rows = {tuple(v): row for row, v in enumerate(opened.store.archive.coordinates.tolist())}
-    square = int(np.rint((REACH / header.lattice.step) ** 2))
-    answers = []
-    for at, own in zip(lattice, voxel, strict=True):
-        fellows = lattice[(voxel == own).all(axis=1)]
-        place = at * header.lattice.step + np.array(header.lattice.origin)
-        answers.append((place, rows[tuple(own.tolist())], naive_normals.find(fellows, at, square)))
-    return answers
+    steps = opened.store.archive.header.lattice.voxel_steps
+    return np.array([rows[tuple(v)] for v in (lattice // steps).tolist()])
 
 
 @pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates", "one point"])
 def test_normals_are_those_of_numpy(tmp_path: Path, kind: str) -> None:
     case = build(tmp_path, kind)
-    found = none = 0
+    found = none = across = 0
     with asked(case.archive) as (opened, normals):
-        for place, _, expected in judged(opened, case.points)[:: 1 if INTERPRETED else 3]:
-            normal = normals.at(place, UP, REACH)
+        lattice, places, square = lattice_points(opened, case.points)
+        rows = voxels_of(opened, lattice)
+        for n in range(0, len(lattice), 1 if INTERPRETED else 3):
+            normal = normals.at(places[n], UP, REACH)
+            expected = naive_normals.find(lattice, lattice[n], square)
             if expected is None:
                 assert normal is None
                 none += 1
@@ -108,37 +104,34 @@ def test_normals_are_those_of_numpy(tmp_path: Path, kind: str) -> None:
             assert naive_normals.angle(normal, expected.normal) < COARSE
             assert abs((normal**2).sum() - 1) < 1e-15 and normal[2] >= 0
             found += 1
-        assert normals.estimated >= found
+            across += len(set(rows[((lattice - lattice[n]) ** 2).sum(axis=1) <= square])) > 1
     assert found > 10 or kind in ("duplicates", "one point")
     assert none > 10 or kind in ("plane", "corner", "pillar", "one point")
+    assert across > 10 or kind in ("duplicates", "one point"), "points of several voxels"
 
 
 @pytest.mark.parametrize("kind", ["corner", "noise"])
-def test_heights_over_a_point_are_those_of_all_points_of_its_voxel(tmp_path: Path, kind: str) -> None:
+def test_heights_over_a_point_are_those_of_all_points_within_reach(tmp_path: Path, kind: str) -> None:
     case = build(tmp_path, kind)
     directions = np.array([[0.0, 0.0, 1.0], [0.6, -0.8, 0.0], [-0.48, 0.6, -0.64]])
     with asked(case.archive) as (opened, normals):
-        header = opened.store.archive.header
-        lattice = naive.lattice_of(case.points, header.lattice.origin, header.lattice.step)
-        voxel = lattice // header.lattice.voxel_steps
-        square = int(np.rint((REACH / header.lattice.step) ** 2))
+        lattice, places, square = lattice_points(opened, case.points)
         several = 0
-        for at, own in list(zip(lattice, voxel, strict=True))[:: max(1, COUNT // 60)]:
-            near = naive_normals.neighbours(lattice[(voxel == own).all(axis=1)], at, square)
-            place = at * header.lattice.step + np.array(header.lattice.origin)
-            found = normals.highest(place, directions, REACH)
-            expected = (near @ directions.T).max(axis=0) * header.lattice.step
+        for n in range(0, len(lattice), max(1, COUNT // 60)):
+            near = naive_normals.neighbours(lattice, lattice[n], square)
+            found = normals.highest(places[n], directions, REACH)
+            expected = (near @ directions.T).max(axis=0) * opened.store.archive.header.lattice.step
             np.testing.assert_allclose(found, expected, atol=1e-12)
             several += len(near) > 3
         assert several > 10
-        assert not normals.highest(np.full(3, 1e3), directions, REACH).any(), "there is no voxel"
+        assert not normals.highest(np.full(3, 1e3), directions, REACH).any(), "there is no point"
 
 
 def test_the_side_is_the_one_that_is_asked_for(tmp_path: Path) -> None:
     case = build(tmp_path, "corner")
     sides = 0
     with asked(case.archive) as (opened, normals):
-        for place, _, _ in judged(opened, case.points)[:40]:
+        for place in lattice_points(opened, case.points)[1][:40]:
             there = [normals.at(place, way, REACH) for way in np.concatenate([np.eye(3), -np.eye(3)])]
             for one, other, way in zip(there[:3], there[3:], np.eye(3), strict=True):
                 if one is None or other is None:
@@ -149,138 +142,126 @@ def test_the_side_is_the_one_that_is_asked_for(tmp_path: Path) -> None:
     assert sides > 50
 
 
-def test_codes_are_the_same_in_any_order_and_whatever_else_is_resident(tmp_path: Path) -> None:
-    case = build(tmp_path, "corner")
-    with asked(case.archive) as (opened, normals):
-        places = [place for place, *_ in judged(opened, case.points)]
-        forward = [normals.code(place, REACH) for place in places]
-        assert [normals.code(place, REACH) for place in places] == forward
-        assert normals.estimated == len(places)
-    for other in (case, build(tmp_path, "corner", leaf=5, cell_points=17, degree=2)):
-        with asked(other.archive, 2 * largest(other.archive), most_bytes=0) as (opened, normals):
-            backward = [normals.code(place, REACH) for place in reversed(places)]
-            assert backward[::-1] == forward
-            assert opened.data.residency.evictions > 0
+def test_normals_are_the_same_in_voxels_of_any_size_and_with_room_for_one(tmp_path: Path) -> None:
+    """A cache that holds the largest voxel alone: the sums of neighbours are found one after the other."""
 
+    def answers(archive: Path, places: NDArray[np.float64], budget: int = 1 << 24) -> list[bytes]:
+        with asked(archive, budget) as (opened, normals):
+            found = [normals.at(place, UP, REACH) for place in places]
+            heights = [normals.highest(place, np.eye(3), REACH) for place in places]
+            assert (opened.data.residency.evictions > 0) == (budget < 1 << 24)
+        return [b"" if each is None else each.tobytes() for each in (*found, *heights)]
 
-def test_what_is_looked_into_is_what_it_was(tmp_path: Path) -> None:
-    """What bounds leave out is in no answer: nodes visited for the same points."""
-    case = build(tmp_path, "corner", 150, voxel=8.0)
-    with asked(case.archive, most_bytes=0) as (opened, normals):
-        places = [place for place, *_ in judged(opened, case.points)]
-        visits = []
-        for reach in (0.02, 0.3, 1.0):
-            before = normals.visits
-            for place in places:
-                normals.code(place, reach)
-            visits.append(normals.visits - before)
-    assert visits == VISITS
-
-
-def test_of_an_evicted_voxel_nothing_is_kept_and_the_same_is_found(tmp_path: Path) -> None:
-    case = build(tmp_path, "plane")
-    with asked(case.archive, 2 * largest(case.archive), most_bytes=1 << 20) as (opened, normals):
-        voxels = {row: place for place, row, _ in judged(opened, case.points)}
-        (first, at), (second, there) = list(voxels.items())[:2]
-        code = normals.code(at, REACH)
-        residency = opened.data.residency
-        assert (
-            residency.is_resident(first)
-            and normals.used_bytes == 64 * opened.store.archive.voxels["leaves"][first]
-        )
-        for row in voxels:
-            if row != first and residency.is_resident(first):
-                with residency.hold([row]):
-                    pass
-        assert not residency.is_resident(first)
-        normals.code(there, REACH)
-        residency.check()
-        assert normals.used_bytes == 64 * opened.store.archive.voxels["leaves"][second]
-        before = normals.estimated
-        assert normals.code(at, REACH) == code
-        assert normals.estimated == before + 1
-
-
-def test_what_is_kept_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> None:
-    case = build(tmp_path, "corner")
-    with serving(case.archive) as opened:
-        voxels = {row: place for place, row, _ in judged(opened, case.points)}
-        sizes = 64 * opened.store.archive.voxels["leaves"].astype(int)
-        most = int(np.sort(sizes)[-3:].sum())
-        normals = Normals(opened.store, opened.data, most)
-        for row, place in voxels.items():
-            normals.code(place, REACH)
-            assert sizes[row] <= normals.used_bytes <= most
-        last = list(voxels.values())[-1]
-        before = normals.estimated
-        normals.code(last, REACH)
-        assert normals.estimated == before
-        normals.code(next(iter(voxels.values())), REACH)
-        assert normals.estimated == before + 1
-        none = Normals(opened.store, opened.data, 0)
-        for place in voxels.values():
-            none.code(place, REACH)
-            assert none.used_bytes == 0
-        assert Normals(opened.store, opened.data).most_bytes == opened.data.residency.budget_bytes // 32
+    case = build(tmp_path, "corner", COUNT // 2)
+    with asked(case.archive) as (opened, _):
+        places = lattice_points(opened, case.points)[1]
+    expected = answers(case.archive, places)
+    assert answers(case.archive, places, largest(case.archive)) == expected
+    for options in ({"voxel": 8.0}, {"voxel": 0.33}, {"leaf": 5, "cell_points": 17, "degree": 2}):
+        other = build(tmp_path, "corner", COUNT // 2, **options).archive
+        assert answers(other, places) == expected
+        if options != {"voxel": 8.0}:
+            assert answers(other, places, largest(other)) == expected
 
 
 def test_each_reach_has_its_own_and_wrong_ones_are_refused(tmp_path: Path) -> None:
     case = build(tmp_path, "corner")
     with asked(case.archive) as (opened, normals):
-        places = [place for place, *_ in judged(opened, case.points)][:60]
-        near = [normals.code(place, REACH) for place in places]
-        far = [normals.code(place, 2 * REACH) for place in places]
-        assert near != far
-        assert [normals.code(place, REACH) for place in places] == near
+        places = lattice_points(opened, case.points)[1][:60]
+        near, far = ([normals.at(place, UP, reach) for place in places] for reach in (REACH, 2 * REACH))
+        assert any(one is not None and (one != other).any() for one, other in zip(near, far, strict=True))
         for reach in (0.0, -1.0, math.nan, 1.5):
             with pytest.raises(BadRequestError, match="normal reach"):
                 normals.at(places[0], UP, reach)
+        assert normals.squares((0.1, 2.0)).tolist() == [1_000_000, 0]
 
 
-def test_where_no_point_is_there_is_no_normal(tmp_path: Path) -> None:
+def test_a_place_counts_to_half_a_step_and_far_from_all_points_there_is_no_normal(tmp_path: Path) -> None:
     case = build(tmp_path, "plane")
     with asked(case.archive) as (opened, normals):
-        header = opened.store.archive.header
-        place = next(place for place, *_ in judged(opened, case.points))
-        assert normals.code(place, REACH) != NO_NORMAL
-        near = place + 0.4 * header.lattice.step
-        assert normals.code(near, REACH) == normals.code(place, REACH)
-        before = normals.estimated
-        for away in (2 * header.lattice.step * UP, [50.0, 0, 0], [-1e9, 1e9, 1e9], 0.1 * UP):
+        step, place = opened.store.archive.header.lattice.step, lattice_points(opened, case.points)[1][0]
+        normal = normals.at(place, UP, REACH)
+        assert normal is not None
+        assert (normals.at(place + 0.4 * step, UP, REACH) == normal).all()
+        for away in ([50.0, 0, 0], [-1e9, 1e9, 1e9], (REACH + 1.0) * UP):
             assert normals.at(place + away, UP, REACH) is None
-        assert normals.estimated == before
 
 
-def test_normals_of_a_voxel_that_cannot_be_read_are_unknown(tmp_path: Path) -> None:
+def border(opened: ArchiveGeneration, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], int, int]:
+    """A point with points of one other voxel within reach: its place, and the rows of both voxels."""
+    lattice, places, square = lattice_points(opened, points)
+    rows = voxels_of(opened, lattice)
+    for n, at in enumerate(lattice):
+        low, high = opened.data.broad.low, opened.data.broad.high
+        near = np.flatnonzero(
+            ((low <= at + math.isqrt(square) + 1) & (high >= at - math.isqrt(square) - 1)).all(axis=1)
+        )
+        if len(near) == 2:
+            return places[n], int(rows[n]), int(near[near != rows[n]][0])
+    raise AssertionError("no such point")
+
+
+def test_a_neighbour_that_cannot_be_read_makes_the_normal_unknown(tmp_path: Path) -> None:
     case = build(tmp_path, "plane")
-    with serving(case.archive) as opened:
-        places = [place for place, *_ in judged(opened, case.points)]
-    for shard in (case.archive / "shards").iterdir():
-        data = bytearray(shard.read_bytes())
-        with VoxelStore(case.archive).archive as archive:
-            for row in range(len(archive.voxels)):
-                data[int(archive.voxels["frame_offset"][row][2]) + 9] ^= 0xFF
-        shard.write_bytes(data)
+    with asked(case.archive) as (opened, _):
+        place, own, other = border(opened, case.points)
+        path = opened.store.archive.shard_path(int(opened.store.archive.voxels["shard"][other]))
+        offset = int(opened.store.archive.voxels["frame_offset"][other][2])
+    data = bytearray(path.read_bytes())
+    data[offset + 9] ^= 0xFF
+    path.write_bytes(data)
     with asked(case.archive) as (opened, normals):
-        for place in places[:20]:
-            with pytest.raises(CorruptError, match="damaged frame"):
-                normals.at(place, UP, REACH)
-        assert normals.used_bytes == 0 == normals.estimated
+        with pytest.raises(CorruptError, match="damaged frame"):
+            normals.at(place, UP, REACH)
+        assert normals.at(place, UP, 2e-4) is None, "only its own voxel is within reach"
+        assert opened.data.residency.is_resident(own)
+
+
+def test_a_neighbour_that_is_not_in_memory_is_loaded_or_the_normal_is_unknown(tmp_path: Path) -> None:
+    case = build(tmp_path, "plane")
+    with asked(case.archive) as (opened, normals):
+        place, own, other = border(opened, case.points)
+        residency = opened.data.residency
+        with residency.hold([own]):
+            pass
+        with pytest.raises(StoppedError):
+            normals.at(place, UP, REACH, waits=False)
+        expected = normals.at(place, UP, REACH)
+        assert residency.is_resident(other) and expected is not None
+        assert (normals.at(place, UP, REACH, waits=False) == expected).all()
 
 
 def test_a_stop_ends_a_wait_for_a_voxel_and_no_request_has_that_of_another(tmp_path: Path) -> None:
     case = build(tmp_path, "plane")
-    with serving(case.archive) as opened:
-        places = [place for place, *_ in judged(opened, case.points)]
+    with asked(case.archive) as (opened, expected):
+        places = lattice_points(opened, case.points)[1]
         stop = StopFlag()
         stop.set("the client is gone")
-        normals = Normals(opened.store, with_stop(opened.data, stop))
+        normals = Normals(with_stop(opened.data, stop), opened.store.archive)
         with pytest.raises(StoppedError):
             normals.at(places[0], UP, REACH, stop)
         assert opened.data.residency.resident == 0
-        expected = Normals(opened.store, opened.data)
         for place in places[:20]:
-            assert normals.code(place, REACH) == expected.code(place, REACH)
+            assert (normals.at(place, UP, REACH) == expected.at(place, UP, REACH)).all()
+
+
+@pytest.mark.parametrize("capacity", [2, 64])
+def test_voxels_in_a_box_are_those_whose_points_may_lie_there(tmp_path: Path, capacity: int) -> None:
+    case, rng = build(tmp_path, "noise"), np.random.default_rng(4)
+    with asked(case.archive) as (opened, _):
+        header, index = opened.store.archive.header, opened.data.broad
+        held = opened.data.references.to(opened.data.arrays, index)
+        counts = set()
+        for size in (1, 2000, 9000, 30_000, 1 << 40):  # the largest holds more cells than there are voxels
+            for _ in range(20):
+                low = rng.integers(header.low - 9000, header.high + 9000)
+                high, rows = low + rng.integers(0, size, 3), np.full(capacity, -1, np.int64)
+                expected = np.flatnonzero(((index.low <= high) & (index.high >= low)).all(axis=1))
+                assert voxels_in_box(held.reference, low, high, rows) == len(expected)
+                if len(expected) <= capacity:
+                    assert sorted(rows[: len(expected)].tolist()) == expected.tolist()
+                counts.add(len(expected))
+    assert {0, 1, 2} < counts
 
 
 def test_nobody_imports_it_but_who_asks() -> None:
@@ -294,74 +275,18 @@ def test_nobody_imports_it_but_who_asks() -> None:
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("keep", [("normal",), ("normal", "scan", "intensity")])
-@pytest.mark.parametrize("models", [{"mean"}, {"mean", "border"}])
-def test_what_is_stored_is_what_is_found_at_first_use(
-    tmp_path: Path, keep: tuple[str, ...], models: set[str]
-) -> None:
-    options = {"keep": frozenset(keep), "normal_reach": REACH, "models": frozenset(models)}
-    case = build(tmp_path, "corner", COUNT // 3, **options)
-    with asked(case.archive) as (opened, normals):
-        assert not opened.store.with_normals
-        places = [place for place, *_ in judged(opened, case.points)]
-        first = [normals.code(place, REACH) for place in places]
-        own = opened.store.sizes
-        assert normals.estimated == len(places) and len(set(first)) > 20
-    opened = ArchiveGeneration(VoxelStore(case.archive, normals=REACH), 2 * int(own.max()))
-    try:
-        normals = Normals(opened.store, opened.data)
-        leaves = opened.store.archive.voxels["leaves"]
-        assert (opened.store.sizes == own + 64 * leaves.astype(int)).all()
-        assert [normals.code(place, REACH) for place in places] == first
-        assert normals.estimated == normals.used_bytes == 0 < opened.data.residency.evictions
-        assert normals.code(places[0] + 0.01, REACH) == NO_NORMAL
-        opened.data.residency.check()
-        # Another reach is found as ever.
-        assert normals.code(places[0], REACH / 2) in range(1 << 16) and normals.estimated == 1
-    finally:
-        opened.release()
-
-
-@pytest.mark.parametrize("normals", [None, REACH / 2])
-def test_of_normals_that_nobody_asks_for_nothing_is_in_memory(tmp_path: Path, normals: float | None) -> None:
-    case = build(tmp_path, "plane", COUNT // 3, keep=frozenset({"normal"}), normal_reach=REACH)
-    plain = build(tmp_path, "plane", COUNT // 3)
-    kept, other = VoxelStore(case.archive, normals=normals), VoxelStore(plain.archive)
-    assert (kept.sizes == other.sizes).all() and not kept.with_normals
-    kept.close()
-    other.close()
-
-
-def test_what_is_left_out_has_no_say_whether_normals_are_stored_or_not(tmp_path: Path) -> None:
-    options = {"keep": frozenset({"normal"}), "normal_reach": REACH}
-    case = build(tmp_path, "corner", COUNT // 3, **options)
+def test_what_is_left_out_has_no_say(tmp_path: Path) -> None:
+    case = build(tmp_path, "corner", COUNT // 3)
     box = np.array([[-0.6, -0.6, -0.6], [0.1, 0.4, 1.5]])
-    without = partial(MaskedArchive, boxes=[box])
     with asked(case.archive) as (opened, normals):
-        places = [place for place, *_ in judged(opened, case.points)]
-        left = [place for place in places if not ((box[0] <= place) & (place <= box[1])).all()]
-        assert len(places) > len(left) > 20
-        whole = [normals.code(place, REACH) for place in left]
-    found = []
-    for reach in (None, REACH):
-        opened = ArchiveGeneration(VoxelStore(case.archive, without, normals=reach), 1 << 24)
-        try:
-            assert opened.store.with_normals == (reach is not None)
-            normals = Normals(opened.store, opened.data)
-            found.append([normals.code(place, REACH) for place in left])
-            assert normals.estimated == (0 if reach else len(left))
-        finally:
-            opened.release()
-    assert found[0] == found[1] != whole
-
-
-def test_warming_loads_nothing_and_leaves_nothing_to_compile(tmp_path: Path) -> None:
-    case = build(tmp_path, "plane")
-    with asked(case.archive) as (opened, normals):
-        warm(opened.data)
-        assert opened.data.residency.resident == 0
-        kernels = (find_voxel, code_at, stored_code_at, decode_normal)
-        compiled = [len(getattr(kernel, "signatures", ())) for kernel in kernels]
-        places = [place for place, *_ in judged(opened, case.points)][:40]
-        assert any(normals.at(place, UP, REACH) is not None for place in places)
-        assert [len(getattr(kernel, "signatures", ())) for kernel in kernels] == compiled
+        places = lattice_points(opened, case.points)[1]
+        stays = ~((box[0] <= places) & (places <= box[1])).all(axis=1)
+        assert len(places) > stays.sum() > 20
+        whole = [normals.at(place, UP, REACH) for place in places[stays]]
+    rest = archive_cases.build(tmp_path, case.points[stays], voxel=0.9, radius=0.01)
+    with asked(rest.archive) as (_, normals):
+        expected = [normals.at(place, UP, REACH) for place in places[stays]]
+    store = VoxelStore(case.archive, partial(MaskedArchive, boxes=[box]))
+    with asked(case.archive, store=store) as (_, normals):
+        found = [normals.at(place, UP, REACH) for place in places[stays]]
+    assert str(found) == str(expected) != str(whole)

@@ -14,7 +14,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.cli.warming.kernel_rehearsal import check_answers, rehearse
 from solidcloud.server.scene import Scene
 
-ARCHIVE = Path(__file__).parents[4] / "golden" / "archive-4"
+ARCHIVE = Path(__file__).parents[4] / "golden" / "archive"
 compiled = pytest.mark.skipif(
     os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="interpreted kernels are not kept"
 )

@@ -5,8 +5,9 @@ import os
 import numpy as np
 import pytest
 from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.bodies.avatar_patch import PATCH_STEPS, SUMS, lowest_heights
+from solidcloud.server.kernels.bodies.avatar_patch import PATCH_STEPS, lowest_heights
 from solidcloud.server.kernels.core.array_references import refer_to_avatar
+from solidcloud.server.kernels.core.normal_codes import SUMS
 
 pytestmark = pytest.mark.interpreted
 

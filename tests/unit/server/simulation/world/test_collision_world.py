@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from effect_frames import body_of, placed, report
 from effect_rooms import at
-from solidcloud.schemas.scene.effect_table import Contacts
+from late_frames import blocked_loads
+from solidcloud.schemas.scene.effect_table import Contacts, Slide
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.queries.context.query_budget import LateVoxels, QueryBudget
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
@@ -148,3 +150,24 @@ def test_a_contact_that_is_not_exact_is_unknown_only_where_something_was_not_loo
             world.begin(NO_STOP)
             world.sweep(BALL, at(1, 0, 0), at(0, 0, 0))
             assert world.unknown == unknown
+
+
+def test_a_normal_with_points_in_a_voxel_that_is_not_in_memory_is_unknown(tmp_path: Path) -> None:
+    wall = effect_rooms.build(tmp_path, effect_rooms.plane((0, -0.5, -0.5), (0, 0.5, 0.5)), voxel=0.5)
+    with effect_rooms.play(wall.archive, Slide()) as game:
+        world, out = game.world, np.array([-1.0, 0, 0])
+        with world as seen, blocked_loads(game.scene) as gate:
+            cloud = np.add(seen[0].data.arrays.origin, [0, 0.48, 0.2])  # the next voxels begin at 0.5
+            hit = Hit(0.0, Verdict.CONTACT, cloud + out, cloud, archive=0)
+            gate.set()
+            world.nearest(cloud, 0.01)
+            gate.clear()
+            late = LateVoxels()
+            world.begin(NO_STOP)
+            assert (
+                world.normal(hit, 0.08, QueryBudget(late=late)) is None and late.count > 0 and world.unknown
+            )
+            assert not world.highest(hit, out[None], 0.08, QueryBudget(late=late)).any() and world.unknown
+            gate.set()
+            world.begin(NO_STOP)
+            assert world.normal(hit, 0.08) == pytest.approx(out) and not world.unknown

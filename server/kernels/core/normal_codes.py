@@ -1,8 +1,8 @@
-"""Surface normal at a scan point, as a 16-bit code; builder and server compute it identically.
+"""Surface normal at a scan point, as a 16-bit code.
 
-The definition does not depend on order, tree or machine. Take all points of the same voxel within
-reach of the point (itself and duplicates included). Sum their differences to the point, in whole
-steps: count, sums and sums of products, exact int64. From these compute in float64, with each
+The definition does not depend on order, tree, voxels or machine. Take all scan points within reach
+of the point (itself and duplicates included). Sum their differences to the point, in whole steps:
+count, sums and sums of products, exact int64. From these compute in float64, with each
 operation exactly as it stands here and nothing but + - * / and square root, which IEEE 754 rounds
 identically everywhere: the covariance, divided by its trace; SWEEPS cyclic sweeps of Jacobi
 rotations (Jacobi 1846; the stable form is Golub and Van Loan, Matrix Computations, section 8.5);
@@ -20,11 +20,16 @@ so both are 1 to 255. The axes are exact; other directions are off by 0.56 degre
 """
 
 import math
+from fractions import Fraction
 
 import numpy as np
 
-from . import compiling as nb
+from ....schemas.errors import BadRequestError
+from ....schemas.kernels import compiling as nb
 
+# Largest reach [m]. Points farther apart do not belong to one surface.
+MAX_NORMAL_REACH = 1.0
+SUMS = 10  # elements of the sums that `normal_code` takes
 NO_NORMAL = np.uint16(0)
 MIN_POINTS = 3
 # Ratio of variances; standard deviations of 1 : 32. The points of one scanner row, with noise, are
@@ -124,7 +129,7 @@ def decode_normal(code):
 def normal_code(sums):
     """Return the code, uint16, of the normal at a point.
 
-    sums: (10,) int64, over the differences to the point [steps]: count, x, y, z, xx, yy, zz, yz,
+    sums: (SUMS,) int64, over the differences to the point [steps]: count, x, y, z, xx, yy, zz, yz,
     zx, xy.
     """
     if sums[0] < MIN_POINTS:
@@ -142,3 +147,24 @@ def normal_code(sums):
     if values[1] <= LINE * values[2] or values[0] > THICK * values[1]:
         return NO_NORMAL
     return encode_normal(vector[0], vector[1], vector[2])
+
+
+def squared_reach(reach: float, step: float, points: int) -> int:
+    """Return the greatest squared distance within `reach` [m], in squared steps.
+
+    Both lengths are taken as the decimal numbers that they print as, so 800 steps of 0.1 mm are
+    exactly 8 cm.
+    points: the most points that may be within reach; their sums must fit 63 bits.
+    Raise BadRequestError for an invalid reach.
+    """
+    if not 0 < reach <= MAX_NORMAL_REACH:
+        raise BadRequestError(
+            f"normal reach {reach!r}: expected a length above 0, at most {MAX_NORMAL_REACH:g} m"
+        )
+    square = int((Fraction(repr(float(reach))) / Fraction(repr(step))) ** 2)
+    if square * max(points, 1) >= 1 << 63:
+        most = 0.995 * math.sqrt((1 << 63) / max(points, 1)) * step
+        raise BadRequestError(
+            f"normal reach {reach!r} m: sums over up to {points} points exceed 63 bits: give at most {most:.3g}"
+        )
+    return square

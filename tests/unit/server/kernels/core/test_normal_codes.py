@@ -6,9 +6,14 @@ import naive_normals
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from solidcloud.schemas.archive.normal_reach import squared_reach
 from solidcloud.schemas.errors import BadRequestError
-from solidcloud.schemas.kernels.normal_codes import THICK, decode_normal, encode_normal, normal_code
+from solidcloud.server.kernels.core.normal_codes import (
+    THICK,
+    decode_normal,
+    encode_normal,
+    normal_code,
+    squared_reach,
+)
 
 pytestmark = pytest.mark.interpreted
 
@@ -68,13 +73,13 @@ def test_a_plane_is_found_as_numpy_finds_it(noise: float) -> None:
 
 def test_sums_of_the_farthest_points_are_exact() -> None:
     """A wall at the end of 63 bits: no sum of what `normal_reach` lets pass overflows."""
-    count = 1 << 19
+    count = 1 << 23
     square = squared_reach(1.0, 1e-6, count)
-    assert square == 10**12 and count * square < 1 << 59
+    assert square == 10**12 and count * square < 1 << 63
     x, y = 600_000, 800_000
     n = count // 4
     sums = np.array([4 * n, 0, 0, 0, 4 * n * x * x, 4 * n * y * y, 0, 0, 0, 0])  # points (+-x, +-y, 0)
-    assert sums[5] == 4 * n * y * y > 1 << 58
+    assert sums[5] == 4 * n * y * y > 1 << 60
     assert decode_normal(normal_code(sums)) == (0.0, 0.0, 1.0)
 
 
@@ -86,7 +91,7 @@ def test_reach_counts_as_its_decimal_text_and_has_bounds() -> None:
         with pytest.raises(BadRequestError, match="normal reach"):
             squared_reach(reach, 1e-4, 1)
     with pytest.raises(BadRequestError, match="63 bits: give at most 0"):
-        squared_reach(1.0, 1e-6, 1 << 23)
+        squared_reach(1.0, 1e-6, 1 << 24)
 
 
 def test_codes_are_these_on_any_machine() -> None:

@@ -138,7 +138,6 @@ def test_nothing_in_contact_is_settled_whatever_the_radii(
         judge(open_made(case.archive, model), model, avatar, poses, rng)
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("model", [None, "local+border:0.3"])
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_of_every_kind_of_scan_clear_pairs_are_settled(

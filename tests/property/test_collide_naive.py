@@ -172,7 +172,6 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
     assert 0 < sum(answers[0][0]) < 60
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)

@@ -174,7 +174,6 @@ def test_collide_is_distance_within_the_margin(tmp_path: Path, rng: np.random.Ge
     assert 0 < (found.verdict == Verdict.CONTACT).sum() < 300
 
 
-@pytest.mark.interpreted
 def test_more_ties_than_are_kept_until_the_end(tmp_path: Path, rng: np.random.Generator) -> None:
     """Two planes, every point of one above a point of the other: all pairs tie, and the least by coordinates counts."""
     grid = np.stack(np.meshgrid(np.arange(12), np.arange(12), [0]), -1).reshape(-1, 3) / 16
@@ -192,7 +191,6 @@ def test_more_ties_than_are_kept_until_the_end(tmp_path: Path, rng: np.random.Ge
         compare(scene.distance("avatar", poses, 1.0), expected, 1.0)
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)

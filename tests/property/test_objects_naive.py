@@ -183,7 +183,6 @@ def test_thousands_of_small_objects_as_all_pairs_say(data: SceneData, rng: np.ra
     assert answers.pairs_tested < 20 * len(expected) and answers.pairs_filtered >= filtered
 
 
-@pytest.mark.interpreted
 def test_a_few_objects_in_all_their_groups(data: SceneData, rng: np.random.Generator) -> None:
     bodies = [body(rng, kind) for kind in ("few", "point", "empty", "off")]
     models = [make_avatar(points, 0.02) for points in bodies]
@@ -198,7 +197,6 @@ def test_a_few_objects_in_all_their_groups(data: SceneData, rng: np.random.Gener
     assert answers.pairs_filtered > 0 and not answers.verdict.any(), "the scene's bit is in no mask"
 
 
-@pytest.mark.interpreted
 def test_tangent_objects_touch_and_one_unit_apart_do_not(data: SceneData) -> None:
     """Lengths of 3, 4, 12 and 13, as near and as far from the origin as the unit is exact."""
     ball = make_avatar([[0.0, 0, 0]], 13 / 128)

@@ -151,7 +151,6 @@ def test_spheres_that_are_large_elsewhere_cost_no_point_tests(rich: ScanCase) ->
     assert tests[1] < tests[0]
 
 
-@pytest.mark.interpreted
 def test_the_larger_sphere_is_the_deeper_though_farther(tmp_path: Path, rng: np.random.Generator) -> None:
     small, large = local_radii()[[4, 15]]
     points = np.array([[2 * small, 0.0, 0.0], [-0.9 * small, 0.0, 0.0]])

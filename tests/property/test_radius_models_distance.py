@@ -187,7 +187,6 @@ def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Gen
             assert {found is None for found in judged} == {True, False}
 
 
-@pytest.mark.interpreted
 def test_a_small_sphere_in_front_of_a_large_one(tmp_path: Path, rng: np.random.Generator) -> None:
     """The nearest centre is not that of the nearest sphere."""
     grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0, 1]), -1).reshape(-1, 3) * 0.2
@@ -217,7 +216,6 @@ def test_a_small_sphere_in_front_of_a_large_one(tmp_path: Path, rng: np.random.G
     assert farther > 0 and len(set(radii)) == 2
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("rim_right", [True, False])
 def test_gaps_that_tie_across_classes_and_a_unit_less(tmp_path: Path, rim_right: bool) -> None:
     """A whole sphere on one side, half a one as near on the other: the lesser point; and a unit decides."""
@@ -253,7 +251,6 @@ def test_gaps_that_tie_across_classes_and_a_unit_less(tmp_path: Path, rim_right:
         assert bounded_too.witness_cloud[:, 0].tolist() == sides
 
 
-@pytest.mark.interpreted
 def test_the_class_of_a_node_may_be_that_of_no_point(tmp_path: Path) -> None:
     """A large sphere halved by the rim beside a small one off it: no upper bound may count on a whole one."""
     points = np.array([[0.0, 0, 0], [2.0**-10, 0, 0]])

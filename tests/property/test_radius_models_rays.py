@@ -9,7 +9,6 @@ import naive
 import naive_objects
 import naive_rays
 import numpy as np
-import pytest
 import radius_class_archives
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -113,7 +112,6 @@ def test_bounded_rays_hold_the_first_sphere(seed: int, kind: str, model: str, tr
                     assert (hit == (right.row >= 0)).all()
 
 
-@pytest.mark.interpreted
 def test_a_larger_sphere_behind_is_hit_before_a_small_one(tmp_path: Path) -> None:
     """Two points on a ray, the near one on a rim; and two beside another."""
     points = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.1875, 1.0], [0.25, 0.1875, 1.0]])

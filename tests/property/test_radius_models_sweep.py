@@ -87,7 +87,6 @@ def test_no_sampled_pose_contradicts_the_answer(
             )
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("model", ["local:0.2", "border:3", "local+border:0.3"])
 def test_a_motion_that_stands_still_touches_from_the_very_unit_on(
     tmp_path: Path, rng: np.random.Generator, model: str
@@ -231,7 +230,6 @@ def test_a_large_sphere_makes_no_work_where_spheres_are_small(
     assert 1000 < visits["local:5"] < 1.2 * visits["fixed:0.005"]
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("model", ["local", "border:3"])
 def test_a_path_asks_of_each_part_what_a_scene_answers(
     tmp_path: Path, rng: np.random.Generator, model: str

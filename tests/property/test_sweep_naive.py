@@ -7,7 +7,6 @@ from typing import Any
 import archive_cases
 import judged_sweeps
 import numpy as np
-import pytest
 import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -147,7 +146,6 @@ def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
     assert (late.lower[late.verdict == Verdict.UNKNOWN] == 0).all()
 
 
-@pytest.mark.interpreted
 def test_a_few_motions_of_every_sort(tmp_path: Path, rng: np.random.Generator) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (5, 3))

@@ -127,17 +127,20 @@ def states_after(session, count, height):
 
 
 def test_a_session_does_not_walk_as_an_avatar_that_somebody_else_added(archive, endpoint):
-    with known_by_a_rogue(archive, endpoint) as (client, known):
-        with served(archive, endpoint), rogue_session(endpoint) as rogue:
-            add(rogue, known, *LIE)
-            user = key_expressions.User(known, "al")
-            wish = Wish(seq=1, time=0.0, pose=pose_at(0.0, -3.0)[None])
-            rogue.put(key_expressions.command_key("floor", user), encode(wish), encoding=MSGPACK)
-            time.sleep(0.2)  # the false wish arrives first
-            with client.session("al") as session:
-                eventually(lambda: states_after(session, 1, 2.0) == [2.0])
-                # The client's own avatar does not enter the floor; the false one would.
-                for height in (1.0, -1.0):
-                    found = states_after(session, 20, height)
-                    assert not [each for each in found if not isinstance(each, str) and each < -0.2], found
-                assert client._connection.client_id != known
+    with (
+        known_by_a_rogue(archive, endpoint) as (client, known),
+        served(archive, endpoint),
+        rogue_session(endpoint) as rogue,
+    ):
+        add(rogue, known, *LIE)
+        user = key_expressions.User(known, "al")
+        wish = Wish(seq=1, time=0.0, pose=pose_at(0.0, -3.0)[None])
+        rogue.put(key_expressions.command_key("floor", user), encode(wish), encoding=MSGPACK)
+        time.sleep(0.2)  # the false wish arrives first
+        with client.session("al") as session:
+            eventually(lambda: states_after(session, 1, 2.0) == [2.0])
+            # The client's own avatar does not enter the floor; the false one would.
+            for height in (1.0, -1.0):
+                found = states_after(session, 20, height)
+                assert not [each for each in found if not isinstance(each, str) and each < -0.2], found
+            assert client._connection.client_id != known

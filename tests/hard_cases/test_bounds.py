@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from numpy.typing import NDArray
+from sample_sizes import sample
 from served_nodes import row_encloses
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.voxel.record_points import voxel_points
@@ -96,7 +97,7 @@ def stored_nodes(
 @pytest.mark.parametrize("voxel", [0.5, 8.0, 70.0])
 def test_case_18_every_node_encloses_its_points(tmp_path: Path, kind: str, voxel: float) -> None:
     # Of 70 m and a step of 0.1 mm a voxel has 2^20 steps: the top tree's unit is 16 of them.
-    count = 250
+    count = sample(120, 250)
     points = synthetic_scans.make_scan(kind, 4, count) * (voxel if voxel > 8 else 1)
     case = archive_cases.build(tmp_path, points, voxel=voxel, leaf=5, degree=3, cell_points=20)
     nodes = boxes = 0

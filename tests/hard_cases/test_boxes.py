@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from numpy.typing import NDArray
+from sample_sizes import sample
 from served_nodes import row_encloses
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
@@ -110,7 +111,7 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
         if count == 1:  # without the slack of its root sphere
             body = body._replace(arrays=body.arrays._replace(radius=np.zeros(len(body.arrays.radius))))
         placed, exact_step = make_placed(body.arrays), Fraction(step)
-        poses = poses_beside(rng, scene, index, 25)
+        poses = poses_beside(rng, scene, index, sample(6, 25))
         boxes = [
             ([f * exact_step for f in fractions(low)], [f * exact_step for f in fractions(high)])
             for low, high in zip(index.low, index.high, strict=True)
@@ -156,7 +157,7 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
 def test_case_39_lists_of_voxels_leave_none_out(step: float, origin: tuple[float, float, float]) -> None:
     rng = np.random.default_rng(39)
     scene, index = boxed_scene(rng, step, origin)
-    k, per_step = 40, Fraction(scene.units_per_step)
+    k, per_step = sample(12, 40), Fraction(scene.units_per_step)
     tree = make_voxel_tree(index.low, index.high, np.empty((0, 2, 3), np.int64))
     places = poses_beside(rng, scene, index, k)[:, :3, 3]
     places[::5] += rng.choice([-1.0, 1.0], (len(places[::5]), 3)) * 1e8  # far from all boxes

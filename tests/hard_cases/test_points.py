@@ -6,6 +6,7 @@ import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.voxel.record_points import voxel_points
@@ -97,7 +98,7 @@ def test_case_10_points_on_borders_are_each_in_one_cell(tmp_path: Path) -> None:
     11, "voxels of 8, 0.3 and 0.07 m and shifted grids: the judge's verdicts; contact from across a border"
 )
 def test_case_11_contact_across_borders_for_any_voxels(tmp_path: Path, rng: np.random.Generator) -> None:
-    size, count = 800, 80
+    size, count = sample((300, 30), (800, 80))
     points, avatar = synthetic_scans.make_scan("noise", 6, size), rng.uniform(-0.3, 0.3, (20, 3))
     poses = archive_cases.near_poses(rng, points, avatar, count, 0.06)
     lows = points.min(axis=0)

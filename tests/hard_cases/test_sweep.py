@@ -10,6 +10,7 @@ import judged_sweeps
 import numpy as np
 import pytest
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
@@ -48,7 +49,7 @@ def test_case_26_ways_from_a_centimetre_to_ten_kilometres(tmp_path: Path, length
 def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random.Generator) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 60), radius=0.0)
     body = rng.uniform(-0.2, 0.2, (8, 3))
-    count = 100
+    count = sample(30, 100)
     poses = np.concatenate(
         [archive_cases.near_poses(rng, case.points, body, count, 0.2, s) for s in (1.0, 0.5)]
     )
@@ -124,7 +125,7 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     """A rod that turns about one end, up to half a turn, against pillars around it."""
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("pillar", 5, 400), radius=0.01)
     rod = np.linspace(0, 0.6, 40)[:, None] * [1.0, 0, 0]
-    count = 60
+    count = sample(20, 60)
     first = np.array(
         [archive_cases.pose_of(turn_z(a), np.array([0.5, 1.0, 1.0])) for a in rng.uniform(0, 7, count)]
     )
@@ -144,7 +145,7 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
 )
 def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np.random.Generator) -> None:
     """Segment by segment, and a segment piece by piece; what lies beyond the contact is never loaded."""
-    points = rng.uniform(0, 1, (6000, 3)) * [60.0, 2, 2]
+    points = rng.uniform(0, 1, (sample(3000, 6000), 3)) * [60.0, 2, 2]
     points = points[(np.abs(points[:, 1:] - 1).max(axis=1) > 0.3) | (points[:, 0] > 50)]
     case = archive_cases.build(tmp_path, points, voxel=1.0, radius=0.05)
     body = rng.uniform(-0.1, 0.1, (10, 3))

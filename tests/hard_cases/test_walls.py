@@ -27,7 +27,7 @@ def test_case_26_no_thin_wall_is_missed(tmp_path: Path, rng: np.random.Generator
     """
     case = archive_cases.build(tmp_path, wall(1.0, 0.02), radius=0.011, voxel=1.0)
     body, radius = rng.uniform(-0.05, 0.05, (20, 3)), 0.01
-    count = 500
+    count = sample(60, 500)
     first, last = np.empty((2, count, 4, 4))
     stepped = 0
     for i in range(count):
@@ -66,7 +66,7 @@ def test_case_26_a_wall_of_a_millimetre_is_met_on_any_way(
 ) -> None:
     # Spheres of 1 mm, 0.7 mm apart: no hole among them, and nothing behind them.
     case = archive_cases.build(tmp_path, wall(0.03, 0.0007), radius=0.0005, resolution=1e-5)
-    count = 100
+    count = sample(30, 100)
     way = rng.normal(size=(count, 3)) * [1, 0.3, 0.3]
     way *= length * np.sign(way[:, :1]) / np.linalg.norm(way, axis=1)[:, None]
     part = rng.uniform(0.2, 0.8, (count, 1))  # of the way is before the wall

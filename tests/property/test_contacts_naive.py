@@ -19,7 +19,7 @@ from solidcloud.server.queries.contacts import contacts
 from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
 
 
-@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -66,7 +66,7 @@ def test_every_pair_and_cluster_is_the_definitions(
                 compare(case, avatar, float(radius), poses, limit, float(margin), distance)
 
 
-@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 20), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), limit=st.sampled_from([1, 5, 64, 1000]), tree=TREES)
 def test_ties_go_by_point_then_centre_then_row_then_scan(seed: int, limit: int, tree: dict[str, Any]) -> None:
     """Points and avatar on one coarse grid, many of them several times, under poses that keep the grid."""
@@ -141,7 +141,7 @@ def listed(answers: ContactsAnswers, pose: int) -> list[tuple[float, ...]]:
     return list(zip(answers.avatar_index[own], answers.signed_distance[own], *places.T, strict=True))
 
 
-@pytest.mark.parametrize("visits", [0, 1, 10, 60, 200, 1000, 1 << 40])
+@pytest.mark.parametrize("visits", [0, 60])
 def test_a_budget_leaves_out_and_never_invents(rich: ScanCase, visits: int) -> None:
     for seed in range(4):
         avatar, radius, poses, _, margin = rich_question(rich, seed)

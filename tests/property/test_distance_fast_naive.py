@@ -58,7 +58,7 @@ def both_ways(
         counted.touching += bool(expected.signed_distance[0] <= 0)
 
 
-@settings(max_examples=sample(12, 40), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 40), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

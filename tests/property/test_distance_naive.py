@@ -30,7 +30,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 
-@settings(max_examples=sample(12, 40), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 40), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -96,7 +96,7 @@ def test_distance_and_witnesses_are_those_of_the_definition(
                     assert (again[0] is None) == (found.square > (units + radii) ** 2)
 
 
-@settings(max_examples=sample(4, 8), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 8), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
 def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -133,7 +133,7 @@ def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -
                     scene.residency.check()
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.tuples(st.sampled_from(KINDS), st.sampled_from(KINDS)))
 def test_either_may_be_the_scan(seed: int, kinds: tuple[str, str]) -> None:
     """distance(A, B, M) == distance(B, A, M^-1) for M exactly invertible (NUMERICS.md case 29)."""
@@ -215,7 +215,7 @@ def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Gen
     avatar = direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(0.2, 0.21, (10_000, 1))
     low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
     poses = np.stack(
-        [archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(low, high)) for _ in range(12)]
+        [archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(low, high)) for _ in range(6)]
     )
     with Scene.open(case.archive) as scene:
         info = scene.info()

@@ -29,7 +29,7 @@ MODELS = (*radius_class_archives.MODELS, "local", "border:0.5")
 
 
 @pytest.mark.timeout(900)  # the first run may have to compile everything
-@settings(max_examples=sample(10, 30), deadline=None, derandomize=True)
+@settings(max_examples=sample(5, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -27,7 +27,7 @@ TOLERANCES = (0.0, 2.0**-26, 3e-3, 0.05, 0.4, 20.0)
     35,
     "25 scenes, six tolerances, radii per point: brute force, with no voxel in memory, and from an empty cache on",
 )
-@settings(max_examples=sample(8, 25), deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 25), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -35,7 +35,7 @@ def least_margin(a: NDArray[np.int64], scan: NDArray[np.int64], radii: NDArray[n
     return min(found)
 
 
-@settings(max_examples=sample(10, 30), deadline=None, derandomize=True)
+@settings(max_examples=sample(5, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -33,7 +33,7 @@ def signed_of(judged: list[naive_distance.Expected | None]) -> NDArray[np.float6
     return np.array([math.inf if found is None else found.signed for found in judged])
 
 
-@settings(max_examples=sample(10, 30), deadline=None, derandomize=True)
+@settings(max_examples=sample(5, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -92,7 +92,7 @@ def test_distance_is_that_of_the_least_gap(
                     compare(again, [found if within else None], limit)
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -171,7 +171,7 @@ def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Gen
     poses = np.stack(
         [
             archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1.2, 1.2, 3))
-            for _ in range(8)
+            for _ in range(4)
         ]
     )
     with radius_class_archives.any_classes():

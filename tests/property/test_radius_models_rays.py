@@ -26,7 +26,7 @@ from solidcloud.server.queries.within import within
 MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0")
 
 
-@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 20), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -74,7 +74,7 @@ def test_the_first_sphere_is_the_definitions(
             same_points(within(data, o, 1.0), near, lattice)
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -54,7 +54,7 @@ def scene_options(tolerance: float, model: str | None) -> dict[str, Any]:
 
 
 @pytest.mark.timeout(900)  # the first run may have to compile everything
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),

@@ -29,7 +29,7 @@ def stored(case: archive_cases.Case, data: SceneData) -> NDArray[np.float64]:
     return np.asarray(naive.lattice_of(case.points, origin, step) * step + origin)
 
 
-@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -74,7 +74,7 @@ def test_rays_and_points_are_answered_as_defined(
                 )
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
 def test_no_tree_voxel_order_or_cache_changes_an_answer(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -101,7 +101,7 @@ def test_no_tree_voxel_order_or_cache_changes_an_answer(seed: int, kind: str) ->
     assert all(one == seen[0] for one in seen)
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @example(seed=1, shift=(6_378_137, -6_378_137, 6_356_752))
 @given(seed=st.integers(0, 2**32 - 1), shift=st.tuples(*[st.integers(-(10**7), 10**7)] * 3))
 def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, int, int]) -> None:

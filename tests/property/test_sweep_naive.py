@@ -17,7 +17,7 @@ from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import QueryBudget
 
 
-@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),
@@ -64,7 +64,7 @@ def test_no_sampled_pose_contradicts_the_answer(
     assert (answers.verdict != Verdict.UNKNOWN).all() or kind == "duplicates" or radius + margin < 2e-3
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),
@@ -94,7 +94,7 @@ def test_no_tree_voxel_or_order_changes_an_answer(seed: int, kind: str, turn: fl
             assert [str(column.tolist()) for column in found] == expected
 
 
-@settings(max_examples=sample(4, 8), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 8), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), turn=st.sampled_from([0.0, 0.5]))
 def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None:
     """The way between exactly shifted poses rounds differently, by 10^-9 m at 5 * 10^6 m: no more may differ."""
@@ -122,7 +122,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None
         assert np.abs(getattr(one, bound)[touches] - getattr(other, bound)[touches]).max() < 1e-5
 
 
-@settings(max_examples=sample(5, 12), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 12), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), visits=st.sampled_from([0, 1, 10, 100, 1000]))
 def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
     """Case 30: with fewer visits the bounds are wider, and still hold; what is clear stays clear."""

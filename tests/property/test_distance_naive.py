@@ -107,7 +107,7 @@ def test_no_tree_voxel_order_or_budget_changes_an_answer(seed: int, kind: str) -
     poses = np.array(
         [
             archive_cases.pose_of(turns[rng.integers(24)], np.rint(rng.uniform(-24, 24, 3)) / 16)
-            for _ in range(40)
+            for _ in range(20)
         ]
     )
     expected = None

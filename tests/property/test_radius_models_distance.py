@@ -171,7 +171,7 @@ def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Gen
     poses = np.stack(
         [
             archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1.2, 1.2, 3))
-            for _ in range(4)
+            for _ in range(8)
         ]
     )
     with radius_class_archives.any_classes():

@@ -18,14 +18,11 @@ from numpy.typing import NDArray
 from point_clouds import KINDS, TREES, cloud
 from sample_sizes import sample
 from solidcloud.schemas.archive.radius_model import RIM_BIT
-from solidcloud.schemas.wire.answers import CollideAnswers, DistanceAnswers, Verdict
-from solidcloud.server.queries.context import anytime_search as bounded
-from solidcloud.server.queries.context.query_budget import NO_LIMIT
+from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.scene import Scene
 
 # `local` and `border` as they are: spheres as large as the cloud, so that avatars are inside most of them.
 MODELS = (*radius_class_archives.MODELS, "local", "local+border", "border:0.5")
-BUDGETS = (0, 5, 30, 200, NO_LIMIT - 1)
 
 
 def signed_of(judged: list[naive_distance.Expected | None]) -> NDArray[np.float64]:
@@ -90,78 +87,6 @@ def test_distance_is_that_of_the_least_gap(
                     again = scene.distance("avatar", pose[None], limit, radius_model=model)
                     within = found.square <= (units + found.radii) ** 2
                     compare(again, [found if within else None], limit)
-
-
-@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    kind=st.sampled_from(KINDS),
-    body=st.sampled_from(KINDS),
-    model=st.sampled_from(MODELS[:-1]),
-    voxel=st.sampled_from([0.3, 5.0]),
-    heap=st.sampled_from([1, 20, bounded.HEAP_PAIRS]),
-    cache=st.sampled_from([None, 2]),
-    tree=TREES,
-)
-def test_bounds_hold_and_a_larger_budget_never_gives_worse(
-    seed: int,
-    kind: str,
-    body: str,
-    model: str | None,
-    voxel: float,
-    heap: int,
-    cache: int | None,
-    tree: dict[str, Any],
-) -> None:
-    """cache: so many of the largest voxel, so that poses are looked at in pieces."""
-    rng = np.random.default_rng(seed)
-    points, avatar = cloud(rng, kind, 300), cloud(rng, body, 50) * rng.uniform(0.05, 0.5)
-    poses = archive_cases.near_poses(rng, points, avatar, 20, 0.6)
-    tolerance = float(rng.choice([0.0, 1e-3, 0.03, 0.3]))
-    margin, reach = float(rng.choice([0.0, 0.02, 0.2])), float(rng.choice([0.05, 1.0]))
-    with (
-        TemporaryDirectory() as folder,
-        pytest.MonkeyPatch.context() as patch,
-        radius_class_archives.any_classes(),
-    ):
-        patch.setattr(bounded, "HEAP_PAIRS", heap)
-        case = archive_cases.build(
-            Path(folder), points, voxel=voxel, models=radius_class_archives.STORED, **tree
-        )
-        stored, radii = radius_class_archives.stored_radii(case.archive, model)
-        with Scene.open(case.archive) as scene:
-            info = scene.info()
-            most = max(scene.residency.bytes_of([row]) for row in range(info.voxels))
-        scan = (stored, info.origin, info.lattice_step, radii, avatar, 0.02)
-        signed = signed_of(naive_distance.distance_by_radii(*scan, poses, 5.0))
-        within = np.where(signed <= reach, signed, np.inf)
-        with Scene.open(case.archive, **({} if cache is None else {"budget_bytes": cache * most})) as scene:
-            scene.add_avatar("avatar", avatar, 0.02)
-            last: tuple[DistanceAnswers, CollideAnswers] | None = None
-            for visits in BUDGETS:
-                options: dict[str, Any] = {
-                    "tolerance": tolerance,
-                    "budget_visits": visits,
-                    "radius_model": model,
-                }
-                ended = visits == BUDGETS[-1]
-                near = scene.distance("avatar", poses, reach, **options)
-                judge_distance(near, within, reach, tolerance, ended)
-                touch = scene.collide("avatar", poses, margin, **options)
-                judge_collide(touch, signed, margin, tolerance, ended)
-                if last is not None:
-                    for now, before in zip((near, touch), last, strict=True):
-                        assert (now.lower >= before.lower).all() and (now.upper <= before.upper).all()
-                    known = last[1].verdict != Verdict.UNKNOWN
-                    assert (touch.verdict[known] == last[1].verdict[known]).all()
-                last = near, touch
-            exact = scene.distance("avatar", poses, reach, radius_model=model)
-            assert exact.signed_distance.tolist() == within.tolist()
-            if tolerance == 0.0:
-                assert near.signed_distance.tolist() == within.tolist()
-                assert np.array_equal(exact.witness_cloud, near.witness_cloud, equal_nan=True)
-                assert np.array_equal(exact.witness_avatar, near.witness_avatar, equal_nan=True)
-            scene.residency.check()
 
 
 def test_an_avatar_whose_front_is_inner_nodes(tmp_path: Path, rng: np.random.Generator) -> None:

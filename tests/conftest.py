@@ -48,8 +48,8 @@ def pytest_configure(config: pytest.Config) -> None:
 class CaseReport:
     """Every test marked `case`, run or not, and what became of it: a JSON object by test function.
 
-    number, text: the marker's.  marks: names of its other markers.  compiled_only: the marker's reason, or "".
-    outcomes: of its runs, one a parameter set; none where it was not run.  skipped: why it was.
+    number, text: the marker's.  marks: names of its other markers.  outcomes: of its runs, one a
+    parameter set; none where it was not run.  skipped: why it was.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,7 +68,6 @@ class CaseReport:
                         "number": number,
                         "text": text,
                         "marks": sorted({m.name for m in item.iter_markers()} - {"case", "parametrize"}),
-                        "compiled_only": mark.kwargs.get("compiled_only", ""),
                         "outcomes": [],
                         "skipped": "",
                     },

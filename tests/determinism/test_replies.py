@@ -1,9 +1,5 @@
-"""Test that equal requests have equal reply bytes, on any number of threads and any processor."""
+"""Test that equal requests have equal reply bytes, on any number of threads."""
 
-import json
-import os
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -15,8 +11,6 @@ import synthetic_scans
 from sample_sizes import sample
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
-
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +26,9 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     25,
     "2,500 mixed requests on 1, 2 and 4 threads, with loads and evictions: the same reply bytes, except for costs",
 )
-@pytest.mark.interpreted
 @pytest.mark.timeout(900)  # the first run may have to compile everything
 def test_threads_change_no_byte(archive: Path) -> None:
-    count = 40 if INTERPRETED else sample(600, 2_500)
+    count = sample(200, 2_500)
     asked = mixed_requests.requests(count)
     assert len(Counter(op for op, _ in asked)) == 8
     with Archive(archive) as opened, Scene.open(archive) as scene:
@@ -46,23 +39,3 @@ def test_threads_change_no_byte(archive: Path) -> None:
         found = mixed_requests.checksums(archive, asked, threads, budget)
         differ = np.flatnonzero(np.array(found) != first)
         assert not len(differ), (threads, budget, len(differ), asked[1 + int(differ[0])][0])
-
-
-@pytest.mark.case(
-    25,
-    "10,000 mixed requests compiled for a generic processor without any extension: the same reply bytes",
-    compiled_only="it compiles twice",
-)
-@pytest.mark.slow
-@pytest.mark.timeout(1000)
-@pytest.mark.skipif(INTERPRETED, reason="it compiles twice")
-def test_the_processor_changes_no_byte(archive: Path) -> None:
-    """Compile everything once more, which takes a minute or two."""
-    here = mixed_requests.checksums(archive, mixed_requests.requests(10_000), 1, 1 << 26)
-    path = os.pathsep.join([str(Path(mixed_requests.__file__).parent), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", mixed_requests.__file__, str(archive), "10000"],
-        env=os.environ | {"PYTHONPATH": path, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
-        capture_output=True, text=True, check=True, timeout=900,
-    )  # fmt: skip
-    assert json.loads(done.stdout) == here

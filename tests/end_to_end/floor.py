@@ -12,7 +12,7 @@ from fake_server import floor_verdicts
 from solidcloud.schemas.wire.warming_parts import READY_LINE
 
 POINTS = np.array([[0.0, 0.0, 0.5], [0.25, 0.0, 1.0], [0.0, 0.25, 1.5]])
-DEADLINE = 20.0
+DEADLINE = 60.0
 
 
 @contextmanager

@@ -40,6 +40,7 @@ def test_an_archive_that_cannot_be_opened_leaves_no_folder(tmp_path: Path) -> No
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.slow
 def test_the_facade_is_built_and_all_questions_are_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,21 @@ import numpy as np
 import pytest
 from cli_floor import RADIUS, build_floor, errors
 from solidcloud.server.cli.main import run
-from solidcloud.server.report.walk.server_process import served
+from solidcloud.server.scene import Scene
+from solidcloud.server.zenoh_server.serve_loop import serving
+from solidcloud.server.zenoh_server.server_config import ServerConfig
 
 
 @pytest.fixture(scope="module")
-def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_floor(tmp_path_factory.mktemp("floor"))
+def endpoint(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Callable[[], str]) -> Iterator[str]:
+    """Serve the floor."""
+    archive, endpoint = build_floor(tmp_path_factory.mktemp("floor")), free_endpoint()
+    with Scene.open(archive, "hall") as scene, serving([scene], ServerConfig(listen=endpoint)):
+        yield endpoint
 
 
 def test_query_agrees_with_the_floor(
-    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     heights = [0.3, 0.0999, 0.1001, 0.02, 5.0]
     # The avatar is one point above a scan point; both radii are 0.05 m.
@@ -27,13 +33,12 @@ def test_query_agrees_with_the_floor(
     (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
     ask = ["query", "--avatar", str(tmp_path / "ball.xyz"), "--poses", str(tmp_path / "poses.csv")]
     ask += ["--radius", str(RADIUS)]
-    with served(archive, "hall", "--cache", "64MB") as endpoint:
-        assert run([*ask, "--connect", endpoint, "--scene", "hall", "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert run([*ask, "--connect", endpoint, "--scene", "hall"]) == 0
-        assert "3 clear, 2 contact, 0 unknown" in capsys.readouterr().out
-        assert run([*ask, "--connect", endpoint, "--scene", "nave"]) == 1
-        assert "served: hall" in errors(capsys)[0]
+    assert run([*ask, "--connect", endpoint, "--scene", "hall", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert run([*ask, "--connect", endpoint, "--scene", "hall"]) == 0
+    assert "3 clear, 2 contact, 0 unknown" in capsys.readouterr().out
+    assert run([*ask, "--connect", endpoint, "--scene", "nave"]) == 1
+    assert "served: hall" in errors(capsys)[0]
     verdicts = [answer["verdict"] for answer in told["answers"]]
     assert verdicts == ["contact" if z <= 2 * RADIUS else "clear" for z in heights]
     assert told["faults"] == [] and told["resident"] >= 1
@@ -114,23 +119,22 @@ LINES["path"] = LINES["distance"]
 
 
 def test_every_question_from_the_command_line(
-    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asks = ask_all(tmp_path)
-    with served(archive, "hall", "--cache", "64MB") as endpoint:
-        for op, options in asks.items():
-            ask = ["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]
-            assert run(ask) == 0, errors(capsys)
-            lines = capsys.readouterr().out.splitlines()
-            assert len(lines) == len(LINES[op]), lines
-            for line, expected in zip(lines, LINES[op], strict=True):
-                assert re.fullmatch(expected, line.strip()), line
-            assert run([*ask, "--json"]) == 0
-            told = json.loads(capsys.readouterr().out)
-            words = [word for line in lines[:-1] for word in ("clear", "contact") if f"  {word}" in line]
-            assert [answer["verdict"] for answer in told["answers"]] == words[: len(told["answers"])]
-            assert told["faults"] == [] and told["engine_seconds"] > 0
-            check_json(op, told)
+    for op, options in asks.items():
+        ask = ["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]
+        assert run(ask) == 0, errors(capsys)
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == len(LINES[op]), lines
+        for line, expected in zip(lines, LINES[op], strict=True):
+            assert re.fullmatch(expected, line.strip()), line
+        assert run([*ask, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        words = [word for line in lines[:-1] for word in ("clear", "contact") if f"  {word}" in line]
+        assert [answer["verdict"] for answer in told["answers"]] == words[: len(told["answers"])]
+        assert told["faults"] == [] and told["engine_seconds"] > 0
+        check_json(op, told)
 
 
 # For each query: the noun for its items, and whether each lies outside the floor, which is 4 m wide
@@ -178,42 +182,40 @@ def outside_files(folder: Path, first: float) -> dict[str, list[str]]:
 
 
 def test_places_outside_the_scan_are_said_and_counted(
-    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with served(archive, "hall", "--cache", "64MB") as endpoint:
-        for first in (0.2, 12.0):
-            for op, options in outside_files(tmp_path, first).items():
-                word, lie = OUTSIDE[op]
-                lie = lie if first < 9 else [True] * len(lie)
-                ask = ["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]
-                assert run(ask) == 0, (op, errors(capsys))
-                shown = capsys.readouterr()
-                warnings = [line for line in shown.err.splitlines() if line.startswith("warning: ")]
-                counted = f"{sum(lie)} of {len(lie)} {word} lie outside the scan"
-                bounds = r"\(its bounds: -2\.000 -2\.000 0\.000 \.\. 1\.900 1\.900 0\.000 m\)"
-                assert len(warnings) == any(lie), (op, shown.err)
-                if any(lie):
-                    assert re.fullmatch(f"warning: {counted} {bounds}", warnings[0]), (op, warnings)
-                if op != "move":
-                    said = f", {sum(lie)} outside the scan; " if any(lie) else " unknown; "
-                    assert said in shown.out.splitlines()[-1], (op, shown.out)
-                assert run([*ask, "--json"]) == 0
-                told = json.loads(capsys.readouterr().out)
-                rows = told if op == "move" else told["answers"]
-                assert [row["outside_scan"] for row in rows] == lie, (op, first)
-                assert op == "move" or told["outside_scan"] == sum(lie)
+    for first in (0.2, 12.0):
+        for op, options in outside_files(tmp_path, first).items():
+            word, lie = OUTSIDE[op]
+            lie = lie if first < 9 else [True] * len(lie)
+            ask = ["query", "--connect", endpoint, "--scene", "hall", "--op", op, *options]
+            assert run(ask) == 0, (op, errors(capsys))
+            shown = capsys.readouterr()
+            warnings = [line for line in shown.err.splitlines() if line.startswith("warning: ")]
+            counted = f"{sum(lie)} of {len(lie)} {word} lie outside the scan"
+            bounds = r"\(its bounds: -2\.000 -2\.000 0\.000 \.\. 1\.900 1\.900 0\.000 m\)"
+            assert len(warnings) == any(lie), (op, shown.err)
+            if any(lie):
+                assert re.fullmatch(f"warning: {counted} {bounds}", warnings[0]), (op, warnings)
+            if op != "move":
+                said = f", {sum(lie)} outside the scan; " if any(lie) else " unknown; "
+                assert said in shown.out.splitlines()[-1], (op, shown.out)
+            assert run([*ask, "--json"]) == 0
+            told = json.loads(capsys.readouterr().out)
+            rows = told if op == "move" else told["answers"]
+            assert [row["outside_scan"] for row in rows] == lie, (op, first)
+            assert op == "move" or told["outside_scan"] == sum(lie)
 
 
 def test_poses_in_millimetres_are_called_so(
-    archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "ball.xyz").write_text("0 0 0\n")
     places = np.random.default_rng(7).uniform(-1.9, 1.8, (40, 2)) * 1000
     rows = "".join(f"{t},{x},{y},50,1,0,0,0\n" for t, (x, y) in enumerate(places))
     (tmp_path / "poses.csv").write_text("t,x,y,z,qw,qx,qy,qz\n" + rows)
     ask = ["query", "--avatar", str(tmp_path / "ball.xyz"), "--poses", str(tmp_path / "poses.csv")]
-    with served(archive, "hall", "--cache", "64MB") as endpoint:
-        assert run([*ask, "--radius", "0.05", "--connect", endpoint, "--scene", "hall"]) == 0
+    assert run([*ask, "--radius", "0.05", "--connect", endpoint, "--scene", "hall"]) == 0
     shown = capsys.readouterr()
     assert "40 of 40 poses lie outside the scan (its bounds: -2.000" in shown.err
     assert "divided by 1000 they would lie inside: expected metres, not millimetres?" in shown.err

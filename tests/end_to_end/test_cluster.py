@@ -1,4 +1,4 @@
-"""Test builds on two dask workers, one killed in the middle: the bytes are those of one process."""
+"""Test builds on two dask workers: the bytes are those of one process, also when a worker is killed."""
 
 import os
 import signal
@@ -108,6 +108,7 @@ class Killer(threading.Thread):
             time.sleep(0.001)
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_mid_build_changes_no_byte(
     scans: Path,
     alone: dict[str, bytes],
@@ -135,6 +136,7 @@ def test_a_worker_killed_in_mid_build_changes_no_byte(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hall"]
 
 
+@pytest.mark.slow
 def test_no_more_workers_read_records_back_than_may_hold_them(
     scheduler: str, scans: Path, alone: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,8 +174,9 @@ def test_a_scheduler_that_runs_elsewhere_makes_the_same_archive(
     assert {name for name in found if found[name] != alone[name]} <= {"index.h5"}
 
 
+@pytest.mark.slow
 def test_what_is_wrong_on_the_cluster_is_said_as_here(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bad.xyz").write_text("1 2 3\n4 5 six\n")
     said = {}
@@ -185,6 +188,10 @@ def test_what_is_wrong_on_the_cluster_is_said_as_here(
     assert said["alone"][0] == 3 and len(said["alone"][1]) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["bad.xyz"]
 
+
+def test_a_scheduler_that_does_not_answer_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cluster_module, "REACH_SECONDS", 1)
     np.savetxt(tmp_path / "good.xyz", np.eye(3))
     more = ["--scheduler", "tcp://127.0.0.1:1"]

@@ -10,8 +10,6 @@ from followed_documents import ROOT, Reader, blocks
 from solidcloud.server.cli.main import app
 
 README, SCENE, WIRE = (ROOT / name for name in ("README.md", "schemas/SCENE.md", "schemas/WIRE.md"))
-# The first start compiles everything if no kernels are kept.
-pytestmark = pytest.mark.timeout(900)
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +20,20 @@ def reader(tmp_path_factory: pytest.TempPathFactory, free_endpoint) -> Iterator[
         yield found
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # the first start compiles everything if no kernels are kept
 def test_readme_runs_from_top_to_bottom(reader: Reader) -> None:
     assert {"scans", "hall", "visitor.obj", "poses.csv"} <= {path.name for path in reader.folder.iterdir()}
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # the first start compiles everything if no kernels are kept
 def test_wire_runs_from_top_to_bottom_beside_the_readmes_server(reader: Reader) -> None:
     reader.follow(WIRE)
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # the first start compiles everything if no kernels are kept
 def test_scene_runs_from_top_to_bottom_in_the_readmes_folder(reader: Reader) -> None:
     reader.follow(SCENE)
 

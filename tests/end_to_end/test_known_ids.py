@@ -2,7 +2,7 @@
 
 import json
 import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +27,8 @@ from walkers import pose_at
 
 POSES = heights([-1.0, -0.5])
 CONTACTS = [Verdict.CONTACT] * 2
-# False avatars "al": a point far away, with another radius, and shifted high above the floor.
-LIES = {
-    "far": (np.full((1, 3), 1e6), 0.125),
-    "radius": (POINTS, 1e-6),
-    "high": (POINTS + np.array([0.0, 0.0, 50.0]), 0.125),
-}
+# A false avatar "al": shifted high above the floor.
+LIE = (POINTS + np.array([0.0, 0.0, 50.0]), 0.125)
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +51,13 @@ def served(archive, endpoint):
 
 
 @contextmanager
-def known_by_a_rogue(archive, endpoint, radius=0.125):
+def known_by_a_rogue(archive, endpoint):
     """Yield a client with right answers, and its id.
 
     An impostor at its dead server's endpoint has heard the id.
     """
     with Client(endpoint, scene="floor", timeout=2.0) as client:
-        client.add_avatar("al", POINTS, radius)
+        client.add_avatar("al", POINTS, 0.125)
         with served(archive, endpoint):
             eventually(lambda: client.collide("al", POSES).verdict.tolist() == CONTACTS)
         with Impostor(endpoint) as impostor:
@@ -89,9 +85,6 @@ def add(session, client, points, radius, name="al"):
 
 def verdicts_of(client, kind):
     """Return the verdicts of one kind of query."""
-    if kind == "objects":
-        found = client.objects([("al", POSES[0]), ("al", POSES[1])])
-        return found.verdict.tolist()
     if kind == "path":
         return np.concatenate([part.verdict for part in client.path("al", POSES)]).tolist()
     return client.collide("al", POSES).verdict.tolist()
@@ -110,45 +103,16 @@ def verdicts_until_right(client, kind):
     return heard
 
 
-@pytest.mark.parametrize("lie", LIES)
-@pytest.mark.parametrize("kind", ["collide", "objects", "path"])
-def test_answers_about_an_avatar_that_somebody_else_added_are_not_believed(archive, endpoint, kind, lie):
+@pytest.mark.parametrize("kind", ["collide", "path"])
+def test_answers_about_an_avatar_that_somebody_else_added_are_not_believed(archive, endpoint, kind):
     with (
         known_by_a_rogue(archive, endpoint) as (client, known),
         served(archive, endpoint),
         rogue_session(endpoint) as rogue,
     ):
-        add(rogue, known, *LIES[lie])
+        add(rogue, known, *LIE)
         assert Verdict.CLEAR not in verdicts_until_right(client, kind)
         assert client._connection.client_id != known, "the id that somebody knows is not used any more"
-
-
-def test_a_radius_that_the_server_makes_is_known_by_what_it_said(archive, endpoint):
-    with (
-        known_by_a_rogue(archive, endpoint, radius=None) as (client, known),
-        served(archive, endpoint),
-        rogue_session(endpoint) as rogue,
-    ):
-        add(rogue, known, *LIES["high"])
-        assert Verdict.CLEAR not in verdicts_until_right(client, "collide")
-
-
-def test_an_avatar_that_somebody_else_added_first_does_not_keep_the_own_one_out(archive, endpoint):
-    """Test a false avatar added between `unknown_avatar` and the client's own `add_avatar`."""
-    with (
-        known_by_a_rogue(archive, endpoint) as (client, known),
-        served(archive, endpoint),
-        rogue_session(endpoint) as rogue,
-    ):
-        ask, added = client._connection.ask, []
-
-        def asking(operation, request, names=()):
-            if operation == "add_avatar" and not added:
-                added.append(add(rogue, known, *LIES["high"]))
-            return ask(operation, request, names)
-
-        client._connection.ask = asking
-        assert Verdict.CLEAR not in verdicts_until_right(client, "collide") and added
 
 
 def states_after(session, count, height):
@@ -162,44 +126,21 @@ def states_after(session, count, height):
     return found
 
 
-@pytest.mark.parametrize("begun", ["before", "after"])
-def test_a_session_does_not_walk_as_an_avatar_that_somebody_else_added(archive, endpoint, begun):
-    with known_by_a_rogue(archive, endpoint) as (client, known):
-        session = client.session("al")
-        if begun == "before":
-            session.__enter__()
-        with served(archive, endpoint), rogue_session(endpoint) as rogue:
-            add(rogue, known, *LIES["high"])
-            user = key_expressions.User(known, "al")
-            wish = Wish(seq=1, time=0.0, pose=pose_at(0.0, -3.0)[None])
-            rogue.put(key_expressions.command_key("floor", user), encode(wish), encoding=MSGPACK)
-            rogue_began = time.monotonic()
-            eventually(lambda: time.monotonic() - rogue_began > 0.2)
-            if begun == "after":
-                session.__enter__()
-            with session:
-                eventually(lambda: states_after(session, 1, 2.0) == [2.0])
-                # The client's own avatar does not enter the floor; the false one would.
-                for height in (1.0, -1.0):
-                    found = states_after(session, 20, height)
-                    assert not [each for each in found if not isinstance(each, str) and each < -0.2], found
-                assert client._connection.client_id != known
-
-
-def test_a_session_goes_on_when_a_question_found_out(archive, endpoint):
+def test_a_session_does_not_walk_as_an_avatar_that_somebody_else_added(archive, endpoint):
     with (
         known_by_a_rogue(archive, endpoint) as (client, known),
         served(archive, endpoint),
         rogue_session(endpoint) as rogue,
-        client.session("al") as session,
     ):
-        eventually(lambda: states_after(session, 1, 2.0) == [2.0])
-        # Take the avatar from the client, as the end of a token does, and replace it.
-        token = rogue.liveliness().declare_token(key_expressions.client_token_key("floor", known))
-        token.undeclare()
-        eventually(lambda: list(rogue.get("solidcloud/1/scenes", timeout=DEADLINE)))
-        time.sleep(0.1)
-        with suppress(AssertionError):  # the client was first
-            add(rogue, known, *LIES["high"])
-        assert Verdict.CLEAR not in verdicts_until_right(client, "collide")
-        eventually(lambda: states_after(session, 1, 1.5) == [1.5])
+        add(rogue, known, *LIE)
+        user = key_expressions.User(known, "al")
+        wish = Wish(seq=1, time=0.0, pose=pose_at(0.0, -3.0)[None])
+        rogue.put(key_expressions.command_key("floor", user), encode(wish), encoding=MSGPACK)
+        time.sleep(0.2)  # the false wish arrives first
+        with client.session("al") as session:
+            eventually(lambda: states_after(session, 1, 2.0) == [2.0])
+            # The client's own avatar does not enter the floor; the false one would.
+            for height in (1.0, -1.0):
+                found = states_after(session, 20, height)
+                assert not [each for each in found if not isinstance(each, str) and each < -0.2], found
+            assert client._connection.client_id != known

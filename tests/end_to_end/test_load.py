@@ -4,11 +4,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.server.cli.main import run
 
 
+@pytest.mark.slow
 def test_a_load_test_of_any_archive(tmp_path: Path) -> None:
     x, y = np.meshgrid(np.arange(0, 16, 0.1), np.arange(0, 8, 0.1))
     np.savetxt(tmp_path / "hall.xyz", np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), fmt="%.3f")

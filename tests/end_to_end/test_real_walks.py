@@ -16,6 +16,8 @@ from walk_scans_cases.measured_walks import MeasuredWalk, measure_walk, scan_poi
 from walk_scans_cases.persons import make_person
 from walk_scans_cases.routes import SCANS
 
+# Minutes of walking.
+pytestmark = pytest.mark.slow
 CYLINDERS = [(name, route.name) for name, scan in SCANS.items() for route in scan.routes]
 
 Walks = Callable[[str, str, str], MeasuredWalk]

@@ -241,9 +241,9 @@ def server(generations: Generations, endpoint: str, tmp_path: Path) -> Iterator[
 def test_a_server_that_is_slow_is_told_from_one_that_is_gone(
     endpoint: str, server: subprocess.Popen[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(OPEN_SECONDS, "reload", 1.5)
     with Client(endpoint, scene="hall", timeout=1.5) as client:
         client.reload()
+        monkeypatch.setitem(OPEN_SECONDS, "reload", 1.5)
         freeze(server.pid)
         with pytest.raises(BusyError) as told:
             client.reload()

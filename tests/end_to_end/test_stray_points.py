@@ -118,6 +118,7 @@ def stands_in_the_air(office: Office, place: NDArray[np.float64]) -> bool:
     return bool((near & upright & stray).any() and not (near & upright & ~stray).any())
 
 
+@pytest.mark.slow
 def test_the_door_is_passed_with_the_proposed_options_only(office: Office, tmp_path: Path) -> None:
     said = office.said[1]
     outliers, moving = ["--outliers", said["outliers"]], ["--moving", said["moving"]]

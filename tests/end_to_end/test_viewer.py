@@ -1,8 +1,4 @@
-"""Test the viewer with a real browser: what its page shows, and that the server moves its user.
-
-The scene is a small façade (builder/synthetic), in whose frame the cloister's wall is at x = -9, and
-the main door between x = -0.8 and 0.8 at y = 0 to 1.2.
-"""
+"""Test the viewer with a real browser: what its page shows, and that the server moves its user."""
 
 import signal
 import subprocess
@@ -14,58 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.schemas.wire.warming_parts import READY_LINE
-from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
+from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.viewer.viewer import viewing
-from viewed_page import CHROMIUM, browsing, coloured, viewed_page
+from viewed_page import CHROMIUM, coloured, needs_chromium, viewed_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
+pytestmark = needs_chromium
 
-POINTS, VOXEL, WALL = 60_000, 2.0, -9.0
+WALL = -9.0
 BY_WALL, BEFORE_DOOR = "-7.6,-9,0.1,180", "0,-0.7,0.5,90"
 
 
-@pytest.fixture(scope="module")
-def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("viewer")
-    make_facade(folder / "facade.laz", points=POINTS)
-    build_archive([folder / "facade.laz"], folder / "archive", BuildConfig(voxel=VOXEL, jobs=1))
-    (folder / "viewer.toml").write_text(archive_scene(folder / "archive"))
-    return folder / "viewer.toml"
-
-
-@contextmanager
-def running(scene: Path, endpoint: str) -> Iterator["subprocess.Popen[str]"]:
-    """Serve a scene file at an endpoint."""
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(scene)]
-    process = subprocess.Popen([*command, "--listen", endpoint], stdout=subprocess.PIPE, text=True)
-    try:
-        assert READY_LINE in map(str.strip, process.stdout or ())
-        yield process
-    finally:
-        process.terminate()
-        process.communicate()
-
-
-@pytest.fixture(scope="module")
-def endpoint(scene_file: Path, free_endpoint: Any) -> Iterator[str]:
-    where = free_endpoint()
-    with running(scene_file, where):
-        yield where
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as browser:
-        yield browser
-
-
 @pytest.fixture
-def url(endpoint: str) -> Iterator[str]:
-    with viewing(endpoint) as url:
+def url(facade_endpoint: str) -> Iterator[str]:
+    with viewing(facade_endpoint) as url:
         yield url
 
 
@@ -106,6 +64,18 @@ def test_user_walks_is_stopped_by_the_wall_and_slides_along_it(browser: Any, url
         viewed.check_clean(url)
 
 
+def test_first_step_removes_the_hint_for_ever(browser: Any, url: str) -> None:
+    with viewed_page(browser, url, full=True) as viewed:
+        viewed.wait("s.place && s.notices.includes('hint')")
+        assert "Walk with W A S D" in viewed.page.inner_text("#notices")
+        with viewed.held("w"):
+            viewed.wait("!s.notices.includes('hint')")
+        viewed.page.reload()
+        viewed.wait("s.place && s.frames > 3")
+        assert "hint" not in viewed.read("s.notices")
+
+
+@pytest.mark.slow
 def test_user_passes_the_door_and_looks_from_its_eyes(browser: Any, url: str) -> None:
     with viewed_page(browser, f"{url}?at={BEFORE_DOOR}") as viewed:
         viewed.wait("s.place")
@@ -117,13 +87,11 @@ def test_user_passes_the_door_and_looks_from_its_eyes(browser: Any, url: str) ->
         viewed.check_clean(url)
 
 
-def test_voxel_boxes_show_what_is_loaded_as_the_user_walks(
-    browser: Any, scene_file: Path, free_endpoint: Any
-) -> None:
-    where = free_endpoint()
+@pytest.mark.slow
+def test_voxel_boxes_show_what_is_loaded_as_the_user_walks(browser: Any, facade_file: Path) -> None:
     with (
-        running(scene_file, where),
-        viewing(where) as url,
+        served(facade_file, None) as endpoint,
+        viewing(endpoint) as url,
         viewed_page(browser, f"{url}?at={BY_WALL}") as viewed,
     ):
         viewed.wait("s.place && s.voxels.some((each) => each.resident)")
@@ -137,6 +105,7 @@ def test_voxel_boxes_show_what_is_loaded_as_the_user_walks(
         viewed.check_clean(url)
 
 
+@pytest.mark.slow
 def test_two_browsers_see_one_another(browser: Any, url: str) -> None:
     with (
         viewed_page(browser, f"{url}?at={BY_WALL}") as one,
@@ -155,19 +124,33 @@ def test_two_browsers_see_one_another(browser: Any, url: str) -> None:
         one.check_clean(url)
 
 
+@contextmanager
+def running(scene: Path, endpoint: str) -> Iterator["subprocess.Popen[str]"]:
+    """Serve a scene file at an endpoint, by a process that a test may kill."""
+    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(scene)]
+    process = subprocess.Popen([*command, "--listen", endpoint], stdout=subprocess.PIPE, text=True)
+    try:
+        assert READY_LINE in map(str.strip, process.stdout or ())
+        yield process
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+@pytest.mark.slow
 def test_loss_and_return_of_the_server_are_shown_and_the_user_continues(
-    browser: Any, scene_file: Path, free_endpoint: Any
+    browser: Any, facade_file: Path, free_endpoint: Any
 ) -> None:
     where = free_endpoint()
     with viewing(where, "archive") as url, viewed_page(browser, f"{url}?at={BY_WALL}") as viewed:
         viewed.wait("s.server === 'searching'")
         assert "No server yet" in viewed.page.inner_text("#notices")
-        with running(scene_file, where) as process:
+        with running(facade_file, where) as process:
             place = viewed.wait("s.server === 'connected' && s.place")
             process.send_signal(signal.SIGKILL)
             viewed.wait("s.server === 'lost'")
             assert "The server is lost" in viewed.page.inner_text("#notices")
-        with running(scene_file, where):
+        with running(facade_file, where):
             viewed.wait("s.server === 'connected'")
             viewed.wait("!s.notices.includes('server')")
             with viewed.held("w"):
@@ -176,8 +159,9 @@ def test_loss_and_return_of_the_server_are_shown_and_the_user_continues(
         viewed.check_clean(url)
 
 
-def test_end_of_the_viewer_is_shown(browser: Any, endpoint: str) -> None:
-    with viewing(endpoint) as url, viewed_page(browser, url) as viewed:
+@pytest.mark.slow
+def test_end_of_the_viewer_is_shown(browser: Any, facade_endpoint: str) -> None:
+    with viewing(facade_endpoint) as url, viewed_page(browser, url) as viewed:
         viewed.wait("s.place")
         # A context that outlives the block: the page stays open while the viewer ends.
         context = browser.new_context()
@@ -190,6 +174,7 @@ def test_end_of_the_viewer_is_shown(browser: Any, endpoint: str) -> None:
         context.close()
 
 
+@pytest.mark.slow
 def test_panel_is_operated_by_keyboard(browser: Any, url: str) -> None:
     with viewed_page(browser, url) as viewed:
         viewed.wait_complete()
@@ -212,6 +197,7 @@ def test_panel_is_operated_by_keyboard(browser: Any, url: str) -> None:
         viewed.check_clean(url)
 
 
+@pytest.mark.slow
 def test_browser_without_webgl_is_told(browser: Any, url: str) -> None:
     plain = browser.browser_type.launch(executable_path=CHROMIUM, args=["--disable-3d-apis"])
     try:
@@ -223,10 +209,11 @@ def test_browser_without_webgl_is_told(browser: Any, url: str) -> None:
         plain.close()
 
 
-def test_command_serves_an_archive_and_prints_the_address(browser: Any, scene_file: Path) -> None:
+@pytest.mark.slow
+def test_command_serves_an_archive_and_prints_the_address(browser: Any, facade_file: Path) -> None:
     command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "view"]
     process = subprocess.Popen(
-        [*command, str(scene_file.parent / "archive"), "--no-browser"], stdout=subprocess.PIPE, text=True
+        [*command, str(facade_file.parent / "archive"), "--no-browser"], stdout=subprocess.PIPE, text=True
     )
     try:
         assert process.stdout is not None

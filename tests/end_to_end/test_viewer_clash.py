@@ -1,37 +1,26 @@
-"""Test the clash check of the viewer with a real browser, on a path through walls of a small façade.
-
-The façade is solid between y = 0 and 1.2 beside its doors, and the cloister's wall is at x = -9.
-"""
+"""Test the clash check of the viewer with a real browser, on a path through walls of the façade."""
 
 import io
 import itertools
 import json
 import math
-import subprocess
-import sys
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.schemas.wire.warming_parts import READY_LINE
 from solidcloud.server.cli.input.pose_file import read_path
-from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
 from solidcloud.server.client import Client
 from solidcloud.server.viewer.users.user_avatar import figure_avatar
 from solidcloud.server.viewer.viewer import viewing
-from viewed_page import CHROMIUM, DEADLINE, ViewedPage, browsing, viewed_page
+from viewed_page import DEADLINE, ViewedPage, needs_chromium, viewed_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
+pytestmark = [needs_chromium, pytest.mark.slow]
 
-POINTS, VOXEL, SCENE = 60_000, 2.0, "facade"
+SCENE = "archive"
 # The user stands far from the clashes: what is seen of them is seen by the jump.
 AT = "4,-9,0.1,90"
 WAY = [(2.6, -3.0, 0.7), (2.6, 3.0, 0.7), (-6.0, 3.0, 0.7), (-6.0, -9.0, 0.7), (-10.5, -9.0, 0.7)]
@@ -54,36 +43,11 @@ def path_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def endpoint(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Any) -> Iterator[str]:
-    """Serve the façade."""
-    folder, where = tmp_path_factory.mktemp("viewer"), free_endpoint()
-    make_facade(folder / "facade.laz", points=POINTS)
-    build_archive([folder / "facade.laz"], folder / SCENE, BuildConfig(voxel=VOXEL, jobs=1))
-    (folder / "viewer.toml").write_text(archive_scene(folder / SCENE))
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve"]
-    process = subprocess.Popen(
-        [*command, str(folder / "viewer.toml"), "--listen", where], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert READY_LINE in map(str.strip, process.stdout or ())
-        yield where
-    finally:
-        process.terminate()
-        process.communicate()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as browser:
-        yield browser
-
-
-@pytest.fixture(scope="module")
-def expected(endpoint: str, path_file: Path) -> list[tuple[float, int, int, int]]:
+def expected(facade_endpoint: str, path_file: Path) -> list[tuple[float, int, int, int]]:
     """Return depth, first and last pose, and contacts of each clash, as `contacts` of every pose finds them."""
     avatar = figure_avatar()
     _, poses = read_path(path_file)
-    with Client(endpoint, scene=SCENE) as client:
+    with Client(facade_endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
         # One at a time: a server ends requests that take long.
         answers = [client.contacts("judge", pose) for pose in poses]
@@ -116,10 +80,10 @@ def saved(viewed: ViewedPage, button: str) -> tuple[str, bytes]:
 
 
 def test_list_jumps_and_files_are_the_clashes_that_contacts_finds(
-    browser: Any, endpoint: str, path_file: Path, expected: list[tuple[float, int, int, int]]
+    browser: Any, facade_endpoint: str, path_file: Path, expected: list[tuple[float, int, int, int]]
 ) -> None:
     assert len(expected) >= 3
-    with viewing(endpoint) as url, viewed_page(browser, f"{url}?at={AT}") as viewed:
+    with viewing(facade_endpoint) as url, viewed_page(browser, f"{url}?at={AT}") as viewed:
         viewed.wait_complete()
         before, user = viewed.picture(), viewed.read("s.camera")
         clash = load(viewed, path_file)
@@ -147,7 +111,9 @@ def test_list_jumps_and_files_are_the_clashes_that_contacts_finds(
         assert math.dist(camera, user) > 2
         assert np.allclose(camera, shown["eye"], atol=1e-3)
         assert viewed.read("s.clash.ghost.body")
-        assert viewed.read("s.clash.ghost.places") == min(60, expected_pairs(endpoint, path_file, listed[0]))
+        assert viewed.read("s.clash.ghost.places") == min(
+            60, expected_pairs(facade_endpoint, path_file, listed[0])
+        )
         assert viewed.read("s.clash.ghost.normals") >= 1
         viewed.wait("s.complete")
         # The ghost and the contacts: light grey, and red.
@@ -174,11 +140,11 @@ def test_list_jumps_and_files_are_the_clashes_that_contacts_finds(
         viewed.check_clean(url)
 
 
-def expected_pairs(endpoint: str, path_file: Path, clash: dict[str, Any]) -> int:
+def expected_pairs(facade_endpoint: str, path_file: Path, clash: dict[str, Any]) -> int:
     """Return how many pairs are in contact at the deepest pose of a clash."""
     avatar = figure_avatar()
     pose = read_path(path_file)[1][clash["pose_deepest"]]
-    with Client(endpoint, scene=SCENE) as client:
+    with Client(facade_endpoint, scene=SCENE) as client:
         client.add_avatar("judge", avatar.points, avatar.radius)
         return int(client.contacts("judge", pose, limit=0).pairs_found[0])
 
@@ -213,19 +179,19 @@ def check_files(viewed: ViewedPage, listed: list[dict[str, Any]]) -> None:
 
 
 def test_path_of_the_command_line_is_checked_at_once(
-    browser: Any, endpoint: str, path_file: Path, expected: list[tuple[float, int, int, int]]
+    browser: Any, facade_endpoint: str, path_file: Path, expected: list[tuple[float, int, int, int]]
 ) -> None:
-    with viewing(endpoint, poses=path_file) as url, viewed_page(browser, url) as viewed:
+    with viewing(facade_endpoint, poses=path_file) as url, viewed_page(browser, url) as viewed:
         result = viewed.wait("s.clash.state === 'done' && s.clash.result")
         assert [each["poses"] for each in result["clashes"]] == [[each[1], each[2]] for each in expected]
         assert f"tour.tum: {len(expected)} clashes." in viewed.page.inner_text("#clash-message")
         viewed.check_clean(url)
 
 
-def test_wall_between_two_poses_is_listed_and_shown(browser: Any, endpoint: str) -> None:
+def test_wall_between_two_poses_is_listed_and_shown(browser: Any, facade_endpoint: str) -> None:
     """Issue 35: the page said "No clash" of a path whose poses lie before and behind a wall."""
     content = b"t,x,y,z,qw,qx,qy,qz\n0,2.6,-3,0.7,1,0,0,0\n2,2.6,3,0.7,1,0,0,0\n"
-    with viewing(endpoint) as url, viewed_page(browser, f"{url}?at={AT}") as viewed:
+    with viewing(facade_endpoint) as url, viewed_page(browser, f"{url}?at={AT}") as viewed:
         viewed.wait_complete()
         clash = load(viewed, {"name": "wall.csv", "mimeType": "text/csv", "buffer": content})
         result = clash["result"]
@@ -263,9 +229,9 @@ def test_wall_between_two_poses_is_listed_and_shown(browser: Any, endpoint: str)
     ],
 )
 def test_malformed_file_is_named_on_the_page(
-    browser: Any, endpoint: str, path_file: Path, name: str, text: str, said: str
+    browser: Any, facade_endpoint: str, path_file: Path, name: str, text: str, said: str
 ) -> None:
-    with viewing(endpoint) as url, viewed_page(browser, url) as viewed:
+    with viewing(facade_endpoint) as url, viewed_page(browser, url) as viewed:
         viewed.wait("s.server === 'connected'")
         content = text.encode("utf-8", "surrogatepass")
         clash = load(viewed, {"name": name, "mimeType": "text/plain", "buffer": content})
@@ -278,11 +244,11 @@ def test_malformed_file_is_named_on_the_page(
         viewed.check_clean(url)
 
 
-def test_cancelled_check_lists_what_was_found(browser: Any, endpoint: str, path_file: Path) -> None:
+def test_cancelled_check_lists_what_was_found(browser: Any, facade_endpoint: str, path_file: Path) -> None:
     _, *rows = path_file.read_text().splitlines()
     # Longer than any machine checks before the button is pressed.
     content = "\n".join(rows * (60_000 // len(rows))).encode()
-    with viewing(endpoint) as url, viewed_page(browser, url) as viewed:
+    with viewing(facade_endpoint) as url, viewed_page(browser, url) as viewed:
         viewed.wait("s.server === 'connected'")
         file = {"name": "long.tum", "mimeType": "text/plain", "buffer": content}
         viewed.page.get_by_label("Load a path").set_input_files(file)

@@ -17,9 +17,9 @@ from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.viewer.viewer import viewing
-from viewed_page import CHROMIUM, ViewedPage, browsing, coloured, viewed_page
+from viewed_page import ViewedPage, coloured, needs_chromium, viewed_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
+pytestmark = [needs_chromium, pytest.mark.slow]
 
 POINTS = 150_000
 BEFORE_DOOR, BY_WALL = "0,-6,0.1,90", "-7.6,-9,0.1,180"
@@ -83,12 +83,6 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def url(archive: Path) -> Iterator[str]:
     with served(archive, None) as endpoint, viewing(endpoint) as url:
         yield url
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as browser:
-        yield browser
 
 
 def test_scan_looks_the_same_in_every_colour(browser: Any, url: str) -> None:

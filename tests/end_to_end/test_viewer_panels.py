@@ -7,17 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.synthetic.scenes import make_facade
 from solidcloud.server.cli.commands.viewed_server import ViewedServer
-from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
 from solidcloud.server.viewer.viewer import viewing
-from viewed_page import CHROMIUM, ViewedPage, browsing, viewed_page
+from viewed_page import ViewedPage, needs_chromium, viewed_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
+pytestmark = [needs_chromium, pytest.mark.slow]
 
-POINTS, VOXEL = 60_000, 2.0
 BY_WALL = "-7.6,-9,0.1,180"
 LAST = "s.samples[s.samples.length - 1]"
 # Pixels of a chart that are neither transparent nor of its grid and text.
@@ -33,19 +28,9 @@ INKED = """(canvas) => {
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ViewedServer]:
-    folder = tmp_path_factory.mktemp("panels")
-    make_facade(folder / "facade.laz", points=POINTS)
-    build_archive([folder / "facade.laz"], folder / "archive", BuildConfig(voxel=VOXEL, jobs=1))
-    (folder / "viewer.toml").write_text(archive_scene(folder / "archive"))
-    with ViewedServer(Path(folder / "viewer.toml")) as server:
+def server(facade_file: Path) -> Iterator[ViewedServer]:
+    with ViewedServer(facade_file) as server:
         yield server
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as browser:
-        yield browser
 
 
 @pytest.fixture

@@ -1,53 +1,25 @@
-"""Test record and replay in the viewer with a real browser.
+"""Test record and replay in the viewer with a real browser."""
 
-The scene is a small façade (builder/synthetic), in whose frame the court before the main door is at
-y < 0.
-"""
-
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from solidcloud.builder.config import BuildConfig
-from solidcloud.builder.pipeline import build_archive
-from solidcloud.builder.synthetic.scenes import make_facade
-from solidcloud.schemas.wire.warming_parts import READY_LINE
 from solidcloud.server.cli.input.pose_file import read_poses, read_tum_poses, write_poses
-from solidcloud.server.cli.scene_files.viewed_scene import archive_scene
 from solidcloud.server.viewer.viewer import viewing
-from viewed_page import CHROMIUM, ViewedPage, browsing, viewed_page
+from viewed_page import ViewedPage, needs_chromium, viewed_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
+pytestmark = [needs_chromium, pytest.mark.slow]
 
-POINTS, VOXEL = 60_000, 2.0
+# Before the main door.
 COURT = "0,-6,0.1,90"
 
 
 @pytest.fixture(scope="module")
-def endpoint(tmp_path_factory: pytest.TempPathFactory, free_endpoint: Any) -> Iterator[str]:
-    folder, where = tmp_path_factory.mktemp("replay"), free_endpoint()
-    make_facade(folder / "facade.laz", points=POINTS)
-    build_archive([folder / "facade.laz"], folder / "archive", BuildConfig(voxel=VOXEL, jobs=1))
-    (folder / "viewer.toml").write_text(archive_scene(folder / "archive"))
-    command = [sys.executable, "-P", "-m", "solidcloud.server.cli.main", "serve", str(folder / "viewer.toml")]
-    process = subprocess.Popen([*command, "--listen", where], stdout=subprocess.PIPE, text=True)
-    try:
-        assert READY_LINE in map(str.strip, process.stdout or ())
-        yield where
-    finally:
-        process.terminate()
-        process.communicate()
-
-
-@pytest.fixture(scope="module")
-def viewed(endpoint: str) -> Iterator[ViewedPage]:
+def viewed(browser: Any, facade_endpoint: str) -> Iterator[ViewedPage]:
     with (
-        viewing(endpoint) as url,
-        browsing() as browser,
+        viewing(facade_endpoint) as url,
         viewed_page(browser, f"{url}?at={COURT}") as viewed,
     ):
         viewed.wait("s.place")

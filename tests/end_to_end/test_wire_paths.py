@@ -44,7 +44,7 @@ def test_a_path_that_nobody_answers_is_unknown_until_a_server_comes(scene, endpo
 def test_a_server_that_ends_in_mid_path_leaves_the_rest_unknown(endpoint, end):
     with server_process(endpoint, "--delay", "0.1") as process, Client(endpoint, scene="floor") as client:
         client.add_avatar("al", POINTS, 0.125)
-        client._connection.timeout = 1.0
+        client._connection.timeout = 2.0
         parts = []
         for part in client.path("al", PATH):
             parts.append(part)

@@ -20,7 +20,7 @@ from solidcloud.server.zenoh_server.server_config import ServerConfig
 
 def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):
     with Client(endpoint, scene="floor", timeout=DEADLINE) as client:
-        with serving([scene], ServerConfig(listen=endpoint)):
+        with serving([scene], ServerConfig(listen=endpoint, stop_seconds=DEADLINE)):
             client.add_avatar("al", POINTS, 0.125)
             eventually(lambda: client.collide("al", heights([-1.0])).verdict.tolist() == [Verdict.CONTACT])
             client.add_avatar("wait", POINTS, 0.125)
@@ -32,7 +32,7 @@ def test_a_server_that_stops_finishes_the_paths_it_accepted(scene, endpoint):
 
 def test_a_server_that_stops_gives_up_what_takes_too_long(endpoint):
     """Test an endless path and a queue behind a slow answer: both are cut short, and no thread remains."""
-    scene = FloorScene(delay=0.05)
+    scene = FloorScene(delay=0.2)
     before = set(threading.enumerate())  # excludes threads of scenes that other tests share
     with Client(endpoint, scene="floor", timeout=DEADLINE) as client, ExitStack() as stack:
         with serving([scene], ServerConfig(listen=endpoint, stop_seconds=0.1)):

@@ -25,7 +25,7 @@ from solidcloud.schemas.wire.requests import AddAvatarRequest, CollideRequest
 from solidcloud.schemas.wire.scene_messages import AvatarInfo, ErrorReply
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
-from viewed_page import CHROMIUM, browsing
+from viewed_page import needs_chromium
 
 PAGE = Path(__file__).resolve().parents[2] / "scripts" / "zenoh_page"
 NODE, NPM = shutil.which("node"), shutil.which("npm")
@@ -208,17 +208,19 @@ def address(built: Path) -> Iterator[str]:
 
 
 @installed_only
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
-def test_built_page_starts_and_says_that_no_bridge_answers(address: str, free_endpoint: Any) -> None:
+@needs_chromium
+def test_built_page_starts_and_says_that_no_bridge_answers(
+    browser: Any, address: str, free_endpoint: Any
+) -> None:
     where = f"ws://127.0.0.1:{free_endpoint().rpartition(':')[2]}"
-    with browsing() as browser:
-        page = browser.new_page()
-        failures: list[str] = []
-        page.on("pageerror", lambda error: failures.append(str(error)))
-        page.goto(address)
-        page.get_by_label("Bridge").fill(where)
-        page.get_by_role("button", name="Connect").click()
-        page.get_by_text(f"Nothing answers at {where}: start the bridge.").wait_for()
-        assert page.inner_text("#verdict") == "unknown"
-        assert page.get_by_role("button", name="Collide").is_disabled()
-        assert failures == []
+    page = browser.new_page()
+    failures: list[str] = []
+    page.on("pageerror", lambda error: failures.append(str(error)))
+    page.goto(address)
+    page.get_by_label("Bridge").fill(where)
+    page.get_by_role("button", name="Connect").click()
+    page.get_by_text(f"Nothing answers at {where}: start the bridge.").wait_for()
+    assert page.inner_text("#verdict") == "unknown"
+    assert page.get_by_role("button", name="Collide").is_disabled()
+    assert failures == []
+    page.close()

@@ -13,10 +13,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import pytest
 from PIL import Image
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DEADLINE = 90.0
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH: apt-get install chromium")
 _OPTIONS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",

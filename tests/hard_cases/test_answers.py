@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import same_answers
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
@@ -19,7 +20,6 @@ from solidcloud.schemas.errors import TooLargeError
 from solidcloud.schemas.wire.request_limits import MAX_AVATAR_POINTS
 from solidcloud.server.scene import Scene
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
 
 
@@ -41,7 +41,6 @@ def elsewhere(code: str, *arguments: str, **environment: str) -> str:
     21,
     "an empty region is clear; outside is clear and flagged; a corrupt record and a scan left out are unknown",
 )
-@pytest.mark.interpreted
 def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
     good = np.array([[0.0, 0, 0], [4.0, 0, 0], [4.0, 0, 4.0]])
     scan = synthetic_scans.write_ply(tmp_path / "good.ply", good)
@@ -70,7 +69,6 @@ def test_case_21_empty_outside_not_loaded_skipped(tmp_path: Path) -> None:
 
 
 @pytest.mark.case(22, "10^7 points are refused as too large; the next avatar is not")
-@pytest.mark.interpreted
 def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
     with Scene.open(archive_cases.build(tmp_path, POINT).archive) as scene:
         with pytest.raises(TooLargeError, match=f"at most {MAX_AVATAR_POINTS}"):
@@ -82,7 +80,6 @@ def test_case_22_an_avatar_over_the_cap_is_refused(tmp_path: Path) -> None:
     23,
     "512 voxels in reach with room for 1, 7 and 200: same answers, none missing, each read once per pose",
 )
-@pytest.mark.interpreted
 def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
     case = archive_cases.build(tmp_path, grid, voxel=1.0, resolution=0.5, radius=0.01)
@@ -92,7 +89,7 @@ def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
     beyond = archive_cases.pose_of(np.eye(3), np.array([3.5, 3.5, 3.525]))
     with Scene.open(case.archive) as scene:
         one = int(scene.residency.bytes_of([0]))
-    for voxels in (7,) if INTERPRETED else (1, 7, 200):
+    for voxels in sample((7, 200), (1, 7, 200)):
         with Scene.open(case.archive, budget_bytes=voxels * one + 64) as scene:
             scene.add_avatar("ball", ball, 0.01)
             answers = scene.collide("ball", np.array([middle, beside, beyond]))
@@ -106,9 +103,7 @@ def test_case_23_a_pose_that_reaches_hundreds_of_voxels(tmp_path: Path) -> None:
 @pytest.mark.case(
     24,
     "placed integers, verdicts and counters of 60 poses equal the interpreter's",
-    compiled_only="it runs both itself",
 )
-@pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")
 def test_case_24_compiled_equals_interpreted(tmp_path: Path) -> None:
     case = archive_cases.build(
         tmp_path, synthetic_scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30
@@ -121,10 +116,7 @@ def test_case_24_compiled_equals_interpreted(tmp_path: Path) -> None:
     assert {0, 1} == set(here["columns"][0])
 
 
-@pytest.mark.case(
-    24, "an archive built interpreted has the same bytes", compiled_only="it builds both itself"
-)
-@pytest.mark.skipif(INTERPRETED, reason="the other side of this comparison is the interpreted one")
+@pytest.mark.case(24, "an archive built interpreted has the same bytes")
 def test_case_24_an_archive_built_interpreted_has_the_same_bytes(tmp_path: Path) -> None:
     case = archive_cases.build(
         tmp_path, synthetic_scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30, radius=None
@@ -147,13 +139,12 @@ def test_case_24_an_archive_built_interpreted_has_the_same_bytes(tmp_path: Path)
 
 
 @pytest.mark.case(25, "500 poses, 7 times, on 1, 2 and 4 threads: the judge's verdict every time")
-@pytest.mark.interpreted
 def test_case_25_any_number_of_threads_gives_the_same_answers(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 5, 600), voxel=0.3)
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
-    count = 10 if INTERPRETED else 500
+    count = sample(100, 500)
     poses = archive_cases.near_poses(rng, case.points, avatar, count, 0.15)
     expected = case.judge(avatar, 0.01, poses).astype(np.uint8)
     for threads in (1, 2, 4):
@@ -172,7 +163,6 @@ def test_case_25_any_number_of_threads_gives_the_same_answers(
 @pytest.mark.case(
     29, "collide(A, B, M) = collide(B, A, M⁻¹) for a small and a tall tree and quarter turns, and the judge's"
 )
-@pytest.mark.interpreted
 def test_case_29_either_tree_may_be_the_taller(tmp_path: Path, rng: np.random.Generator) -> None:
     """collide(A, B, M) == collide(B, A, M^-1), for a small and a tall tree and quarter turns."""
     step = archive_cases.BINARY_STEP
@@ -185,7 +175,7 @@ def test_case_29_either_tree_may_be_the_taller(tmp_path: Path, rng: np.random.Ge
     )
     turn = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     poses, back = [], []
-    for _ in range(12 if INTERPRETED else 200):
+    for _ in range(200):
         a, b = small[rng.integers(3)], tall[rng.integers(150)]
         poses.append(archive_cases.pose_of(turn, a - turn @ b + rng.integers(-7, 8, 3) * step))
         back.append(archive_cases.pose_of(turn.T, -turn.T @ poses[-1][:3, 3]))

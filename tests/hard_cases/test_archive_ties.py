@@ -1,7 +1,6 @@
 """Hard case of ties between archives; a test's number is its row in NUMERICS.md."""
 
 import itertools
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from solidcloud.schemas.wire.arrays import array_fields
 from solidcloud.server.scene import Scene
 from split_scans import several
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 Floats = NDArray[np.float64]
 STEP = archive_cases.BINARY_STEP
 OPTIONS: dict[str, Any] = {"resolution": STEP, "keep": frozenset({"scan"})}
@@ -36,7 +34,7 @@ def build(folder: Path, *scans: list[list[float]], radius: float = 0.0625) -> li
 def in_any_order(placed: list[tuple[Path, Any]], *asks: Callable[[Scene], Cost]) -> list[Any]:
     """Return the answers of a scene of these archives, which must be the same in any order of them."""
     found = []
-    for order in list(itertools.permutations(placed))[:: 5 if INTERPRETED else 1]:
+    for order in itertools.permutations(placed):
         with several(*order) as scene:
             for name, points, radius in BODIES:
                 scene.add_avatar(name, np.array(points), radius)
@@ -69,7 +67,6 @@ TURN = archive_cases.pose_of(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.
     36,
     "four archives, each with a sphere equally far: in any order the least, for distance, rays, points and sweeps",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("pose", [None, TURN], ids=["identity", "placed"])
 def test_case_36_the_least_scan_point_is_named(tmp_path: Path, pose: Any) -> None:
     points = AROUND if pose is None else [pose[:3, :3].T @ (np.array(a) - pose[:3, 3]) for a in AROUND]
@@ -107,7 +104,6 @@ def test_case_36_the_least_scan_point_is_named(tmp_path: Path, pose: Any) -> Non
     36,
     "archives of unequal radii whose spheres are equally far: in any order the one with the least scan point",
 )
-@pytest.mark.interpreted
 def test_case_36_spheres_of_unequal_size(tmp_path: Path) -> None:
     small = build(tmp_path, [[1.0, 0, 0], [0.0, 8, 0]], [[-1.0, 0, 0], [0.0, 16, 0]])
     large = build(tmp_path, [[0.0, 1.25, 0], [0.25, 8, 0]], [[0.0, -1.25, 0], [-0.25, 16, 0]], radius=0.3125)
@@ -133,7 +129,6 @@ def test_case_36_spheres_of_unequal_size(tmp_path: Path) -> None:
 @pytest.mark.case(
     36, "three archives that share points: pairs and clusters of equal depth in any order, whatever the limit"
 )
-@pytest.mark.interpreted
 def test_case_36_contacts_of_equal_depth(tmp_path: Path) -> None:
     """Points of one archive are also in the others, which have other neighbours beside them."""
     shared = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]]

@@ -1,7 +1,6 @@
 """Hard cases of bounds: degenerate sets, enclosure, tightness; a test's number is its row in NUMERICS.md."""
 
 import itertools
-import os
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from numpy.typing import NDArray
+from sample_sizes import sample
 from served_nodes import row_encloses
 from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.voxel.record_points import voxel_points
@@ -20,10 +20,6 @@ from solidcloud.schemas.archive.voxel import Links, VoxelData
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.kernels.core.scene_arrays import ROW_WORDS
 from solidcloud.server.scene import Scene
-
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# The builder is a subject of these cases.
-pytestmark = pytest.mark.usefixtures("builds_here")
 
 # Whole lattice steps of 2^-10 m, so that a set that is flat or round as written is so as stored.
 _ROUND = [(15, 20, 0), (0, 7, 24), (25, 0, 0)]
@@ -45,19 +41,18 @@ DEGENERATE = {
 @pytest.mark.case(
     8, "equal, collinear, coplanar and cospherical points: bounds finite and proved, the judge's verdicts"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_case_08_degenerate_sets_have_bounds(tmp_path: Path, rng: np.random.Generator, name: str) -> None:
     points = np.array(DEGENERATE[name]) * archive_cases.BINARY_STEP
     trees = [{"leaf": 4, "degree": 2}, {"cell_points": 8}, {"with_slab": False}]
-    for options in trees[:1] if INTERPRETED else trees:
+    for options in trees:
         case = archive_cases.build(
             tmp_path, points, resolution=archive_cases.BINARY_STEP, radius=0.002, **options
         )
         report = verify_archive(case.archive, exact=True)
         assert report.faults == () and report.exact_nodes == report.nodes > 0
         avatar = rng.uniform(-0.02, 0.02, (5, 3))
-        poses = archive_cases.near_poses(rng, points, avatar, 6 if INTERPRETED else 30, 0.01)
+        poses = archive_cases.near_poses(rng, points, avatar, 30, 0.01)
         found = archive_cases.ask(case, avatar, 0.002, poses)
         assert found.tolist() == case.judge(avatar, 0.002, poses).astype(int).tolist()
     with Archive(case.archive) as archive:
@@ -98,12 +93,11 @@ def stored_nodes(
 @pytest.mark.case(
     18, "every node of the test scenes, as stored and as the server holds it (float32): proved in fractions"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 @pytest.mark.parametrize("voxel", [0.5, 8.0, 70.0])
 def test_case_18_every_node_encloses_its_points(tmp_path: Path, kind: str, voxel: float) -> None:
     # Of 70 m and a step of 0.1 mm a voxel has 2^20 steps: the top tree's unit is 16 of them.
-    count = 60 if INTERPRETED else 250
+    count = sample(120, 250)
     points = synthetic_scans.make_scan(kind, 4, count) * (voxel if voxel > 8 else 1)
     case = archive_cases.build(tmp_path, points, voxel=voxel, leaf=5, degree=3, cell_points=20)
     nodes = boxes = 0
@@ -141,11 +135,10 @@ def test_case_18_every_node_encloses_its_points(tmp_path: Path, kind: str, voxel
 @pytest.mark.case(
     18, "every node of an avatar, in float64, encloses its points as given: proved in fractions"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("far", [0.0, 1e5])
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_case_18_every_node_of_an_avatar_encloses_its_points(kind: str, far: float) -> None:
-    points = synthetic_scans.make_scan(kind, 9, 60 if INTERPRETED else 300) + far
+    points = synthetic_scans.make_scan(kind, 9, 300) + far
     model = make_avatar(points, 0.01)
     arrays, rows = model.arrays, model.rows
     own: dict[int, list[int]] = {}
@@ -184,11 +177,10 @@ def tightness(archive: Path) -> NDArray[np.float64]:
 @pytest.mark.case(
     20, "spheres of full leaf nodes: at most 1.25 times the minimal ball's radius, which a dual bound gives"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", ["plane", "corner", "pillar", "noise", "duplicates"])
 def test_case_20_leaf_spheres_are_near_the_minimal_ball(tmp_path: Path, kind: str) -> None:
     # Found: at most 1.030 on each of these and on the façade, 1.01 on average.
-    count = 600 if INTERPRETED else 3000
+    count = 3000
     ratio = tightness(
         archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 5, count), voxel=2.5).archive
     )

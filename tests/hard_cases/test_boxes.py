@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import synthetic_scans
 from numpy.typing import NDArray
+from sample_sizes import sample
 from served_nodes import row_encloses
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
@@ -30,9 +30,6 @@ from solidcloud.server.residency.arena import ArenaBuffer
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.runtime.stop_flag import NO_STOP
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# The builder is a subject of these cases.
-pytestmark = pytest.mark.usefixtures("builds_here")
 UNITS = 2**26
 # Steps and origins [m]: map coordinates, the largest ones, and numbers that no float64 holds exactly.
 STEPS = [1e-6, 1e-4, 0.1 / 3, 2.0**-10, 0.3]
@@ -101,7 +98,6 @@ def placed_exactly(body: AvatarModel, pose: NDArray[np.float64], scene: SceneArr
     39,
     "box_distance and the broad phase at 1e9 m, steps of 1 µm to 30 cm: at most the true distance, in fractions",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("origin", ORIGINS)
 @pytest.mark.parametrize("step", STEPS)
 def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
@@ -115,7 +111,7 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
         if count == 1:  # without the slack of its root sphere
             body = body._replace(arrays=body.arrays._replace(radius=np.zeros(len(body.arrays.radius))))
         placed, exact_step = make_placed(body.arrays), Fraction(step)
-        poses = poses_beside(rng, scene, index, 6 if INTERPRETED else 25)
+        poses = poses_beside(rng, scene, index, sample(6, 25))
         boxes = [
             ([f * exact_step for f in fractions(low)], [f * exact_step for f in fractions(high)])
             for low, high in zip(index.low, index.high, strict=True)
@@ -156,13 +152,12 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
     39,
     "voxels listed for points and rays at 2^57 units: none is left out, `near` is at most the true distance",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("origin", ORIGINS)
 @pytest.mark.parametrize("step", STEPS)
 def test_case_39_lists_of_voxels_leave_none_out(step: float, origin: tuple[float, float, float]) -> None:
     rng = np.random.default_rng(39)
     scene, index = boxed_scene(rng, step, origin)
-    k, per_step = 6 if INTERPRETED else 40, Fraction(scene.units_per_step)
+    k, per_step = sample(12, 40), Fraction(scene.units_per_step)
     tree = make_voxel_tree(index.low, index.high, np.empty((0, 2, 3), np.int64))
     places = poses_beside(rng, scene, index, k)[:, :3, 3]
     places[::5] += rng.choice([-1.0, 1.0], (len(places[::5]), 3)) * 1e8  # far from all boxes
@@ -219,11 +214,10 @@ def entered(at: Vector, way: Vector, low: Vector, high: Vector, grow: Fraction) 
     39,
     "boxes that a motion meets, at 2^41 steps: never later than in fractions, never none where there is one",
 )
-@pytest.mark.interpreted
 def test_case_39_motions_enter_boxes_no_later_than_in_fractions() -> None:
     rng = np.random.default_rng(39)
     met = 0
-    for _ in range(300 if INTERPRETED else 3000):
+    for _ in range(3000):
         size = float(rng.choice([10.0, 2.0**24, 2.0**41]))
         low = np.rint(rng.uniform(-size, size, 3)).astype(np.int64)
         high = low + rng.integers(0, int(rng.choice([1, 20, 1 << 21])), 3, endpoint=True)
@@ -249,11 +243,10 @@ def test_case_39_motions_enter_boxes_no_later_than_in_fractions() -> None:
 @pytest.mark.case(
     39, "the box of a block of points, in float32: no avatar point is dropped that is as near to one of them"
 )
-@pytest.mark.interpreted
 def test_case_39_boxes_of_blocks_drop_no_near_point() -> None:
     rng = np.random.default_rng(39)
     kept = 0
-    for _ in range(20 if INTERPRETED else 300):
+    for _ in range(300):
         size = int(rng.choice([1, 300, 65536]))
         halves = rng.integers(0, size, 3 * LANES).astype(np.uint16)
         corner = np.float32(rng.uniform(-1, 1, 3) * rng.choice([0.0, 1e3, 2.0**23]))
@@ -280,7 +273,6 @@ def test_case_39_boxes_of_blocks_drop_no_near_point() -> None:
     39,
     "the index of an archive and of its level: the least boxes around the points, in integers, at UTM coordinates",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", ["corner", "noise", "duplicates"])
 def test_case_39_boxes_of_the_index_fit_their_points(tmp_path: Path, kind: str) -> None:
     points = synthetic_scans.make_scan(kind, 6, 200) + np.array([512345.678901234, 5612345.1, -0.3])
@@ -306,11 +298,10 @@ def test_case_39_boxes_of_the_index_fit_their_points(tmp_path: Path, kind: str) 
     39,
     "spheres, slabs and covers of a level as served (float32): each point in all nodes above a representative",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", ["plane", "corner", "noise", "duplicates"])
 def test_case_39_nodes_of_a_level_enclose_what_they_stand_for(tmp_path: Path, kind: str) -> None:
     """No search of the level passes by a point of the archive."""
-    points = synthetic_scans.make_scan(kind, 7, 60 if INTERPRETED else 250)
+    points = synthetic_scans.make_scan(kind, 7, 250)
     case = archive_cases.build(tmp_path, points, voxel=70.0, leaf=4, degree=3, cell_points=40)
     with Archive(case.archive) as archive:
         level = open_level(archive)

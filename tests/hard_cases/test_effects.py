@@ -26,8 +26,6 @@ from solidcloud.server.simulation.make_simulation import make_simulation
 from solidcloud.server.zenoh_server.request_dispatcher import RequestDispatcher
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-
 ASK = """
 import json, pathlib, sys
 import numpy as np
@@ -124,7 +122,6 @@ print(json.dumps(found))
     31,
     "each effect alone: only this effect and its requirements are imported, and only they report",
 )
-@pytest.mark.interpreted
 def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_something(tmp_path: Path) -> None:
     floor = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4), [0]), axis=-1).reshape(-1, 3) * 0.1
     case = archive_cases.build(tmp_path, floor, radius=0.05)
@@ -161,7 +158,6 @@ def test_case_31_of_all_effects_only_those_declared_are_imported_and_say_somethi
     31,
     "a scene that is opened and queried imports no effect, report, generator, reader, transport, zenoh or plotting",
 )
-@pytest.mark.interpreted
 def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, np.zeros((1, 3)), radius=0.1)
     done = subprocess.run(
@@ -197,7 +193,6 @@ def test_case_31_what_is_not_declared_is_not_imported(tmp_path: Path) -> None:
     31,
     "beside other avatars, queries and all effects, collide replies the same bytes at the same cost",
 )
-@pytest.mark.interpreted
 def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -205,7 +200,7 @@ def test_case_31_what_else_a_scene_holds_costs_a_question_nothing(
         tmp_path, synthetic_scans.make_scan(*same_answers.SCAN), leaf=8, cell_points=30
     )
     body, other = rng.uniform(-0.2, 0.2, (2, 20, 3))
-    poses = archive_cases.near_poses(rng, case.points, body, 6 if INTERPRETED else 60, 0.2)
+    poses = archive_cases.near_poses(rng, case.points, body, 60, 0.2)
     replies = []
     for beside in ("nothing", "others", "effects"):
         with Scene.open(case.archive, "scene") as scene:

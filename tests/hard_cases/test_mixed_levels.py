@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,18 +25,16 @@ from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 # ECEF and UTM, in whole metres.
 SHIFTS = [(0, 0, 0), (4_027_894, 307_045, 4_919_475), (500_000, 5_600_000, 100)]
-SHIFTS = SHIFTS[:2] if INTERPRETED else SHIFTS
 STEP = archive_cases.BINARY_STEP
 MARGIN, REACH = 0.02, 0.75
-TOLERANCES = sample((0.05,), (0.0, 0.05)) if INTERPRETED else (0.0, 3e-3, 0.05, 0.4)
+TOLERANCES = sample((0.0, 0.05), (0.0, 3e-3, 0.05, 0.4))
 
 
 def scan(rng: np.random.Generator) -> NDArray[np.float64]:
     """Return a floor, a wall and scattered points in nine voxels and more, on the lattice."""
-    count = 60 if INTERPRETED else 1500
+    count = 1500
     floor, wall = rng.uniform(0, 1.5, (2, count, 3))
     floor[:, 2] *= 0.002
     wall[:, 0] *= 0.002
@@ -84,13 +81,12 @@ def ask(scene: Scene, poses: NDArray[np.float64], budget: QueryBudget) -> list[A
     35,
     "voxels in memory beside representatives of others, at UTM and ECEF too: brute force, and the same everywhere",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 1.0])
 def test_case_35_voxels_and_representatives_together(tmp_path: Path, share: float) -> None:
     rng = np.random.default_rng(35)
     points = scan(rng)
     body = np.rint(rng.uniform(-0.15, 0.15, (20, 3)) / STEP) * STEP
-    poses = archive_cases.near_poses(rng, points, body, 5 if INTERPRETED else 40, 0.5)
+    poses = archive_cases.near_poses(rng, points, body, 40, 0.5)
     poses[:, :3, 3] = np.rint(poses[:, :3, 3] / STEP) * STEP
     chosen: set[int] = set()
     answers: list[list[Any]] = []
@@ -128,7 +124,7 @@ def test_case_35_voxels_and_representatives_together(tmp_path: Path, share: floa
             assert (swept.lower <= np.minimum(true.upper, 1.0)).all()
             assert (swept.upper >= true.lower).all()
             assert share < 1.0 or (touch.verdict != Verdict.UNKNOWN).all()
-            if 0.0 < share < 1.0 and not INTERPRETED:
+            if 0.0 < share < 1.0:
                 lost = touch.voxels_missing > 0
                 assert deadline == math.inf or (lost & (touch.verdict == Verdict.CLEAR)).any(), "by the level"
                 assert (~lost).any(), "by voxels, or by the level before a voxel was asked for"

@@ -1,7 +1,6 @@
 """Hard cases of numbers: large, small, near-tangent, not finite; a test's number is its row in NUMERICS.md."""
 
 import math
-import os
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,20 +11,19 @@ import naive_rays
 import numpy as np
 import pytest
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, ScanError
 from solidcloud.server.scene import Scene
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
 
 
 @pytest.mark.case(
     1, "moved by 5.6e6, 6.4e6 and 1e8 m: index and verdicts equal those at the origin, and the judge's"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize(
     "shift", [(500_000, 5_600_000, 100), (4_027_894, 307_045, 4_919_475), (-(10**8), 10**8, 7)]
 )
@@ -58,7 +56,6 @@ def test_case_01_map_coordinates_answer_as_the_origin_does(
 @pytest.mark.case(
     3, "a uniform scale scales radii, tangent to the unit; shear, mirror and 1e-6 of stretch are refused"
 )
-@pytest.mark.interpreted
 def test_case_03_scale_grows_radii_and_shear_is_refused(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -79,9 +76,8 @@ def test_case_03_scale_grows_radii_and_shear_is_refused(tmp_path: Path) -> None:
     6,
     "10,000 pairs within 3 units of 15 nm of tangency at UTM coordinates: none wrong; plain float64 gets some wrong",
 )
-@pytest.mark.interpreted
 def test_case_06_near_tangent_pairs_are_decided_exactly(tmp_path: Path, rng: np.random.Generator) -> None:
-    count = 60 if INTERPRETED else 10_000
+    count = sample(1_000, 10_000)
     case = archive_cases.build(tmp_path, np.array([[5e5, 5.6e6, 0.0]]), radius=0.3)
     avatar = np.array([[0.7, -1.1, 0.4]])
     away = rng.normal(size=(count, 3))
@@ -104,7 +100,6 @@ def test_case_06_near_tangent_pairs_are_decided_exactly(tmp_path: Path, rng: np.
     14,
     "NaN, infinities, 1e300 and 1.1e9 m: left out of a scan and counted, an error with --strict; refused in requests",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, 1.1e9])
 def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float) -> None:
     points = np.concatenate(
@@ -135,7 +130,6 @@ def test_case_14_what_is_not_finite_reaches_no_kernel(tmp_path: Path, bad: float
 @pytest.mark.case(
     15, "radii of 0 and denormal radii give contact where the integers coincide; negative ones are refused"
 )
-@pytest.mark.interpreted
 def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, POINT, radius=0.0)
     unit = 2.0**-26
@@ -158,7 +152,6 @@ def test_case_15_radii_of_zero_and_less(tmp_path: Path) -> None:
 @pytest.mark.case(
     16, "scan points at the corners of 1e9 m: the judge's verdicts, to a micrometre of 16 m reach"
 )
-@pytest.mark.interpreted
 def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) -> None:
     corners = np.array([[-1e9, -1e9, -1e9], [1e9, 1e9, 1e9], [1e9, -1e9, 0.0]])
     case = archive_cases.build(tmp_path, corners, voxel=2000.0, resolution=1e-3, radius=8.0)
@@ -175,9 +168,8 @@ def test_case_16_coordinates_up_to_their_bound_overflow_nothing(tmp_path: Path) 
     17,
     "a² - 2ab + b² in float64 at UTM: over a tenth negative, over a tenth of verdicts wrong; of ours none",
 )
-@pytest.mark.interpreted
 def test_case_17_the_expanded_square_is_not_what_decides(tmp_path: Path, rng: np.random.Generator) -> None:
-    count = 60 if INTERPRETED else 2000
+    count = 2000
     base = np.array([5e5, 5.6e6, 100.0])
     case = archive_cases.build(tmp_path, base[None], radius=0.01, resolution=archive_cases.BINARY_STEP)
     away = rng.normal(size=(count, 3))
@@ -203,7 +195,6 @@ def test_case_17_the_expanded_square_is_not_what_decides(tmp_path: Path, rng: np
     19,
     "against the points as delivered, in fractions: early or late by at most the band, with it as margin never late",
 )
-@pytest.mark.interpreted
 def test_case_19_the_lattice_moves_contact_by_its_declared_band(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -236,7 +227,6 @@ def test_case_19_the_lattice_moves_contact_by_its_declared_band(
 
 
 @pytest.mark.case(16, "a reach of 2^30 units is accepted, more is refused")
-@pytest.mark.interpreted
 def test_case_16_reach_is_bounded_so_that_squares_fit(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, POINT, radius=8.0, resolution=1e-2, voxel=8.0)
     diagonal = np.full(3, 16.0 / math.sqrt(3))

@@ -1,12 +1,12 @@
 """Hard cases of points and where they lie; a test's number is its row in the table of hard cases (NUMERICS.md)."""
 
-import os
 from pathlib import Path
 
 import archive_cases
 import numpy as np
 import pytest
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.pipeline import build_archive
 from solidcloud.builder.voxel.record_points import voxel_points
@@ -14,9 +14,6 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, ScanError
 from solidcloud.server.scene import Scene
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# The builder is a subject of these cases.
-pytestmark = pytest.mark.usefixtures("builds_here")
 POINT = np.zeros((1, 3))
 
 
@@ -35,11 +32,10 @@ def stored(case: archive_cases.Case) -> np.ndarray:
 
 @pytest.mark.case(
     7,
-    "10^6 identical points (2,000 interpreted): one cell over its capacity, a tree of the usual height, contact exact",
+    "10^6 identical points: one cell over its capacity, a tree of the usual height, contact exact",
 )
-@pytest.mark.interpreted
 def test_case_07_identical_points_build_and_answer(tmp_path: Path) -> None:
-    count = 2_000 if INTERPRETED else 1_000_000
+    count = 1_000_000
     points = np.full((count, 3), 0.125)
     case = archive_cases.build(tmp_path, points, voxel=8.0)
     with Archive(case.archive) as archive:
@@ -55,7 +51,6 @@ def test_case_07_identical_points_build_and_answer(tmp_path: Path) -> None:
     9,
     "one point needs --radius; an empty voxel is clear; an avatar and a scene without points are refused",
 )
-@pytest.mark.interpreted
 def test_case_09_one_point_an_empty_voxel_an_empty_avatar_an_empty_scene(tmp_path: Path) -> None:
     with pytest.raises(BadRequestError, match="give --radius"):
         archive_cases.build(tmp_path, POINT, radius=None)
@@ -82,7 +77,6 @@ def test_case_09_one_point_an_empty_voxel_an_empty_avatar_an_empty_scene(tmp_pat
     10,
     "points on cell and voxel borders, including -0.0, are stored once each and give contact where they are",
 )
-@pytest.mark.interpreted
 def test_case_10_points_on_borders_are_each_in_one_cell(tmp_path: Path) -> None:
     steps = np.array([-20, -11, -10, -9, -1, 0, 1, 9, 10, 11, 20])
     points = np.stack(np.meshgrid(steps, steps, [0, 10], indexing="ij"), axis=-1).reshape(-1, 3) * 0.1
@@ -103,9 +97,8 @@ def test_case_10_points_on_borders_are_each_in_one_cell(tmp_path: Path) -> None:
 @pytest.mark.case(
     11, "voxels of 8, 0.3 and 0.07 m and shifted grids: the judge's verdicts; contact from across a border"
 )
-@pytest.mark.interpreted
 def test_case_11_contact_across_borders_for_any_voxels(tmp_path: Path, rng: np.random.Generator) -> None:
-    size, count = (200, 12) if INTERPRETED else (800, 80)
+    size, count = sample((300, 30), (800, 80))
     points, avatar = synthetic_scans.make_scan("noise", 6, size), rng.uniform(-0.3, 0.3, (20, 3))
     poses = archive_cases.near_poses(rng, points, avatar, count, 0.06)
     lows = points.min(axis=0)
@@ -139,7 +132,6 @@ def test_case_11_contact_across_borders_for_any_voxels(tmp_path: Path, rng: np.r
     12,
     "points one step apart in far corners of a voxel of 2^21 steps, twins among them: cells of one step, no deeper",
 )
-@pytest.mark.interpreted
 def test_case_12_the_deepest_level_is_one_lattice_step(tmp_path: Path) -> None:
     step = archive_cases.BINARY_STEP
     last = (1 << 21) - 2
@@ -166,15 +158,14 @@ def test_case_12_the_deepest_level_is_one_lattice_step(tmp_path: Path) -> None:
 
 @pytest.mark.case(
     13,
-    "10^6 points in 5 cm beside 100 over 8 m (4,000 interpreted): work grows with the levels, in build and queries",
+    "10^6 points in 5 cm beside 100 over 8 m: work grows with the levels, in build and queries",
 )
-@pytest.mark.interpreted
 def test_case_13_a_million_to_one_in_one_voxel(tmp_path: Path, rng: np.random.Generator) -> None:
-    sizes = (40, 4_000) if INTERPRETED else (10_000, 1_000_000)
+    sizes = (10_000, 1_000_000)
     thin = rng.uniform(0, 8, (100, 3))
     thin[:2] = [[0, 0, 0], [7.9, 7.9, 7.9]]
     avatar = rng.uniform(-0.02, 0.02, (30, 3))
-    poses = archive_cases.near_poses(rng, np.full((1, 3), 4.025), avatar, 8 if INTERPRETED else 100, 0.08)
+    poses = archive_cases.near_poses(rng, np.full((1, 3), 4.025), avatar, 100, 0.08)
     work, cost, near = [], [], []
     for size in sizes:
         dense = 4.0 + rng.uniform(0, 0.05, (size, 3))
@@ -206,7 +197,6 @@ def test_case_13_a_million_to_one_in_one_voxel(tmp_path: Path, rng: np.random.Ge
     27,
     "points and avatar in any order, files in any order: the same shards, the same archive, the same verdicts",
 )
-@pytest.mark.interpreted
 def test_case_27_no_order_changes_answers_or_bytes(tmp_path: Path, rng: np.random.Generator) -> None:
     points, avatar = synthetic_scans.make_scan("corner", 8, 200), rng.uniform(-0.2, 0.2, (15, 3))
     poses = archive_cases.near_poses(rng, points, avatar, 10, 0.1)

@@ -1,6 +1,5 @@
 """Hard cases of origins and poses as they arrive; a test's number is its row in NUMERICS.md."""
 
-import os
 from pathlib import Path
 
 import archive_cases
@@ -16,7 +15,6 @@ from solidcloud.schemas.wire.scene_messages import SceneInfo
 from solidcloud.server.cli.input.pose_file import read_poses
 from solidcloud.server.scene import Scene
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
 COLUMNS = "t,x,y,z,qw,qx,qy,qz\n"
 
@@ -24,7 +22,6 @@ COLUMNS = "t,x,y,z,qw,qx,qy,qz\n"
 @pytest.mark.case(
     2, "origin, step and radius: the same 64 bits in the index, in Python and on the wire, both encodings"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize(
     "place", [(0.1 + 0.2, -1e-9 / 3, 1e9 / 3), (512345.678901234, 5612345.1, -0.3), (-1 / 3,) * 3]
 )
@@ -53,7 +50,6 @@ def test_case_02_an_origin_comes_back_to_the_bit(tmp_path: Path, place: tuple[fl
     4,
     "a quaternion off by 1e-6 is normalised to rounding; 1 % off, zero or not finite, it is refused with its line",
 )
-@pytest.mark.interpreted
 def test_case_04_quaternions_are_normalised_or_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     def rows(quaternions: np.ndarray) -> np.ndarray:
         """The poses read of a file of these, at 10 m from the origin."""
@@ -87,11 +83,10 @@ def test_case_04_quaternions_are_normalised_or_refused(tmp_path: Path, rng: np.r
 
 @pytest.mark.case(
     5,
-    "a pose rotated 10^6 times (10^4 interpreted), queried each time: closes within 1 µm at 10 m, same verdict",
+    "a pose rotated 10^6 times, queried each time: closes within 1 µm at 10 m, same verdict",
 )
-@pytest.mark.interpreted
 def test_case_05_a_pose_updated_a_million_times_closes(tmp_path: Path) -> None:
-    count, chunk = (10_000, 1_000) if INTERPRETED else (1_000_000, 100_000)
+    count, chunk = 1_000_000, 100_000
     # Turned about z by a millionth of a full turn at a time and renormalised; a body point 10 m out.
     step = np.exp(2j * np.pi / count).item()
     case = archive_cases.build(

@@ -18,7 +18,6 @@ CLEAR, CONTACT, UNKNOWN = Verdict
     30,
     "a verdict decided under a budget of visits stays under every larger one; none contradicts the judge's",
 )
-@pytest.mark.interpreted
 def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Generator) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 7, 300), voxel=0.7, leaf=4)
     avatar = rng.uniform(-0.2, 0.2, (30, 3))
@@ -39,7 +38,6 @@ def test_case_30_a_budget_takes_nothing_back(tmp_path: Path, rng: np.random.Gene
 
 
 @pytest.mark.case(30, "contact is reported early by no more than the tolerance, and flagged as not exact")
-@pytest.mark.interpreted
 def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
     # One point, one ball of 0.25 m: contact begins at a distance of exactly 0.25 m, and early at 0.25 m + 1/8 m.
     case = archive_cases.build(tmp_path, np.zeros((1, 3)), radius=0.0, resolution=archive_cases.BINARY_STEP)
@@ -61,7 +59,6 @@ def test_case_30_early_by_at_most_the_tolerance(tmp_path: Path) -> None:
 
 
 @pytest.mark.case(30, "what is not loaded when the time is over is unknown, never clear")
-@pytest.mark.interpreted
 def test_case_30_what_is_not_resident_by_the_deadline_is_unknown(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, np.array([[0.0, 0, 0], [2.0, 0, 0]]), voxel=1.0, resolution=1e-3)
     places = [(0.5, 0, 0), (1.5, 0, 0), (1.0, 5.0, 0)]

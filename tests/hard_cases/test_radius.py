@@ -1,7 +1,6 @@
 """Hard case of the radius that is measured; a test's number is its row in NUMERICS.md."""
 
 import math
-import os
 from pathlib import Path
 
 import archive_cases
@@ -10,21 +9,16 @@ import pytest
 import synthetic_scans
 from solidcloud.schemas.archive.archive import Archive
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
-# The builder is a subject of these cases.
-pytestmark = pytest.mark.usefixtures("builds_here")
-
 
 @pytest.mark.case(
     28,
     "half the mean closest-point distance, with duplicates and voxel borders everywhere: brute force to 2^-33 m",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", ["plane", "noise", "duplicates"])
 @pytest.mark.parametrize("voxel", [0.0625, 8.0])
 def test_case_28_the_mean_distance_is_that_of_brute_force(tmp_path: Path, kind: str, voxel: float) -> None:
     step = archive_cases.BINARY_STEP
-    steps = synthetic_scans.make_steps(kind, 6, 60 if INTERPRETED else 200, 1024).astype(np.int64)
+    steps = synthetic_scans.make_steps(kind, 6, 200, 1024).astype(np.int64)
     steps -= steps.min(axis=0)
     # Every third point again, and pairs one step apart on either side of borders of the grid of voxels.
     edge = round(voxel / step) * np.arange(1, 4)[:, None] * [1, 1, 1]

@@ -115,7 +115,6 @@ def angles_at_limits() -> list[float]:
 @pytest.mark.case(
     37, "Euler angles at ±90° and beside it, of 1e300 rad and of 5e-324: the exact rotation to 1e-15 a number"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("axes", ["xyz", "ZYX", "zxz", "YXY"])
 def test_case_37_euler_angles_at_their_limits(axes: str) -> None:
     assert abs(Fraction(PI, 1 << BITS) - Fraction(math.pi)) < Fraction(1, 1 << 52)
@@ -129,7 +128,6 @@ def test_case_37_euler_angles_at_their_limits(axes: str) -> None:
     37,
     "one angle: sine and cosine to 2^-51 of themselves; at gimbal lock outer angles of one sum are one rotation",
 )
-@pytest.mark.interpreted
 def test_case_37_tiny_angles_and_gimbal_lock() -> None:
     for angle in angles_at_limits():
         found = poses.from_euler(angle, axes="z")
@@ -164,7 +162,6 @@ def quaternions_at_limits() -> list[tuple[float, ...]]:
     38,
     "lengths of 5e-324 to 1.7e308, half turns, either sign: the exact rotation to 1e-15 a number, -q that of q",
 )
-@pytest.mark.interpreted
 def test_case_38_quaternions_at_their_limits() -> None:
     given = np.array(quaternions_at_limits())
     found = poses.from_quaternion(given, order="wxyz")
@@ -183,7 +180,6 @@ def test_case_38_quaternions_at_their_limits() -> None:
     38,
     "zero of either sign and NaN are refused; pose files take -q and half turns, and refuse tiny and huge lengths",
 )
-@pytest.mark.interpreted
 def test_case_38_what_is_no_rotation_is_refused(tmp_path: Path) -> None:
     for zero in ([0.0] * 4, [-0.0] * 4):
         with pytest.raises(BadRequestError, match="quaternion 1 is zero"):
@@ -214,7 +210,6 @@ def test_case_38_what_is_no_rotation_is_refused(tmp_path: Path) -> None:
 @pytest.mark.case(
     38, "the engine takes every such rotation, Euler angles' too, and gives the judge's verdicts"
 )
-@pytest.mark.interpreted
 def test_case_38_the_engine_takes_these_rotations(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.25]]), radius=0.3)
     given = [poses.from_quaternion(q, order="wxyz") for q in quaternions_at_limits()]

@@ -10,6 +10,7 @@ import judged_sweeps
 import numpy as np
 import pytest
 import synthetic_scans
+from sample_sizes import sample
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError, BadTransformError
 from solidcloud.schemas.wire.answers import Verdict
@@ -18,7 +19,6 @@ from solidcloud.server.queries.collide import collide
 from solidcloud.server.queries.context.query_budget import QueryBudget
 from sweep_poses import at, turn_z
 
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 POINT = np.zeros((1, 3))
 UNIT = 2.0**-26
 
@@ -27,7 +27,6 @@ UNIT = 2.0**-26
     26,
     "motions of 1 cm, 1 m, 100 m and 10 km: first contact within 1 µm of the truth; clear if it ends 0.1 mm short",
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("length", [0.01, 1.0, 100.0, 10_000.0])
 def test_case_26_ways_from_a_centimetre_to_ten_kilometres(tmp_path: Path, length: float) -> None:
     # Touches 0.3 m before the wall's point, at 7/8 of the way.
@@ -47,11 +46,10 @@ def test_case_26_ways_from_a_centimetre_to_ten_kilometres(tmp_path: Path, length
 
 
 @pytest.mark.case(26, "a motion of length zero: the verdict of collide, exact to the unit")
-@pytest.mark.interpreted
 def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random.Generator) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("plane", 1, 60), radius=0.0)
     body = rng.uniform(-0.2, 0.2, (8, 3))
-    count = 10 if INTERPRETED else 100
+    count = sample(30, 100)
     poses = np.concatenate(
         [archive_cases.near_poses(rng, case.points, body, count, 0.2, s) for s in (1.0, 0.5)]
     )
@@ -72,7 +70,6 @@ def test_case_26_zero_motion_is_the_static_answer(tmp_path: Path, rng: np.random
 
 
 @pytest.mark.case(26, "tangency, exact to the unit, at one end only: found")
-@pytest.mark.interpreted
 def test_case_26_contact_at_the_very_end_and_at_the_very_beginning(tmp_path: Path) -> None:
     # Tangent, to the unit, at one end of the way and nowhere else.
     case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
@@ -88,7 +85,6 @@ def test_case_26_contact_at_the_very_end_and_at_the_very_beginning(tmp_path: Pat
 
 
 @pytest.mark.case(26, "a grazing contact within rounding is unknown or found, never clear")
-@pytest.mark.interpreted
 def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None:
     """Past a sphere by so many units: well apart is clear, well inside exact, between them nothing is claimed."""
     case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
@@ -110,7 +106,6 @@ def test_case_26_a_graze_is_unknown_or_found_never_clear(tmp_path: Path) -> None
 
 
 @pytest.mark.case(26, "contact beyond an undecided grazing contact is found")
-@pytest.mark.interpreted
 def test_case_26_contact_beyond_a_graze_is_found(tmp_path: Path) -> None:
     points = np.array([[0.0, 0, 0], [2.0, 0.5, 0]])
     case = archive_cases.build(tmp_path, points, radius=0.25, resolution=archive_cases.BINARY_STEP)
@@ -126,12 +121,11 @@ def test_case_26_contact_beyond_a_graze_is_found(tmp_path: Path) -> None:
     26,
     "rotations in place up to half a turn: the judge's answers, none unknown",
 )
-@pytest.mark.interpreted
 def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     """A rod that turns about one end, up to half a turn, against pillars around it."""
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("pillar", 5, 400), radius=0.01)
     rod = np.linspace(0, 0.6, 40)[:, None] * [1.0, 0, 0]
-    count = 20 if INTERPRETED else 60
+    count = sample(20, 60)
     first = np.array(
         [archive_cases.pose_of(turn_z(a), np.array([0.5, 1.0, 1.0])) for a in rng.uniform(0, 7, count)]
     )
@@ -149,10 +143,9 @@ def test_case_26_turns_alone(tmp_path: Path, rng: np.random.Generator) -> None:
     23,
     "a motion through over 8 times the cache: the bounds of a large cache; voxels beyond contact are not loaded",
 )
-@pytest.mark.interpreted
 def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np.random.Generator) -> None:
     """Segment by segment, and a segment piece by piece; what lies beyond the contact is never loaded."""
-    points = rng.uniform(0, 1, (1500 if INTERPRETED else 6000, 3)) * [60.0, 2, 2]
+    points = rng.uniform(0, 1, (sample(3000, 6000), 3)) * [60.0, 2, 2]
     points = points[(np.abs(points[:, 1:] - 1).max(axis=1) > 0.3) | (points[:, 0] > 50)]
     case = archive_cases.build(tmp_path, points, voxel=1.0, radius=0.05)
     body = rng.uniform(-0.1, 0.1, (10, 3))
@@ -177,7 +170,6 @@ def test_case_23_a_way_through_more_than_the_cache_holds(tmp_path: Path, rng: np
 
 
 @pytest.mark.case(21, "voxels that cannot be read: unknown from there on along the motion, exact before")
-@pytest.mark.interpreted
 def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: np.random.Generator) -> None:
     points = np.concatenate(
         [rng.uniform(0, 0.4, (40, 3)), rng.uniform([2.0, 0, 0], [2.4, 0.4, 0.4], (40, 3))]
@@ -218,7 +210,6 @@ def test_case_21_what_is_missing_is_unknown_from_there_on(tmp_path: Path, rng: n
 
 
 @pytest.mark.case(21, "regions of scans left out: unknown from there on along the motion")
-@pytest.mark.interpreted
 def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, POINT, radius=0.25, resolution=archive_cases.BINARY_STEP)
     box = np.array([[[2.0, -1, -1], [3.0, 1, 1]]])
@@ -245,7 +236,6 @@ def test_case_21_regions_of_scans_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.case(3, "motions that change size or shear, and unequal numbers of ends, are refused")
-@pytest.mark.interpreted
 def test_case_03_motions_that_change_size_are_refused(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, POINT, radius=0.25)
     grown, nearly, sheared = at(1.0), at(1.0), at(1.0)
@@ -269,13 +259,12 @@ def test_case_03_motions_that_change_size_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.case(30, "a tolerance widens the interval of a sweep and changes no verdict")
-@pytest.mark.interpreted
 def test_case_30_a_tolerance_widens_the_interval_and_no_more(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 2, 60), radius=0.01)
     body = rng.uniform(-0.1, 0.1, (6, 3))
-    count = 4 if INTERPRETED else 40
+    count = 40
     first = archive_cases.near_poses(rng, case.points, body, count, 0.4)
     last = archive_cases.near_poses(rng, case.points, body, count, 0.2)
     with judged_sweeps.opened(case) as data:
@@ -303,9 +292,7 @@ print([column.tobytes().hex() for column in (found.verdict, found.lower, found.u
 """
 
 
-@pytest.mark.case(
-    24, "bounds and witnesses of sweeps equal the interpreter's", compiled_only="it runs both itself"
-)
+@pytest.mark.case(24, "bounds and witnesses of sweeps equal the interpreter's")
 def test_case_24_compiled_and_interpreted_agree_bit_for_bit(tmp_path: Path) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 2, 60), radius=0.01)
     path = os.pathsep.join([str(Path(judged_sweeps.__file__).parent), os.environ.get("PYTHONPATH", "")])

@@ -18,7 +18,6 @@ SHIFTS = [(0, 0, 0), (500_000, 5_600_000, 100), (4_027_894, 307_045, 4_919_475)]
 @pytest.mark.case(
     32, "bounds of a voxel out of memory, from its nodes: the same at the origin, at UTM and at ECEF"
 )
-@pytest.mark.interpreted
 def test_case_32_coarse_bounds_are_the_same_everywhere(tmp_path: Path) -> None:
     """A floor and a wall fill the box of a voxel, and bodies hang between them."""
     side = np.stack(np.meshgrid(*[np.linspace(0.05, 3.95, 30)] * 2), axis=-1).reshape(-1, 2)
@@ -57,7 +56,6 @@ def test_case_32_coarse_bounds_are_the_same_everywhere(tmp_path: Path) -> None:
 @pytest.mark.case(
     33, "a share of 1e-9 to 1,000 allowed, spheres 20 cm deep to 1 m apart: errors, bounds and verdicts"
 )
-@pytest.mark.interpreted
 def test_case_33_a_share_of_nothing_allows_a_millimetre(tmp_path: Path, rng: np.random.Generator) -> None:
     """A row of points beside the nearest one, each a little farther, tempts the search to end early."""
     row = np.column_stack([np.linspace(0, 1, 200), np.zeros(200), -(np.linspace(0, 0.3, 200) ** 2)])
@@ -88,7 +86,6 @@ def test_case_33_a_share_of_nothing_allows_a_millimetre(tmp_path: Path, rng: np.
 @pytest.mark.case(
     34, "budgets of 0, 1 and 2 visits for every query that takes one: bounds hold, none is clear unseen"
 )
-@pytest.mark.interpreted
 @pytest.mark.parametrize("visits", [0, 1, 2])
 def test_case_34_with_hardly_a_visit_bounds_hold(
     tmp_path: Path, rng: np.random.Generator, visits: int

@@ -11,7 +11,6 @@ from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.schemas.archive.archive import Archive
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize(("kind", "degree"), [("noise", 8), ("plane", 3), ("corner", 2), ("duplicates", 4)])
 @pytest.mark.parametrize("resolution", [1e-4, 5e-6])
 def test_contacts_are_those_of_the_plain_octree(

@@ -13,13 +13,11 @@ from hypothesis import strategies as st
 from point_clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from sample_sizes import sample
 from solidcloud.schemas.wire.answers import ContactsAnswers
-from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries import contacts as contacts_module
-from solidcloud.server.queries.contacts import contacts
-from solidcloud.server.queries.context.query_budget import QueryBudget, make_budget
+from solidcloud.server.queries.context.query_budget import make_budget
 
 
-@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -66,7 +64,7 @@ def test_every_pair_and_cluster_is_the_definitions(
                 compare(case, avatar, float(radius), poses, limit, float(margin), distance)
 
 
-@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 20), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), limit=st.sampled_from([1, 5, 64, 1000]), tree=TREES)
 def test_ties_go_by_point_then_centre_then_row_then_scan(seed: int, limit: int, tree: dict[str, Any]) -> None:
     """Points and avatar on one coarse grid, many of them several times, under poses that keep the grid."""
@@ -139,26 +137,3 @@ def listed(answers: ContactsAnswers, pose: int) -> list[tuple[float, ...]]:
     own = slice(answers.pair_starts[pose], answers.pair_starts[pose + 1])
     places = np.column_stack([answers.avatar_point[own], answers.cloud_point[own]])
     return list(zip(answers.avatar_index[own], answers.signed_distance[own], *places.T, strict=True))
-
-
-@pytest.mark.parametrize("visits", [0, 1, 10, 60, 200, 1000, 1 << 40])
-def test_a_budget_leaves_out_and_never_invents(rich: ScanCase, visits: int) -> None:
-    for seed in range(4):
-        avatar, radius, poses, _, margin = rich_question(rich, seed)
-        model = make_avatar(avatar, radius)
-        whole = contacts(rich.data, model, poses, 10_000, margin)
-        answers = contacts(rich.data, model, poses, 10_000, margin, None, QueryBudget(visits=visits))
-        assert (answers.node_visits <= visits + 16).all() and (answers.pairs_found <= whole.pairs_found).all()
-        for i in range(len(poses)):
-            own, all_of = listed(answers, i), listed(whole, i)
-            assert len(own) == answers.pairs_found[i]
-            assert set(own) <= set(all_of)
-            clusters = slice(answers.cluster_starts[i], answers.cluster_starts[i + 1])
-            assert answers.cluster_count[clusters].sum() == len(own)
-            if answers.exact[i]:
-                assert own == all_of and answers.verdict[i] == whole.verdict[i]
-            else:
-                assert answers.verdict[i] == (1 if own else 2)
-        # A node's children are tested together, so that the last of them may lie beyond the budget.
-        assert answers.exact[whole.node_visits <= visits].all()
-        assert not answers.exact[whole.node_visits > visits + 16].any()

@@ -1,6 +1,5 @@
 """`near` answers one pose with the bits of `distance`: fields, counters of work and what is held in memory."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,8 +22,6 @@ from solidcloud.server.queries.context.query_context import SceneData
 from solidcloud.server.queries.distance import distance
 from solidcloud.server.queries.resident_fast_path import MAX_FAST_REACH, distance_fast
 from solidcloud.server.scene import Scene
-
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 
 COLUMNS = (
     "verdict", "signed_distance", "lower", "upper", "exact", "witness_avatar", "witness_cloud", "normal", "outside",
@@ -61,8 +58,7 @@ def both_ways(
         counted.touching += bool(expected.signed_distance[0] <= 0)
 
 
-@pytest.mark.interpreted
-@settings(max_examples=4 if INTERPRETED else sample(12, 40), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 40), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -77,9 +73,9 @@ def test_one_pose_has_the_bits_of_distance(
     seed: int, kind: str, body: str, far: float, scale: float, step: float, reach: float, tree: dict[str, Any]
 ) -> None:
     rng = np.random.default_rng(seed)
-    points = cloud(rng, kind, 40 if INTERPRETED else 400) + far * rng.uniform(-1, 1, 3)
+    points = cloud(rng, kind, 400) + far * rng.uniform(-1, 1, 3)
     avatar = make_avatar(cloud(rng, body, 30) * 0.2, float(rng.choice([0.0, 0.01])))
-    poses = archive_cases.near_poses(rng, points, avatar.points, 3 if INTERPRETED else 12, 1.0, scale)
+    poses = archive_cases.near_poses(rng, points, avatar.points, 12, 1.0, scale)
     with TemporaryDirectory() as folder:
         case = archive_cases.build(Path(folder), points, voxel=1.0, resolution=step, radius=step, **tree)
         with Scene.open(case.archive) as scene:

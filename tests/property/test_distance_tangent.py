@@ -37,7 +37,6 @@ def judge(scene: Scene, poses: NDArray[np.float64], least: list[int], radii: int
 @pytest.mark.case(
     6,
     "10^5 near-tangent pairs among 10^7: distance exact to the unit, collide one unit on either side; none wrong",
-    compiled_only="10^7 pairs; test_case_06_… is",
 )
 def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) -> None:
     # A fine lattice and a large voxel: what float32 cannot tell there is half a step wide.

@@ -1,7 +1,6 @@
 """Queries of frames that do not wait, compared with brute force: any voxels in memory, others absent."""
 
 import math
-import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,14 +25,11 @@ from solidcloud.server.queries.sweep import sweep
 from solidcloud.server.queries.within import within
 from solidcloud.server.scene import Scene
 
-pytestmark = pytest.mark.interpreted
-
-INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 MODELS = (*radius_class_archives.MODELS, "local", "border:0.5")
 
 
 @pytest.mark.timeout(900)  # the first run may have to compile everything
-@settings(max_examples=4 if INTERPRETED else sample(10, 30), deadline=None, derandomize=True)
+@settings(max_examples=sample(5, 30), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -47,9 +43,9 @@ def test_what_a_frame_is_told_without_waiting_is_true(
     seed: int, kind: str, body: str, model: str | None, policy: str, level: int, tree: dict[str, Any]
 ) -> None:
     rng = np.random.default_rng(seed)
-    points, avatar = cloud(rng, kind, 60 if INTERPRETED else 200), cloud(rng, body, 12 if INTERPRETED else 30)
+    points, avatar = cloud(rng, kind, 200), cloud(rng, body, 30)
     avatar *= rng.uniform(0.05, 0.5)
-    poses = archive_cases.near_poses(rng, points, avatar, 4 if INTERPRETED else 10, 0.6)
+    poses = archive_cases.near_poses(rng, points, avatar, 10, 0.6)
     with TemporaryDirectory() as folder, radius_class_archives.any_classes():
         case = archive_cases.build(
             Path(folder), points, voxel=0.5, models=radius_class_archives.STORED, **tree

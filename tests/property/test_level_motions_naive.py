@@ -97,7 +97,6 @@ def test_what_a_level_settles_is_true(
             assert said(kept.contacts("avatar", poses, 5, margin, radius_model=model)) == said(counted)
 
 
-@pytest.mark.interpreted
 def test_motions_towards_a_dense_wall_need_no_voxel(tmp_path: Path, rng: np.random.Generator) -> None:
     wall = rng.uniform(0, 1, (6000, 3)) * [2.0, 0.003, 2.0]
     body = rng.uniform(-0.1, 0.1, (200, 3))

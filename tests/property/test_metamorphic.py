@@ -5,7 +5,6 @@ powers of two, so that an image is exact. Sums of a turned body's coordinates ar
 scene may round one the other way, by a unit of 15 nm, once in 2^27 coordinates; the draws are fixed.
 """
 
-import os
 from collections import Counter
 from collections.abc import Callable
 from functools import lru_cache
@@ -23,7 +22,7 @@ from solidcloud.server.scene import Scene
 
 # Scenes of an archive, far apart, so that 40 draws take 4 builds.
 SCENES = 10
-ARCHIVES = 2 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else sample(4, 12)
+ARCHIVES = sample(4, 12)
 APART = 64 * 1024  # [STEP]
 STEP = archive_cases.BINARY_STEP
 POINTS, BODY = 40, 12
@@ -104,7 +103,6 @@ def check(image: Callable[[np.random.Generator, Drawn], Contacts]) -> None:
 
 
 @pytest.mark.case(27, "200 scenes moved by whole metres up to 10^7: the same set of contacts")
-@pytest.mark.interpreted
 def test_translation_changes_no_contact() -> None:
     def moved(rng: np.random.Generator, drawn: Drawn) -> Contacts:
         shift = rng.integers(-(10**7), 10**7 + 1, 3).astype(float)
@@ -116,7 +114,6 @@ def test_translation_changes_no_contact() -> None:
 
 
 @pytest.mark.case(27, "200 scenes turned by quarter turns about any axes: the same set of contacts")
-@pytest.mark.interpreted
 def test_quarter_turns_change_no_contact() -> None:
     turns = signed_permutations()
 
@@ -133,7 +130,6 @@ def test_quarter_turns_change_no_contact() -> None:
 
 
 @pytest.mark.case(27, "200 scenes and bodies with their points in another order: the same set of contacts")
-@pytest.mark.interpreted
 def test_permutation_changes_no_contact() -> None:
     def shuffled(rng: np.random.Generator, drawn: Drawn) -> Contacts:
         order = rng.permutation(len(drawn.body))
@@ -144,13 +140,11 @@ def test_permutation_changes_no_contact() -> None:
 
 
 @pytest.mark.case(11, "200 scenes in voxels of 20 cm to 300 m and other trees: the same set of contacts")
-@pytest.mark.interpreted
 def test_voxels_and_trees_change_no_contact() -> None:
     check(lambda rng, drawn: contacts(drawn._replace(options=tree_options(rng))))
 
 
 @pytest.mark.case(11, "200 scenes with the grid of voxels shifted by a stray point: the same set of contacts")
-@pytest.mark.interpreted
 def test_a_shifted_grid_changes_no_contact() -> None:
     def shifted(rng: np.random.Generator, drawn: Drawn) -> Contacts:
         # Out of reach of everything; the origin, and with it the grid, lie there then.

@@ -9,16 +9,16 @@ import archive_cases
 import effect_rooms
 import numpy as np
 import pytest
-from effect_rooms import INTERPRETED, Play, play
+from effect_rooms import Play, play
 from numpy.typing import NDArray
 from solidcloud.schemas.scene.effect_table import AnyEffect, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.simulation.world.frame import Body
 
 # Pushes of a test, and of the one that is asked for with -m slow.
-PUSHES, MANY = (800, 100_000) if not INTERPRETED else (3, 3)
-REST = 1_000 if not INTERPRETED else 5
-SIZE = 2.4 if not INTERPRETED else 1.6
+PUSHES, MANY = 800, 100_000
+REST = 1_000
+SIZE = 2.4
 # Pushes go so far [m].
 LEAST, MOST = 0.01, 50.0
 
@@ -73,7 +73,6 @@ def in_room(game: Play) -> Body:
     return game.body(effect_rooms.body_box(), effect_rooms.at(SIZE / 4, 0.05, 0.02))
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize(
     ("effects", "turn"),
     [
@@ -98,7 +97,6 @@ def test_nor_by_a_hundred_thousand_pushes(rooms: archive_cases.Case, rng: np.ran
         check(game, rooms, body, push(game, body, rng, MANY, 0.3))
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize(
     ("way", "length"),
     [((1, 0, 0), 0.05), ((1, 1, 0), 0.05), ((1, 1, 1), 0.05), ((0.3, 0.9, 0.2), 0.05), ((-1, -1, 1), 3.0)],
@@ -109,9 +107,7 @@ def test_who_pushes_into_walls_creases_and_corners_does_not_tremble(
     with play(rooms.archive, Stop(), Sweep(), Slide()) as game:
         body = in_room(game)
         wish = np.array(way) / np.linalg.norm(way) * length
-        for _ in range(
-            20 if INTERPRETED else round(2 * SIZE / length) + 20
-        ):  # there, and along, into the corner
+        for _ in range(round(2 * SIZE / length) + 20):  # there, and along, into the corner
             game.go(body, wish)
         rests = body.pose.copy()
         for _ in range(REST):
@@ -120,12 +116,11 @@ def test_who_pushes_into_walls_creases_and_corners_does_not_tremble(
         assert not game.touches(body)
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("effects", [(), (Slide(), Ground(), Step())])
 def test_at_rest_not_a_bit_moves(rooms: archive_cases.Case, effects: tuple[AnyEffect, ...]) -> None:
     with play(rooms.archive, Stop(), Sweep(), *effects) as game:
         body = game.body(effect_rooms.person(), effect_rooms.at(SIZE / 4, 0.05, -SIZE / 2 + 0.2, 0.3))
-        for _ in range(5 if INTERPRETED else 30):
+        for _ in range(30):
             game.go(body, (0.0, 0.0, 0.0))
         rests = body.pose.tobytes()
         for _ in range(REST):
@@ -134,12 +129,11 @@ def test_at_rest_not_a_bit_moves(rooms: archive_cases.Case, effects: tuple[AnyEf
         assert not game.touches(body)
 
 
-@pytest.mark.interpreted
 def test_the_same_wishes_give_the_same_bits_whatever_is_in_memory(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     case = effect_rooms.build(tmp_path, effect_rooms.room(SIZE), voxel=0.5)
-    ways = pushes(rng, 400 if not INTERPRETED else 3)
+    ways = pushes(rng, 400)
     ways *= np.minimum(1.0, 0.2 / np.linalg.norm(ways, axis=1))[:, None]
     walks, budget = [], 1 << 26
     for _ in range(2):
@@ -150,7 +144,7 @@ def test_the_same_wishes_give_the_same_bits_whatever_is_in_memory(
                 poses.append(body.pose.tobytes())
             walks.append(poses)
             residency = game.scene.residency
-            assert INTERPRETED or (residency.evictions > 0) == (budget < 1 << 26)
+            assert (residency.evictions > 0) == (budget < 1 << 26)
             # What one motion reaches fits, and not much more.
             budget = residency.bytes_of(range(len(residency.where))) // 3
     assert walks[0] == walks[1]

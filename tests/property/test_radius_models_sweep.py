@@ -33,7 +33,7 @@ def columns(answers: SweepAnswers, names: tuple[str, ...] = FOUND) -> list[str]:
     return [str(getattr(answers, name).tolist()) for name in names]
 
 
-@settings(max_examples=sample(6, 16), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 16), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),
@@ -87,7 +87,6 @@ def test_no_sampled_pose_contradicts_the_answer(
             )
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("model", ["local:0.2", "border:3", "local+border:0.3"])
 def test_a_motion_that_stands_still_touches_from_the_very_unit_on(
     tmp_path: Path, rng: np.random.Generator, model: str
@@ -116,7 +115,7 @@ def test_a_motion_that_stands_still_touches_from_the_very_unit_on(
     assert found > 3
 
 
-@settings(max_examples=sample(8, 20), deadline=None, derandomize=True)
+@settings(max_examples=sample(4, 20), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), model=st.sampled_from(radius_class_archives.MODELS), tree=TREES)
 def test_a_point_going_straight_touches_when_the_quadratic_says(
     seed: int, model: str | None, tree: dict[str, Any]
@@ -158,7 +157,7 @@ def test_a_point_going_straight_touches_when_the_quadratic_says(
     assert np.abs(answers.witness_cloud - places[sooner.argmin(axis=1)])[alone].max(initial=0.0) < 1e-9
 
 
-@settings(max_examples=sample(4, 8), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 8), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),
@@ -230,7 +229,6 @@ def test_a_large_sphere_makes_no_work_where_spheres_are_small(
     assert 1000 < visits["local:5"] < 1.2 * visits["fixed:0.005"]
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("model", ["local", "border:3"])
 def test_a_path_asks_of_each_part_what_a_scene_answers(
     tmp_path: Path, rng: np.random.Generator, model: str

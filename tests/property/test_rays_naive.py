@@ -29,7 +29,7 @@ def stored(case: archive_cases.Case, data: SceneData) -> NDArray[np.float64]:
     return np.asarray(naive.lattice_of(case.points, origin, step) * step + origin)
 
 
-@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(KINDS),
@@ -74,7 +74,7 @@ def test_rays_and_points_are_answered_as_defined(
                 )
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(KINDS))
 def test_no_tree_voxel_order_or_cache_changes_an_answer(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -101,7 +101,7 @@ def test_no_tree_voxel_order_or_cache_changes_an_answer(seed: int, kind: str) ->
     assert all(one == seen[0] for one in seen)
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @example(seed=1, shift=(6_378_137, -6_378_137, 6_356_752))
 @given(seed=st.integers(0, 2**32 - 1), shift=st.tuples(*[st.integers(-(10**7), 10**7)] * 3))
 def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, int, int]) -> None:
@@ -128,7 +128,6 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
     radius=st.sampled_from([0, 1, 10**5, 10**6, 2**30]),
     grazing=st.booleans(),
 )
-@pytest.mark.interpreted
 def test_the_formula_is_as_near_the_ideal_as_it_says(
     seed: int, size: float, radius: int, grazing: bool
 ) -> None:
@@ -159,7 +158,6 @@ def test_the_formula_is_as_near_the_ideal_as_it_says(
         assert abs(Fraction(t) - ideal) <= off * 2 + naive_rays.root(off * 4 * radius) + Fraction(1, 2**40)
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("leaf", [1, 32])
 def test_of_spheres_hit_at_once_the_least_point_is_named(tmp_path: Path, leaf: int) -> None:
     """The four corners of a square, by a ray through its middle; from within all four; nearest to its middle."""
@@ -177,7 +175,6 @@ def test_of_spheres_hit_at_once_the_least_point_is_named(tmp_path: Path, leaf: i
                 assert within(data, [(0.0, 0, 0)], 1.0).cloud_point.tolist() == [list(least)]
 
 
-@pytest.mark.interpreted
 def test_reach_is_inclusive_to_the_unit(tmp_path: Path) -> None:
     """Lengths of 3, 4, 12 and 13: at the reach, one unit of 2^-26 m short of it, and one beyond."""
     unit = 2.0**-26
@@ -192,7 +189,6 @@ def test_reach_is_inclusive_to_the_unit(tmp_path: Path) -> None:
             assert raycast(data, passing, [(1.0, 0, 0)], 1.5).verdict.tolist() == [found]
 
 
-@pytest.mark.interpreted
 @pytest.mark.parametrize("kind", synthetic_scans.WITH_POINTS)
 def test_a_few_rays_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)

@@ -162,4 +162,3 @@ class ResidencyMachine(RuleBasedStateMachine):
 
 TestResidency = ResidencyMachine.TestCase
 TestResidency.settings = settings(max_examples=80, stateful_step_count=40, deadline=None, derandomize=True)
-TestResidency.pytestmark = [pytest.mark.interpreted]

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
+from sample_sizes import sample
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_table import Ground, Objects, Slide, Stop
 from solidcloud.schemas.scene.scene_file import SceneFile, parse_scene
@@ -104,14 +105,19 @@ def as_toml(scene: SceneFile) -> bytes:
 
 
 @given(SCENES)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=sample(60, 200), deadline=None, derandomize=True)
 def test_a_scene_comes_back_from_toml_as_it_was(scene: SceneFile) -> None:
     assert decode(as_toml(scene), SceneFile, "made") == scene
     assert msgspec.json.decode(msgspec.json.encode(scene), type=SceneFile) == scene
 
 
 @given(SCENES.map(mended).filter(is_right))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(
+    max_examples=sample(30, 100),
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.filter_too_much],
+)
 def test_a_right_scene_is_read_with_its_poses_made_rigid(scene: SceneFile) -> None:
     found = parse_scene(as_toml(scene), "made")
     assert msgspec.structs.replace(found, archives=scene.archives, objects=scene.objects) == scene
@@ -120,7 +126,7 @@ def test_a_right_scene_is_read_with_its_poses_made_rigid(scene: SceneFile) -> No
 
 
 @given(SCENES.filter(lambda scene: not is_right(scene)))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=sample(30, 100), deadline=None, derandomize=True)
 def test_a_scene_that_is_refused_is_refused_by_its_line(scene: SceneFile) -> None:
     with pytest.raises(BadRequestError, match=r"^made: line [0-9]+: \$\."):
         parse_scene(as_toml(scene), "made")

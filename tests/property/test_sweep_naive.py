@@ -7,7 +7,6 @@ from typing import Any
 import archive_cases
 import judged_sweeps
 import numpy as np
-import pytest
 import synthetic_scans
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,10 +14,9 @@ from sample_sizes import sample
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.queries.collide import collide
-from solidcloud.server.queries.context.query_budget import QueryBudget
 
 
-@settings(max_examples=sample(12, 35), deadline=None, derandomize=True)
+@settings(max_examples=sample(6, 35), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),
@@ -65,7 +63,7 @@ def test_no_sampled_pose_contradicts_the_answer(
     assert (answers.verdict != Verdict.UNKNOWN).all() or kind == "duplicates" or radius + margin < 2e-3
 
 
-@settings(max_examples=sample(4, 10), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 10), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(judged_sweeps.CLOUDS),
@@ -94,7 +92,7 @@ def test_no_tree_voxel_or_order_changes_an_answer(seed: int, kind: str, turn: fl
             assert [str(column.tolist()) for column in found] == expected
 
 
-@settings(max_examples=sample(4, 8), deadline=None, derandomize=True)
+@settings(max_examples=sample(3, 8), deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), turn=st.sampled_from([0.0, 0.5]))
 def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None:
     """The way between exactly shifted poses rounds differently, by 10^-9 m at 5 * 10^6 m: no more may differ."""
@@ -122,31 +120,6 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, turn: float) -> None
         assert np.abs(getattr(one, bound)[touches] - getattr(other, bound)[touches]).max() < 1e-5
 
 
-@settings(max_examples=sample(5, 12), deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**32 - 1), visits=st.sampled_from([0, 1, 10, 100, 1000]))
-def test_a_budget_never_makes_a_false_claim(seed: int, visits: int) -> None:
-    """Case 30: with fewer visits the bounds are wider, and still hold; what is clear stays clear."""
-    rng = np.random.default_rng(seed)
-    points, avatar = synthetic_scans.make_scan("corner", seed, 300), rng.uniform(-0.2, 0.2, (30, 3))
-    first, last = judged_sweeps.motions(rng, points, avatar, 20, 0.3, 0.5, 0.5)
-    with TemporaryDirectory() as folder:
-        case = archive_cases.build(Path(folder), points)
-        with judged_sweeps.opened(case) as data:
-            full = judged_sweeps.ask(data, avatar, 0.01, first, last)
-            part = judged_sweeps.ask(data, avatar, 0.01, first, last, budget=QueryBudget(visits=visits))
-            late = judged_sweeps.ask(data, avatar, 0.01, first, last, budget=QueryBudget(deadline=0.0))
-            judged_sweeps.judge(case, data, avatar, 0.01, first, last, part, samples=20)
-    assert (part.node_visits <= visits + 64).all()
-    clear = part.verdict == Verdict.CLEAR
-    assert (full.verdict[clear] == Verdict.CLEAR).all()
-    assert (part.lower <= full.upper).all() and (part.upper >= full.lower).all()
-    out = full.node_visits > visits
-    assert (part.verdict[out] != Verdict.CLEAR).all()
-    assert (late.verdict == np.where(full.node_visits == 0, Verdict.CLEAR, Verdict.UNKNOWN)).all()
-    assert (late.lower[late.verdict == Verdict.UNKNOWN] == 0).all()
-
-
-@pytest.mark.interpreted
 def test_a_few_motions_of_every_sort(tmp_path: Path, rng: np.random.Generator) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan("corner", 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (5, 3))

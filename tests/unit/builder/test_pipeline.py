@@ -43,7 +43,6 @@ def out(tmp_path: Path) -> Path:
 @pytest.mark.case(
     27,
     "an archive's bytes for any order of files and any bound on memory",
-    compiled_only="it is of the build's passes",
 )
 def test_the_bytes_do_not_depend_on_order_jobs_or_memory(
     scans: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
@@ -61,9 +60,7 @@ def test_the_bytes_do_not_depend_on_order_jobs_or_memory(
     assert content(out / "a") == content(out / "c")
 
 
-@pytest.mark.case(
-    27, "an archive's bytes for one job and two", compiled_only="it starts processes that compile"
-)
+@pytest.mark.case(27, "an archive's bytes for one job and two")
 def test_two_jobs_write_the_bytes_of_one(scans: list[Path], out: Path) -> None:
     # Here a plugin for the zstd filter is loaded, in the spawned processes it is not: HDF5 would write its name.
     assert h5py.h5z.filter_avail(32015)  # zstd
@@ -72,9 +69,7 @@ def test_two_jobs_write_the_bytes_of_one(scans: list[Path], out: Path) -> None:
     assert content(out / "a") == content(out / "b")
 
 
-@pytest.mark.case(
-    27, "an archive's bytes from one run of points and from three", compiled_only="600,000 points"
-)
+@pytest.mark.case(27, "an archive's bytes from one run of points and from three")
 def test_a_small_memory_bound_gives_several_runs_and_the_same_bytes(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

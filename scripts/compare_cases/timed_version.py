@@ -66,7 +66,8 @@ def scene_cases(archive: Path, stack: ExitStack) -> dict[str, Case]:
             scene.within(origins, 5.0)
 
     def objects() -> None:
-        scene.objects([("al", pose) for pose in frames[::OBJECTS]])
+        for _ in range(PASSES):
+            scene.objects([("al", pose) for pose in frames[::OBJECTS]])
 
     walker = open_walk(scene_file(archive), stack)
     walker.add_avatar("al", figure)

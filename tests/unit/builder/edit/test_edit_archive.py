@@ -4,7 +4,6 @@ from pathlib import Path
 
 import archive_cases
 import numpy as np
-import pytest
 import synthetic_scans
 from archive_edits import (
     EVERYTHING,
@@ -27,15 +26,8 @@ from solidcloud.schemas.archive.archive import Archive
 from solidcloud.server.scene import Scene
 
 
-@pytest.mark.parametrize(
-    ("models", "keep"),
-    [(MODELS[0], EVERYTHING), (MODELS[-1], frozenset())],
-    ids=lambda names: ",".join(sorted(names)) or "nothing",
-)
-def test_what_is_added_is_as_if_built_together(
-    built: Build, files: Files, tmp_path: Path, models: frozenset[str], keep: frozenset[str]
-) -> None:
-    options = {"models": models, "keep": keep}
+def test_what_is_added_is_as_if_built_together(built: Build, files: Files, tmp_path: Path) -> None:
+    options = {"models": MODELS[-1], "keep": frozenset()}
     target = built(tmp_path / "x", "a", **options)
     summary = add_scans(target, [files.b], jobs=1)
     assert (summary.generation, summary.points_before, summary.points) == (1, len(A), len(A) + len(B))
@@ -47,11 +39,8 @@ def test_what_is_added_is_as_if_built_together(
     assert not verify_archive(target).notes, "the preview is of this generation"
 
 
-@pytest.mark.parametrize("models", MODELS[::3], ids=lambda m: ",".join(sorted(m)))
-def test_what_is_left_is_as_if_built_without(
-    built: Build, files: Files, tmp_path: Path, models: frozenset[str]
-) -> None:
-    options = {"models": models, "keep": EVERYTHING}
+def test_what_is_left_is_as_if_built_without(built: Build, files: Files, tmp_path: Path) -> None:
+    options = {"models": MODELS[0], "keep": EVERYTHING}
     target = built(tmp_path / "x", "abc", **options)
     summary = remove_scans(target, [str(files.b)], jobs=1)
     assert (summary.generation, summary.points, summary.scans) == (1, len(A) + len(C), (f"{files.b}[0]",))

@@ -229,7 +229,7 @@ def test_shards_that_no_voxel_refers_to_are_deleted(built: Build, files: Files, 
     target = built(tmp_path / "x", "ab", keep=EVERYTHING)
     keep = target / SHARD_FOLDER / "notes.txt"
     keep.write_text("not ours")
-    for number in range(3):
+    for number in range(2):
         add_scans(target, [files.c], again=True, jobs=1)
         remove_scans(target, [str(files.c)], jobs=1)
         with Archive(target) as archive:

@@ -16,7 +16,6 @@ from solidcloud.builder.edit.edit_archive import add_scans
 from solidcloud.builder.edit.renew_level import renew_level
 from solidcloud.builder.passes.level_pass import write_level
 from solidcloud.builder.passes.verify import verify_archive
-from solidcloud.builder.run.executor import ProcessExecutor
 from solidcloud.builder.voxel.exact_enclosure import loose_nodes
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
@@ -127,9 +126,6 @@ def test_bytes_depend_on_the_archive_alone(tmp_path: Path) -> None:
     folder = archive_cases.build(tmp_path, scan("noise"), voxel=2.0).archive
     before = contents(folder / LEVEL_FOLDER)
     write_level(folder)
-    assert contents(folder / LEVEL_FOLDER) == before
-    with ProcessExecutor(2) as executor:
-        write_level(folder, executor)
     assert contents(folder / LEVEL_FOLDER) == before
 
 

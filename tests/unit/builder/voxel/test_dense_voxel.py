@@ -24,8 +24,8 @@ def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kind", ["corner", "duplicates"])
-@pytest.mark.parametrize("steps", [1000])
-def test_a_voxel_built_in_parts_is_the_voxel(kind: str, steps: int, tmp_path: Path) -> None:
+def test_a_voxel_built_in_parts_is_the_voxel(kind: str, tmp_path: Path) -> None:
+    steps = 1000
     points = make_steps(kind, 3, 1500, steps)
     names = {
         "corner": ("scan_index", "intensity"), "duplicates": tuple(COLUMNS), "noise": ("classification",)

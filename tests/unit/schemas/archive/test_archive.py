@@ -166,7 +166,7 @@ def virtual(file: h5py.File, name: str) -> None:
 
 
 EDITS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
-    "other version": (set_attribute("format_version", np.uint32(6)), "format version 6, .* reads 1, 2, 3, 4, 5"),
+    "other version": (set_attribute("format_version", np.uint32(6)), "format version 6, .* reads 1, 2, 3, 5"),
     "other format": (set_attribute("format", np.bytes_("solidcloud shard")), "not a solidcloud index"),
     "other units": (set_attribute("units", np.bytes_("ft")), "units 'ft', expected 'm'"),
     "text of variable length": (set_attribute("format", "solidcloud"), "not a solidcloud index"),

@@ -64,10 +64,10 @@ def test_walks_are_the_same_in_voxels_of_any_size(archives: list[Path]) -> None:
 
 
 def test_a_cache_of_a_few_voxels_changes_no_walk(archives: list[Path]) -> None:
-    """The voxels of a motion fit in it, and it holds a ninth of the scan."""
+    """Not all voxels of a motion fit in it."""
     store = VoxelStore(archives[0])
     store.close()
-    budget = 3 * ArenaBuffer.rounded(int(store.sizes.max()))
+    budget = 9 * ArenaBuffer.rounded(int(store.sizes.max())) // 8
     with play(archives[0], *EFFECTS) as game:
         expected = walks(game).tobytes()
     with play(archives[0], *EFFECTS, budget_bytes=budget, coarse_bytes=0) as game:

@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -336,15 +336,24 @@ def scenes_at(
     return sorted(served)
 
 
-def _open_session(endpoint: str) -> zenoh.Session:
+@contextmanager
+def _open_session(endpoint: str) -> Iterator[zenoh.Session]:
     """Open a session connected to an endpoint; raise BadRequestError if it is invalid."""
     check_endpoint(endpoint, "endpoint")
     try:
-        return zenoh.open(session_config(connect=endpoint))
+        session = zenoh.open(session_config(connect=endpoint))
     except zenoh.ZError as error:
         raise BadRequestError(
             f"endpoint {endpoint!r}: {zenoh_words(error)}: expected one such as {DEFAULT_ENDPOINT}"
         ) from None
+    try:
+        yield session
+    finally:
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            # A frozen server accepts no farewell, and zenoh gives up. The client has nothing left to do.
+            log.warning("%s: %s", endpoint, zenoh_words(error))
 
 
 def _ask_scenes(session: zenoh.Session, timeout: float, anchor: TrustAnchor) -> tuple[set[str], set[int]]:

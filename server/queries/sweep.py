@@ -219,6 +219,8 @@ def sweep_steps(
         lost[:] = 0.0
     met = lost <= until
     proved[met] = np.minimum(proved, lost)[met]
+    if part is None and ((proved < 1.0).any() or (progress.upper < np.inf).any()):
+        budget.lacked(len(spent.late))  # what else is near decides in which interval a contact is found
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return msgspec.structs.replace(answers, **spent.fields())

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.kernels import compiling as nb
-from .kernel_decorators import njit_no_refcount
+from .kernel_decorators import njit_inlined, njit_no_refcount
 from .scene_arrays import ROWS_AT_ONCE, stopped
 
 # What a search may do with a voxel: stop before it, examine it, or count it as missing. An array of
 # states (v,) uint8; an empty one says that all voxels are held.
 NOT_HELD, HELD, MISSING = 0, 1, 2
+U = np.uint64  # see placed_avatar.py
 FAN = 8
 # On each level, FAN - 1 siblings stay on the stack; 2^63 rows have 21 levels.
 REACH_STACK = 22 * FAN
@@ -31,15 +32,17 @@ INFINITE = np.inf
 class VoxelTree(NamedTuple):
     """Boxes around the points of the v voxels of an index, level by level, beginning with the voxels.
 
-    low, high: (n, 3) float64 [steps], exact; the first v are those of the voxels.
-    levels: (l + 1,) int64, the start of each level; the last level is one box.
+    low, high: (n, 3) float64 [steps], exact; the first v are those of the voxels, the last is the root.
+    below: (n, 2) int64, first and end of the boxes below a box, at most FAN; -1 for those of voxels.
+    voxels: their number v.
     scene: (2, 3) float64 [steps], the box of all points.
     unknown: (u, 2, 3) float64 [steps], boxes of scans that were left out.
     """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    levels: NDArray[np.int64]
+    below: NDArray[np.int64]
+    voxels: int
     scene: NDArray[np.float64]
     unknown: NDArray[np.float64]
 
@@ -73,13 +76,6 @@ class VoxelLists(NamedTuple):
     unseen: NDArray[np.float64]
 
 
-class ReachStack(NamedTuple):
-    """Scratch of `list_item`: a box and its level, (REACH_STACK,) int64 each."""
-
-    box: NDArray[np.int64]
-    level: NDArray[np.int64]
-
-
 def make_voxel_tree(
     low: NDArray[np.int64], high: NDArray[np.int64], scene: NDArray[np.int64], unknown: NDArray[np.int64]
 ) -> VoxelTree:
@@ -87,14 +83,18 @@ def make_voxel_tree(
 
     Rows are in Morton order.  scene: (2, 3).  unknown: (u, 2, 3).
     """
-    lows, highs = [low.astype(np.float64)], [high.astype(np.float64)]
+    lows, highs, below = [low.astype(np.float64)], [high.astype(np.float64)], [np.full((len(low), 2), -1)]
+    start = 0
     while len(lows[-1]) > 1:
-        groups = np.arange(0, len(lows[-1]), FAN)
+        count = len(lows[-1])
+        groups = np.arange(0, count, FAN)
+        below.append(start + np.column_stack([groups, np.minimum(groups + FAN, count)]))
+        start += count
         lows.append(np.minimum.reduceat(lows[-1], groups))
         highs.append(np.maximum.reduceat(highs[-1], groups))
-    levels = np.cumsum([0, *map(len, lows)])
     return VoxelTree(
-        np.concatenate(lows), np.concatenate(highs), levels, scene.astype(np.float64), unknown.astype(np.float64)
+np.concatenate(lows), np.concatenate(highs), np.concatenate(below), len(low), scene.astype(np.float64),
+        unknown.astype(np.float64),
     )  # fmt: skip
 
 
@@ -115,51 +115,38 @@ def all_resident(where, rows, needed):
     return True
 
 
-@nb.njit(nogil=True, cache=True)
-def make_reach_stack():
-    """Allocate the scratch of `list_item`."""
-    return ReachStack(np.empty(REACH_STACK, np.int64), np.empty(REACH_STACK, np.int64))
+@njit_inlined
+def _entry(bx, by, bz, ex, ey, ez, span, low, high, at):
+    """Return the fraction of its way at which a moving cube first meets box `at`; see `entry_fraction`.
 
-
-@njit_no_refcount
-def entry_fraction(begin, end, span, low, high):
-    """Return the fraction of its way at which a moving cube first meets the box [low, high].
-
-    begin, end: (3,), its centre.  span: half its edge. Rounded down; inf if it does not meet the box.
+    b, e: its centre at both ends.  low, high: (n, 3).
     """
-    least, most = 0.0, 1.0
+    least, most, misses = 0.0, 1.0, False
     for r in range(3):
-        displacement = end[r] - begin[r]
-        near, far = low[r] - span - begin[r], high[r] + span - begin[r]
-        if displacement == 0.0:
-            if near > 0.0 or far < 0.0:
-                return INFINITE
+        begin = bx if r == 0 else by if r == 1 else bz
+        way = (ex if r == 0 else ey if r == 1 else ez) - begin
+        near, far = low[at, r] - span - begin, high[at, r] + span - begin
+        if way == 0.0:
+            misses |= near > 0.0 or far < 0.0
             continue
-        first, last = near / displacement, far / displacement
-        if displacement < 0.0:
+        first, last = near / way, far / way
+        if way < 0.0:
             first, last = last, first
         # near and far are rounded to 2^-52 of terms; spans are wider than necessary by that much.
         least, most = max(least, first), min(most, last)
-    if least > most * (1.0 + 1e-12) + 1e-12:
+    if misses or least > most * (1.0 + 1e-12) + 1e-12:
         return INFINITE
     return max(0.0, least - 1e-9)
 
 
 @njit_no_refcount
-def _near(begin, end, still, way, span, own, low, high):
-    """Return `near` of an item and a box; inf if the box is not in reach.
+def entry_fraction(begin, end, span, low, high, at):
+    """Return the fraction of its way at which a moving cube first meets the box low[at] to high[at].
 
-    still: whether the item stands still.  way: length of its way.
+    begin, end: (3,), its centre.  span: half its edge.  low, high: (n, 3). Rounded down; inf if it does
+    not meet the box.
     """
-    if not still:
-        return entry_fraction(begin, end, span, low, high) * way
-    square = 0.0
-    for r in range(3):
-        gap = max(low[r] - begin[r], begin[r] - high[r], 0.0)
-        square += gap * gap
-    if not square <= span * span:
-        return INFINITE
-    return max(math.sqrt(square) * (1.0 - 1e-9) - own, 0.0)
+    return _entry(begin[0], begin[1], begin[2], end[0], end[1], end[2], span, low, high, at)
 
 
 @njit_no_refcount
@@ -191,35 +178,42 @@ def list_item(tree, begin, end, span, own, stop, stack, rows, near, count):
     """Append the voxels in reach of one item to rows and near, from `count` on, sorted.
 
     begin, end, span, own: of one item, see `Items`.  stop: the request's stop flag; once it is set,
-    the list is incomplete and unsorted.
+    the list is incomplete.  stack: (REACH_STACK,) int64, scratch.
     Returns the new count. Entries beyond the capacity are not written, and the list is then not
     sorted.
     """
-    still, square = True, 0.0
-    for r in range(3):
-        still &= begin[r] == end[r]
-        square += (end[r] - begin[r]) ** 2
-    way, depth, first = math.sqrt(square), 0, count
-    if tree.low.shape[0] > 0:
-        stack.box[0], stack.level[0] = 0, tree.levels.shape[0] - 2
-        depth = 1
+    low, high, below, boxes = tree.low, tree.high, tree.below, tree.low.shape[0]
+    bx, by, bz, ex, ey, ez = begin[0], begin[1], begin[2], end[0], end[1], end[2]
+    still = bx == ex and by == ey and bz == ez
+    way, most = math.sqrt((ex - bx) ** 2 + (ey - by) ** 2 + (ez - bz) ** 2), span * span
+    first, depth, capacity = count, 0, rows.shape[0]
+    if boxes > 0:
+        stack[0], depth = boxes - 1, 1
     while depth > 0 and not stopped(stop):
         depth -= 1
-        number, level = stack.box[depth], stack.level[depth]
-        at = tree.levels[level] + number
-        gap = _near(begin, end, still, way, span, own, tree.low[at], tree.high[at])
-        if gap == INFINITE:
+        # Unsigned: numba adds a comparison for every index that may be negative.
+        at = U(stack[U(depth)])
+        if still:
+            dx = max(low[at, 0] - bx, bx - high[at, 0], 0.0)
+            dy = max(low[at, 1] - by, by - high[at, 1], 0.0)
+            dz = max(low[at, 2] - bz, bz - high[at, 2], 0.0)
+            gap = dx * dx + dy * dy + dz * dz
+            if not gap <= most:
+                continue
+        else:
+            gap = _entry(bx, by, bz, ex, ey, ez, span, low, high, at)
+            if gap == INFINITE:
+                continue
+        if below[at, 0] >= 0:
+            for box in range(below[at, 0], below[at, 1]):
+                stack[U(depth)] = box
+                depth += 1
             continue
-        if level == 0:
-            if count < rows.shape[0]:
-                rows[count], near[count] = number, gap
-            count += 1
-            continue
-        below = tree.levels[level] - tree.levels[level - 1]
-        for child in range(number * FAN, min((number + 1) * FAN, below)):
-            stack.box[depth], stack.level[depth] = child, level - 1
-            depth += 1
-    if count <= rows.shape[0]:
+        if count < capacity:
+            rows[count] = np.int64(at)
+            near[count] = max(math.sqrt(gap) * (1.0 - 1e-9) - own, 0.0) if still else gap * way
+        count += 1
+    if count - first > 1 and count <= capacity:
         _sort(rows, near, first, count, stop)
     return count
 
@@ -227,13 +221,21 @@ def list_item(tree, begin, end, span, own, stop, stack, rows, near, count):
 @njit_no_refcount
 def unknown_near(tree, begin, end, span, own):
     """Return the least `near` of one item and a scan that was left out; inf where none is in reach."""
-    still, square, least = True, 0.0, INFINITE
-    for r in range(3):
-        still &= begin[r] == end[r]
-        square += (end[r] - begin[r]) ** 2
-    for u in range(tree.unknown.shape[0]):
-        gap = _near(begin, end, still, math.sqrt(square), span, own, tree.unknown[u, 0], tree.unknown[u, 1])
-        least = min(least, gap)
+    unknown, least = tree.unknown, INFINITE
+    still = begin[0] == end[0] and begin[1] == end[1] and begin[2] == end[2]
+    for u in range(unknown.shape[0]):
+        square = 0.0
+        for r in range(3):
+            if still:
+                gap = max(unknown[u, 0, r] - begin[r], begin[r] - unknown[u, 1, r], 0.0)
+                square += gap * gap
+            else:
+                square += (end[r] - begin[r]) ** 2
+        if not still:
+            low, high = unknown[:, 0], unknown[:, 1]
+            least = min(least, entry_fraction(begin, end, span, low, high, u) * math.sqrt(square))
+        elif square <= span * span:
+            least = min(least, max(math.sqrt(square) * (1.0 - 1e-9) - own, 0.0))
     return least
 
 
@@ -245,7 +247,7 @@ def list_reach(tree, items, stop, lists):
     is 0 for these and for the one in hand.
     Fills `lists`. Returns how many entries are needed; those beyond the capacity are not written.
     """
-    stack, needed = make_reach_stack(), 0
+    stack, needed = np.empty(REACH_STACK, np.int64), 0
     for i in range(items.span.shape[0]):
         begin, end, span, own = items.begin[i], items.end[i], items.span[i], items.own[i]
         lists.starts[i] = needed

@@ -11,7 +11,7 @@ from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.kernels import compiling as nb
 from .kernel_decorators import njit_no_refcount
 from .placed_avatar import MAX_REACH_UNITS, largest_term, place
-from .reach import VoxelLists, list_item, make_reach_stack, unknown_near
+from .reach import REACH_STACK, VoxelLists, list_item, unknown_near
 from .scene_arrays import stopped
 
 # Poses checked between two checks of the stop flag.
@@ -163,7 +163,7 @@ def voxels_in_reach(poses, avatar, scene, tree, reach):
     The reach is widened by more than the rounding of this function: a millionth of itself, one
     step, and 2^-49 of the largest term of the sums.
     """
-    boxes, outside, lists, stack = reach.boxes, reach.outside, reach.lists, make_reach_stack()
+    boxes, outside, lists, stack = reach.boxes, reach.outside, reach.lists, np.empty(REACH_STACK, np.int64)
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
     shift, center = np.empty(3), np.empty(3)
     needed = 0

@@ -10,7 +10,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import largest_term, place
-from ..core.reach import INFINITE, ReachStack, entry_fraction, list_item, make_reach_stack
+from ..core.reach import INFINITE, REACH_STACK, entry_fraction, list_item
 from ..core.scene_arrays import stopped
 from .screw_motion import make_motion, pose_at
 
@@ -55,13 +55,13 @@ class PlanSpace(NamedTuple):
     shift: NDArray[np.float64]
     begin: NDArray[np.float64]
     end: NDArray[np.float64]
-    stack: ReachStack
+    stack: NDArray[np.int64]
 
 
 @nb.njit(nogil=True, cache=True)
 def make_plan_space():
     """Allocate a `PlanSpace`."""
-    return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), make_reach_stack())
+    return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), np.empty(REACH_STACK, np.int64))
 
 
 @nb.njit(nogil=True, cache=True)
@@ -169,7 +169,7 @@ def plan_segments(box, first, last, avatar, scales, units, scene, tree, which, p
                 span, place_root_sphere(motion, stop, avatar, scales[i], units[i], scene, pose, shift, end)
             )
             span += sagitta_of(motion, stop - t, scene)
-            if entry_fraction(begin, end, span, tree.scene[0], tree.scene[1]) < INFINITE:
+            if entry_fraction(begin, end, span, tree.scene[:1], tree.scene[1:], 0) < INFINITE:
                 if length > segment * (1.0 + 1e-9):
                     length = length * 0.5
                     continue
@@ -227,6 +227,6 @@ def find_unknown_regions(box, first, last, avatar, scales, units, scene, tree, u
                 outside[i] |= min(begin[r], end[r]) - span < tree.scene[0, r]
                 outside[i] |= max(begin[r], end[r]) + span > tree.scene[1, r]
             for u in range(tree.unknown.shape[0]):
-                met = entry_fraction(begin, end, span, tree.unknown[u, 0], tree.unknown[u, 1])
+                met = entry_fraction(begin, end, span, tree.unknown[:, 0], tree.unknown[:, 1], u)
                 if met < INFINITE:
                     unknown_from[i] = min(unknown_from[i], max(0.0, t0 + met * (t1 - t0) - 2.0**-52))

@@ -11,7 +11,7 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import box_square, has_box
-from ..core.reach import list_item, make_reach_stack
+from ..core.reach import REACH_STACK, list_item
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .rays import STACK
 
@@ -29,7 +29,9 @@ def voxels_near(held, x, y, z, square, rows):
     center, near = np.empty(3), np.empty(rows.shape[0])
     center[0], center[1], center[2] = x, y, z
     span = np.sqrt(np.float64(square)) * (1.0 + 1e-9) + 1.0
-    return list_item(held.tree, center, center, span, 0.0, held.one.never, make_reach_stack(), rows, near, 0)
+    return list_item(
+        held.tree, center, center, span, 0.0, held.one.never, np.empty(REACH_STACK, np.int64), rows, near, 0
+    )
 
 
 @njit_no_refcount

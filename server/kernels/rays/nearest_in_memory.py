@@ -8,7 +8,7 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.array_references import with_flag
-from ..core.reach import all_resident, list_item, make_reach_stack
+from ..core.reach import REACH_STACK, all_resident, list_item
 from ..core.scene_arrays import stopped
 from .rays import STACK, ClosestHits
 from .within_point import search_voxel
@@ -39,7 +39,7 @@ def nearest_in_memory(held, place, reach, stop, found):
     # A step more exceeds what rounding loses.
     span = reach / scene.step + 1.0
     count = list_item(
-        held.tree, center, center, span, 0.0, stop, make_reach_stack(), lists.rows, lists.near, 0
+        held.tree, center, center, span, 0.0, stop, np.empty(REACH_STACK, np.int64), lists.rows, lists.near, 0
     )
     if not all_resident(scene.where, lists.rows, count):
         return -1, False, 0

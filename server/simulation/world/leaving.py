@@ -91,7 +91,7 @@ class LeavingPose:
         nothing = np.empty((0, kernel.GATHERED))
         if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
             return _Gathered(nothing, True)
-        rows = np.flatnonzero(_meets(box, tree.low[: tree.levels[1]], tree.high[: tree.levels[1]])).tolist()
+        rows = np.flatnonzero(_meets(box, tree.low[: tree.voxels], tree.high[: tree.voxels])).tolist()
         held = data.references.to(arrays, tree)
         found, count = np.empty((4096, kernel.GATHERED)), 0
         for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):

@@ -32,7 +32,7 @@ from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
 from .raycast import raycast
-from .resident_fast_path import collide_fast
+from .resident_fast_path import collide_fast, distance_fast
 from .sweep import sweep
 from .within import within
 
@@ -52,7 +52,7 @@ def _sweep(
 
 ENGINES: dict[str, Callable[..., Any]] = {
     COLLIDE.name: collide_fast,
-    DISTANCE.name: distance,
+    DISTANCE.name: distance_fast,
     CONTACTS.name: contacts,
     SWEEP.name: _sweep,
     RAYCAST.name: raycast,
@@ -82,6 +82,8 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             return
         if question.name == COLLIDE.name:  # several poses use other kernels than one pose
             collide(data, avatar, poses, 0.0, budget)
+        if question.name == DISTANCE.name:
+            distance(data, avatar, poses, 0.01, budget)
         arguments = [
             samples[name] for name in question.arguments if name in question.required or name in samples
         ]

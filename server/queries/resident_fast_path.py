@@ -99,18 +99,24 @@ def collide_fast(
 def distance_fast(
     data: SceneData,
     avatar: AvatarModel,
-    pose: ArrayLike,
+    poses: ArrayLike,
     reach: float,
     budget: QueryBudget = EXACT,
     body: Any = None,
 ) -> DistanceAnswers:
-    """Answer `distance` for one pose (4, 4), in one kernel call if the fast path applies.
+    """Answer `distance`, in one kernel call if there is one pose and the fast path applies.
 
     body: reference to the arrays of the avatar, if there is one.
     """
     begin = time.perf_counter()
-    poses = kernel_poses(np.asarray(pose)[None])
-    if reach > MAX_FAST_REACH or len(avatar.points) > MAX_FAST_POINTS or budget.limited or _has_unknown(data):
+    poses = kernel_poses(poses)
+    if (
+        len(poses) != 1
+        or not 0.0 <= reach <= MAX_FAST_REACH
+        or len(avatar.points) > MAX_FAST_POINTS
+        or budget.limited
+        or _has_unknown(data)
+    ):
         return distance(data, avatar, poses, reach, budget)
     reach_units = to_units(reach, "reach")
     residency = data.residency

@@ -18,13 +18,12 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, FormatError
 from ...schemas.wire.warming_parts import MOTION, PARTS
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.prediction.track_prediction import SceneIndex
 from ..queries.context.level_of_detail import open_level_data, with_level
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from ..queries.engine_table import warm_engines
-from ..residency.coarse_bounds import coarse_filler, make_coarse_bounds
 from ..residency.eviction import make_policy, prefetches
-from ..residency.index_proof import ProvedBounds
-from ..residency.level_store import in_turn, level_filler, open_level_store
+from ..residency.level_store import level_filler, open_level_store
 from ..residency.motion_prediction import User, UserTracks
 from ..residency.prefetch import Prefetcher
 from ..residency.voxel_cache import VoxelCache
@@ -109,14 +108,23 @@ class ArchiveGeneration:
         The other parameters are as in `__init__`.
         """
         store = self.store
-        bounds, lattice = ProvedBounds(store.archive), store.archive.header.lattice
-        around = UserTracks(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
+        header, lattice, coords = (
+            store.archive.header,
+            store.archive.header.lattice,
+            store.archive.coordinates,
+        )
+        base = coords * lattice.voxel_steps
+        index = SceneIndex(
+            store.archive.voxels["key"].astype(np.uint64),
+            base + store.archive.voxels["low"],
+            base + store.archive.voxels["high"],
+            header.low,
+            header.high,
+        )
+        around = UserTracks(index, lattice.voxel_steps, lattice.origin, lattice.step)
         ahead = prefetches(policy)
         if self._level is not None:
             budget_bytes -= self._level.bytes
-        coarse = make_coarse_bounds(store, budget_bytes) if ahead else None
-        if coarse is not None:
-            budget_bytes -= coarse.bytes
         residency = VoxelCache(
             store,
             budget_bytes,
@@ -125,15 +133,7 @@ class ArchiveGeneration:
             refuse_large=self._level is None or not is_coarse,
         )
         residency.on_load_time = took
-        if coarse is not None:
-            arena, remember = residency.buffer.arena, coarse.store_from_arena
-            residency.on_loaded = lambda row, where: remember(row, arena, where)
-        # If the level or the coarse bounds of all voxels do not fit, only those of requested voxels
-        # are stored.
-        fill = in_turn(
-            level_filler(self._level),
-            coarse_filler(coarse, store) if coarse is not None and coarse.has_room_for_all else None,
-        )
+        fill = level_filler(self._level)
         weak = weakref.ref(self)  # the prefetcher's thread must not keep a generation alive
         self.prefetcher = Prefetcher(
             residency,
@@ -143,7 +143,7 @@ class ArchiveGeneration:
             running_requests=lambda: (opened := weak()) is not None and opened._readers > 1,
             level=None if self._level is None else self._level.residency,
         )
-        figure = make_scene_data(store.archive, residency, bounds, coarse)
+        figure = make_scene_data(store.archive, residency)
         level = None
         if self._level is not None:
             level = open_level_data(
@@ -169,8 +169,7 @@ class ArchiveGeneration:
     @property
     def coarse_bytes(self) -> int:
         """Return the memory of coarse bounds and of the level of detail [bytes]."""
-        coarse = self.data.coarse
-        return (0 if coarse is None else coarse.bytes) + (0 if self._level is None else self._level.bytes)
+        return 0 if self._level is None else self._level.bytes
 
     @property
     def level_archive(self) -> Archive | None:
@@ -271,7 +270,6 @@ class ArchiveGeneration:
     def warm(self, *parts: str) -> None:
         """Run the queries of these parts once, with a load; see `Scene.warm`."""
         archive = self.store.archive
-        self.data.bounds.trees()  # made before the first load, which tightens the bounds
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
         x, y, z = place = archive.header.lattice.to_world(corner).tolist()

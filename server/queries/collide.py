@@ -1,12 +1,9 @@
 """Query `collide`: whether an avatar touches the scene, one verdict a pose."""
 
-import math
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
@@ -14,166 +11,135 @@ from ...schemas.wire.answers import CollideAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
+from ..kernels.core.reach import VoxelLists
+from ..kernels.core.scene_arrays import NO_LIMIT
 from ..kernels.core.voxels_in_reach import VoxelsInReach
-from .context.anytime_search import collide_bounded
-from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
-from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
-from .context.query_context import (
-    LevelOfDetail,
-    SceneData,
-    as_held,
-    find_proved_reach,
-    in_unknown,
-    kernel_poses,
-    pieces,
-    to_units,
-)
-from .context.unloaded_voxels import drop_clear_voxels
+from .context.level_of_detail import below, find_level, level_budget, level_reach
+from .context.query_budget import EXACT, CostCounter, QueryBudget
+from .context.query_context import LevelOfDetail, SceneData, check_request, in_unknown, kernel_poses, to_units
+from .resolve import Steps, drop_items, load_and_search, resolve, run
 
 
 def collide(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float = 0.0, budget: QueryBudget = EXACT
 ) -> CollideAnswers:
+    """Answer `collide`; see `collide_steps`."""
+    return run(collide_steps(data, avatar, poses, margin, budget))
+
+
+def collide_steps(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, margin: float, budget: QueryBudget
+) -> Steps[CollideAnswers]:
     """Test whether the avatar touches the scene under each pose.
 
-    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
+    poses: (k, 4, 4) float64, avatar to world, rigid, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
-    budget: a limited one is passed to `collide_bounded`. With a tolerance, CONTACT means a pair
-    within margin plus tolerance, and CLEAR none within the margin; the answer has bounds.
-    The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read or
+    budget: with a tolerance, CONTACT means a pair within margin plus tolerance, and CLEAR none within
+    the margin; the answer has bounds.
+    The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach was not examined or
     a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
     definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    if budget.limited:
-        answers = collide_bounded(data, avatar, poses, margin, budget)
-        return _with_level_verdicts(data, avatar, poses, margin, budget, answers)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
-    spent = CostCounter(begin, data.residency, data.broad.keys)
-    found = np.zeros(len(array), np.uint8)  # verdicts of the poses that the level settles
+    spent = CostCounter(begin, data.residency, data.keys)
+    reach = check_request(data, avatar, array, data.radius_units + margin_units)
+    verdict, counts = np.zeros(len(array), np.uint8), np.zeros((3, len(array)), np.uint32)
+    level = find_level(data, budget)
 
-    def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        found[which] = _level_verdicts(level, avatar, array[which], margin_units, budget, spent)
-        return np.asarray(found[which] != UNKNOWN)
+    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+        lists = drop_items(lists, (verdict == CONTACT) | (verdict == EARLY))
+        if level is None or not lists.starts[-1]:
+            return lists
+        which = np.flatnonzero(np.diff(lists.starts))
+        rows = lists.rows[: lists.starts[-1]]
+        clear = yield from clear_of_rows(level, avatar, array[which], margin_units, rows, budget, spent)
+        settled = np.zeros(len(array), bool)
+        settled[which[clear]] = True
+        left = which[~clear]
+        touched = yield from _touches_level(level, avatar, array[left], margin_units, budget, spent)
+        verdict[left[touched]] = EARLY if budget.tolerance_units else CONTACT
+        settled[left[touched]] = True
+        return drop_items(lists, settled)
 
-    by_level, coarse = SettledPoses(data, array, budget, ask), drop_clear_voxels(data, avatar, array)
-    if budget.late is not None:
-        coarse = drop_proved_voxels(data, avatar, array, margin_units, budget)
-    verdict, counts, reach = _verdicts(
-        data, avatar, array, margin_units, budget, spent, lambda reach: by_level.drop(coarse(reach))
-    )
-    verdict[by_level.settled] = found[by_level.settled]
-    # A load may have proved the index wrong by now.
-    if (data.nothing_clear or len(data.unknown)) and len(avatar.points):
-        lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
-        verdict[lost & (verdict == CLEAR)] = UNKNOWN
+    if len(avatar.points):
+        left = yield from resolve(
+            data, reach.lists, _search(data, avatar, array, reach, budget.tolerance_units, verdict, counts), budget,
+            spent, settle,
+        )  # fmt: skip
+        verdict[(left < np.inf) & (verdict == CLEAR)] = UNKNOWN
+        # A load may have proved the index wrong by now.
+        if data.nothing_clear or len(data.unknown):
+            verdict[in_unknown(reach.boxes, data.unknown, data.nothing_clear) & (verdict == CLEAR)] = UNKNOWN
     bounds = verdict_bounds(verdict, reach.units - margin_units, margin, margin_units, budget)
     return CollideAnswers(verdict, reach.outside, counts[0], counts[1], counts[2], **spent.fields(), **bounds)
 
 
-def _verdicts(
+def _search(
     data: SceneData,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
-    margin_units: int,
-    budget: QueryBudget,
-    spent: CostCounter,
-    settled: Callable[[VoxelsInReach], VoxelsInReach] = lambda reach: reach,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint32], VoxelsInReach]:
-    """Return verdicts (k,), counts (3, k) and reach of poses (k, 4, 4).
+    reach: VoxelsInReach,
+    tolerance_units: int,
+    verdict: NDArray[np.uint8],
+    counts: NDArray[np.uint32],
+) -> Any:
+    """Return the search of `resolve`: it writes verdict (k,) and counts (3, k)."""
 
-    Regions that were left out are not considered. settled: see `find_proved_reach`.
-    """
-    k, other_units = len(poses), data.radius_units + margin_units
-    reach = find_proved_reach(data, avatar, poses, other_units, budget, spent, settled)
-    verdict, counts = np.zeros(k, np.uint8), np.zeros((3, k), np.uint32)
-    # An avatar without points is clear, even if the index is wrong or a scan was left out.
-    if not len(avatar.points):
-        return verdict, counts, reach
-    residency, early = data.residency, budget.tolerance_units
-    for which, rows, part in pieces(reach, residency, budget.share, budget.stop):
-        if budget.stop:
-            verdict[which[verdict[which] == CLEAR]] = UNKNOWN
-            continue
-        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            seen = as_held(data, held)
-            collide_poses(poses, avatar.arrays, seen.arrays, part, which, early, NO_LIMIT, verdict, counts)
-        spent.add(held)
-    return verdict, counts, reach
+    def search(
+        lists: VoxelLists, which: NDArray[np.int64], cursor: NDArray[np.int64], state: NDArray[np.uint8]
+    ) -> None:
+        own = reach._replace(lists=lists)
+        collide_poses(
+            poses, avatar.arrays, data.arrays, own, which, cursor, state, tolerance_units, NO_LIMIT, verdict, counts
+        )  # fmt: skip
+
+    return search
 
 
-def _level_verdicts(
+def clear_of_rows(
     level: LevelOfDetail,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
     margin_units: int,
+    rows: NDArray[np.int64],
     budget: QueryBudget,
     spent: CostCounter,
-) -> NDArray[np.uint8]:
-    """Return the verdicts (k,) that follow from the level alone; UNKNOWN where none does.
-
-    CLEAR and CONTACT are those of the scene, EARLY is a pair within margin plus tolerance.
-    """
-    verdict = np.full(len(poses), UNKNOWN, np.uint8)
-    clear = clear_by_level(level, avatar, poses, margin_units, budget, spent)
-    verdict[clear] = CLEAR
-    left = np.flatnonzero(~clear)
-    if len(left):
-        exact, own = level_budget(budget), spent.of_level(level.covers.residency)
-        within = margin_units + budget.tolerance_units
-        touched, _, _ = _verdicts(level.points, avatar, poses[left], within, exact, own)
-        verdict[left[touched == CONTACT]] = EARLY if budget.tolerance_units else CONTACT
-        spent.add_level(own)
-    return verdict
-
-
-def clear_by_level(
-    level: LevelOfDetail,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    margin_units: int,
-    budget: QueryBudget,
-    spent: CostCounter,
-) -> NDArray[np.bool_]:
-    """Return which poses (k,) the level proves clear of the scene."""
-    own = spent.of_level(level.covers.residency)
-    covered, _, reach = _verdicts(level.covers, avatar, poses, margin_units, level_budget(budget), own)
+) -> Steps[NDArray[np.bool_]]:
+    """Return which poses (k,) the level proves clear of all the scene's voxels `rows`."""
+    covers = level.covers
+    verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
+    reach = level_reach(covers, avatar, poses, margin_units)
+    if reach is None or covers.nothing_clear:
+        return np.zeros(len(poses), bool)
+    lists = below(level, reach.lists, rows)
+    own = spent.of_level(covers.residency)
+    search = _search(covers, avatar, poses, reach, 0, verdict, counts)
+    left = yield from load_and_search(covers, lists, search, level_budget(budget), own)
     spent.add_level(own)
-    lost = in_unknown(reach.boxes, level.covers.unknown, level.covers.nothing_clear)
-    return np.asarray((covered == CLEAR) & ~lost)
+    return np.asarray((verdict == CLEAR) & (left == np.inf))
 
 
-def _with_level_verdicts(
-    data: SceneData,
+def _touches_level(
+    level: LevelOfDetail,
     avatar: AvatarModel,
-    poses: ArrayLike,
-    margin: float,
+    poses: NDArray[np.float64],
+    margin_units: int,
     budget: QueryBudget,
-    answers: CollideAnswers,
-) -> CollideAnswers:
-    """Return the answers of a request with a deadline, with those of its level where voxels are missing."""
-    which = np.flatnonzero((answers.verdict == UNKNOWN) & (answers.voxels_missing > 0))
-    if data.level is None or budget.deadline == math.inf or not len(which) or budget.stop:
-        return answers
-    array, margin_units = kernel_poses(poses)[which], to_units(margin, "margin")
-    spent = CostCounter(0.0, data.residency, data.broad.keys)
-    level = stoppable(data.level, budget)
-    found = asked(lambda: _level_verdicts(level, avatar, array, margin_units, budget, spent))
-    if found is None:
-        return answers
-    if data.nothing_clear:
-        found[found == CLEAR] = UNKNOWN
-    clear, touched = which[found == CLEAR], which[(found == CONTACT) | (found == EARLY)]
-    verdict, lower, upper, exact = (
-        column.copy() for column in (answers.verdict, answers.lower, answers.upper, answers.exact)
-    )
-    rounded = margin_units / UNITS_PER_METRE
-    verdict[clear], lower[clear], exact[clear] = CLEAR, min(float(margin), rounded), True
-    within = float(np.nextafter(max(float(margin), rounded) + budget.tolerance, math.inf))
-    verdict[touched], upper[touched] = CONTACT, np.minimum(upper[touched], within)
-    return structs.replace(answers, verdict=verdict, lower=lower, upper=upper, exact=exact)
+    spent: CostCounter,
+) -> Steps[NDArray[np.bool_]]:
+    """Return which poses (k,) touch a representative, within margin plus tolerance."""
+    points = level.points
+    verdict, counts = np.zeros(len(poses), np.uint8), np.zeros((3, len(poses)), np.uint32)
+    reach = level_reach(points, avatar, poses, margin_units + budget.tolerance_units)
+    if reach is None:
+        return np.zeros(len(poses), bool)
+    own = spent.of_level(points.residency)
+    search = _search(points, avatar, poses, reach, 0, verdict, counts)
+    yield from load_and_search(points, reach.lists, search, level_budget(budget), own)
+    spent.add_level(own)
+    return np.asarray(verdict == CONTACT)
 
 
 def verdict_bounds(
@@ -183,17 +149,17 @@ def verdict_bounds(
     margin_units: int,
     budget: QueryBudget,
 ) -> dict[str, Any]:
-    """Return the bounds of `CollideAnswers` that follow from verdicts; {} without a tolerance.
+    """Return the bounds of `CollideAnswers` that follow from verdicts; {} if the budget has no limit.
 
     verdict: (k,), in which EARLY becomes CONTACT.
     radii: (k,) sum of the largest radii of avatar and scan, exact units: the depth limit of a pair.
     margin: [m].  margin_units: the margin as rounded, up or down; verdicts are based on it.
     """
-    if budget.tolerance == 0:
+    if budget.tolerance == 0 and not budget.limited:
         return {}
     rounded, k = margin_units / UNITS_PER_METRE, len(verdict)
     low, high = min(float(margin), rounded), max(float(margin), rounded)
-    early = float(np.nextafter(high + budget.tolerance, math.inf))
+    early = float(np.nextafter(high + budget.tolerance, np.inf))
     lower, upper, exact = np.empty(k), np.empty(k), np.empty(k, bool)
     write_verdict_bounds(verdict, radii, low, high, early, lower, upper, exact)
     return {"lower": lower, "upper": upper, "exact": exact}

@@ -4,7 +4,6 @@ It serves clash detection: it returns where and how deep two bodies touch, and a
 `collide` only returns whether they touch.
 """
 
-import math
 import operator
 import time
 from typing import Any
@@ -28,6 +27,7 @@ from ..kernels.contacts.contact_cells import (
     LOW,
     PAIRS,
     POINT,
+    POSE,
     RECORD,
     ROW,
     SCAN,
@@ -37,34 +37,23 @@ from ..kernels.contacts.contact_cells import (
     ContactState,
     make_cells,
 )
+from ..kernels.contacts.contact_clusters import list_pose
 from ..kernels.contacts.contact_pairs import ContactResults, gather_contacts
 from ..kernels.core.node_overlap import STACK
+from ..kernels.core.reach import VoxelLists
 from ..kernels.core.scene_arrays import LANES
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
-from .collide import clear_by_level
-from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, asked, stoppable
+from .collide import clear_of_rows
+from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import (
-    LevelOfDetail,
-    SceneData,
-    as_held,
-    find_proved_reach,
-    in_unknown,
-    kernel_poses,
-    pieces,
-    to_units,
-)
+from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units
 from .context.signed_distance import signed_from_square
+from .resolve import Steps, drop_items, resolve, run
 
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
 # columns temporarily takes some three times as much. The wire's largest message holds an eighth.
 MAX_BYTES = 256 << 20
-# Node visits between two checks of the clock, about a millisecond; and, without a deadline, between
-# two checks of the size of the lists.
-SLICE_VISITS = 1 << 15
-SIZE_VISITS = 1 << 19
 # Initial capacity in cells, a power of two and at least LANES. A kernel doubles it as needed, up to
 # MAX_CELLS, which take 200 MB.
 FIRST_CELLS, MAX_CELLS = 256, 1 << 20
@@ -79,6 +68,19 @@ def contacts(
     cluster_distance: float | None = None,
     budget: QueryBudget = EXACT,
 ) -> ContactsAnswers:
+    """Answer `contacts`; see `contacts_steps`."""
+    return run(contacts_steps(data, avatar, poses, limit, margin, cluster_distance, budget))
+
+
+def contacts_steps(
+    data: SceneData,
+    avatar: AvatarModel,
+    poses: ArrayLike,
+    limit: int,
+    margin: float,
+    cluster_distance: float | None,
+    budget: QueryBudget,
+) -> Steps[ContactsAnswers]:
     """Find all pairs in contact under each pose: count them, list the deepest, and cluster them.
 
     poses, margin: as for `collide`.
@@ -104,47 +106,36 @@ def contacts(
     limit = _checked_limit(limit)
     margin_units = to_units(margin, "margin")
     edge_units = None if cluster_distance is None else to_units(cluster_distance, "cluster_distance")
-    spent = CostCounter(begin, data.residency, data.broad.keys)
-
-    def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return clear_by_level(level, avatar, array[which], margin_units, budget, spent)
-
-    by_level = SettledPoses(data, array, budget, ask)
-    proved = drop_proved_voxels(data, avatar, array, margin_units, budget)
-    other_units = data.radius_units + margin_units
-    reach = find_proved_reach(
-        data, avatar, array, other_units, budget, spent, lambda reach: by_level.drop(proved(reach))
-    )
+    spent = CostCounter(begin, data.residency, data.keys)
+    reach = check_request(data, avatar, array, data.radius_units + margin_units)
     k = len(array)
-    tally = ContactResults(
-        np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros(k, bool), np.zeros((k, 4), np.int64)
-    )
-    memory = _empty_memory(limit)
+    tally = ContactResults(np.zeros((3, k), np.int64), np.zeros(k, np.int64), np.zeros((k, 4), np.int64))
+    memory, finished, level = _empty_memory(limit), np.ones(k, bool), find_level(data, budget)
+    options = ContactOptions(
+        avatar.rows, _edges(reach, edge_units, data.arrays.units_per_step), data.keeps_scan, limit, MAX_CELLS
+    )  # fmt: skip
+
+    def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
+        nonlocal memory
+        own = reach._replace(lists=lists)
+        memory = gather_contacts(array, avatar.arrays, data.arrays, own, *state, options, memory, tally)
+        _check_room(memory)
+
+    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+        if level is None:
+            return lists
+        which, rows = np.flatnonzero(np.diff(lists.starts)), lists.rows[: lists.starts[-1]]
+        clear = yield from clear_of_rows(level, avatar, array[which], margin_units, rows, budget, spent)
+        settled = np.zeros(k, bool)
+        settled[which[clear]] = True
+        return drop_items(lists, settled)
+
     if len(avatar.points):
-        edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        options = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MAX_CELLS)
-        parts = list(pieces(reach, data.residency, budget.share, budget.stop))
-        for number, (which, rows, part) in enumerate(parts):
-            # A pose that is split over several pieces is alone in each, and the pieces are
-            # adjacent.
-            closes = (
-                number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
-            )
-            if budget.spent:
-                memory = _gather(data, avatar, array, part, which, options, closes, budget, memory, tally)
-                continue
-            with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-                seen = as_held(data, held)
-                memory = _gather(seen, avatar, array, part, which, options, closes, budget, memory, tally)
-            spent.add(held)
-    columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
-    verdict, exact = columns["verdict"], columns["exact"]
-    late = np.flatnonzero((verdict == Verdict.UNKNOWN) & (columns["voxels_missing"] > 0))
-    if data.level is not None and budget.deadline < math.inf and len(late) and not budget.stop:
-        level = stoppable(data.level, budget)
-        clear = asked(lambda: ask(level, late))
-        if clear is not None and not data.nothing_clear:
-            verdict[late[clear]], exact[late[clear]] = Verdict.CLEAR, True
+        left = yield from resolve(data, reach.lists, search, budget, spent, settle, together=True)
+        finished = left == np.inf
+        if memory.sizes[POSE] >= 0:  # what was found of the pose in hand
+            memory = list_pose(memory, tally.runs[memory.sizes[POSE]], NO_STOP.flag)
+    columns = _columns(data, reach, margin_units, tally, finished, memory, len(avatar.points) > 0)
     return ContactsAnswers(**columns, **spent.fields())
 
 
@@ -177,39 +168,10 @@ def _edges(reach: VoxelsInReach, edge_units: int | None, units_per_step: float) 
 def _empty_memory(limit: int) -> ContactState:
     """Return the memory of a search that has not begun."""
     return ContactState(
-        make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1]),
-        np.zeros(3, np.int64), np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
+        make_cells(FIRST_CELLS, NO_STOP.flag), np.empty((limit, RECORD), np.int64), np.array([0, 0, 0, 0, -1, 0, -1]),
+        np.empty((STACK, 2), np.int64), np.empty((0, RECORD), np.int64),
         np.empty((0, CLUSTER), np.int64),
     )  # fmt: skip
-
-
-def _gather(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: NDArray[np.float64],
-    part: VoxelsInReach,
-    which: NDArray[np.int64],
-    options: ContactOptions,
-    closes: bool,
-    budget: QueryBudget,
-    memory: ContactState,
-    tally: ContactResults,
-) -> ContactState:
-    """Search one piece until it is complete or the deadline passes; mark unfinished poses as cut.
-
-    part: voxels in reach of the poses `which`.  closes: whether the piece completes its last pose.
-    memory: state of the search between pieces, in and out.  tally: results, written.
-    """
-    memory.cursor[:] = 0, -1, 0
-    pause = SIZE_VISITS if budget.deadline == math.inf else SLICE_VISITS
-    while memory.cursor[0] < len(which):
-        if budget.spent:
-            options = options._replace(visits=-1)
-        memory = gather_contacts(
-            poses, avatar.arrays, data.arrays, part, which, options, closes, pause, memory, tally
-        )
-        _check_room(memory)
-    return memory
 
 
 def _check_room(memory: ContactState) -> None:
@@ -239,11 +201,12 @@ def _columns(
     reach: VoxelsInReach,
     margin_units: int,
     tally: ContactResults,
+    finished: NDArray[np.bool_],
     memory: ContactState,
     has_points: bool,
 ) -> dict[str, Any]:
     """Return the fields of `ContactsAnswers` except the cost of the request."""
-    exact = ~tally.cut & (tally.counts[0] == 0)
+    exact = finished & (tally.counts[0] == 0)
     if has_points:  # an avatar without points is clear, even if the index is wrong
         exact &= ~in_unknown(reach.boxes, data.unknown, data.nothing_clear)
     verdict = np.where(exact, Verdict.CLEAR, Verdict.UNKNOWN)

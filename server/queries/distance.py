@@ -5,83 +5,90 @@ signed_distance.py has the definition.
 
 import math
 import time
-from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.wire.answers import DistanceAnswers, Verdict
+from ...schemas.wire.answers import DistanceAnswers
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.reach import VoxelLists
+from ..kernels.core.scene_arrays import NO_LIMIT
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
-from .context.anytime_search import TOLERANCE_SLACK, distance_bounded
-from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
-from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
-from .context.query_context import (
-    LevelOfDetail,
-    SceneData,
-    as_held,
-    find_proved_reach,
-    kernel_poses,
-    pieces,
-    to_units,
-)
+from .context.level_of_detail import below, find_level, level_budget, level_reach
+from .context.query_budget import EXACT, CostCounter, QueryBudget
+from .context.query_context import LevelOfDetail, SceneData, check_request, kernel_poses, to_units
 from .context.signed_distance import distance_columns, unknown_gaps
-from .context.unloaded_voxels import bound_missing
+from .resolve import Search, Steps, drop_items, load_and_search, resolve, run
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
+# Conversion to metres widens bounds by some exact units; a smaller tolerance has no effect.
+TOLERANCE_SLACK = 8.0
 
 
 def distance(
     data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget = EXACT
 ) -> DistanceAnswers:
+    """Answer `distance`; see `distance_steps`."""
+    return run(distance_steps(data, avatar, poses, reach, budget))
+
+
+def distance_steps(
+    data: SceneData, avatar: AvatarModel, poses: ArrayLike, reach: float, budget: QueryBudget
+) -> Steps[DistanceAnswers]:
     """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
-    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.
+    poses: (k, 4, 4) float64, avatar to world, rigid.
     reach: pairs whose spheres are farther apart than this do not count; reach and largest radii
     together are at most 16 m.
     budget: with a tolerance, the pair found may be farther than the nearest one by as much as it
     allows; `lower` and `upper` then bound the distance.
-    If a voxel in reach is missing or a scan was left out, the distance is that of the nearest
-    examined pair, and exact only if nothing missing can contain a nearer pair.
+    If a voxel in reach was not examined or a scan was left out, the distance is that of the nearest
+    examined pair, and exact only if nothing else can contain a nearer pair.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    if budget.limited:
-        answers = distance_bounded(data, avatar, poses, reach, budget)
-        return _with_level_distances(data, avatar, poses, reach, budget, answers)
     begin = time.perf_counter()
-    array = kernel_poses(poses)
-    reach_units = to_units(reach, "reach")
-    spent = CostCounter(begin, data.residency, data.broad.keys)
-    found = no_pairs(len(array))
+    array, reach_units = kernel_poses(poses), to_units(reach, "reach")
+    spent = CostCounter(begin, data.residency, data.keys)
+    around = check_request(data, avatar, array, data.radius_units + reach_units)
+    nearest, counts = no_pairs(len(array)), np.zeros((3, len(array)), np.uint32)
+    # A level does not know the radii of a scene with several.
+    level = find_level(data, budget) if len(data.arrays.radius_deficit) == 1 else None
 
-    def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        if len(data.arrays.radius_deficit) > 1:  # the level does not know the radius of its points
-            return np.zeros(len(which), bool)
-        of_level = _search_level(level, avatar, array[which], reach_units, budget, spent)
-        settled = _settled(of_level, reach_units, budget)
-        for column, own in zip(found, of_level.pairs, strict=True):
-            column[which[settled]] = own[settled]
-        return settled
+    absent_bound = np.zeros(len(array))  # of what absent voxels hold, by the level [steps]
+    resident_bound = np.full(len(array), np.inf)
 
-    by_level = SettledPoses(data, array, budget, ask)
-    settled: Callable[[VoxelsInReach], VoxelsInReach] = by_level.drop
-    if budget.late is not None:
-        settled = drop_proved_voxels(data, avatar, array, reach_units, budget)
-    nearest, counts, around = _pairs(data, avatar, array, reach_units, budget, spent, settled)
-    for column, own in zip(nearest, found, strict=True):
-        column[by_level.settled] = own[by_level.settled]
+    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+        lists = _drop_farther(data, lists, nearest)
+        resident_bound[:], nearest.missing_bound[:] = nearest.missing_bound, np.inf
+        which = np.flatnonzero(np.diff(lists.starts))
+        if level is None or not len(which):
+            return lists
+        absent_bound[which] = yield from _ask_level(
+            level,
+            avatar,
+            array[which],
+            which,
+            lists.rows[: lists.starts[-1]],
+            reach_units,
+            budget,
+            nearest,
+            spent,
+        )
+        units = absent_bound * data.arrays.units_per_step
+        return drop_items(lists, _is_within(nearest, units, around.units, budget))
+
     if len(avatar.points):
+        search = _search(data, avatar, array, around, reach_units, budget, nearest, counts)
+        left = yield from resolve(data, around.lists, search, budget, spent, settle)
+        missing = np.maximum(np.minimum(nearest.missing_bound, left), absent_bound)
+        np.minimum(missing, resident_bound, out=nearest.missing_bound)
         np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
     return DistanceAnswers(
-        **distance_columns(data, around, float(reach), reach_units, nearest, counts),
-        **spent.fields(),
+        **distance_columns(data, around, float(reach), reach_units, nearest, counts), **spent.fields()
     )
 
 
@@ -92,142 +99,93 @@ def no_pairs(k: int) -> NearestPairs:
     )
 
 
-def _pairs(
+def _search(
     data: SceneData,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
-    reach_units: int,
+    reach: VoxelsInReach,
+    beyond: int,
     budget: QueryBudget,
-    spent: CostCounter,
-    settled: Callable[[VoxelsInReach], VoxelsInReach] = lambda reach: reach,
-) -> tuple[NearestPairs, NDArray[np.uint32], VoxelsInReach]:
-    """Return nearest pairs, counts (3, k) and reach of poses (k, 4, 4).
-
-    Regions that were left out are not considered. settled: see `find_proved_reach`.
-    """
-    k, residency = len(poses), data.residency
-    around = find_proved_reach(data, avatar, poses, data.radius_units + reach_units, budget, spent, settled)
-    nearest, counts = no_pairs(k), np.zeros((3, k), np.uint32)
+    nearest: NearestPairs,
+    counts: NDArray[np.uint32],
+) -> Search:
+    """Return the search of `resolve`: it writes `nearest` and counts (3, k)."""
     tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
-    if not len(avatar.points):
-        return nearest, counts, around
-    for which, rows, part in pieces(around, residency, budget.share, budget.stop):
-        if budget.stop:
-            nearest.missing_bound[which] = 0.0
-            continue
-        with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            seen = as_held(data, held)
-            own = bound_missing(seen, held, avatar, poses, part, which, nearest.missing_bound, counts, budget)
-            nearest_poses(
-                poses,
-                avatar.arrays,
-                seen.arrays,
-                data.broad,
-                own,
-                reach_units,
-                which,
-                budget.relative,
-                tolerance,
-                NO_LIMIT,
-                nearest,
-                counts,
-            )
-        spent.add(held)
-    return nearest, counts, around
+
+    def search(
+        lists: VoxelLists, which: NDArray[np.int64], cursor: NDArray[np.int64], state: NDArray[np.uint8]
+    ) -> None:
+        own = reach._replace(lists=lists)
+        nearest_poses(
+            poses, avatar.arrays, data.arrays, own, which, cursor, state, beyond, budget.relative, tolerance, NO_LIMIT,
+            nearest, counts,
+        )  # fmt: skip
+
+    return search
 
 
-class _LevelDistances(NamedTuple):
-    """Result of a search of the level for k poses.
-
-    pairs: the nearest representatives; their `missing_bound` is `lower` in steps.
-    nearest, lower: (k,) float64, upper and lower bound of the distance between the avatar's centres
-    and those of the scene [exact units]; inf: no pair within reach.
-    radii: (k,) int64, sum of the radii of avatar and scene, exact units.
-    reach: of the cover spheres.
-    """
-
-    pairs: NearestPairs
-    nearest: NDArray[np.float64]
-    lower: NDArray[np.float64]
-    radii: NDArray[np.int64]
-    reach: VoxelsInReach
+def _drop_farther(data: SceneData, lists: VoxelLists, nearest: NearestPairs) -> VoxelLists:
+    """Return lists without items whose next voxel is farther than the pair found."""
+    k = len(nearest.square)
+    held = np.flatnonzero(np.diff(lists.starts))
+    next_units = np.full(k, np.inf)
+    next_units[held] = lists.near[lists.starts[:-1][held]] * data.arrays.units_per_step
+    found = np.sqrt(np.maximum(nearest.square, 0).astype(np.float64)) + 2.0 + nearest.deficit
+    return drop_items(lists, (nearest.square >= 0) & (next_units > found))
 
 
-def _search_level(
+def _ask_level(
     level: LevelOfDetail,
     avatar: AvatarModel,
     poses: NDArray[np.float64],
+    which: NDArray[np.int64],
+    rows: NDArray[np.int64],
     reach_units: int,
     budget: QueryBudget,
+    nearest: NearestPairs,
     spent: CostCounter,
-) -> _LevelDistances:
-    """Search the level of a scene with a single radius under poses (k, 4, 4)."""
-    exact, own = level_budget(budget), spent.of_level(level.covers.residency)
-    covered, _, reach = _pairs(level.covers, avatar, poses, reach_units, exact, own)
-    np.minimum(covered.missing_bound, unknown_gaps(level.covers, reach), out=covered.missing_bound)
-    pairs, _, _ = _pairs(level.points, avatar, poses, reach_units, exact, own)
+) -> Steps[NDArray[np.float64]]:
+    """Return lower bounds (k,) of the distance of the scene's voxels `rows` from the avatar's centres [steps].
+
+    Of poses (k, 4, 4), numbers `which`. A representative nearer than the pair in `nearest` replaces it.
+    """
+    k, covers, points, exact = len(poses), level.covers, level.points, level_budget(budget)
+    around, near = (level_reach(each, avatar, poses, reach_units) for each in (covers, points))
+    if around is None or near is None or covers.nothing_clear:
+        return np.zeros(k)
+    own, counts = spent.of_level(covers.residency), np.zeros((3, k), np.uint32)
+    covered, pairs = no_pairs(k), no_pairs(k)
+    search = _search(covers, avatar, poses, around, reach_units, exact, covered, counts)
+    left = yield from load_and_search(covers, below(level, around.lists, rows), search, exact, own)
+    search = _search(points, avatar, poses, near, reach_units, exact, pairs, counts)
+    yield from load_and_search(points, near.lists, search, exact, own)
     spent.add_level(own)
+    closer = _lengths(pairs) < _lengths(nearest)[which]
+    at = which[closer]
+    nearest.square[at], nearest.pair[at], nearest.deficit[at] = pairs.square[closer], pairs.pair[closer], 0
     # All points lie within the cover radius of a representative, also those of voxels of the level
     # that are missing.
-    covers, scene = level.covers.radius_units, level.points.radius_units
-    beyond, nearest = _lengths(covered), _lengths(pairs)
-    lower = beyond - (covers - covered.deficit) + scene
-    missing = covered.missing_bound * level.covers.arrays.units_per_step - covers + scene
-    lower = np.maximum(np.minimum(lower, missing) - _ROUNDING, 0.0)
-    pairs.deficit[:] = 0
-    pairs.missing_bound[:] = lower / level.covers.arrays.units_per_step * (1.0 - 1e-12)
-    radii = reach.units - reach_units - covers + scene
-    return _LevelDistances(pairs, nearest, lower, radii, reach)
+    grown, per_step = covers.radius_units - points.radius_units, covers.arrays.units_per_step
+    missing = np.minimum(covered.missing_bound, left) * per_step
+    lower = np.minimum(_lengths(covered) + covered.deficit, missing) - grown - _ROUNDING
+    return np.asarray(np.maximum(lower, 0.0) / per_step * (1.0 - 1e-12))
+
+
+def _is_within(
+    nearest: NearestPairs, lower: NDArray[np.float64], reach: NDArray[np.int64], budget: QueryBudget
+) -> NDArray[np.bool_]:
+    """Return which poses (k,) need nothing of their absent voxels, which are `lower` or more away.
+
+    lower, reach: (k,), of centres [exact units].
+    """
+    upper = _lengths(nearest)
+    with np.errstate(invalid="ignore"):  # no pair within reach: inf - inf, or no share of inf
+        allowed = np.fmax(budget.between_bounds * UNITS_PER_METRE, budget.relative * lower)
+        near = upper - lower <= allowed - TOLERANCE_SLACK
+    return np.where(np.isfinite(upper), near | (lower > upper), lower > reach)
 
 
 def _lengths(pairs: NearestPairs) -> NDArray[np.float64]:
     """Return the distances of pairs (k,) [exact units]; inf for none."""
     square = np.where(pairs.square >= 0, pairs.square.astype(np.float64), np.inf)
     return np.asarray(np.sqrt(square), np.float64)
-
-
-def _settled(found: _LevelDistances, reach_units: int, budget: QueryBudget) -> NDArray[np.bool_]:
-    """Return which poses (k,) the level answers within the tolerance, or without any pair in reach."""
-    with np.errstate(invalid="ignore"):  # no pair within reach: inf - inf, or no share of inf
-        allowed = np.fmax(budget.between_bounds * UNITS_PER_METRE, budget.relative * found.lower)
-        near = found.nearest - found.lower <= allowed - TOLERANCE_SLACK
-    return np.where(np.isfinite(found.nearest), near, found.lower > found.radii + reach_units)
-
-
-def _with_level_distances(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: ArrayLike,
-    reach: float,
-    budget: QueryBudget,
-    answers: DistanceAnswers,
-) -> DistanceAnswers:
-    """Return the answers of a request with a deadline, with closer bounds where voxels are missing."""
-    which = np.flatnonzero(~answers.exact & (answers.voxels_missing > 0))
-    one_radius = len(data.arrays.radius_deficit) == 1
-    if data.level is None or budget.deadline == math.inf or not len(which) or not one_radius or budget.stop:
-        return answers
-    array, reach_units = kernel_poses(poses)[which], to_units(reach, "reach")
-    spent = CostCounter(0.0, data.residency, data.broad.keys)
-    level = stoppable(data.level, budget)
-    found = asked(lambda: _search_level(level, avatar, array, reach_units, budget, spent))
-    if found is None:
-        return answers
-    if data.nothing_clear:
-        found.pairs.missing_bound[:] = 0.0
-    own = found.reach._replace(units=found.radii + reach_units)
-    columns = distance_columns(
-        data, own, reach, reach_units, found.pairs, np.zeros((3, len(which)), np.uint32)
-    )
-    closer = columns["upper"] < answers.upper[which]
-    at = which[closer]
-    changed = {}
-    for name in ("signed_distance", "upper", "witness_avatar", "witness_cloud", "normal"):
-        changed[name] = getattr(answers, name).copy()
-        changed[name][at] = columns[name][closer]
-    lower = answers.lower.copy()
-    lower[which] = np.minimum(np.maximum(lower[which], columns["lower"]), changed["upper"][which])
-    verdict = answers.verdict.copy()
-    verdict[which[changed["upper"][which] <= 0]] = Verdict.CONTACT
-    verdict[which[lower[which] > 0]] = Verdict.CLEAR
-    return structs.replace(answers, lower=lower, verdict=verdict, **changed)

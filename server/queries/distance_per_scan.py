@@ -1,24 +1,19 @@
 """Separation of each scan of an archive from an avatar under one pose, to estimate scan noise."""
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..avatars.avatar_model import AvatarModel
+from ..kernels.core.reach import VoxelLists
 from ..kernels.nearest.nearest_by_scan import NearestPerScan, nearest_by_scan
-from .context.late_voxels import drop_proved_voxels
+from .collide import clear_of_rows
+from .context.level_of_detail import find_level
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import (
-    SceneData,
-    as_held,
-    find_proved_reach,
-    in_unknown,
-    kernel_poses,
-    pieces,
-    to_units,
-)
+from .context.query_context import SceneData, check_request, in_unknown, kernel_poses, to_units
+from .resolve import Steps, drop_items, resolve, run
 
 # Key of points whose scan is not stored, or whose number belongs to no scan.
 ANY_SCAN = -1
@@ -60,25 +55,27 @@ def separation_per_scan(
     poses = kernel_poses(np.asarray(pose)[None])
     margin_units = to_units(margin, "margin")
     units = data.radius_units + margin_units
-    spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    proved = drop_proved_voxels(data, avatar, poses, margin_units, budget)
-    reach = find_proved_reach(data, avatar, poses, units, budget, spent, proved)
+    spent = CostCounter(time.perf_counter(), data.residency, data.keys)
+    reach = check_request(data, avatar, poses, units)
     if not len(avatar.points):
         return ScanSeparations({}, True)
     nearer = NearestPerScan(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
-    counts, exact = np.zeros(3, np.int64), True
-    for _, rows, part in pieces(reach, data.residency, budget.share, budget.stop):
-        if budget.spent:
-            exact = False
-            break
-        with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            arrays = as_held(data, held).arrays
-            exact &= bool(
-                nearest_by_scan(
-                    poses, avatar.arrays, arrays, part, margin_units, budget.visits, nearer, counts
-                )
-            )
-    exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
+    counts, lists, level = np.zeros(3, np.int64), reach.lists, find_level(data, budget)
+
+    def search(lists: VoxelLists, _: NDArray[np.int64], *state: NDArray[Any]) -> None:
+        own = reach._replace(lists=lists)
+        nearest_by_scan(poses, avatar.arrays, data.arrays, own, *state, margin_units, nearer, counts)
+
+    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+        if level is None or not lists.starts[-1]:
+            return lists
+        rows = lists.rows[: lists.starts[-1]]
+        clear = yield from clear_of_rows(level, avatar, poses, margin_units, rows, budget, spent)
+        return drop_items(lists, clear)
+
+    left = run(resolve(data, lists, search, budget, spent, settle))
+    exact = left[0] == np.inf and counts[0] == 0
+    exact &= not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
     found = np.flatnonzero(nearer.gaps < np.inf).tolist()
     separations = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}
     return ScanSeparations(separations, bool(exact), int(counts[1]), int(counts[2]))

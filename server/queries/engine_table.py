@@ -25,20 +25,15 @@ from ...schemas.wire.question_table import (
 )
 from ...schemas.wire.warming_parts import BUDGETS, MOTION
 from ..avatars.avatar_model import AvatarModel, make_avatar
-from ..residency.coarse_bounds import drop_clear_pairs
-from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import EXACT, CostCounter, LateVoxels, QueryBudget
-from .context.query_context import SceneData, check_request
-from .context.unloaded_voxels import bound_missing
+from .context.query_budget import EXACT, LateVoxels, QueryBudget
+from .context.query_context import SceneData
 from .distance import distance
 from .objects import objects
-from .raycast import ask_level as bound_rays_by_level
 from .raycast import raycast
-from .resident_fast_path import collide_fast
+from .resident_fast_path import collide_fast, distance_fast
 from .sweep import sweep
-from .within import ask_level as bound_points_by_level
 from .within import within
 
 
@@ -57,7 +52,7 @@ def _sweep(
 
 ENGINES: dict[str, Callable[..., Any]] = {
     COLLIDE.name: collide_fast,
-    DISTANCE.name: distance,
+    DISTANCE.name: distance_fast,
     CONTACTS.name: contacts,
     SWEEP.name: _sweep,
     RAYCAST.name: raycast,
@@ -87,6 +82,8 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             return
         if question.name == COLLIDE.name:  # several poses use other kernels than one pose
             collide(data, avatar, poses, 0.0, budget)
+        if question.name == DISTANCE.name:
+            distance(data, avatar, poses, 0.01, budget)
         arguments = [
             samples[name] for name in question.arguments if name in question.required or name in samples
         ]
@@ -100,38 +97,13 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
     if part == BUDGETS:
         # These limits are too large to be reached here.
         for budget in (
-            QueryBudget(tolerance=1e-3, visits=1 << 20),
+            QueryBudget(tolerance=1e-3),
             QueryBudget(deadline=time.perf_counter() + 3600.0),
         ):
             for question in QUESTIONS.values():
                 run(question, budget)
-    if part in (DISTANCE.name, BUDGETS):
-        lacking = HeldVoxels(0, 0, ("not read",))
-        reach = check_request(data, avatar, pose, data.radius_units)
-        bound_missing(
-            data,
-            lacking,
-            avatar,
-            pose,
-            reach,
-            np.zeros(1, np.int64),
-            np.zeros(1),
-            np.zeros((3, 1), np.uint32),
-            EXACT,
-        )
-    if part in (RAYCAST.name, WITHIN.name) and data.level is not None:
-        spent, origin = CostCounter(0.0, data.residency, data.broad.keys), np.zeros((1, 3), np.int64)
-        if part == RAYCAST.name:
-            bound_rays_by_level(data.level, origin, samples["directions"], 1 << 20, EXACT, spent)
-        else:
-            bound_points_by_level(data.level, data.radius_units, origin, 1 << 20, EXACT, spent)
     if part == MOTION:
         _warm_late(data, avatar, pose)
-    if part == COLLIDE.name and data.coarse is not None:
-        # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
-        reach = check_request(data, avatar, pose, data.radius_units)
-        nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-        drop_clear_pairs(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
 
 
 def _warm_late(data: SceneData, avatar: AvatarModel, pose: NDArray[np.float64]) -> None:

@@ -87,7 +87,7 @@ def objects(
     checked = _check(data, avatars, poses, groups, masks, margin)
     n = len(checked.poses)
     verdict, outside, counts = np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((3, n), np.uint32)
-    spent = CostCounter(begin, data.residency, data.broad.keys)
+    spent = CostCounter(begin, data.residency, data.keys)
     for number, model in enumerate(checked.models):
         rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):

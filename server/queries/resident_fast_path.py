@@ -76,18 +76,18 @@ def collide_fast(
     ):
         return collide(data, avatar, array, margin, budget)
     residency = data.residency
-    rows, outside = np.empty(MAX_FAST_VOXELS, np.int64), np.zeros(1, bool)
     verdict, counts = np.zeros(1, np.uint8), np.zeros((3, 1), np.uint32)
     other_units = data.radius_units + to_units(margin, "margin")
-    body, held = refer_to_avatar(avatar.arrays), data.references.to(data.arrays, data.broad)
+    body, held = refer_to_avatar(avatar.arrays), data.references.to(data.arrays, data.tree)
     with residency.frozen():
-        fault, pose, found, needed = held.call(
-            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, data.arrays.stop, rows,
-            outside, verdict, counts,
+        fault, found, needed = held.call(
+            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, data.arrays.stop, verdict,
+            counts,
         )  # fmt: skip
+        outside = held.outside.copy()
         if needed > 0:
-            residency.use(rows[:needed].tolist())
-    refuse(fault, pose, found)
+            residency.use(held.rows[:needed].tolist())
+    refuse(fault, 0, found)
     if needed < 0:
         return collide(data, avatar, array, margin, budget)
     return CollideAnswers(
@@ -99,39 +99,46 @@ def collide_fast(
 def distance_fast(
     data: SceneData,
     avatar: AvatarModel,
-    pose: ArrayLike,
+    poses: ArrayLike,
     reach: float,
     budget: QueryBudget = EXACT,
     body: Any = None,
 ) -> DistanceAnswers:
-    """Answer `distance` for one pose (4, 4), in one kernel call if the fast path applies.
+    """Answer `distance`, in one kernel call if there is one pose and the fast path applies.
 
     body: reference to the arrays of the avatar, if there is one.
     """
     begin = time.perf_counter()
-    poses = kernel_poses(np.asarray(pose)[None])
-    if reach > MAX_FAST_REACH or len(avatar.points) > MAX_FAST_POINTS or budget.limited or _has_unknown(data):
+    poses = kernel_poses(poses)
+    if (
+        len(poses) != 1
+        or not 0.0 <= reach <= MAX_FAST_REACH
+        or len(avatar.points) > MAX_FAST_POINTS
+        or budget.limited
+        or _has_unknown(data)
+    ):
         return distance(data, avatar, poses, reach, budget)
     reach_units = to_units(reach, "reach")
     residency = data.residency
-    rows, result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_nearest.COLUMNS)
+    result = np.empty(_nearest.COLUMNS)
     body = refer_to_avatar(avatar.arrays) if body is None else body
-    held = data.references.to(data.arrays, data.broad)
+    held = data.references.to(data.arrays, data.tree)
     with residency.frozen():
-        fault, at, found, needed, outside, visits, tests = held.call(
+        fault, found, needed, visits, tests = held.call(
             nearest_resident, poses, body, avatar.radius, data.radius_units, reach_units, float(reach), held.reference,
-            data.arrays.stop, rows, result,
+            data.arrays.stop, result,
         )  # fmt: skip
+        outside = held.outside.copy()
         if needed > 0:
-            residency.use(rows[:needed].tolist(), scan=budget.scan)
-    refuse(fault, at, found)
+            residency.use(held.rows[:needed].tolist(), scan=budget.scan)
+    refuse(fault, 0, found)
     if needed < 0:
         return distance(data, avatar, poses, reach, budget)
     signed, row = result[_SIGNED], result[None]
     return DistanceAnswers(
         verdict=np.array([_CONTACT if signed[0] <= 0.0 else _CLEAR], np.uint8), signed_distance=signed,
         lower=result[_LOWER], upper=signed.copy(), exact=np.ones(1, bool), witness_avatar=row[:, _AVATAR],
-        witness_cloud=row[:, _CLOUD], normal=row[:, _NORMAL], outside=np.array([outside]),
+        witness_cloud=row[:, _CLOUD], normal=row[:, _NORMAL], outside=outside,
         voxels_missing=np.zeros(1, np.uint32), node_visits=np.array([visits], np.uint32),
         point_tests=np.array([tests], np.uint32), engine_seconds=time.perf_counter() - begin, hits=needed,
         resident=residency.resident, resident_bytes=residency.resident_bytes,
@@ -184,10 +191,8 @@ class ResidentQueries:
         "_counts",
         "_first",
         "_last",
-        "_outside",
         "_poses",
         "_result",
-        "_rows",
         "_scratch",
         "_small",
         "_used",
@@ -204,9 +209,9 @@ class ResidentQueries:
         self._box = box_of(avatar.arrays) if len(avatar.points) else np.zeros((2, 3))
         self._scratch = make_scratch(avatar.arrays) if self._small else None
         self._poses, self._first, self._last = np.empty((1, 4, 4)), np.empty((4, 4)), np.empty((4, 4))
-        self._rows, self._result = np.empty(MAX_FAST_VOXELS, np.int64), np.empty(_swept.COLUMNS)
+        self._result = np.empty(_swept.COLUMNS)
         self._walking: Any = None
-        self._verdict, self._outside = np.zeros(1, np.uint8), np.zeros(1, bool)
+        self._verdict = np.zeros(1, np.uint8)
         self._counts = np.zeros((3, 1), np.uint32)
         self._used: list[int] = []
         self._again = 0
@@ -225,17 +230,17 @@ class ResidentQueries:
         skin: distance to keep from a contact [m], for `SweepResult.end`; negative: not requested.
         """
         if self._small and not budget.limited:
-            residency, rows, result = data.residency, self._rows, self._result
+            residency, result = data.residency, self._result
             self._first[:], self._last[:] = pose_from, pose_to
-            held = data.references.to(data.arrays, data.broad)
+            held = data.references.to(data.arrays, data.tree)
             with residency.frozen():
                 needed, verdict, visits, _, _ = held.call(
                     sweep_resident, self._first, self._last, self.body.reference, self._scratch, self.avatar.radius,
-                    data.radius_units, self._box, held.reference, data.arrays.stop, data.unknown, data.nothing_clear,
-                    max(tolerance, budget.tolerance), skin, rows, result,
+                    data.radius_units, self._box, held.reference, data.arrays.stop, data.nothing_clear,
+                    max(tolerance, budget.tolerance), skin, result,
                 )  # fmt: skip
                 if needed > 0:
-                    self.use(residency, rows[:needed].tolist())
+                    self.use(residency, held.rows[:needed].tolist())
             if needed >= 0:
                 return self._swept(
                     data, pose_from, verdict, visits, max(tolerance, budget.tolerance), skin, result
@@ -323,20 +328,18 @@ class ResidentQueries:
     def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
         """Return verdict and node visits of `collide` for a pose (4, 4)."""
         if self._small and not budget.limited and not _has_unknown(data):
-            residency, rows = data.residency, self._rows
-            held = data.references.to(data.arrays, data.broad)
+            residency = data.residency
+            held = data.references.to(data.arrays, data.tree)
             poses, verdict, counts = self._poses, self._verdict, self._counts
             poses[0] = pose
-            verdict[0] = _CLEAR
-            counts[:] = 0
             with residency.frozen():
-                fault, at, found, needed = held.call(
+                fault, found, needed = held.call(
                     collide_resident, poses, self.body.reference, self.avatar.radius, data.radius_units,
-                    budget.tolerance_units, held.reference, data.arrays.stop, rows, self._outside, verdict, counts,
+                    budget.tolerance_units, held.reference, data.arrays.stop, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:
-                    self.use(residency, rows[:needed].tolist())
-            refuse(fault, at, found)
+                    self.use(residency, held.rows[:needed].tolist())
+            refuse(fault, 0, found)
             if needed >= 0:
                 return _VERDICTS[int(verdict[0])], int(counts[1, 0])
         answers = collide(data, self.avatar, pose[None], budget=budget)

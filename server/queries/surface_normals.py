@@ -28,7 +28,7 @@ class Normals:
         Both must stay open while this object is used.
         """
         self._data, self._lattice = data, archive.header.lattice
-        self._held = data.references.to(data.arrays, data.broad)
+        self._held = data.references.to(data.arrays, data.tree)
         self._points = archive.header.points, int(archive.voxels["rows"][:, 2].max(initial=0))
         self._squares: dict[float, int] = {}
         self._all_squares: dict[tuple[float, ...], NDArray[np.int64]] = {}

@@ -1,6 +1,7 @@
 """Query `sweep`: first contact of an avatar with the scene on a motion between two poses."""
 
 import time
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -8,22 +9,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
-from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.errors import BadRequestError, BadTransformError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE, VoxelsInReach, check_poses
+from ..kernels.core.reach import VoxelLists
+from ..kernels.core.scene_arrays import NO_LIMIT
+from ..kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE, check_poses
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
-from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
-from ..residency.index_proof import ENTRIES_AT_ONCE
-from ..runtime.stop_flag import StopFlag
+from ..kernels.motion.sweep_segments import (
+    SweepProgress,
+    avatar_box,
+    find_unknown_regions,
+    make_plan_space,
+    plan_segments,
+)
+from .context.level_of_detail import below, find_level, level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
-from .late_sweep import AbsentVoxels, Motions, clear_until
-from .sweep_by_level import DEFAULT_TOLERANCE, SweepsByLevel, cold_motions
+from .context.query_context import LevelOfDetail, SceneData, kernel_poses, refuse, to_units
+from .resolve import Steps, drop_items, resolve, run
 
-# Motions of one kernel call if there is a deadline, which is checked between calls.
-_PER_CALL = 64
+# `tolerance` of a request that gives none [m].
+DEFAULT_TOLERANCE = 1e-6
+# Tolerance of a sweep through the level, as a share of the request's, and at least [m]: no time is spent
+# on less than covers.
+_LEVEL_SHARE, _LEVEL_LEAST = 0.25, 1e-4
 
 
 def _check(
@@ -111,54 +121,11 @@ def sweep(
     tolerance: float = DEFAULT_TOLERANCE,
     budget: QueryBudget = EXACT,
 ) -> SweepAnswers:
-    """Find the first contact of the avatar with the scene on the screw motion between two poses.
-
-    kernels/motion/screw_motion.py defines the motion, in the dataset's frame: translations are
-    t - O (NUMERICS.md N5). Each scan point has the sphere given by the radius model of `data`,
-    constant during the motion.
-    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as
-    given.
-    margin: distance at or below which two spheres are in contact [m].
-    tolerance: how far any avatar point may move between `lower` and `upper` [m]; the tolerance of
-    `budget` if that is larger.
-    The verdict is CONTACT in [lower, upper]; CLEAR; or UNKNOWN from `lower` on: something is
-    missing there, the budget was spent, or a graze of some hundredths of a micrometre cannot be
-    distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
-    A motion that is clear with a budget of visits is clear with a larger one. A contact found may
-    be lost with a larger budget, which may be spent on an unresolved place before it.
-    If the budget has a tolerance, or where voxels are late, the scene's level of detail is asked
-    before they are loaded: how far the motion is clear, and whether a contact is near enough to
-    that place. With a budget that does not wait for loads, late_sweep.py bounds the motion by absent
-    voxels.
-    Raise BadRequestError, BadTransformError, TooLargeError.
-    """
-
-    def ask(
-        scene: SceneData,
-        begin: NDArray[np.float64],
-        end: NDArray[np.float64],
-        within: float,
-        own: QueryBudget,
-    ) -> SweepAnswers:
-        return _sweep(scene, avatar, begin, end, margin, within, own, None)
-
-    absent = None if budget.late is None else AbsentVoxels()
-    level = SweepsByLevel(data, max(tolerance, budget.tolerance), budget, ask)
-    answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, level, absent)
-    which = np.flatnonzero((answers.verdict == Verdict.UNKNOWN) & (answers.voxels_missing > 0))
-    if budget.deadline == np.inf or not len(which) or budget.stop:
-        return answers
-    found = level.find_clear(kernel_poses(pose_from)[which], kernel_poses(pose_to)[which])
-    if found is None:
-        return answers
-    lower, verdict, exact = answers.lower.copy(), answers.verdict.copy(), answers.exact.copy()
-    lower[which] = np.maximum(lower[which], found.lower)
-    clear = which[found.verdict == Verdict.CLEAR]
-    verdict[clear], exact[clear] = Verdict.CLEAR, True
-    return msgspec.structs.replace(answers, lower=lower, verdict=verdict, exact=exact)
+    """Answer `sweep`; see `sweep_steps`."""
+    return run(sweep_steps(data, avatar, pose_from, pose_to, margin, tolerance, budget))
 
 
-def _sweep(
+def sweep_steps(
     data: SceneData,
     avatar: AvatarModel,
     pose_from: ArrayLike,
@@ -166,13 +133,23 @@ def _sweep(
     margin: float,
     tolerance: float,
     budget: QueryBudget,
-    level: SweepsByLevel | None,
-    absent: AbsentVoxels | None = None,
-) -> SweepAnswers:
-    """Answer `sweep` from the voxels of the scene, and before they are loaded from its level.
+    part: "LevelPart | None" = None,
+) -> Steps[SweepAnswers]:
+    """Find the first contact of the avatar with the scene on the screw motion between two poses.
 
-    absent: collects the voxels that are not in memory and bounds the motions by them; None: these
-    are loaded.
+    kernels/motion/screw_motion.py defines the motion, in the dataset's frame: translations are
+    t - O (NUMERICS.md N5). Each scan point has the sphere given by the radius model of `data`,
+    constant during the motion.
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid, bits used as given.
+    margin: distance at or below which two spheres are in contact [m].
+    tolerance: how far any avatar point may move between `lower` and `upper` [m]; the tolerance of
+    `budget` if that is larger.
+    part: `data` is a level, and only this part of the motions and of its voxels counts.
+    The verdict is CONTACT in [lower, upper]; CLEAR; or UNKNOWN from `lower` on: something is
+    missing there, the budget was spent, or a graze of some hundredths of a micrometre cannot be
+    distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
+    Where voxels are absent, the scene's level of detail may prove how far the motion is clear of them
+    (`find_level`). Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
     if not 0.0 <= tolerance <= MAX_COORDINATE:
@@ -183,167 +160,134 @@ def _sweep(
         raise BadRequestError(
             f"{len(first)} poses to begin at and {len(last)} to end at: expected equal numbers"
         )
-    k = len(first)
+    k, world = len(first), (first, last)
     other_units = data.radius_units + to_units(margin, "margin")
     scales, units, loose = _check(data, avatar, first, last, other_units)
-    world = first, last
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
-        np.full(k, budget.visits, np.int64),
+        np.full(k, NO_LIMIT, np.int64), np.zeros(k), np.zeros(k),
     )  # fmt: skip
     counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
     proved = np.ones(k)
     if not len(avatar.points) or not k:
         return _answers(progress, proved, counts, outside, tolerance)
-    bounds, residency, box = data.bounds, data.residency, avatar_box(avatar.arrays)
-    spent = CostCounter(begin, residency, data.broad.keys)
-    starts, rows = np.zeros(k + 1, np.int64), np.empty(16 * k + 64, np.int64)
+    box, scratch = avatar_box(avatar.arrays), make_scratch(avatar.arrays)
+    spent = CostCounter(begin, data.residency, data.keys)
+    level = find_level(data, budget)
+
+    def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
+        advance_segments(
+            box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, data.arrays, lists,
+            *state, tolerance, scratch, progress, counts,
+        )  # fmt: skip
+
+    def settle(lists: VoxelLists) -> Steps[VoxelLists]:
+        which = np.flatnonzero(np.diff(lists.starts))
+        if level is None:
+            return lists
+        own = LevelPart(level, lists.rows[: lists.starts[-1]], progress.at[which], progress.end[which])
+        progress.floor[which] = yield from _clear_until(
+            own, avatar, world[0][which], world[1][which], margin, tolerance, budget, spent
+        )
+        return drop_items(lists, progress.floor >= progress.end)
+
     which = np.arange(k)
-    asked: set[int] = set()  # rows loaded to prove the index
-    by_level: NDArray[np.bool_] = np.zeros(k, bool)  # motions about which the level was asked
-    # A round plans the next segment of each unfinished motion, loads the voxels that only the index
-    # excludes, and advances the motions through the segment's voxels, piece by piece.
-    scratch = make_scratch(avatar.arrays)
-    while len(which):
-        begun = progress.at.copy()
-        unproved = bounds.unproved
-        planned = box, first, last, avatar.arrays, scales, units, data.arrays
-        needed = plan_segments(*planned, data.broad, which, progress, starts, rows)
-        if needed < 0:
+    if part is not None:
+        progress.at[:] = part.at
+    while len(which) and not budget.spent:
+        lists = _plan(data, avatar, box, first, last, scales, units, which, progress)
+        if lists is None:
             break
-        if needed > len(rows):
-            rows = np.empty(2 * needed, np.int64)
-            continue
-        if level is not None and level.before_loads:
-            cold = cold_motions(data, starts, rows, by_level)
-            if len(cold):
-                by_level[cold] = True
-                progress.at[:] = begun
-                settled = level.settle(cold, *world, progress, proved, tolerance)
-                progress.witness[settled] -= origin
-                own = progress.witness[settled, 0]
-                progress.witness[settled, 0] = np.rint(own * UNITS_PER_METRE) / UNITS_PER_METRE
-                which = np.setdiff1d(which, settled)
-                continue
-        if unproved and absent is None and bounds.unsettled(rows[:needed], unproved).any():
-            # By the boxes of the index some may be out of reach, or be met later, which changes the
-            # segments: what is answered must not depend on which voxels were loaded before.
-            by_index = progress._replace(
-                at=begun.copy(), end=progress.end.copy(), speed=progress.speed.copy()
-            )
-            index_starts, index_rows = starts.copy(), np.empty_like(rows)
-            count = plan_segments(*planned, bounds.index_boxes, which, by_index, index_starts, index_rows)
-            if not 0 <= count <= len(index_rows):
-                index_starts[:] = 0
-            moved = (by_index.at != progress.at) | (by_index.end != progress.end)
-            doubted = _hidden_rows(
-                (starts, rows), (index_starts, index_rows), moved, len(bounds.proved), budget.stop
-            )
-            new = set(doubted) - asked
-            if new:
-                asked |= new
-                prove(data, sorted(row for row in new if not bounds.proved[row]), budget, spent)
-                progress.at[:] = begun
-                continue
+        if part is not None:
+            lists = below(part.level, lists, part.rows)
         progress.lower[which] = progress.end[which]
-        boxes = np.empty((k, 2, 3))  # unused here
-        near = starts, rows
-        if absent is not None:
-            near = absent.set_aside(starts, rows, data.arrays.where)
-        around = VoxelsInReach(scales, units, *near, boxes, outside)
-        for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
-            chunk = len(part) if budget.deadline == np.inf else _PER_CALL
-            if budget.stop:
-                progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
-                continue
-            with residency.hold(held_rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-                seen = as_held(data, held)
-                for at in range(0, len(part), chunk):
-                    if budget.spent:
-                        progress.visits[part[at:]] = -1
-                    advance_segments(
-                        box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
-                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, scratch,
-                        progress, counts,
-                    )  # fmt: skip
-            spent.add(held)
+        left = yield from resolve(data, lists, search, budget, spent, settle, together=True)
+        unfinished = left < np.inf
+        progress.lower[unfinished] = np.minimum(progress.lower, progress.at)[unfinished]
         which = _next_round(which, progress, proved)
-        if budget.stop:
+        if part is not None and (progress.at[which] >= part.end[which]).all():
             break
     # Beyond the place where a motion was stopped, nothing is known.
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
-    if absent is not None and absent.rows and not absent.restricted:
-        motions = Motions(first, last, scales, units, loose, box)
-        clear = clear_until(
-            data, avatar, motions, absent, budget,
-            lambda covers, own: _sweep(covers, avatar, pose_from, pose_to, margin, tolerance, budget, None, own),
-        )  # fmt: skip
-        counts[0][clear < until] += np.uint32(len(absent.rows))
-        proved = np.minimum(proved, clear)
-        if (clear < 1.0).any() or (progress.upper < np.inf).any():
-            # What else is near decides in which interval a contact is found.
-            budget.lacked(len(absent.rows))
-            with residency.hold(sorted(absent.rows), budget.loads_until()) as held:
-                spent.add(held)  # their loads are owed
     lost = np.empty(k)
     find_unknown_regions(
-        box,
-        first,
-        last,
-        avatar.arrays,
-        scales,
-        units,
-        data.arrays,
-        data.broad,
-        data.unknown,
-        until,
-        outside,
-        lost,
+        box, first, last, avatar.arrays, scales, units, data.arrays, data.tree, until, outside, lost
     )
     if data.nothing_clear:
         lost[:] = 0.0
     met = lost <= until
     proved[met] = np.minimum(proved, lost)[met]
+    if part is None and ((proved < 1.0).any() or (progress.upper < np.inf).any()):
+        budget.lacked(len(spent.late))  # what else is near decides in which interval a contact is found
     progress.witness[:] += origin
     answers = _answers(progress, proved, counts, outside, tolerance)
     return msgspec.structs.replace(answers, **spent.fields())
 
 
-def _hidden_rows(
-    planned: tuple[NDArray[np.int64], NDArray[np.int64]],
-    by_index: tuple[NDArray[np.int64], NDArray[np.int64]],
-    moved: NDArray[np.bool_],
-    voxels: int,
-    stop: StopFlag,
-) -> list[int]:
-    """Return the distinct rows, ascending, in reach of a motion by `planned` but not by the index.
+def _plan(
+    data: SceneData,
+    avatar: AvatarModel,
+    box: NDArray[np.float64],
+    first: NDArray[np.float64],
+    last: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    units: NDArray[np.int64],
+    which: NDArray[np.int64],
+    progress: SweepProgress,
+) -> VoxelLists | None:
+    """Plan the next segment of each motion in `which`, and list its voxels; None after a stop."""
+    k, capacity = len(first), 16 * len(which) + 64
+    space, moved = make_plan_space(), np.empty(len(which))
+    while True:
+        lists = VoxelLists(
+            np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), np.full(k, np.inf)
+        )
+        needed = plan_segments(
+            box, first, last, avatar.arrays, scales, units, data.arrays, data.tree, which, progress, lists, space, moved
+        )  # fmt: skip
+        if needed < 0:
+            return None
+        if needed <= capacity:
+            return lists
+        capacity = needed
 
-    planned, by_index: starts (k + 1,) and rows of k motions.
-    moved: (k,) motions whose segment is another one by the index; all their rows are returned.
-    stop: once it is set, the result may be incomplete.
+
+class LevelPart(NamedTuple):
+    """Part of k motions, and voxels, about which a level is asked.
+
+    rows: voxels of the scene that the level divides.  at, end: (k,) fractions.
     """
-    hidden: NDArray[np.bool_] = np.zeros(voxels, bool)
-    starts, _ = planned
-    begin, k = 0, len(starts) - 1
-    while begin < k and not stop:
-        end = int(np.searchsorted(starts, starts[begin] + ENTRIES_AT_ONCE, side="right")) - 1
-        end = min(max(end, begin + 1), k)
-        own, known = (_pairs(*lists, begin, end, voxels) for lists in (planned, by_index))
-        known = known[~moved[known // voxels]]
-        hidden[np.setdiff1d(own, known) % voxels] = True
-        begin = end
-    found: list[int] = np.flatnonzero(hidden).tolist()
-    return found
+
+    level: LevelOfDetail
+    rows: NDArray[np.int64]
+    at: NDArray[np.float64]
+    end: NDArray[np.float64]
 
 
-def _pairs(
-    starts: NDArray[np.int64], rows: NDArray[np.int64], begin: int, end: int, voxels: int
-) -> NDArray[np.int64]:
-    """Encode each row of motions [begin, end) as one number: motion * voxels + voxel."""
-    motions = np.repeat(np.arange(begin, end), np.diff(starts[begin : end + 1]))
-    return np.asarray(motions * voxels + rows[starts[begin] : starts[end]], np.int64)
+def _clear_until(
+    part: LevelPart,
+    avatar: AvatarModel,
+    first: NDArray[np.float64],
+    last: NDArray[np.float64],
+    margin: float,
+    tolerance: float,
+    budget: QueryBudget,
+    spent: CostCounter,
+) -> Steps[NDArray[np.float64]]:
+    """Return the fraction (k,) up to which the level proves that motions, world, touch none of its voxels."""
+    covers, own = part.level.covers, spent.of_level(part.level.covers.residency)
+    within = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST)
+    try:
+        found = yield from sweep_steps(
+            covers, avatar, first, last, margin, within, level_budget(budget), part
+        )
+    except (BadRequestError, TooLargeError):  # cover spheres are larger than those of the scene
+        return np.zeros(len(first))
+    own.add_cost(found)
+    spent.add_level(own)
+    return np.zeros(len(first)) if covers.nothing_clear else found.lower
 
 
 def _next_round(
@@ -360,4 +304,4 @@ def _next_round(
     doubt = looked & ((lower < end) | touches) & (proved[which] >= 1.0)
     proved[which[doubt]] = lower[doubt]
     progress.at[which] = np.where(looked, end, at)
-    return which[looked & ~touches & (end < 1.0) & (progress.visits[which] >= 0)]
+    return which[looked & ~touches & (end < 1.0)]

@@ -17,8 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..kernels.core.voxels_in_reach import SceneIndex
-from ..kernels.prediction.track_prediction import PredictionLimits, rows_in_reach, write_path_distances
+from ..kernels.prediction.track_prediction import (
+    PredictionLimits,
+    SceneIndex,
+    rows_in_reach,
+    write_path_distances,
+)
 from ..kernels.prediction.user_tracks import (
     COUNT,
     LAST,

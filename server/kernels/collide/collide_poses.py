@@ -47,6 +47,7 @@ from ..core.placed_avatar import (
     place_lanes,
     place_root,
 )
+from ..core.reach import MISSING, NOT_HELD, all_resident, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -58,8 +59,8 @@ from ..core.scene_arrays import (
     should_end,
     stopped,
 )
-from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
-from .early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, set_early, surely_near
+from ..core.voxels_in_reach import VALID, find_reach
+from .early_contact import CLEAR, EARLY, UNKNOWN, set_early, surely_near
 from .leaf_contact import below_touches, leaves_touch, make_collide_scratch
 
 U = np.uint64  # see placed_avatar.py
@@ -176,65 +177,45 @@ def _collide_voxel(
     return CLEAR
 
 
-@njit_no_refcount
-def _first_voxel(scene, rows, begin, end, placed):
-    """Return which of rows[begin:end] has the least power distance; `begin` if one is not resident.
-
-    A pose in contact counts the missing voxels before the one that it touches, in stored order.
-    """
-    nodes = placed.nodes
-    nearest, least = begin, np.float32(np.inf)
-    for at in range(begin, end):
-        if scene.where[rows[at], 0] < 0:
-            return begin
-        location = locate_voxel(scene, rows[at], placed)
-        x, y, z = nodes[0, 0] - location.x, nodes[1, 0] - location.y, nodes[2, 0] - location.z
-        power = power_distance(scene.words, location.rows, x, y, z)
-        if power < least:
-            nearest, least = at, power
-    return nearest
-
-
 @nb.njit(nogil=True, cache=True)
-def collide_poses(poses, avatar, scene, reach, which, tolerance, most, verdict, counts):
-    """Answer `collide` for the poses numbered in `which`: one call a request, with all voxels.
+def collide_poses(poses, avatar, scene, reach, which, cursor, state, tolerance, most, verdict, counts):
+    """Answer `collide` for the poses numbered in `which`, each from its cursor on.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
-    (voxels_in_reach.py); a voxel in it that is not resident is counted as missing.  tolerance:
-    exact units by which a pair may exceed the reach and still end the search, as EARLY.  most: node
-    visits of a pose, beyond which its search ends.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses.
+    cursor: (k,) int64, entries of `reach.lists` that are examined; a pose is finished at the end of
+    its list.  state: (v,) uint8, what may be examined now, see queries/context/resolve.py.
+    tolerance: exact units by which a pair may exceed the reach and still end the search, as EARLY.
+    most: node visits of a pose, beyond which its search ends.
     Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
-    tests), whose initial values are CLEAR and 0. A pose may therefore be answered in pieces: a
-    contact, early or not, overrides a missing voxel, and a missing voxel overrides CLEAR. Once the scene's stop
-    flag is set, poses without a contact so far become UNKNOWN; a pose whose search ends early does
-    too.
+    tests), whose initial values are CLEAR and 0. A contact, early or not, overrides a missing voxel,
+    and a missing voxel overrides CLEAR. A pose whose search ends early, by the scene's stop flag or
+    by `most`, is not finished.
     """
     placed, front, scratch = make_placed(avatar), make_front(avatar), make_collide_scratch(avatar)
     by_class = make_class_thresholds(scene.radius_deficit)
     scratch.counters[2] = most
     _collide_poses(
-        poses, avatar, scene, reach, which, tolerance, verdict, counts, placed, front, by_class, scratch
-    )
+        poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, placed, front, by_class, scratch
+    )  # fmt: skip
 
 
 @njit_no_refcount
 def _collide_poses(
-    poses, avatar, scene, reach, which, tolerance, verdict, counts, placed, front, by_class, scratch
-):
+    poses, avatar, scene, reach, which, cursor, state, tolerance, verdict, counts, placed, front, by_class, scratch
+):  # fmt: skip
     """Implement `collide_poses` with its scratch passed in."""
-    nodes, ints = placed.nodes, scene.ints
+    nodes, ints, rows = placed.nodes, scene.ints, reach.lists.rows
     scratch.early[:] = np.float32(-1.0)
     largest_deficit = np.int64(0)
     for c in range(scene.radius_deficit.shape[0]):
         largest_deficit = max(largest_deficit, scene.radius_deficit[c])
     for number in range(which.shape[0]):
         i = which[number]
-        begin, end = reach.starts[i], reach.starts[i + 1]
-        if verdict[i] == CONTACT or verdict[i] == EARLY or begin == end:
+        at, end = cursor[i], reach.lists.starts[i + 1]
+        if at == end:
             continue
         if stopped(scene.stop):
-            verdict[i] = UNKNOWN
-            continue
+            return
         m, scale = poses[i], reach.scales[i]
         scratch.counters[0], scratch.counters[1] = 0, 0
         extent, farthest = place_root(avatar, m, scale, placed, scene)
@@ -250,80 +231,72 @@ def _collide_poses(
         if tolerance > 0:
             set_early(scratch.early, tolerance, reach.units[i] - largest_deficit, scene.units_per_step, error)
         count = 0  # length of the front; not placed yet, as most far poses never need it
-        nearest = begin if end == begin + 1 else _first_voxel(scene, reach.rows, begin, end, placed)
-        for number_in_reach in range(begin, end):
-            at = number_in_reach
-            if at == begin:
-                at = nearest
-            elif at == nearest:
-                at = begin
-            voxel = reach.rows[at]
-            if scene.where[voxel, 0] < 0:
+        while at < end:
+            voxel = rows[at]
+            may = state_of(state, voxel)
+            if may == NOT_HELD:
+                break
+            if may == MISSING:
                 counts[0, i] += np.uint32(1)
                 verdict[i] = UNKNOWN
+                at += 1
                 continue
             location = locate_voxel(scene, voxel, placed)
             x, y, z = nodes[0, 0] - location.x, nodes[1, 0] - location.y, nodes[2, 0] - location.z
             scratch.counters[0] += 1
             threshold = by_class.threshold[node_class(ints, location.rows, by_class.mask)]
-            if not nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
-                continue
-            if count == 0:
-                count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
-            found = _collide_voxel(
-                avatar, m, scale, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
-            )
-            if found != CLEAR:
-                verdict[i] = found
-                break
-            if should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
-                verdict[i] = UNKNOWN
-                break
+            if nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
+                if count == 0:
+                    count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
+                found = _collide_voxel(
+                    avatar,
+                    m,
+                    scale,
+                    extent,
+                    i,
+                    placed,
+                    scene,
+                    voxel,
+                    location,
+                    by_class,
+                    front,
+                    count,
+                    scratch,
+                )
+                if found != CLEAR:
+                    verdict[i], at = found, end
+                    break
+                if should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
+                    break
+            at += 1
+        cursor[i] = at
         counts[1, i] += np.uint32(scratch.counters[0])
         counts[2, i] += np.uint32(scratch.counters[1])
 
 
 @nb.njit(nogil=True, cache=True)
-def rows_or_reset(needed, verdict, counts):
-    """Return `needed`, or undo the request and return -1 where a search ended early.
+def collide_resident(pose, body, radius, other_units, tolerance, held, stop, verdict, counts):
+    """Answer `collide` for one pose in one call, where all voxels in its reach are resident.
 
-    needed: the rows of a request all of whose voxels are resident. Undoing resets verdict (k,) to
-    CLEAR and counts (3, k) to 0.
-    """
-    for i in range(verdict.shape[0]):
-        if verdict[i] == UNKNOWN:  # nothing is missing: the search ended early
-            verdict[:] = CLEAR
-            counts[:] = 0
-            return -1
-    return needed
-
-
-@nb.njit(nogil=True, cache=True)
-def collide_resident(poses, body, radius, other_units, tolerance, held, stop, rows, outside, verdict, counts):
-    """Answer a whole request in one call, where all voxels in its reach are resident.
-
-    body, held: references to the arrays of the avatar and the scene (array_references.py).  stop:
-    (1,) int64, the request's stop flag.
-    This is `find_reach`, then `collide_poses`. Writes rows (capacity,) int64, the voxels in reach,
-    pose by pose; outside (k,) bool; and verdict and counts, as `collide_poses` does. The remaining
-    arrays of `VoxelsInReach` are local: arrays created here cost a tenth of arrays passed in.
-    Returns (fault, pose, value found), as `check_poses` does, and the number of rows. -1 rows: not
+    pose: (1, 4, 4).  body, held: references to the arrays of the avatar and the scene
+    (array_references.py).  stop: (1,) int64, the request's stop flag.
+    This is `find_reach`, then `collide_poses`. Writes held.one, the voxels in reach, and verdict (1,)
+    and counts (3, 1) as `collide_poses` does.
+    Returns (fault, value found), as `check_poses` does, and the number of rows. -1 rows: not
     answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
-    (scene.stop, MAX_RESIDENT_PATH_VISITS); verdict and counts are then unchanged.
+    (scene.stop, MAX_RESIDENT_PATH_VISITS).
     """
-    avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
-    k = poses.shape[0]
-    reach = VoxelsInReach(
-        np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside
-    )
-    fault, pose, found, needed = find_reach(poses, avatar, radius, other_units, scene, index, reach)
-    if fault != VALID or needed < 0 or needed > rows.shape[0]:
-        return fault, pose, found, -1
-    for at in range(needed):
-        if scene.where[rows[at], 0] < 0:
-            return fault, pose, found, -1
-    if avatar.radius.shape[0] > 0:
+    avatar, scene, one, reach = body.avatar, with_flag(held.scene, stop), held.one, held.one.reach
+    verdict[0], counts[0, 0], counts[1, 0], counts[2, 0] = CLEAR, np.uint32(0), np.uint32(0), np.uint32(0)
+    fault, _, found, needed = find_reach(pose, avatar, radius, other_units, scene, held.tree, reach)
+    if fault != VALID or not all_resident(scene.where, reach.lists.rows, needed):
+        return fault, found, -1
+    if needed > 0:
+        one.cursor[0] = 0
         collide_poses(
-            poses, avatar, scene, reach, np.arange(k), tolerance, MAX_RESIDENT_PATH_VISITS, verdict, counts
-        )
-    return fault, pose, found, rows_or_reset(needed, verdict, counts)
+            pose, avatar, scene, reach, one.which, one.cursor, held.one.all_held, tolerance, MAX_RESIDENT_PATH_VISITS, verdict,
+            counts,
+        )  # fmt: skip
+        if one.cursor[0] < needed:
+            return fault, found, -1
+    return fault, found, needed

@@ -27,8 +27,8 @@ SQUARE, DEFICIT, POINT, CENTER, ROW, SCAN, ORDER, TAG, RECORD = 0, 1, 2, 5, 8, 9
 # touched points. A cell is the same, followed by its place in the grid.
 PAIRS, LOW, HIGH, CLUSTER, PLACE, CELL = 11, 12, 15, 18, 18, 21
 # Counters of `ContactState.sizes`: cells, pairs kept, pairs listed, clusters listed, the last cell
-# used.
-CELLS, KEPT, LISTED, CLUSTERS, LAST = range(5)
+# used, depth of the stack, and the pose whose pairs these are (-1: none).
+CELLS, KEPT, LISTED, CLUSTERS, LAST, DEPTH, POSE = range(7)
 
 
 class ContactCells(NamedTuple):
@@ -50,9 +50,7 @@ class ContactState(NamedTuple):
 
     cells: of the current pose.
     heap: (limit, RECORD) int64, its deepest pairs, the least deep first.
-    sizes: (5,) int64, see above.
-    cursor: (3,) int64: position among the poses, position among the pose's voxels (-1: not begun),
-    depth of the stack.
+    sizes: (7,) int64, see above.
     stack: (STACK, 2) int64.
     pairs: (p, RECORD), clusters: (c, CLUSTER) int64: those of the finished poses, followed by free
     rows; a pair's TAG is its row among the pose's clusters.
@@ -61,7 +59,6 @@ class ContactState(NamedTuple):
     cells: ContactCells
     heap: NDArray[np.int64]
     sizes: NDArray[np.int64]
-    cursor: NDArray[np.int64]
     stack: NDArray[np.int64]
     pairs: NDArray[np.int64]
     clusters: NDArray[np.int64]
@@ -74,7 +71,6 @@ class ContactOptions(NamedTuple):
     edges: (k,) int64, edge of a cell [steps].
     with_scan: whether the arena holds scan numbers.
     limit: number of pairs to list for each pose.
-    visits: node visits a pose; -1: time is up, examine nothing more.
     cells: limit of the table of cells, a power of two.
     """
 
@@ -82,7 +78,6 @@ class ContactOptions(NamedTuple):
     edges: NDArray[np.int64]
     with_scan: bool
     limit: int
-    visits: int
     cells: int
 
 

@@ -20,6 +20,7 @@ from .contact_cells import (
     ORDER,
     PAIRS,
     PLACE,
+    POSE,
     TAG,
     ContactState,
     deeper,
@@ -81,8 +82,8 @@ def list_pose(state, runs, stop):
     """List the pairs and clusters of the current pose, deepest first, and remove its cells.
 
     Writes runs (4,) int64: first pair, number of pairs, first cluster, number of clusters. Returns
-    the state, whose lists may have grown, and whether the pose is listed. When the stop flag (1,)
-    is set, the pose has no pairs and no clusters, and the state must not be used for further poses.
+    the state, whose lists may have grown. When the stop flag (1,) is set, the pose has no pairs and
+    no clusters, and the state must not be used for further poses.
     """
     cells, heap, sizes = state.cells, state.heap, state.sizes
     table, used, kept = cells.table, sizes[CELLS], sizes[KEPT]
@@ -118,8 +119,8 @@ def list_pose(state, runs, stop):
     pairs = _with_capacity(state.pairs, sizes[LISTED], kept, stop)
     if stopped(stop):  # the rows above may be in any order
         runs[0], runs[1], runs[2], runs[3] = sizes[LISTED], 0, sizes[CLUSTERS], 0
-        sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
-        return ContactState(cells, heap, sizes, state.cursor, state.stack, pairs, clusters), False
+        sizes[CELLS], sizes[KEPT], sizes[LAST], sizes[POSE] = 0, 0, -1, -1
+        return ContactState(cells, heap, sizes, state.stack, pairs, clusters)
     for i in range(kept):
         pairs[sizes[LISTED] + i] = heap[i]
         pairs[sizes[LISTED] + i, TAG] = rank[_root(parent, heap[i, TAG])]
@@ -127,5 +128,5 @@ def list_pose(state, runs, stop):
     sizes[LISTED] += kept
     sizes[CLUSTERS] += found
     empty_cells(cells, used, stop)
-    sizes[CELLS], sizes[KEPT], sizes[LAST] = 0, 0, -1
-    return ContactState(cells, heap, sizes, state.cursor, state.stack, pairs, clusters), True
+    sizes[CELLS], sizes[KEPT], sizes[LAST], sizes[POSE] = 0, 0, -1, -1
+    return ContactState(cells, heap, sizes, state.stack, pairs, clusters)

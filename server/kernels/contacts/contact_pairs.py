@@ -26,6 +26,7 @@ from ..core.node_overlap import (
     set_class_thresholds,
 )
 from ..core.placed_avatar import make_placed, place_block, place_nodes
+from ..core.reach import MISSING, NOT_HELD, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -39,8 +40,10 @@ from ..core.scene_arrays import (
 )
 from .contact_cells import (
     CELLS,
+    DEPTH,
     KEPT,
     POINT,
+    POSE,
     RECORD,
     SCAN,
     ContactScratch,
@@ -58,13 +61,11 @@ class ContactResults(NamedTuple):
     """Results for k poses.
 
     counts: (3, k) int64, voxels missing, node visits, point tests.  pairs: (k,) int64.
-    cut: (k,) bool, the search was incomplete.
     runs: (k, 4) int64, first pair listed, pairs, first cluster, clusters.
     """
 
     counts: NDArray[np.int64]
     pairs: NDArray[np.int64]
-    cut: NDArray[np.bool_]
     runs: NDArray[np.int64]
 
 
@@ -136,12 +137,11 @@ def _gather_leaves(avatar, m, a, block, placed, scene, voxel, row, options, edge
 
 
 @njit_no_refcount
-def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, results, stop):
+def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, results):
     """Gather all pairs in contact of the placed avatar and one resident voxel by a joint descent.
 
-    Continues from state.cursor and its stack. Suspends, with a cursor depth other than 0, before a
-    node test once the pose has cost `stop` node visits, where the cells have no space for another
-    LANES, and when the scene's stop flag is set.
+    Continues from the stack that an earlier call left. Suspends, with a depth other than 0, where the
+    cells have no space for another LANES, and when the scene's stop flag is set.
     """
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
@@ -151,7 +151,7 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, r
     thresholds, mask, flag = scratch.by_class.threshold, scratch.by_class.mask, scene.stop
     for r in range(3):
         off[r] = np.float32(scene.coordinates[voxel, r] * scene.voxel_steps - placed.frame[r])
-    depth = state.cursor[2]
+    depth = sizes[DEPTH]
     if depth == 0:
         counts[1, i] += 1
         if nodes_meet(
@@ -164,10 +164,7 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, r
         a, row = stack[depth - 1, 0], stack[depth - 1, 1]
         a_first, b_first = first[a], ints[row + FIRST]
         leaves = a_first < 0 and b_first < 0
-        # A pair of leaf nodes costs no visits, but cells.
-        if sizes[CELLS] + LANES > most_cells if leaves else counts[1, i] >= stop:
-            break
-        if stopped(flag):
+        if stopped(flag) or (leaves and sizes[CELLS] + LANES > most_cells):
             break
         depth -= 1
         if leaves:
@@ -197,7 +194,7 @@ def _gather_voxel(avatar, m, i, placed, scene, voxel, options, state, scratch, r
                 if nodes_meet(words, child_row, x, y, z, nodes[3, a], threshold):
                     stack[depth, 0], stack[depth, 1] = a, child_row
                     depth += 1
-    state.cursor[2] = depth
+    sizes[DEPTH] = depth
 
 
 @njit_no_refcount
@@ -212,26 +209,15 @@ def _set_thresholds(units, extent, farthest, scene, scratch):
     set_class_thresholds(scratch.by_class, scene.radius_deficit, units, per_step, extent, farthest, steps)
 
 
-@njit_no_refcount
-def _cut_rest(reach, which, cursor, results):
-    """Mark the current pose and the remaining ones as cut."""
-    for number in range(cursor[0], which.shape[0]):
-        i = which[number]
-        results.cut[i] |= reach.starts[i + 1] > reach.starts[i]
-    cursor[0] = which.shape[0]
-
-
 @nb.njit(nogil=True, cache=True)
-def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, state, results):
-    """Answer `contacts` for the poses numbered in `which`, usually in one call a request.
+def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, state, results):
+    """Answer `contacts` for the poses numbered in `which`, one after the other, each from its cursor on.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses; a voxel in
-    it that is not resident is counted as missing.  closes: whether this call sees the last voxels
-    of its poses; they are then listed.
-    pause: node visits after which the call returns with the work unfinished, 1 or more. The work is
-    finished when state.cursor[0] == len(which). Until then, call again with the returned memory,
-    unless its table of cells has reached `options.cells` and has no space for LANES more. A pose
-    that has cost `options.visits` with work left is cut. Adds to `results`.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses.  cursor: as in
+    `collide_poses`.  held: states of voxels.
+    A finished pose is listed. The call returns before a voxel that is not held; when the scene's stop
+    flag is set; and if the table of cells has reached `options.cells` and has no space for LANES more.
+    Call again with the returned state, from the same pose on. Adds to `results`.
     """
     placed = make_placed(avatar)
     scratch = ContactScratch(
@@ -239,55 +225,38 @@ def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, 
         np.empty(3, np.float32), np.empty(1), np.empty(1), np.empty((1, RECORD), np.int64),
         make_class_thresholds(scene.radius_deficit),
     )  # fmt: skip
-    cursor, left = state.cursor, np.int64(pause)
-    while cursor[0] < which.shape[0]:
-        if stopped(scene.stop):
-            _cut_rest(reach, which, cursor, results)
-            break
-        i = which[cursor[0]]
-        end = reach.starts[i + 1]
-        if cursor[1] < 0:
-            cursor[1], cursor[2] = reach.starts[i], 0
-        if cursor[1] < end and options.visits >= 0:
-            extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
-            _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
-            scratch.bound[0] = listing_bound(
-                state.heap, state.sizes[KEPT], scene.units_per_step, scratch.error[0]
-            )
-            while cursor[1] < end:
-                voxel = reach.rows[cursor[1]]
-                if scene.where[voxel, 0] < 0:
-                    results.counts[0, i] += 1
-                    cursor[1] += 1
-                    continue
-                before = results.counts[1, i]
-                short = state.sizes[CELLS] + LANES > state.cells.table.shape[0]
-                # Over the budget, and not merely suspended for lack of space?
-                if before >= options.visits and not (short and cursor[2] > 0):
-                    break
-                if stopped(scene.stop):
-                    break
-                if left <= 0 or (short and state.cells.table.shape[0] >= options.cells):
+    rows = reach.lists.rows
+    for number in range(which.shape[0]):
+        i = which[number]
+        end = reach.lists.starts[i + 1]
+        if stopped(scene.stop) or state_of(held, rows[cursor[i]]) == NOT_HELD:
+            return state
+        state.sizes[POSE] = i
+        extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+        _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
+        scratch.bound[0] = listing_bound(
+            state.heap, state.sizes[KEPT], scene.units_per_step, scratch.error[0]
+        )
+        while cursor[i] < end:
+            voxel = rows[cursor[i]]
+            may = state_of(held, voxel)
+            if may == NOT_HELD or stopped(scene.stop):
+                return state
+            if may == MISSING:
+                results.counts[0, i] += 1
+                cursor[i] += 1
+                continue
+            if state.sizes[CELLS] + LANES > state.cells.table.shape[0]:
+                if state.cells.table.shape[0] >= options.cells:
                     return state
-                stop = min(np.int64(options.visits), before + left)
-                if short:
-                    # Here and not in the descent: a loop that changes a tuple of arrays counts
-                    # their references in every iteration, which took a third of the time.
-                    state = ContactState(
-                        grow_cells(state.cells, state.sizes[CELLS], scene.stop), state.heap, state.sizes, cursor,
-                        state.stack, state.pairs, state.clusters,
-                    )  # fmt: skip
-                _gather_voxel(
-                    avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results, stop
-                )
-                left -= results.counts[1, i] - before
-                if cursor[2] == 0:
-                    cursor[1] += 1
-        if cursor[1] < end:
-            results.cut[i] = True
-        if closes:
-            state, listed = list_pose(state, results.runs[i], scene.stop)
-            results.cut[i] |= not listed
-        cursor[0] += 1
-        cursor[1] = -1
+                # Here and not in the descent: a loop that changes a tuple of arrays counts
+                # their references in every iteration, which took a third of the time.
+                state = ContactState(
+                    grow_cells(state.cells, state.sizes[CELLS], scene.stop), state.heap, state.sizes, state.stack,
+                    state.pairs, state.clusters,
+                )  # fmt: skip
+            _gather_voxel(avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results)
+            if state.sizes[DEPTH] == 0:
+                cursor[i] += 1
+        state = list_pose(state, results.runs[i], scene.stop)
     return state

@@ -9,16 +9,18 @@ from typing import Any, NamedTuple
 
 from ....schemas.kernels import compiling as nb
 from .placed_avatar import Avatar
+from .reach import VoxelTree
 from .scene_arrays import SceneArrays
-from .voxels_in_reach import SceneIndex
+from .voxels_in_reach import OneReach, make_one_reach
 
 if nb.config.DISABLE_JIT:
 
     class SceneReference(NamedTuple):
-        """Arrays and index of a scene."""
+        """Arrays of a scene, the boxes of its voxels, and scratch of a query of one pose or point."""
 
         scene: SceneArrays
-        index: SceneIndex  # type: ignore[assignment]  # hides tuple.index, which nobody calls
+        tree: VoxelTree
+        one: OneReach
 
     class AvatarReference(NamedTuple):
         """Arrays of an avatar."""
@@ -36,19 +38,19 @@ else:
         """numba's type of an `AvatarReference`."""
 
     class SceneReference(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
-        """Arrays and index of a scene."""
+        """Arrays of a scene, the boxes of its voxels, and scratch of a query of one pose or point."""
 
     class AvatarReference(nb.structref.StructRefProxy):  # type: ignore[misc,no-redef]
         """Arrays of an avatar."""
 
-    nb.structref.define_proxy(SceneReference, _SceneReferenceType, ["scene", "index"])
+    nb.structref.define_proxy(SceneReference, _SceneReferenceType, ["scene", "tree", "one"])
     nb.structref.define_proxy(AvatarReference, _AvatarReferenceType, ["avatar"])
 
 
 @nb.njit(nogil=True, cache=True)
-def refer_to_scene(scene, index):
-    """Return a reference to the arrays and the index of a scene."""
-    return SceneReference(scene, index)
+def refer_to_scene(scene, tree, one):
+    """Return a reference to the arrays of a scene, the boxes of its voxels, and scratch."""
+    return SceneReference(scene, tree, one)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -89,26 +91,37 @@ class Held:
 class SceneReferences:
     """The last reference made for a scene's data, whose arrays never change but for the stop flag.
 
-    Thread-safe.
+    Thread-safe. Its scratch may be used only while the scene's residency is locked.
     """
 
     __slots__ = ("_known",)
 
     def __init__(self) -> None:
-        self._known: tuple[SceneArrays, SceneIndex, Held] | None = None
+        self._known: tuple[SceneArrays, VoxelTree, HeldScene] | None = None
 
-    def to(self, scene: SceneArrays, index: SceneIndex) -> Held:
+    def to(self, scene: SceneArrays, tree: VoxelTree) -> "HeldScene":
         """Return a reference to these arrays; its stop flag is that of an earlier request."""
         if self._known is not None:
-            known, known_index, held = self._known
+            known, known_tree, held = self._known
             if (
                 known.words is scene.words
                 and known.where is scene.where
                 and known.origin is scene.origin
                 and known.radius_deficit is scene.radius_deficit
-                and known_index is index
+                and known_tree is tree
             ):
                 return held
-        held = Held(refer_to_scene(scene, index))
-        self._known = scene, index, held
+        held = HeldScene(scene, tree)
+        self._known = scene, tree, held
         return held
+
+
+class HeldScene(Held):
+    """Reference to the arrays of a scene. rows: voxels in reach of the last pose or point."""
+
+    __slots__ = ("outside", "rows")
+
+    def __init__(self, scene: SceneArrays, tree: VoxelTree) -> None:
+        one = make_one_reach()
+        self.rows, self.outside = one.reach.lists.rows, one.reach.outside
+        super().__init__(refer_to_scene(scene, tree, one))

@@ -1,7 +1,4 @@
-"""Broad phase: check poses, and list the voxels that the avatar could touch under each.
-
-A voxel is listed by the box around its points (server/residency/index_proof.py).
-"""
+"""Poses of a request: their checks, and the voxels that the avatar could touch under each."""
 
 import math
 from typing import NamedTuple
@@ -10,16 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.archive.voxel_grid import KEY_BIAS, MAX_COORDINATE
+from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.morton import morton_code
 from .kernel_decorators import njit_no_refcount
 from .placed_avatar import MAX_REACH_UNITS, largest_term, place
+from .reach import REACH_STACK, VoxelLists, list_item, unknown_near
 from .scene_arrays import stopped
 
-# Poses checked, and cells or voxels examined, between two checks of the stop flag.
+# Poses checked between two checks of the stop flag.
 POSES_AT_ONCE = 64
-CELLS_AT_ONCE = 1024
+# Voxels in reach of a query of one item that is answered in one call.
+MAX_ROWS_OF_ONE = 64
 
 SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
@@ -28,38 +26,49 @@ MAX_FRAME_STEPS = 1 << 23
 VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
 
 
-class SceneIndex(NamedTuple):
-    """Arrays of a scene's v voxels that the broad phase reads.
-
-    keys: (v,) uint64, sorted.
-    low, high: (v, 3) int64, least and greatest lattice coordinates of a box around a voxel's
-    points. It is the box of the voxel's cell until the voxel's record proves what the index states.
-    scene_low, scene_high: (3,) int64, those of all points, as the index states them. They decide
-    only what lies outside and which cells exist.
-    """
-
-    keys: NDArray[np.uint64]
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    scene_low: NDArray[np.int64]
-    scene_high: NDArray[np.int64]
-
-
 class VoxelsInReach(NamedTuple):
     """Voxels that k poses could touch.
 
     scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.
-    starts: (k + 1,), rows: int64: the voxel rows of pose i are rows[starts[i]:starts[i + 1]].
+    lists: the voxels; `near` bounds the distance between centres, and `unseen` is that of scans that
+    were left out.
     boxes: (k, 2, 3) float64, the box of the root sphere and its reach [steps].
     outside: (k,) bool, whether that box extends beyond the scene's box.
     """
 
     scales: NDArray[np.float64]
     units: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    rows: NDArray[np.int64]
+    lists: VoxelLists
     boxes: NDArray[np.float64]
     outside: NDArray[np.bool_]
+
+
+class OneReach(NamedTuple):
+    """Scratch for the reach of one pose or point: reach, with space for MAX_ROWS_OF_ONE rows.
+
+    which, cursor: (1,) int64, zero, and entries examined.  all_held: (0,) uint8, states.  never: (1,)
+    int64, a stop flag that is not set.
+    """
+
+    reach: VoxelsInReach
+    which: NDArray[np.int64]
+    cursor: NDArray[np.int64]
+    all_held: NDArray[np.uint8]
+    never: NDArray[np.int64]
+
+
+def make_reach(k: int, rows: int) -> VoxelsInReach:
+    """Return an empty `VoxelsInReach` for k poses, with space for `rows` voxel rows."""
+    lists = VoxelLists(
+        np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty(rows), np.full(k, np.inf)
+    )
+    return VoxelsInReach(np.empty(k), np.empty(k, np.int64), lists, np.empty((k, 2, 3)), np.zeros(k, bool))
+
+
+def make_one_reach() -> OneReach:
+    """Allocate the scratch for one pose or point."""
+    which, cursor, never = np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64)
+    return OneReach(make_reach(1, MAX_ROWS_OF_ONE), which, cursor, np.empty(0, np.uint8), never)
 
 
 @njit_no_refcount
@@ -127,52 +136,8 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
     return VALID, 0, 0.0
 
 
-@njit_no_refcount
-def find_key(keys, key):
-    """Return the row of `key` in sorted keys (v,) uint64, or -1."""
-    lo, hi = 0, keys.shape[0]
-    while lo < hi:
-        mid = (lo + hi) // 2
-        if keys[mid] < key:
-            lo = mid + 1
-        else:
-            hi = mid
-    return lo if lo < keys.shape[0] and keys[lo] == key else -1
-
-
-@njit_no_refcount
-def grid_low(scene_low, voxel_steps):
-    """Return the lowest lattice coordinate along an axis of the grid cells that hold points.
-
-    float64, exact.
-    """
-    return np.float64(scene_low // voxel_steps * voxel_steps)
-
-
-@njit_no_refcount
-def grid_high(scene_high, voxel_steps):
-    """Return the highest lattice coordinate along an axis of the grid cells that hold points.
-
-    float64, exact.
-    """
-    return np.float64((scene_high // voxel_steps + 1) * voxel_steps - 1)
-
-
-@njit_no_refcount
-def _near_box(center, reach, low, high):
-    """Return whether a ball (center (3,), reach) touches a box.
-
-    low, high: (3,) float64; all [steps].
-    """
-    square = 0.0
-    for k in range(3):
-        gap = max(low[k] - center[k], center[k] - high[k], 0.0)
-        square += gap * gap
-    return square <= reach * reach
-
-
 @nb.njit(nogil=True, cache=True)
-def find_reach(poses, avatar, radius, other_units, scene, index, reach):
+def find_reach(poses, avatar, radius, other_units, scene, tree, reach):
     """Check poses and list the voxels in reach of each: `check_poses`, then `voxels_in_reach`.
 
     radius: of the avatar's points [m].  other_units: radius of the scan's points plus the margin,
@@ -184,85 +149,41 @@ def find_reach(poses, avatar, radius, other_units, scene, index, reach):
     )
     if fault != VALID or avatar.radius.shape[0] == 0:
         return fault, pose, found, 0
-    return fault, pose, found, voxels_in_reach(poses, avatar, scene, index, reach)
+    return fault, pose, found, voxels_in_reach(poses, avatar, scene, tree, reach)
 
 
 @nb.njit(nogil=True, cache=True)
-def voxels_in_reach(poses, avatar, scene, index, reach):
-    """List, for each pose, the voxels whose points the avatar's root sphere could touch.
+def voxels_in_reach(poses, avatar, scene, tree, reach):
+    """List, for each pose, the voxels whose points the avatar's root sphere could touch, nearest first.
 
-    The order depends on the positions alone.
     poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays.
-    Fills starts, rows, boxes and outside of `reach` from its scales and units. Returns how many
-    rows are needed; those beyond the capacity are not written. Returns -1 when the scene's stop
-    flag is set; `reach` is then not filled.
+    Fills lists, boxes and outside of `reach` from its units. Returns how many rows are needed; those
+    beyond the capacity are not written. Returns -1 when the scene's stop flag is set; `reach` is then
+    not filled.
     The reach is widened by more than the rounding of this function: a millionth of itself, one
     step, and 2^-49 of the largest term of the sums.
     """
-    step, units_per_step, voxel_steps = scene.step, scene.units_per_step, scene.voxel_steps
-    keys, scene_low, scene_high = index.keys, index.scene_low, index.scene_high
-    boxes, outside = reach.boxes, reach.outside
+    boxes, outside, lists, stack = reach.boxes, reach.outside, reach.lists, np.empty(REACH_STACK, np.int64)
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
     shift, center = np.empty(3), np.empty(3)
-    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
-    box_low, box_high = np.empty(3), np.empty(3)
     needed = 0
     for i in range(poses.shape[0]):
-        if stopped(scene.stop):
-            return -1
         m = poses[i]
         for r in range(3):
             shift[r] = m[r, 3] - scene.origin[r]
-        span = (avatar.radius[0] * reach.scales[i] / step + reach.units[i] / units_per_step) * (
-            1.0 + 1e-6
-        ) + 1.0
-        span += largest_term(m, shift, x, y, z) / step * 2.0**-49
-        cells = 1.0
+        rounding = largest_term(m, shift, x, y, z) / scene.step * 2.0**-49
+        root = avatar.radius[0] * reach.scales[i] / scene.step
+        span = (root + reach.units[i] / scene.units_per_step) * (1.0 + 1e-6) + 1.0 + rounding
         outside[i] = False
         for r in range(3):
-            center[r] = place(m, shift, r, x, y, z) / step
+            center[r] = place(m, shift, r, x, y, z) / scene.step
             boxes[i, 0, r], boxes[i, 1, r] = center[r] - span, center[r] + span
-            outside[i] |= boxes[i, 0, r] < scene_low[r] or boxes[i, 1, r] > scene_high[r]
-            least = max(boxes[i, 0, r], grid_low(scene_low[r], voxel_steps))
-            most = min(boxes[i, 1, r], grid_high(scene_high[r], voxel_steps))
-            first[r] = np.int64(math.floor(least / voxel_steps))
-            last[r] = np.int64(math.floor(most / voxel_steps))
-            cells *= max(0.0, np.float64(last[r] - first[r] + 1)) if least <= most else 0.0
-        reach.starts[i] = needed
-        if cells == 0.0:
-            continue
-        listed = cells > keys.shape[0]  # cheaper to test every voxel than every cell of the grid
-        ix, iy, iz = first[0], first[1], first[2]
-        row, looked = -1, 0
-        while True:
-            looked += 1
-            if looked % CELLS_AT_ONCE == 0 and stopped(scene.stop):
-                return -1
-            if listed:
-                row += 1
-                if row == keys.shape[0]:
-                    break
-            else:
-                if ix > last[0]:
-                    break
-                row = find_key(
-                    keys,
-                    morton_code(np.uint64(ix + KEY_BIAS), np.uint64(iy + KEY_BIAS), np.uint64(iz + KEY_BIAS)),
-                )
-                iz += 1
-                if iz > last[2]:
-                    iz = first[2]
-                    iy += 1
-                    if iy > last[1]:
-                        iy = first[1]
-                        ix += 1
-                if row < 0:
-                    continue
-            for r in range(3):
-                box_low[r], box_high[r] = np.float64(index.low[row, r]), np.float64(index.high[row, r])
-            if _near_box(center, span, box_low, box_high):
-                if needed < reach.rows.shape[0]:
-                    reach.rows[needed] = row
-                needed += 1
-    reach.starts[poses.shape[0]] = needed
+            outside[i] |= boxes[i, 0, r] < tree.scene[0, r] or boxes[i, 1, r] > tree.scene[1, r]
+        own = root * (1.0 + 1e-6) + 1.0 + rounding
+        lists.starts[i] = needed
+        needed = list_item(tree, center, center, span, own, scene.stop, stack, lists.rows, lists.near, needed)
+        lists.unseen[i] = unknown_near(tree, center, center, span, own)
+        if stopped(scene.stop):
+            return -1
+    lists.starts[poses.shape[0]] = needed
     return needed

@@ -6,12 +6,13 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import place, to_units
+from ..core.reach import INFINITE, MISSING, NOT_HELD, state_of
 from ..core.scene_arrays import stopped
-from .contact_times import INFINITE, scan_coordinate, touches_at
+from .contact_times import scan_coordinate, touches_at
 from .moving_avatar import AvatarSweep
 from .screw_motion import make_motion, pose_at
 from .sweep_interval import search
-from .sweep_segments import avatar_size, entry_fraction, longest_part, place_root_sphere, sagitta_of
+from .sweep_segments import avatar_size, longest_part
 
 # Sagitta of a first chord, in avatar sizes: spheres grow by it.
 _CHORD_BEND = 1.0 / 16.0
@@ -22,43 +23,34 @@ MAX_REFUSED = 512
 
 @nb.njit(nogil=True, cache=True)
 def advance_segments(
-    box, first, last, avatar, radius, other_units, scales, units, loose, scene, index, starts, rows, which, tolerance,
+    box, first, last, avatar, radius, other_units, scales, units, loose, scene, lists, which, cursor, state, tolerance,
     scratch, progress, counts,
 ):  # fmt: skip
-    """Advance the motions numbered in `which` along their segments: one call for all of a piece.
+    """Advance the motions numbered in `which` along their segments, each through voxels from its cursor on.
 
     box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
-    the way.  starts, rows: the voxels of each motion's segment that this piece holds.  tolerance:
-    [m].  scratch: `make_scratch` of the avatar.
+    the way.  lists: the voxels of each motion's segment.  cursor, state: as in `collide_poses`.
+    tolerance: [m].  scratch: `make_scratch` of the avatar.
     Lowers progress.lower and upper, sets a witness with upper, of equal ones the first by
     NUMERICS.md N11, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
-    A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
-    it. Once the scene's stop flag is set, a motion is unknown from its current position on.
+    A missing voxel makes the motion unknown from where the root sphere's cube reaches it, or from
+    progress.floor on if that is later. Once the scene's stop flag is set, motions are not finished.
     """
-    moving, begin, end = scratch.moving, scratch.space.begin, scratch.space.end
+    moving, rows, near = scratch.moving, lists.rows, lists.near
     for number in range(which.shape[0]):
         i = which[number]
-        if starts[i + 1] == starts[i]:
-            continue
+        at, until = cursor[i], lists.starts[i + 1]
         if progress.visits[i] < 0 or stopped(scene.stop):
             progress.lower[i] = min(progress.lower[i], progress.at[i])
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
         t0, t1 = progress.at[i], progress.end[i]
-        span = place_root_sphere(
-            motion, t0, avatar, scales[i], units[i], scene, moving.pose, moving.shift, begin
-        )
-        span = max(
-            span,
-            place_root_sphere(motion, t1, avatar, scales[i], units[i], scene, moving.pose, moving.shift, end),
-        )
-        span += sagitta_of(motion, t1 - t0, scene)
-        gap = INFINITE
-        for at in range(starts[i], starts[i + 1]):
-            row = rows[at]
-            if scene.where[row, 0] < 0:
+        begin, gap = at, INFINITE
+        while at < until and state_of(state, rows[at]) != NOT_HELD:
+            if state_of(state, rows[at]) == MISSING:
                 counts[0, i] += np.uint32(1)
-                gap = min(gap, entry_fraction(begin, end, span, index.low[row], index.high[row]))
+                gap = min(gap, near[at] / progress.way[i] if progress.way[i] > 0.0 else 0.0)
+            at += 1
         moving.counters[0], moving.counters[1], moving.counters[3] = 0, 0, progress.visits[i]
         sweep = AvatarSweep(
             motion,
@@ -72,10 +64,11 @@ def advance_segments(
             np.float64(loose[i]),
         )
         size = avatar_size(box, scales[i], units[i])
-        near = rows[starts[i] : starts[i + 1]]
-        lower, upper, steps = _advance(sweep, t0, t1, progress.upper[i], near, size, tolerance)
+        lower, upper, steps = _advance(
+            sweep, t0, t1, progress.upper[i], rows[begin:at], state, size, tolerance
+        )
         if gap < INFINITE:
-            lower = min(lower, max(t0, t0 + gap * (t1 - t0) - 2.0**-52))
+            lower = min(lower, max(t0, t0 + gap * (t1 - t0) - 2.0**-52, progress.floor[i]))
         progress.lower[i] = min(progress.lower[i], lower)
         if upper < INFINITE and upper <= progress.upper[i]:
             _name_witness(sweep, upper, upper == progress.upper[i], progress.witness[i])
@@ -84,10 +77,12 @@ def advance_segments(
         counts[1, i] += np.uint32(moving.counters[0])
         counts[2, i] += np.uint32(moving.counters[1])
         counts[3, i] += np.uint32(steps)
+        if not stopped(scene.stop):
+            cursor[i] = at
 
 
 @njit_no_refcount
-def _advance(sweep, start, stop, known, rows, size, tolerance):
+def _advance(sweep, start, stop, known, rows, state, size, tolerance):
     """Advance one motion over [start, stop] through some voxels. Return (lower, upper, advances).
 
     Nothing touches in [start, lower). upper: a contact, confirmed by the integers; inf when none
@@ -109,17 +104,17 @@ def _advance(sweep, start, stop, known, rows, size, tolerance):
     while True:
         after = stop if t + length >= stop else t + length
         steps += 1
-        whole, final = search(sweep, t, after, rows)
+        whole, final = search(sweep, t, after, rows, state)
         earliest_possible, earliest_certain = moving.first[0], moving.first[1]
         if final and earliest_certain == 0.0 and after > t:
             # The search ended at the first pair it met that touches at t.
-            search(sweep, t, t, rows)
+            search(sweep, t, t, rows, state)
         elif earliest_possible == 0.0 and not final:
             # It ended at the first pair it met that may touch at t: in another tree, another pair.
             earliest_certain = INFINITE
             if t == 0.0 and not begun:
                 begun = True
-                search(sweep, t, t, rows)
+                search(sweep, t, t, rows, state)
                 earliest_certain = moving.first[1]
         sure = INFINITE
         if earliest_certain < INFINITE:

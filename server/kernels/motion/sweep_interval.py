@@ -46,6 +46,7 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_inlined, njit_no_refcount
 from ..core.node_boxes import has_box
 from ..core.node_overlap import ONE_SLACK, SLACK, make_thresholds
+from ..core.reach import HELD, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -290,8 +291,8 @@ def _sweep_voxel(sweep, chord, voxel):
 
 
 @njit_no_refcount
-def search(sweep, t0, t1, rows):
-    """Descend once over the interval [t0, t1], through those voxels of `rows` that are resident.
+def search(sweep, t0, t1, rows, state):
+    """Descend once over the interval [t0, t1], through those voxels of `rows` that are held.
 
     Fills moving.first and moving.pair. With t0 < t1 the search ends at the first pair found that
     may touch at t0; with t0 = t1 it finds the first of these pairs by NUMERICS.md N11. Returns
@@ -316,7 +317,7 @@ def search(sweep, t0, t1, rows):
     moving.counters[2] += 1
     moving.first[0], moving.first[1], moving.first[2] = INFINITE, INFINITE, INFINITE
     for row in rows:
-        if scene.where[row, 0] >= 0 and not _sweep_voxel(sweep, chord, row):
+        if state_of(state, row) == HELD and not _sweep_voxel(sweep, chord, row):
             break
     spent = moving.counters[0] > moving.counters[3] or stopped(scene.stop)
     return not (spent and moving.first[2] > 0.0), chord.final

@@ -10,12 +10,13 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.kernel_decorators import njit_no_refcount
+from ..core.reach import all_resident
 from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, SceneArrays, stopped
 from ..core.voxels_in_reach import SIMILARITY_TOLERANCE, VALID, check_poses
 from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
 from .screw_motion import make_motion, pose_at
 from .sweep_advance import advance_segments
-from .sweep_segments import avatar_box, find_unknown_regions, plan_in_space
+from .sweep_segments import avatar_box, find_unknown_regions, plan_segments
 
 _CLEAR, _CONTACT, _UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
@@ -47,8 +48,7 @@ def _rigid(pose):
 
 @nb.njit(nogil=True, cache=True)
 def sweep_resident(
-    pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown,
-    unknown_everywhere, tolerance, skin, rows, result,
+    pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown_everywhere, tolerance, skin, result,
 ):  # fmt: skip
     """Sweep one motion if it is short, of scale 1, and all voxels in its reach are resident.
 
@@ -56,14 +56,14 @@ def sweep_resident(
     that is not empty, and of the scene.  scratch: `make_scratch` of the avatar.  box: `box_of` the
     avatar.  stop: (1,) int64, the request's stop flag.  radius, other_units, tolerance: as in
     kernels/motion/sweep_advance.py.  The dataset's origin is subtracted from the motion as in
-    server/queries/sweep.py.  unknown: (u, 2, 3) int64, boxes [steps] of excluded scans.  skin:
-    distance to keep from what is touched [m]; negative: the end of the motion is not computed.
-    Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64; the witness
-    is written where the verdict is CONTACT.
+    server/queries/sweep.py.  skin: distance to keep from what is touched [m]; negative: the end of
+    the motion is not computed.
+    Writes held.one, the voxels in reach, and result (COLUMNS,) float64; the witness is written where
+    the verdict is CONTACT.
     Returns (number of rows, verdict, node visits, point tests, advances). -1 rows: not answered;
     this includes invalid poses.
     """
-    avatar, scene, index = body.avatar, held.scene, held.index
+    avatar, scene, tree, lists = body.avatar, held.scene, held.tree, held.one.reach.lists
     one, origin = scratch.one, scene.origin
     first, last, scales, units, progress, counts = (
         one.first, one.last, one.scales, one.units, one.progress, one.counts,
@@ -86,24 +86,20 @@ def sweep_resident(
         scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
     progress.at[0], progress.end[0], progress.lower[0], progress.speed[0] = 0.0, 1.0, 1.0, 0.0
-    progress.upper[0], progress.visits[0] = np.inf, MAX_RESIDENT_PATH_VISITS
+    progress.upper[0], progress.visits[0], progress.floor[0] = np.inf, MAX_RESIDENT_PATH_VISITS, 0.0
     for n in range(4):
         counts[n, 0] = np.uint32(0)
-    needed = plan_in_space(
-        box, first, last, avatar, scales, units, from_zero, index, one.which, progress, one.starts, rows,
-        scratch.space, one.moved,
+    needed = plan_segments(
+        box, first, last, avatar, scales, units, from_zero, tree, one.which, progress, lists, scratch.space, one.moved,
     )  # fmt: skip
-    if needed < 0 or needed > rows.shape[0] or (needed > 0 and progress.end[0] < 1.0):
+    if not all_resident(scene.where, lists.rows, needed) or (needed > 0 and progress.end[0] < 1.0):
         return _NOT_ANSWERED
-    for at in range(needed):
-        if scene.where[rows[at], 0] < 0:
-            return _NOT_ANSWERED
     proved = 1.0
     if needed > 0:
-        progress.lower[0] = progress.end[0]
+        progress.lower[0], one.cursor[0] = progress.end[0], 0
         advance_segments(
-            box, first, last, avatar, radius, other_units, scales, units, one.loose, from_zero, index, one.starts, rows,
-            one.which, tolerance, scratch, progress, counts,
+            box, first, last, avatar, radius, other_units, scales, units, one.loose, from_zero, lists, one.which,
+            one.cursor, held.one.all_held, tolerance, scratch, progress, counts,
         )  # fmt: skip
         if progress.visits[0] < 0 or stopped(stop):
             return _NOT_ANSWERED
@@ -111,10 +107,10 @@ def sweep_resident(
     upper = progress.upper[0]
     if unknown_everywhere:
         proved = 0.0
-    elif unknown.shape[0] > 0:
+    elif tree.unknown.shape[0] > 0:
         until, outside, unknown_from = np.full(1, min(upper, 1.0)), np.zeros(1, np.bool_), np.empty(1)
         find_unknown_regions(
-            box, first, last, avatar, scales, units, from_zero, index, unknown, until, outside, unknown_from
+            box, first, last, avatar, scales, units, from_zero, tree, until, outside, unknown_from
         )
         if unknown_from[0] <= until[0]:
             proved = min(proved, unknown_from[0])

@@ -7,14 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....schemas.archive.units import UNITS_PER_METRE
-from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.morton import morton_code
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import largest_term, place
+from ..core.reach import INFINITE, REACH_STACK, entry_fraction, list_item
 from ..core.scene_arrays import stopped
-from ..core.voxels_in_reach import find_key, grid_high, grid_low
-from .contact_times import INFINITE
 from .screw_motion import make_motion, pose_at
 
 # Extent of a segment, and thereby of what must be resident together: four avatars plus 8 m.
@@ -36,6 +33,8 @@ class SweepProgress(NamedTuple):
     speed: upper bound of the speed of the fastest avatar point [m per unit of t].
     witness: (k, 2, 3), the pair's centres, avatar and scan, world [m].
     visits: (k,) int64, node visits left.
+    floor: fraction before which nothing absent touches, as the level of detail proves.
+    way: how far the reach of the segment moves [steps], as in `VoxelLists.near`.
     """
 
     at: NDArray[np.float64]
@@ -45,22 +44,24 @@ class SweepProgress(NamedTuple):
     speed: NDArray[np.float64]
     witness: NDArray[np.float64]
     visits: NDArray[np.int64]
+    floor: NDArray[np.float64]
+    way: NDArray[np.float64]
 
 
 class PlanSpace(NamedTuple):
-    """Scratch of `plan_segments`: pose, shift, two positions, and the range of cells (2, 3)."""
+    """Scratch of `plan_segments`: pose, shift, two positions, and that of `list_item`."""
 
     pose: NDArray[np.float64]
     shift: NDArray[np.float64]
     begin: NDArray[np.float64]
     end: NDArray[np.float64]
-    cells: NDArray[np.int64]
+    stack: NDArray[np.int64]
 
 
 @nb.njit(nogil=True, cache=True)
 def make_plan_space():
     """Allocate a `PlanSpace`."""
-    return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), np.empty((2, 3), np.int64))
+    return PlanSpace(np.empty((4, 4)), np.empty(3), np.empty(3), np.empty(3), np.empty(REACH_STACK, np.int64))
 
 
 @nb.njit(nogil=True, cache=True)
@@ -131,112 +132,20 @@ def sagitta_of(motion, length, scene):
     return (motion.bend * length * length / 8.0 + 4.0 * motion.slip + 2.0 / UNITS_PER_METRE) / scene.step
 
 
-@njit_no_refcount
-def entry_fraction(begin, end, span, low, high):
-    """Return the fraction at which a moving cube (half edge span) first meets the box [low, high].
-
-    begin, end: (3,), its centre. Rounded down; inf if it does not meet the box.
-    """
-    least, most = 0.0, 1.0
-    for r in range(3):
-        displacement = end[r] - begin[r]
-        near, far = np.float64(low[r]) - span - begin[r], np.float64(high[r]) + span - begin[r]
-        if displacement == 0.0:
-            if near > 0.0 or far < 0.0:
-                return INFINITE
-            continue
-        first, last = near / displacement, far / displacement
-        if displacement < 0.0:
-            first, last = last, first
-        # near and far are rounded to 2^-52 of terms; `span` is wider than necessary by that much
-        # (voxels_in_reach).
-        least, most = max(least, first), min(most, last)
-    if least > most * (1.0 + 1e-12) + 1e-12:
-        return INFINITE
-    return max(0.0, least - 1e-9)
-
-
-@njit_no_refcount
-def _still_near(center, span, low, high):
-    """Return whether a ball touches a voxel's box, by the test of voxels_in_reach."""
-    square = 0.0
-    for r in range(3):
-        gap = max(np.float64(low[r]) - center[r], center[r] - np.float64(high[r]), 0.0)
-        square += gap * gap
-    return square <= span * span
-
-
-@njit_no_refcount
-def _list_rows(span, still, scene, index, space, rows, count):
-    """Append the voxels that a moving cube meets to rows, from `count` on.
-
-    It moves from space.begin to space.end. Returns the new count, which may exceed the capacity.
-    """
-    begin, end, first, last = space.begin, space.end, space.cells[0], space.cells[1]
-    cells = 1.0
-    for r in range(3):
-        least = max(min(begin[r], end[r]) - span, grid_low(index.scene_low[r], scene.voxel_steps))
-        most = min(max(begin[r], end[r]) + span, grid_high(index.scene_high[r], scene.voxel_steps))
-        if least > most:
-            return count
-        first[r] = np.int64(math.floor(least / scene.voxel_steps))
-        last[r] = np.int64(math.floor(most / scene.voxel_steps))
-        cells *= np.float64(last[r] - first[r] + 1)
-    listed = cells > index.keys.shape[0]
-    side_y, side_z = last[1] - first[1] + 1, last[2] - first[2] + 1
-    total = index.keys.shape[0] if listed else (last[0] - first[0] + 1) * side_y * side_z
-    for n in range(total):
-        if stopped(scene.stop):
-            return count
-        row = n
-        if not listed:
-            ix, iy, iz = (
-                first[0] + n // (side_y * side_z),
-                first[1] + n // side_z % side_y,
-                first[2] + n % side_z,
-            )
-            row = find_key(
-                index.keys,
-                morton_code(np.uint64(ix + KEY_BIAS), np.uint64(iy + KEY_BIAS), np.uint64(iz + KEY_BIAS)),
-            )
-            if row < 0:
-                continue
-        low, high = index.low[row], index.high[row]
-        if entry_fraction(begin, end, span, low, high) == INFINITE or (
-            still and not _still_near(begin, span, low, high)
-        ):
-            continue
-        if count < rows.shape[0]:
-            rows[count] = row
-        count += 1
-    return count
-
-
 @nb.njit(nogil=True, cache=True)
-def plan_segments(box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows):
+def plan_segments(box, first, last, avatar, scales, units, scene, tree, which, progress, lists, space, moved):
     """Plan the next segment of each motion in `which` that reaches any voxel, and list its voxels.
 
     box: `avatar_box`.  first, last: (k, 4, 4), checked.  scales, units: (k,), the larger value of
-    the two ends.
+    the two ends.  space: scratch.  moved: (w,) float64, one for each of `which`; scratch.
     Reads progress.at and advances it to the start of the segment; everything before is out of reach
-    of all voxels. Writes end and speed. `at` becomes 1 for a motion with nothing left in reach,
-    which gets no rows. Fills starts (k + 1,) and rows (capacity,) int64, with no rows for motions
-    not in `which` (ascending).
+    of all voxels. Writes end, speed and way. `at` becomes 1 for a motion with nothing left in reach,
+    which gets no rows. Fills starts, rows and near of `lists`, with no rows for motions not in
+    `which` (ascending).
     Returns the number of rows; those beyond the capacity are not written, and progress.at is then
     unchanged. Returns -1, with progress.at unchanged, when the scene's stop flag is set.
     """
-    return plan_in_space(
-        box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows, make_plan_space(),
-        np.empty(which.shape[0]),
-    )  # fmt: skip
-
-
-@nb.njit(nogil=True, cache=True)
-def plan_in_space(
-    box, first, last, avatar, scales, units, scene, index, which, progress, starts, rows, space, moved
-):
-    """Do the work of `plan_segments`. moved: (w,) float64, one for each of `which`; scratch."""
-    pose, shift, begin, end = space.pose, space.shift, space.begin, space.end
+    pose, shift, begin, end, starts = space.pose, space.shift, space.begin, space.end, lists.starts
     count, next_start = 0, 0
     for number in range(which.shape[0]):
         if stopped(scene.stop):
@@ -260,39 +169,38 @@ def plan_in_space(
                 span, place_root_sphere(motion, stop, avatar, scales[i], units[i], scene, pose, shift, end)
             )
             span += sagitta_of(motion, stop - t, scene)
-            # Outside the scene's bounds there are only cells of voxels whose own bounds are not
-            # proved.
-            if (
-                entry_fraction(begin, end, span, index.scene_low, index.scene_high) < INFINITE
-                or _list_rows(span, motion.speed == 0.0, scene, index, space, rows, count) > count
-            ):
+            if entry_fraction(begin, end, span, tree.scene[:1], tree.scene[1:], 0) < INFINITE:
                 if length > segment * (1.0 + 1e-9):
                     length = length * 0.5
                     continue
-                count = _list_rows(span, motion.speed == 0.0, scene, index, space, rows, count)
+                count = list_item(
+                    tree, begin, end, span, 0.0, scene.stop, space.stack, lists.rows, lists.near, count
+                )
             if count == before:
                 t, length = stop, 2.0 * length
             else:
                 progress.end[i] = stop
+                square = 0.0
+                for r in range(3):
+                    square += (end[r] - begin[r]) ** 2
+                progress.way[i] = math.sqrt(square)
         moved[number] = t
     if stopped(scene.stop):
         return -1
     for n in range(next_start, starts.shape[0]):
         starts[n] = count
-    if count <= rows.shape[0]:
+    if count <= lists.rows.shape[0]:
         for number in range(which.shape[0]):
             progress.at[which[number]] = moved[number]
     return count
 
 
 @nb.njit(nogil=True, cache=True)
-def find_unknown_regions(
-    box, first, last, avatar, scales, units, scene, index, unknown, until, outside, unknown_from
-):
+def find_unknown_regions(box, first, last, avatar, scales, units, scene, tree, until, outside, unknown_from):
     """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, until].
 
     Writes outside (k,) bool, whether the reach leaves the scene's bounds, and unknown_from (k,)
-    float64, the fraction at which it first meets one of the boxes unknown (u, 2, 3) int64 [steps];
+    float64, the fraction at which it first meets the box of a scan that was left out;
     inf if it never does.
     The reach is the cube around the avatar's root sphere, as in `collide`, along chords; neither
     result depends on voxels. Once the scene's stop flag is set, motions are unknown from their
@@ -316,9 +224,9 @@ def find_unknown_regions(
             )
             span += sagitta_of(motion, t1 - t0, scene)
             for r in range(3):
-                outside[i] |= min(begin[r], end[r]) - span < index.scene_low[r]
-                outside[i] |= max(begin[r], end[r]) + span > index.scene_high[r]
-            for u in range(unknown.shape[0]):
-                met = entry_fraction(begin, end, span, unknown[u, 0], unknown[u, 1])
+                outside[i] |= min(begin[r], end[r]) - span < tree.scene[0, r]
+                outside[i] |= max(begin[r], end[r]) + span > tree.scene[1, r]
+            for u in range(tree.unknown.shape[0]):
+                met = entry_fraction(begin, end, span, tree.unknown[:, 0], tree.unknown[:, 1], u)
                 if met < INFINITE:
                     unknown_from[i] = min(unknown_from[i], max(0.0, t0 + met * (t1 - t0) - 2.0**-52))

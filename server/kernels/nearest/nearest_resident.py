@@ -15,8 +15,9 @@ from ....schemas.kernels import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import lattice_to_units
+from ..core.reach import all_resident
 from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS
-from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
+from ..core.voxels_in_reach import VALID, find_reach
 from .nearest_pair import NearestPairs
 from .nearest_search import nearest_poses
 
@@ -46,45 +47,45 @@ def _write_result(square, pair, deficit, radii, reach, scene, result):
 
 
 @nb.njit(nogil=True, cache=True)
-def nearest_resident(poses, body, radius, radius_units, reach_units, reach, held, stop, rows, result):
+def nearest_resident(pose, body, radius, radius_units, reach_units, reach, held, stop, result):
     """Answer `distance` for one pose: `find_reach`, `nearest_poses`, then the values of the pair.
 
-    poses: (1, 4, 4) float64, unchecked.  body, held: references to the arrays of the avatar and the
+    pose: (1, 4, 4) float64, unchecked.  body, held: references to the arrays of the avatar and the
     scene (array_references.py).  stop: (1,) int64, the request's stop flag.  radius: of the avatar's
     points [m].  radius_units: radius of the scan's largest sphere, exact units.  reach_units: the
     reach, exact units.  reach: the same [m].
-    Writes rows (capacity,) int64, the voxels in reach, and result (COLUMNS,) float64: signed
-    distance and its lower bound [m], normal, witness of the avatar, witness of the cloud, world
-    [m]; inf and NaN where no pair is within reach.
-    Returns (fault, pose, value found), as `check_poses` does, then the number of rows, outside,
-    node visits, point tests. -1 rows: not answered, because a voxel has to be loaded, the rows do
-    not fit, or the search ended early (scene.stop, MAX_RESIDENT_PATH_VISITS).
+    Writes held.one, the voxels in reach, and result (COLUMNS,) float64: signed distance and its lower
+    bound [m], normal, witness of the avatar, witness of the cloud, world [m]; inf and NaN where no
+    pair is within reach.
+    Returns (fault, value found), as `check_poses` does, then the number of rows, node visits, point
+    tests. -1 rows: not answered, because a voxel has to be loaded, the rows do not fit, or the search
+    ended early (scene.stop, MAX_RESIDENT_PATH_VISITS).
     """
-    avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
-    outside = np.zeros(1, np.bool_)
-    scales, units = np.empty(1), np.empty(1, np.int64)
-    around = VoxelsInReach(scales, units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)
-    fault, pose, found, needed = find_reach(
-        poses, avatar, radius, radius_units + reach_units, scene, index, around
+    avatar, scene, around = body.avatar, with_flag(held.scene, stop), held.one.reach
+    fault, _, found, needed = find_reach(
+        pose, avatar, radius, radius_units + reach_units, scene, held.tree, around
     )
-    ready = fault == VALID and 0 <= needed <= rows.shape[0]
-    if ready:
-        for at in range(needed):
-            ready &= scene.where[rows[at], 0] >= 0
-    if not ready:
-        return fault, pose, found, -1, False, 0, 0
+    if fault != VALID or not all_resident(scene.where, around.lists.rows, needed):
+        return fault, found, -1, 0, 0
     nearest = NearestPairs(
         np.full(1, -1, np.int64), np.zeros((1, 6), np.int64), np.zeros(1, np.int64), np.full(1, np.inf)
     )
-    counts = np.zeros((3, 1), np.uint32)
+    counts, cursor = np.zeros((3, 1), np.uint32), held.one.cursor
+    cursor[0] = 0
     if needed > 0:
         nearest_poses(
-            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), 0.0, 0.0,
+            pose, avatar, scene, around, held.one.which, cursor, held.one.all_held, reach_units, 0.0, 0.0,
             MAX_RESIDENT_PATH_VISITS, nearest, counts,
         )  # fmt: skip
-        if nearest.missing_bound[0] < np.inf:  # all is resident: the search ended early
-            return fault, pose, found, -1, False, 0, 0
+        if cursor[0] < needed:
+            return fault, found, -1, 0, 0
     _write_result(
-        nearest.square[0], nearest.pair[0], nearest.deficit[0], units[0] - reach_units, reach, scene, result
+        nearest.square[0],
+        nearest.pair[0],
+        nearest.deficit[0],
+        around.units[0] - reach_units,
+        reach,
+        scene,
+        result,
     )
-    return fault, pose, found, needed, outside[0], np.int64(counts[1, 0]), np.int64(counts[2, 0])
+    return fault, found, needed, np.int64(counts[1, 0]), np.int64(counts[2, 0])

@@ -40,6 +40,7 @@ from ..core.placed_avatar import (
     place_lanes,
     place_root,
 )
+from ..core.reach import HELD, NOT_HELD, state_of
 from ..core.scene_arrays import (
     COUNT,
     COUNTED,
@@ -52,7 +53,6 @@ from ..core.scene_arrays import (
     stopped,
 )
 from .block_distances import nearest_squares, unmark_beyond_box
-from .missing_voxels import box_distance
 from .nearest_pair import (
     found_units,
     lower_bound,
@@ -263,13 +263,13 @@ def _nearest_voxel(avatar, m, pose, placed, scene, voxel, front, count, scratch,
 
 @njit_no_refcount
 def _search_widening(
-    m, pose, avatar, placed, scene, reach, beyond, first, last, front, count, scratch, best, gaps, classes
+    m, pose, avatar, placed, scene, rows, beyond, first, last, front, count, scratch, best, gaps, classes
 ):
-    """Search the voxels reach.rows[first:last] for the nearest pair, within widening bounds.
+    """Search the voxels rows[first:last] for the nearest pair, within widening bounds.
 
     The bounds widen until a pair is found. A search that finds nothing costs little: nearly all
     nodes are far.
-    gaps: for each voxel, see `box_distance`; inf: not resident.  classes: of their largest spheres.
+    gaps: for each voxel, its `near`; inf: missing.  classes: of their largest spheres.
     """
     units, found, deficit, cut = best.units, best.found, best.deficit, best.cut
     # Under the radius model, no sphere here is larger than the largest minus this.
@@ -295,9 +295,7 @@ def _search_widening(
             if at < 0 or should_end(scene.stop, best.counters[0], best.counters[3]):
                 break
             gaps[at] = -1.0 - least
-            _nearest_voxel(
-                avatar, m, pose, placed, scene, reach.rows[first + at], front, count, scratch, best
-            )
+            _nearest_voxel(avatar, m, pose, placed, scene, rows[first + at], front, count, scratch, best)
         if units[1] < bound or bound == limit or should_end(scene.stop, best.counters[0], best.counters[3]):
             break
         # With a tolerance, a pair just beyond the bound may leave nothing within it worth finding.
@@ -312,46 +310,58 @@ def _search_widening(
 
 @nb.njit(nogil=True, cache=True)
 def nearest_poses(
-    poses, avatar, scene, index, reach, beyond, which, share, tolerance, most_visits, nearest, counts
+    poses, avatar, scene, reach, which, cursor, state, beyond, share, tolerance, most_visits, nearest, counts
 ):
-    """Answer `distance` for the poses numbered in `which`: one call a request, with all voxels.
+    """Answer `distance` for the poses numbered in `which`, each from its cursor on.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
-    (voxels_in_reach.py), to the largest distance requested; a voxel in it that is not resident is
-    counted as missing.  beyond: the part of the reach that is not the radii, exact units.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of all k poses, to the
+    largest distance requested.  cursor, state: as in `collide_poses`.  beyond: the part of the reach
+    that is not the radii, exact units.
     share, tolerance: how much farther than the nearest pair the one found may be: this share of
     the nearest pair's |a - b|, or these exact units, whichever is more.
     Accumulates into `nearest` and counts (3, k) uint32 (voxels missing, node visits, point tests),
-    whose initial values are -1, inf and 0. A pose may therefore be answered in pieces. Once the
-    scene's stop flag is set, or a pose has cost more than `most_visits`, voxels that were not
-    searched count in `missing_bound` as though they were missing.
+    whose initial values are -1, inf and 0. Once the scene's stop flag is set, or a pose has cost more
+    than `most_visits`, a pose is not finished.
     """
     placed, best = make_placed(avatar), make_best_pair(scene.radius_deficit)
     best.counters[3], best.frame[5], best.frame[6] = most_visits, share, tolerance
     front, scratch = make_front(avatar), make_nearest_scratch()
     most = 0
     for number in range(which.shape[0]):
-        most = max(most, reach.starts[which[number] + 1] - reach.starts[which[number]])
+        i = which[number]
+        most = max(most, reach.lists.starts[i + 1] - cursor[i])
     gaps, classes = np.empty(most), np.empty(most, np.uint64)
     _nearest_poses(
-        poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, scratch, gaps,
+        poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, scratch, gaps,
         classes,
     )  # fmt: skip
 
 
 @njit_no_refcount
 def _nearest_poses(
-    poses, avatar, scene, index, reach, beyond, which, nearest, counts, placed, best, front, scratch, gaps, classes
+    poses, avatar, scene, reach, which, cursor, state, beyond, nearest, counts, placed, best, front, scratch, gaps,
+    classes,
 ):  # fmt: skip
     """Implement `nearest_poses` with its scratch passed in."""
+    rows, near = reach.lists.rows, reach.lists.near
     for number in range(which.shape[0]):
         i = which[number]
-        first, last = reach.starts[i], reach.starts[i + 1]
+        first, end = cursor[i], reach.lists.starts[i + 1]
+        last = first
+        while last < end and state_of(state, rows[last]) != NOT_HELD:
+            voxel, gap = rows[last], near[last]
+            if state_of(state, voxel) == HELD:
+                gaps[last - first] = gap
+                classes[last - first] = leaf_class(scene.ints, scene.where[voxel, 0], best.mask)
+            else:
+                gaps[last - first], classes[last - first] = np.inf, U(0)
+                counts[0, i] += np.uint32(1)
+                nearest.missing_bound[i] = min(nearest.missing_bound[i], gap)
+            last += 1
         if first == last:
             continue
         if stopped(scene.stop):
-            nearest.missing_bound[i] = 0.0
-            continue
+            return
         best.frame[0], best.frame[1], count = place_all(
             avatar, poses[i], reach.scales[i], placed, scene, front.bounds
         )
@@ -362,22 +372,9 @@ def _nearest_poses(
         best.found[7] = nearest.deficit[i]
         best.counters[0], best.counters[1], best.counters[2] = 0, 0, 0
         best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
-        root = avatar.radius[0] * reach.scales[i]
-        for at in range(first, last):
-            gap = box_distance(root, placed, best.frame[1], scene, index, reach.rows[at])
-            row = scene.where[reach.rows[at], 0]
-            if row >= 0:
-                gaps[at - first], classes[at - first] = gap, leaf_class(scene.ints, row, best.mask)
-            else:
-                gaps[at - first], classes[at - first] = np.inf, U(0)
-                counts[0, i] += np.uint32(1)
-                nearest.missing_bound[i] = min(nearest.missing_bound[i], gap)
         _search_widening(
-            poses[i], i, avatar, placed, scene, reach, beyond, first, last, front, count, scratch, best, gaps, classes
+            poses[i], i, avatar, placed, scene, rows, beyond, first, last, front, count, scratch, best, gaps, classes
         )  # fmt: skip
-        if should_end(scene.stop, best.counters[0], best.counters[3]):
-            # The gap of no voxel is below 0, and any of them may have been searched only in part.
-            nearest.missing_bound[i] = 0.0
         nearest.missing_bound[i] = min(nearest.missing_bound[i], unsearched_bound(best))
         nearest.square[i] = best.found[0]
         for r in range(6):
@@ -385,3 +382,9 @@ def _nearest_poses(
         nearest.deficit[i] = best.found[7]
         counts[1, i] += np.uint32(best.counters[0])
         counts[2, i] += np.uint32(best.counters[1])
+        if should_end(scene.stop, best.counters[0], best.counters[3]):
+            continue
+        # No voxel farther than the pair found holds a nearer pair, or one that ties.
+        if last < end and best.found[0] >= 0 and near[last] * scene.units_per_step > found_units(best.found):
+            last = end
+        cursor[i] = last

@@ -8,12 +8,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.voxels_in_reach import find_key, grid_high, grid_low
 
 # Typical values of poses that look like a walk: scatter of clock and position together [m], and
 # speeds [m/s] and accelerations [m/s²] of people. The fit relies on them where poses are few or
@@ -40,6 +40,54 @@ class PredictionLimits(NamedTuple):
     speed: float
     acceleration: float
     fade: float
+
+
+class SceneIndex(NamedTuple):
+    """Arrays of a scene's v voxels that the broad phase reads.
+
+    keys: (v,) uint64, sorted.
+    low, high: (v, 3) int64, least and greatest lattice coordinates of a box around a voxel's
+    points. It is the box of the voxel's cell until the voxel's record proves what the index states.
+    scene_low, scene_high: (3,) int64, those of all points, as the index states them. They decide
+    only what lies outside and which cells exist.
+    """
+
+    keys: NDArray[np.uint64]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    scene_low: NDArray[np.int64]
+    scene_high: NDArray[np.int64]
+
+
+@njit_no_refcount
+def find_key(keys, key):
+    """Return the row of `key` in sorted keys (v,) uint64, or -1."""
+    lo, hi = 0, keys.shape[0]
+    while lo < hi:
+        mid = (lo + hi) // 2
+        if keys[mid] < key:
+            lo = mid + 1
+        else:
+            hi = mid
+    return lo if lo < keys.shape[0] and keys[lo] == key else -1
+
+
+@njit_no_refcount
+def grid_low(scene_low, voxel_steps):
+    """Return the lowest lattice coordinate along an axis of the grid cells that hold points.
+
+    float64, exact.
+    """
+    return np.float64(scene_low // voxel_steps * voxel_steps)
+
+
+@njit_no_refcount
+def grid_high(scene_high, voxel_steps):
+    """Return the highest lattice coordinate along an axis of the grid cells that hold points.
+
+    float64, exact.
+    """
+    return np.float64((scene_high // voxel_steps + 1) * voxel_steps - 1)
 
 
 @njit_no_refcount

@@ -8,76 +8,30 @@ exactly; integers decide each point.
 
 import numpy as np
 
-from ....schemas.archive.voxel_grid import KEY_BIAS
 from ....schemas.kernels import compiling as nb
-from ....schemas.kernels.morton import morton_code
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import box_square, has_box
+from ..core.reach import REACH_STACK, list_item
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
-from ..core.voxels_in_reach import find_key
 from .rays import STACK
 
 U = np.uint64  # see placed_avatar.py
 
 
 @nb.njit(nogil=True, cache=True)
-def _find_voxel(keys, ix, iy, iz):
-    """Return the index row of the voxel with these coordinates; -1 if it holds no points.
+def voxels_near(held, x, y, z, square, rows):
+    """List the voxels whose points may lie near a lattice point, nearest first.
 
-    keys: (v,) uint64, sorted.
-    """
-    ix, iy, iz = ix + KEY_BIAS, iy + KEY_BIAS, iz + KEY_BIAS
-    if min(ix, iy, iz) < 0 or max(ix, iy, iz) >= 2 * KEY_BIAS:
-        return -1
-    return find_key(keys, morton_code(np.uint64(ix), np.uint64(iy), np.uint64(iz)))
-
-
-@nb.njit(nogil=True, cache=True)
-def voxels_in_box(held, low, high, rows):
-    """List the voxels whose points may lie in a box.
-
-    held: reference to the scene's arrays.  low, high: (3,) int64, inclusive, lattice coordinates.
-    rows: (capacity,) int64, set to index rows, in an order that depends on the positions alone.
+    held: reference to the scene's arrays.  x, y, z: int64.  square: squared distance [steps^2].
+    rows: (capacity,) int64, set to index rows.
     Returns the number of voxels. Those beyond the capacity are not written.
     """
-    index, steps = held.index, held.scene.voxel_steps
-    first, sizes = np.empty(3, np.int64), np.empty(3, np.int64)
-    for r in range(3):
-        first[r] = max(low[r], index.scene_low[r]) // steps
-        sizes[r] = max(min(high[r], index.scene_high[r]) // steps - first[r] + 1, 0)
-    voxels = index.keys.shape[0]
-    cells = np.float64(sizes[0]) * np.float64(sizes[1]) * np.float64(sizes[2])
-    listed = cells > voxels  # cheaper to test every voxel than every cell of the grid
-    needed = 0
-    for n in range(voxels if listed else np.int64(cells)):
-        row = n
-        if not listed:
-            line = n // sizes[2]
-            x, y, z = line // sizes[1], line % sizes[1], n % sizes[2]
-            row = _find_voxel(index.keys, first[0] + x, first[1] + y, first[2] + z)
-            if row < 0:
-                continue
-        meets = True
-        for r in range(3):
-            meets &= index.low[row, r] <= high[r] and index.high[row, r] >= low[r]
-        if meets:
-            if needed < rows.shape[0]:
-                rows[needed] = row
-            needed += 1
-    return needed
-
-
-@nb.njit(nogil=True, cache=True)
-def voxels_near(held, x, y, z, square, rows):
-    """List the voxels whose points may lie near a lattice point, as `voxels_in_box` does.
-
-    x, y, z: int64.  square: squared distance [steps^2].
-    """
-    reach = np.int64(np.sqrt(np.float64(square))) + 1
-    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    low[0], low[1], low[2] = x - reach, y - reach, z - reach
-    high[0], high[1], high[2] = x + reach, y + reach, z + reach
-    return voxels_in_box(held, low, high, rows)
+    center, near = np.empty(3), np.empty(rows.shape[0])
+    center[0], center[1], center[2] = x, y, z
+    span = np.sqrt(np.float64(square)) * (1.0 + 1e-9) + 1.0
+    return list_item(
+        held.tree, center, center, span, 0.0, held.one.never, np.empty(REACH_STACK, np.int64), rows, near, 0
+    )
 
 
 @njit_no_refcount

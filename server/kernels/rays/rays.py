@@ -33,6 +33,7 @@ from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import enter_box, has_box
 from ..core.node_overlap import U32
 from ..core.placed_avatar import lattice_to_units
+from ..core.reach import MISSING, NOT_HELD, state_of
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, node_class, point_class, stopped
 
 U = np.uint64  # see placed_avatar.py
@@ -240,11 +241,11 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
 
 
 @njit_no_refcount
-def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, deficits):
+def _follow(scene, voxel, rays, i, ray, near, best, rows, bounds, deficits):
     """Follow ray i through the tree of one resident voxel, front to back; update `best`.
 
     deficits: `scene.radius_deficit` in float64 [steps].  near: exact units, as in VoxelLists. A
-    bound of a node holds for its children; no bound therefore gets worse with more visits.
+    bound of a node holds for its children.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -270,9 +271,10 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        if bound > best.value[i] - tolerance or spent >= visits or stopped(scene.stop):
-            if bound <= best.value[i]:
-                best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
+        if bound > best.value[i]:
+            continue
+        if stopped(scene.stop):
+            best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
         first = ints[row + FIRST]
         if first < 0:
@@ -294,36 +296,30 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
 
 
 @nb.njit(nogil=True, cache=True)
-def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
-    """Follow each ray along its list, from its cursor up to the first voxel that is not held.
+def follow_rays(rays, lists, which, cursor, state, scene, best):
+    """Follow the rays numbered in `which` along their lists, each from its cursor on; update `best`.
 
-    One call serves one round. Once the scene's stop flag is set, no more visits are spent.
-    lists: VoxelLists of these rays.  cursor: (k,) int64, entries processed; a ray whose cursor is
-    at the end of its list is finished.  held: (v,) bool, voxels that do not change during this
-    call; a held voxel that is not resident is counted as missing.  tolerance: exact units.  visits:
-    node visits a ray. Updates cursor and best.
+    lists: VoxelLists of these rays.  cursor, state: as in `collide_poses`.
     """
-    ray = np.empty(12)
+    ray, per_step = np.empty(12), scene.units_per_step
     rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
-    deficits = scene.radius_deficit.astype(np.float64) / scene.units_per_step
-    for i in range(cursor.shape[0]):
+    deficits = scene.radius_deficit.astype(np.float64) / per_step
+    for number in range(which.shape[0]):
+        i = which[number]
         end = lists.starts[i + 1]
-        if cursor[i] == end:
-            continue
         set_frame(ray, rays.direction[i])
-        while cursor[i] < end:
+        while cursor[i] < end and not stopped(scene.stop):
             at = cursor[i]
-            near, voxel = lists.near[at], lists.rows[at]
-            if near > best.value[i] - tolerance or best.counts[1, i] >= visits or stopped(scene.stop):
-                if near <= best.value[i]:
-                    best.unseen[i] = min(best.unseen[i], near)
+            near, voxel = lists.near[at] * per_step, lists.rows[at]
+            if near > best.value[i]:
                 cursor[i] = end
                 break
-            if not held[voxel]:
+            may = state_of(state, voxel)
+            if may == NOT_HELD:
                 break
-            if scene.where[voxel, 0] < 0:
+            if may == MISSING:
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, deficits)
+                _follow(scene, voxel, rays, i, ray, near, best, rows, bounds, deficits)
             cursor[i] = at + 1

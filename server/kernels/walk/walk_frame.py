@@ -37,7 +37,7 @@ from .walk_vectors import copy_pose
 @nb.njit(nogil=True, cache=True)
 def walk_frame(
     parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear, settings, avatar, memory, held, stop,
-    unknown, unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares,
+    unknown_everywhere, alone, native, bodies, other_units, least_tolerance, tolerance_units, squares,
     standing, own,
 ):  # fmt: skip
     """Run parts of a frame of one user, or raise AskedError for Python to answer a query.
@@ -47,7 +47,7 @@ def walk_frame(
     pose, and the pose reached.  seconds: duration of the frame.  fell: speed of falling [m/s].
     stood: whether the avatar stood.  verdict: of the frame.  clear: whether `pose` is known to be clear.
     settings, avatar, memory: references, see walk_state.py.
-    held: reference to the scene's arrays.  stop, unknown, unknown_everywhere, other_units: as for
+    held: reference to the scene's arrays.  stop, unknown_everywhere, other_units: as for
     `sweep_resident`.  alone: whether the scene is one archive at the identity.  native: whether queries
     may be answered here: it is alone, and the avatar is small and not empty.  bodies: whether other bodies
     are obstacles.  least_tolerance, tolerance_units: of the frame's budget [m], [exact units].
@@ -56,7 +56,7 @@ def walk_frame(
     own: the avatar's row of them, -1 if it has none; ASKS if Python answers about bodies.
     """
     walk = Walk(
-        settings, avatar, memory, held, stop, unknown, unknown_everywhere, alone, native, bodies, other_units,
+        settings, avatar, memory, held, stop, unknown_everywhere, alone, native, bodies, other_units,
         least_tolerance, tolerance_units, squares, standing, own,
     )  # fmt: skip
     log = memory.log

@@ -4,6 +4,7 @@ import numpy as np
 
 from ....schemas.kernels import compiling as nb
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
+from ..core.reach import all_resident
 from ..rays.near_points import add_near, voxels_near
 from .walk_queries import ask_at, pair_of
 from .walk_state import (
@@ -27,21 +28,18 @@ def _add_near(walk, place, level, sums, directions, heights):
 
     It is unknown unless all voxels within reach are in memory. level: as for `scan_normal`.
     """
-    memory, scene, square = walk.memory, walk.held.scene, walk.squares[level]
+    scene, square, rows = walk.held.scene, walk.squares[level], walk.held.one.reach.lists.rows
     if not walk.native or square == 0:
         return False
     # Rounds half to even, as `Lattice.to_lattice`.
     x = np.int64(np.rint((place[0] - scene.origin[0]) / scene.step))
     y = np.int64(np.rint((place[1] - scene.origin[1]) / scene.step))
     z = np.int64(np.rint((place[2] - scene.origin[2]) / scene.step))
-    count = voxels_near(walk.held, x, y, z, square, memory.rows)
-    if count > memory.rows.shape[0]:
+    count = voxels_near(walk.held, x, y, z, square, rows)
+    if not all_resident(scene.where, rows, count):
         return False
-    voxels = memory.rows[:count]
-    for voxel in voxels:
-        if scene.where[voxel, 0] < 0:
-            return False
-    use_voxels(memory, count)
+    voxels = rows[:count]
+    use_voxels(walk, count)
     add_near(walk.held, voxels, x, y, z, square, sums, directions, heights)
     return True
 

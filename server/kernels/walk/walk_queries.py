@@ -141,20 +141,20 @@ def _sweep(walk, to, tolerance, skin, row):
     within = max(tolerance, walk.least_tolerance)
     needed, verdict, visits, _, _ = sweep_resident(
         pose, to, avatar.body, avatar.scratch, avatar.radius, walk.other_units, avatar.box, walk.held, walk.stop,
-        walk.unknown, walk.unknown_everywhere, within, skin, memory.rows, result[:VERDICT],
+        walk.unknown_everywhere, within, skin, result[:VERDICT],
     )  # fmt: skip
     if needed < 0:
         return False
     if verdict == CONTACT and result[UPPER] == 0.0 and memory.numbers[FRAME_VERDICT] == CONTACT:
         return False  # the frame began in contact: Python answers such motions
-    use_voxels(memory, needed)
+    use_voxels(walk, needed)
     exact = True
     if verdict == CONTACT:
         apart = result[UPPER] - result[LOWER]
         exact = apart == 0.0 or result[SPEED] * apart <= within
         if not exact and not farthest_motion(walk, pose, to) * apart <= MAX_UNDECIDED:
             verdict = UNKNOWN
-    part_unknown = walk.unknown_everywhere or walk.unknown.shape[0] > 0
+    part_unknown = walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0
     count_visits(walk, visits, (verdict == UNKNOWN and exact) or (not exact and part_unknown))
     pair, ends = verdict == CONTACT, verdict == CONTACT and skin >= 0.0
     result[VERDICT], result[ARCHIVE] = verdict, 0.0 if pair else -1.0
@@ -170,19 +170,16 @@ def _sweep(walk, to, tolerance, skin, row):
 def _collide(walk, pose):
     """Return the verdict of the scene at a pose (4, 4); -1 if it is not known."""
     memory, avatar = walk.memory, walk.avatar
-    if walk.unknown_everywhere or walk.unknown.shape[0] > 0:
+    if walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0:
         return -1
     copy_pose(pose, memory.one[0])
-    memory.verdict[0] = CLEAR
-    for n in range(3):
-        memory.counts[n, 0] = np.uint32(0)
-    fault, _, _, needed = collide_resident(
+    fault, _, needed = collide_resident(
         memory.one, avatar.body, avatar.radius, walk.other_units, walk.tolerance_units, walk.held, walk.stop,
-        memory.rows, memory.outside, memory.verdict, memory.counts,
+        memory.verdict, memory.counts,
     )  # fmt: skip
     if fault != VALID or needed < 0:
         return -1
-    use_voxels(memory, needed)
+    use_voxels(walk, needed)
     found = memory.verdict[0]
     verdict = CLEAR if found == CLEAR else UNKNOWN if found == UNKNOWN else CONTACT
     count_visits(walk, np.int64(memory.counts[1, 0]), verdict == UNKNOWN)
@@ -245,13 +242,13 @@ def nearest_point(walk, place, reach):
     row = next_row(memory)
     if row >= memory.log[KNOWN]:
         needed, known, visits = -1, False, 0
-        if walk.native and not (walk.unknown_everywhere or walk.unknown.shape[0] > 0):
+        if walk.native and not (walk.unknown_everywhere or walk.held.tree.unknown.shape[0] > 0):
             cloud = memory.tape[row, CLOUD:ENDED]
-            needed, known, visits = nearest_in_memory(walk.held, place, reach, walk.stop, memory.rows, cloud)
+            needed, known, visits = nearest_in_memory(walk.held, place, reach, walk.stop, cloud)
         if needed < 0:
             memory.asked[3] = reach
             ask_at(walk, NEAREST, place)
-        use_voxels(memory, needed)
+        use_voxels(walk, needed)
         count_visits(walk, visits, False)
         memory.tape[row, HAS_PAIR], memory.tape[row, ARCHIVE] = 1.0 if known else 0.0, 0.0
         memory.log[KNOWN] = row + 1

@@ -76,7 +76,7 @@ _SETTINGS = [
 ]  # fmt: skip
 _AVATAR = ["body", "rows", "surface", "scratch", "box", "points", "radius"]
 _WALK = [
-    "settings", "avatar", "memory", "held", "stop", "unknown", "unknown_everywhere", "alone", "native", "bodies",
+    "settings", "avatar", "memory", "held", "stop", "unknown_everywhere", "alone", "native", "bodies",
     "other_units", "least_tolerance", "tolerance_units", "squares", "standing", "own",
 ]  # fmt: skip
 
@@ -96,9 +96,7 @@ class WalkArrays(NamedTuple):
     normals: NDArray[np.float64]
     asked_poses: NDArray[np.float64]
     asked: NDArray[np.float64]
-    rows: NDArray[np.int64]
     used: NDArray[np.int64]
-    outside: NDArray[np.bool_]
     verdict: NDArray[np.uint8]
     counts: NDArray[np.uint32]
     one: NDArray[np.float64]
@@ -154,7 +152,6 @@ if nb.config.DISABLE_JIT:
         memory: WalkMemory
         held: SceneReference
         stop: NDArray[np.int64]
-        unknown: NDArray[np.int64]
         unknown_everywhere: bool
         alone: bool
         native: bool
@@ -239,8 +236,8 @@ def make_arrays(rows: int, voxels: int) -> WalkArrays:
     tape: (rows, ROW).  log, numbers, values, inputs, poses: with the elements above.
     old_plane: point and normal of the plane that the avatar stood on.  old_raised: place of its last raise.
     hits: (rows,), row of each recorded hit.  normals: (rows, 4), whether its normal is known, and it.
-    asked_poses, asked: of the query that Python answers.  rows: voxels of a query.  used: of all.
-    outside, verdict, counts, one: scratch of `collide_resident`.  saved: state before a call.
+    asked_poses, asked: of the query that Python answers.  used: voxels of all queries.
+    verdict, counts, one: scratch of `collide_resident`.  saved: state before a call.
     """
     return WalkArrays(
         tape=np.zeros((rows, ROW)),
@@ -255,9 +252,7 @@ def make_arrays(rows: int, voxels: int) -> WalkArrays:
         normals=np.zeros((rows, 4)),
         asked_poses=np.zeros((2, 4, 4)),
         asked=np.zeros(16),
-        rows=np.zeros(voxels, np.int64),
         used=np.zeros(4 * voxels, np.int64),
-        outside=np.zeros(1, np.bool_),
         verdict=np.zeros(1, np.uint8),
         counts=np.zeros((3, 1), np.uint32),
         one=np.zeros((1, 4, 4)),
@@ -272,8 +267,7 @@ def refer_to_memory(arrays):
     """Return a reference to the state of a frame."""
     return WalkMemory(
         arrays.tape, arrays.log, arrays.numbers, arrays.values, arrays.inputs, arrays.poses, arrays.old_plane,
-        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.rows, arrays.used,
-        arrays.outside, arrays.verdict, arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values,
+        arrays.old_raised, arrays.hits, arrays.normals, arrays.asked_poses, arrays.asked, arrays.used, arrays.verdict, arrays.counts, arrays.one, arrays.saved_numbers, arrays.saved_values,
         arrays.saved_poses,
     )  # fmt: skip
 
@@ -296,10 +290,11 @@ def next_row(memory):
 
 
 @nb.njit(nogil=True, cache=True)
-def use_voxels(memory, count):
-    """Record a use of the first `count` voxels of memory.rows."""
+def use_voxels(walk, count):
+    """Record a use of the first `count` voxels of the last query."""
+    memory, rows = walk.memory, walk.held.one.reach.lists.rows
     for n in range(count):
-        row, known = memory.rows[n], False
+        row, known = rows[n], False
         for m in range(memory.log[USED]):
             known |= memory.used[m] == row
         if not known and memory.log[USED] < memory.used.shape[0]:

@@ -8,9 +8,7 @@ answered from the voxels themselves.
 """
 
 import math
-import time
-from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +17,13 @@ from ....schemas.archive.archive import Archive
 from ....schemas.archive.level import cover_units, halvings_between
 from ....schemas.archive.voxel_grid import voxel_keys
 from ....schemas.errors import BadRequestError, TooLargeError
+from ...avatars.avatar_model import AvatarModel
+from ...kernels.core.reach import VoxelLists
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...residency.voxel_cache import VoxelCache
+from ..resolve import drop_entries
 from .query_budget import QueryBudget
-from .query_context import LevelOfDetail, SceneData, make_scene_data, with_stop
-
-_A = TypeVar("_A")
-
-# Time after a request's deadline in which it may begin to load voxels of the level [s]. Without it,
-# a request with no time at all would have no bounds until another has loaded them.
-LEVEL_GRACE = 2e-3
+from .query_context import LevelOfDetail, SceneData, check_request, make_scene_data, with_stop
 
 
 class LevelData(NamedTuple):
@@ -73,87 +68,44 @@ def with_level(data: SceneData, level: LevelData | None) -> SceneData:
     return data._replace(level=LevelOfDetail(covers, points, level.settles_exact, level.parents))
 
 
-class SettledPoses:
-    """Poses of one request that its scene's level settles.
+def find_level(data: SceneData, budget: QueryBudget) -> LevelOfDetail | None:
+    """Return the scene's level if a request with this budget asks it about absent voxels.
 
-    settled: (k,) bool, poses whose voxels need not be examined.
+    An exact request that may wait asks it only if the level says so: its voxels would be read in
+    addition to nearly all of the scene's.
     """
-
-    def __init__(
-        self,
-        data: SceneData,
-        poses: NDArray[np.float64],
-        budget: QueryBudget,
-        ask: Callable[[LevelOfDetail, NDArray[np.int64]], NDArray[np.bool_]],
-    ) -> None:
-        """Begin with no pose settled.
-
-        ask: function that asks the level about the poses of some numbers and returns which of them
-        it settles.
-        """
-        self.settled = np.zeros(len(poses), bool)
-        self._asked = np.zeros(len(poses), bool)
-        self._where = data.residency.where
-        level = data.level
-        wanted = level is not None and (budget.tolerance > 0 or budget.relative > 0 or level.settles_exact)
-        # A frame that does not wait has no voxels in reach that the level proves clear (late_voxels.py).
-        self._level = level if wanted and budget.late is None else None
-        if self._level is not None:
-            self._level = stoppable(self._level, budget)
-        self._ask = ask
-
-    def drop(self, reach: VoxelsInReach) -> VoxelsInReach:
-        """Ask about poses with a voxel in reach that is not resident; return the reach without those settled."""
-        if self._level is None:
-            return reach
-        rows = reach.rows[: reach.starts[-1]]
-        absent = self._where[rows, 0] < 0
-        if absent.any():
-            pose_of = np.repeat(np.arange(len(self.settled)), np.diff(reach.starts))
-            cold = np.zeros(len(self.settled), bool)
-            cold[pose_of[absent]] = True
-            which = np.flatnonzero(cold & ~self._asked)
-            self._asked[which] = True
-            if len(which):
-                self.settled[which] = self._answer(which)
-        if not self.settled.any():
-            return reach
-        held = np.where(self.settled, 0, np.diff(reach.starts))
-        starts = np.concatenate([[0], np.cumsum(held)])
-        kept = ~np.repeat(self.settled, np.diff(reach.starts))
-        return reach._replace(starts=starts, rows=np.append(rows[kept], np.int64(-1)))
-
-    def _answer(self, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which poses the level settles."""
-        level = self._level
-        assert level is not None
-        found = asked(lambda: self._ask(level, which))
-        return np.zeros(len(which), bool) if found is None else found
+    level = None if data.nothing_clear else data.level
+    if level is None:
+        return None
+    hurried = budget.deadline < math.inf or budget.late is not None
+    if not (hurried or budget.tolerance > 0 or budget.relative > 0 or level.settles_exact):
+        return None
+    covers, points = (with_stop(each, budget.stop) for each in (level.covers, level.points))
+    return level._replace(covers=covers, points=points)
 
 
-def asked(ask: Callable[[], _A]) -> _A | None:
-    """Return what a query of the level finds; None if its spheres reach too far for the request.
+def level_reach(
+    data: SceneData, avatar: AvatarModel, poses: NDArray[np.float64], beyond: int
+) -> VoxelsInReach | None:
+    """Return the voxels of a level in reach of poses (k, 4, 4); None if its spheres reach too far.
 
-    The scene has accepted the request. The cover spheres are larger than the scene's.
+    The scene has accepted the poses, but cover spheres are larger than its own.
+    data: covers or points of a level.  beyond: the part of the reach that is not the radii, exact
+    units.
     """
     try:
-        return ask()
+        return check_request(data, avatar, poses, data.radius_units + beyond)
     except (BadRequestError, TooLargeError):
         return None
 
 
-def stoppable(level: LevelOfDetail, budget: QueryBudget) -> LevelOfDetail:
-    """Return the same level for a request that only its stop flag ends early."""
-    covers, points = (with_stop(data, budget.stop) for data in (level.covers, level.points))
-    return level._replace(covers=covers, points=points)
+def below(level: LevelOfDetail, lists: VoxelLists, rows: NDArray[np.int64]) -> VoxelLists:
+    """Return the entries of lists of a level whose voxels divide one of the scene's voxels `rows`."""
+    wanted: NDArray[np.bool_] = np.zeros(int(level.parents.max(initial=0)) + 1, bool)
+    wanted[rows[rows < len(wanted)]] = True
+    return drop_entries(lists, ~wanted[level.parents[lists.rows[: lists.starts[-1]]]])
 
 
 def level_budget(budget: QueryBudget) -> QueryBudget:
-    """Return the budget of an exact query of the level for a request with `budget`.
-
-    With a deadline, loads of the level may begin until `LEVEL_GRACE` after the deadline.
-    """
-    until = (
-        max(budget.deadline, time.perf_counter() + LEVEL_GRACE) if budget.deadline < math.inf else math.inf
-    )
-    return QueryBudget(deadline=until, scan=budget.scan, stop=budget.stop)
+    """Return the budget of an exact query of the level for a request with `budget`."""
+    return budget._replace(tolerance=0.0, relative=0.0)

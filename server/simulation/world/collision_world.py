@@ -234,8 +234,8 @@ class World:
         least = np.inf
         with self as seen:
             for each in seen:
-                arrays, index = each.data.arrays, each.data.broad
-                box = np.array([index.scene_low, index.scene_high]) * arrays.step + arrays.origin
+                arrays = each.data.arrays
+                box = each.data.tree.scene * arrays.step + arrays.origin
                 corners = np.array([[box[i & 1, 0], box[i >> 1 & 1, 1], box[i >> 2, 2]] for i in range(8)])
                 if each.placed.pose is not None:
                     corners = transform_points(each.placed.pose, corners)

@@ -113,7 +113,7 @@ class Walker:
             alone = world.is_alone
             native = self.native and alone and probe.is_small and not budget.limited
             squares = normals_of(each).squares(self._reaches) if self._has_normals else _NO_SQUARES
-            held = data.references.to(data.arrays, data.broad)
+            held = data.references.to(data.arrays, data.tree)
             thread.memory.log[state.REPEATS] = 0
             while True:
                 try:
@@ -124,7 +124,7 @@ class Walker:
                         self._code.call(
                             walk_frame, parts, starts, begin, target, pose, seconds, fell, stood, verdict, clear,
                             self._settings, probe.walking, thread.reference, held.reference, data.arrays.stop,
-                            data.unknown, data.nothing_clear, alone, native, bodies, data.radius_units,
+                            data.nothing_clear, alone, native, bodies, data.radius_units,
                             tolerance, budget.tolerance_units, squares, standing, own,
                         )  # fmt: skip
                         log = thread.memory.log.tolist()

@@ -81,7 +81,7 @@ class LeavingPose:
         pose: (4, 4), avatar to archive.
         """
         data, residency = seen.data, seen.data.residency
-        arrays, broad = data.arrays, data.broad
+        arrays, tree = data.arrays, data.tree
         more = self.reach + avatar.radius + data.radius_units / UNITS_PER_METRE + 1e-6
         axes, shift = np.empty((6, 3)), pose[:3, 3] - arrays.origin
         axes[:3], axes[3:] = -pose[:3, :3], pose[:3, :3]
@@ -91,8 +91,8 @@ class LeavingPose:
         nothing = np.empty((0, kernel.GATHERED))
         if data.nothing_clear or _meets(box, data.unknown[:, 0], data.unknown[:, 1]).any():
             return _Gathered(nothing, True)
-        rows = np.flatnonzero(_meets(box, broad.low, broad.high)).tolist()
-        held = data.references.to(arrays, broad)
+        rows = np.flatnonzero(_meets(box, tree.low[: tree.voxels], tree.high[: tree.voxels])).tolist()
+        held = data.references.to(arrays, tree)
         found, count = np.empty((4096, kernel.GATHERED)), 0
         for part in parts_that_fit(residency, rows, residency.buffer.total_bytes):
             with residency.hold(part, budget.loads_until(), stop=budget.stop) as loaded:

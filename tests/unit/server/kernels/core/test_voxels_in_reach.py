@@ -34,7 +34,8 @@ def open_data(case: archive_cases.Case) -> SceneData:
 
 def listed(reach: VoxelsInReach, pose: int) -> list[int]:
     """The voxel rows of one pose."""
-    return reach.rows[reach.starts[pose] : reach.starts[pose + 1]].tolist()
+    lists = reach.lists
+    return sorted(lists.rows[lists.starts[pose] : lists.starts[pose + 1]].tolist())
 
 
 @pytest.mark.parametrize(("shift", "scale", "margin"), [(0.0, 1.0, 0.0), (5.6e6, 1.0, 0.1), (-1e8, 1.0, 3.0)])
@@ -66,7 +67,7 @@ def test_no_voxel_in_reach_is_left_out(
         # And each one listed has its box within reach of the sphere around the avatar.
         center = placed.mean(axis=0)
         ball = np.linalg.norm(placed - center, axis=1).max() * 2 + most * 1.001 + 2 * step * naive.UNITS
-        low, high = data.broad.low[rows] * step * naive.UNITS, data.broad.high[rows] * step * naive.UNITS
+        low, high = data.tree.low[rows] * step * naive.UNITS, data.tree.high[rows] * step * naive.UNITS
         gap = np.maximum(np.maximum(low - center, center - high), 0)
         assert (np.linalg.norm(gap, axis=1) <= ball).all()
 

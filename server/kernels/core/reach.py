@@ -1,0 +1,260 @@
+"""Broad phase of every query: the voxels in reach of poses, points, rays and motions, nearest first.
+
+No voxel is read. The rows of the index are in Morton order; a tree of boxes over them therefore
+groups FAN consecutive rows at a time. An *item* is a ball that stands still, or a cube that moves
+along a straight line. A pose is the ball around the avatar's root sphere, a point the ball of its
+reach; a ray and a part of a motion are moving cubes. All tests are wider than their rounding.
+
+An entry of a list carries `near`, a lower bound of how far away the voxel's points are. It serves
+order and pruning, and bounds what is not in memory. It never decides an answer.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....schemas.kernels import compiling as nb
+from .kernel_decorators import njit_inlined, njit_no_refcount
+from .scene_arrays import ROWS_AT_ONCE, stopped
+
+# What a search may do with a voxel: stop before it, examine it, or count it as missing. An array of
+# states (v,) uint8; an empty one says that all voxels are held.
+NOT_HELD, HELD, MISSING = 0, 1, 2
+U = np.uint64  # see placed_avatar.py
+FAN = 8
+# On each level, FAN - 1 siblings stay on the stack; 2^63 rows have 21 levels.
+REACH_STACK = 22 * FAN
+INFINITE = np.inf
+
+
+class VoxelTree(NamedTuple):
+    """Boxes around the points of the v voxels of an index, level by level, beginning with the voxels.
+
+    low, high: (n, 3) float64 [steps], exact; the first v are those of the voxels, the last is the root.
+    below: (n, 2) int64, first and end of the boxes below a box, at most FAN; -1 for those of voxels.
+    voxels: their number v.
+    scene: (2, 3) float64 [steps], the box of all points.
+    unknown: (u, 2, 3) float64 [steps], boxes of scans that were left out.
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    below: NDArray[np.int64]
+    voxels: int
+    scene: NDArray[np.float64]
+    unknown: NDArray[np.float64]
+
+
+class Items(NamedTuple):
+    """What k items reach, in the frame of the dataset's origin [steps].
+
+    begin, end: (k, 3), equal for an item that stands still.
+    span: (k,) radius of the ball, or half the edge of the moving cube.
+    own: (k,) the part of the span that is the item itself: `near` is the distance beyond it. Unused
+    for items that move, whose `near` is the way to the voxel.
+    """
+
+    begin: NDArray[np.float64]
+    end: NDArray[np.float64]
+    span: NDArray[np.float64]
+    own: NDArray[np.float64]
+
+
+class VoxelLists(NamedTuple):
+    """Voxels that k items reach, for each of them by ascending `near`, then row.
+
+    starts: (k + 1,) int64: the entries of item i are [starts[i], starts[i + 1]).
+    rows: int64, index rows.  near: float64 [steps].
+    unseen: (k,) float64 [steps], the least `near` of a scan that was left out; inf where there is none.
+    """
+
+    starts: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    near: NDArray[np.float64]
+    unseen: NDArray[np.float64]
+
+
+def make_voxel_tree(
+    low: NDArray[np.int64], high: NDArray[np.int64], scene: NDArray[np.int64], unknown: NDArray[np.int64]
+) -> VoxelTree:
+    """Build the tree over voxels whose points lie in the boxes low, high (v, 3) [steps].
+
+    Rows are in Morton order.  scene: (2, 3).  unknown: (u, 2, 3).
+    """
+    lows, highs, below = [low.astype(np.float64)], [high.astype(np.float64)], [np.full((len(low), 2), -1)]
+    start = 0
+    while len(lows[-1]) > 1:
+        count = len(lows[-1])
+        groups = np.arange(0, count, FAN)
+        below.append(start + np.column_stack([groups, np.minimum(groups + FAN, count)]))
+        start += count
+        lows.append(np.minimum.reduceat(lows[-1], groups))
+        highs.append(np.maximum.reduceat(highs[-1], groups))
+    return VoxelTree(
+np.concatenate(lows), np.concatenate(highs), np.concatenate(below), len(low), scene.astype(np.float64),
+        unknown.astype(np.float64),
+    )  # fmt: skip
+
+
+@njit_no_refcount
+def state_of(state, voxel):
+    """Return the state of a voxel."""
+    return np.uint8(HELD) if state.shape[0] == 0 else state[voxel]
+
+
+@njit_no_refcount
+def all_resident(where, rows, needed):
+    """Return whether a list of `needed` rows was written, and all of its voxels are resident."""
+    if needed < 0 or needed > rows.shape[0]:
+        return False
+    for at in range(needed):
+        if where[rows[at], 0] < 0:
+            return False
+    return True
+
+
+@njit_inlined
+def _entry(bx, by, bz, ex, ey, ez, span, low, high, at):
+    """Return the fraction of its way at which a moving cube first meets box `at`; see `entry_fraction`.
+
+    b, e: its centre at both ends.  low, high: (n, 3).
+    """
+    least, most, misses = 0.0, 1.0, False
+    for r in range(3):
+        begin = bx if r == 0 else by if r == 1 else bz
+        way = (ex if r == 0 else ey if r == 1 else ez) - begin
+        near, far = low[at, r] - span - begin, high[at, r] + span - begin
+        if way == 0.0:
+            misses |= near > 0.0 or far < 0.0
+            continue
+        first, last = near / way, far / way
+        if way < 0.0:
+            first, last = last, first
+        # near and far are rounded to 2^-52 of terms; spans are wider than necessary by that much.
+        least, most = max(least, first), min(most, last)
+    if misses or least > most * (1.0 + 1e-12) + 1e-12:
+        return INFINITE
+    return max(0.0, least - 1e-9)
+
+
+@njit_no_refcount
+def entry_fraction(begin, end, span, low, high, at):
+    """Return the fraction of its way at which a moving cube first meets the box low[at] to high[at].
+
+    begin, end: (3,), its centre.  span: half its edge.  low, high: (n, 3). Rounded down; inf if it does
+    not meet the box.
+    """
+    return _entry(begin[0], begin[1], begin[2], end[0], end[1], end[2], span, low, high, at)
+
+
+@njit_no_refcount
+def _sort(rows, near, begin, end, stop):
+    """Sort entries [begin, end) by near, then row (Shell 1959, gaps after Knuth).
+
+    Ends early, unsorted, once `stop` is set.
+    """
+    gap = 1
+    while gap < (end - begin) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(begin + gap, end):
+            if i % ROWS_AT_ONCE == 0 and stopped(stop):
+                return
+            row, key = rows[i], near[i]
+            j = i
+            while j >= begin + gap and (
+                near[j - gap] > key or (near[j - gap] == key and rows[j - gap] > row)
+            ):
+                rows[j], near[j] = rows[j - gap], near[j - gap]
+                j -= gap
+            rows[j], near[j] = row, key
+        gap //= 3
+
+
+@njit_no_refcount
+def list_item(tree, begin, end, span, own, stop, stack, rows, near, count):
+    """Append the voxels in reach of one item to rows and near, from `count` on, sorted.
+
+    begin, end, span, own: of one item, see `Items`.  stop: the request's stop flag; once it is set,
+    the list is incomplete.  stack: (REACH_STACK,) int64, scratch.
+    Returns the new count. Entries beyond the capacity are not written, and the list is then not
+    sorted.
+    """
+    low, high, below, boxes = tree.low, tree.high, tree.below, tree.low.shape[0]
+    bx, by, bz, ex, ey, ez = begin[0], begin[1], begin[2], end[0], end[1], end[2]
+    still = bx == ex and by == ey and bz == ez
+    way, most = math.sqrt((ex - bx) ** 2 + (ey - by) ** 2 + (ez - bz) ** 2), span * span
+    first, depth, capacity = count, 0, rows.shape[0]
+    if boxes > 0:
+        stack[0], depth = boxes - 1, 1
+    while depth > 0 and not stopped(stop):
+        depth -= 1
+        # Unsigned: numba adds a comparison for every index that may be negative.
+        at = U(stack[U(depth)])
+        if still:
+            dx = max(low[at, 0] - bx, bx - high[at, 0], 0.0)
+            dy = max(low[at, 1] - by, by - high[at, 1], 0.0)
+            dz = max(low[at, 2] - bz, bz - high[at, 2], 0.0)
+            gap = dx * dx + dy * dy + dz * dz
+            if not gap <= most:
+                continue
+        else:
+            gap = _entry(bx, by, bz, ex, ey, ez, span, low, high, at)
+            if gap == INFINITE:
+                continue
+        if below[at, 0] >= 0:
+            for box in range(below[at, 0], below[at, 1]):
+                stack[U(depth)] = box
+                depth += 1
+            continue
+        if count < capacity:
+            rows[count] = np.int64(at)
+            near[count] = max(math.sqrt(gap) * (1.0 - 1e-9) - own, 0.0) if still else gap * way
+        count += 1
+    if count - first > 1 and count <= capacity:
+        _sort(rows, near, first, count, stop)
+    return count
+
+
+@njit_no_refcount
+def unknown_near(tree, begin, end, span, own):
+    """Return the least `near` of one item and a scan that was left out; inf where none is in reach."""
+    unknown, least = tree.unknown, INFINITE
+    still = begin[0] == end[0] and begin[1] == end[1] and begin[2] == end[2]
+    for u in range(unknown.shape[0]):
+        square = 0.0
+        for r in range(3):
+            if still:
+                gap = max(unknown[u, 0, r] - begin[r], begin[r] - unknown[u, 1, r], 0.0)
+                square += gap * gap
+            else:
+                square += (end[r] - begin[r]) ** 2
+        if not still:
+            low, high = unknown[:, 0], unknown[:, 1]
+            least = min(least, entry_fraction(begin, end, span, low, high, u) * math.sqrt(square))
+        elif square <= span * span:
+            least = min(least, max(math.sqrt(square) * (1.0 - 1e-9) - own, 0.0))
+    return least
+
+
+@nb.njit(nogil=True, cache=True)
+def list_reach(tree, items, stop, lists):
+    """List the voxels in reach of k items.
+
+    stop: the request's stop flag. Once it is set, the remaining items have no entries, and `unseen`
+    is 0 for these and for the one in hand.
+    Fills `lists`. Returns how many entries are needed; those beyond the capacity are not written.
+    """
+    stack, needed = np.empty(REACH_STACK, np.int64), 0
+    for i in range(items.span.shape[0]):
+        begin, end, span, own = items.begin[i], items.end[i], items.span[i], items.own[i]
+        lists.starts[i] = needed
+        if not stopped(stop):
+            needed = list_item(tree, begin, end, span, own, stop, stack, lists.rows, lists.near, needed)
+            lists.unseen[i] = unknown_near(tree, begin, end, span, own)
+        if stopped(stop):
+            lists.unseen[i] = 0.0
+    lists.starts[items.span.shape[0]] = needed
+    return needed

@@ -1,0 +1,180 @@
+"""The one way in which every query gets the voxels that it needs: a generator of slices.
+
+A query lists the voxels in reach of each of its items (poses, points, rays, motions), nearest first
+(kernels/core/reach.py), and gives the search that examines them. `resolve` first searches the voxels
+that are resident. What these leave open, the query may settle in another way, for example by the
+level of detail (level_of_detail.py). The rest is loaded: `load_and_search` repeats a round until
+every item is finished. A round holds the next voxel of each item, and all later ones that are
+resident, as many as fit in the cache, and calls the search, which goes on where each item stopped.
+A hit in the first voxel therefore loads no second one. A query whose items need their voxels
+together, because it cannot compare parts of an answer exactly (sweep) or collects one item at a time
+(contacts), holds all voxels of as many whole items as fit.
+
+Between two rounds the generator yields, holding nothing. Whoever runs it decides what happens there:
+`run` goes on at once.
+
+A voxel that cannot be read, that comes too late, or that the budget does not wait for is MISSING: the
+search bounds it by its box. Loads that came too late are owed (residency).
+"""
+
+from collections.abc import Callable, Generator
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels.core.reach import HELD, MISSING, NOT_HELD, VoxelLists
+from .context.query_budget import CostCounter, QueryBudget
+from .context.query_context import SceneData
+
+_A = TypeVar("_A")
+
+# What a query is: it yields between two slices of its work, and returns its answers.
+Steps = Generator[None, None, _A]
+# search(lists, which, cursor, state): examine voxels of the items numbered in `which`, each from its
+# entry `cursor` of the lists on, while `state` (v,) uint8 says HELD or MISSING. Move the cursors; an
+# item is finished at the end of its list.
+Search = Callable[[VoxelLists, NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]], None]
+# settle(lists): settle what can be settled without the voxels of `lists`, which are absent; return
+# what is left of the lists.
+Settle = Callable[[VoxelLists], Steps[VoxelLists]]
+
+
+def run(steps: Steps[_A]) -> _A:
+    """Run a query through and return its answers."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as ended:
+            answers: _A = ended.value
+            return answers
+
+
+def resolve(
+    data: SceneData,
+    lists: VoxelLists,
+    search: Search,
+    budget: QueryBudget,
+    spent: CostCounter,
+    settle: Settle | None = None,
+    *,
+    together: bool = False,
+) -> Steps[NDArray[np.float64]]:
+    """Search the voxels in reach of k items; add the cost to `spent`.
+
+    settle: asked about the voxels that are absent; None: load them all.  together: the voxels of an
+    item are searched in one call where they fit in the cache together, instead of those that are
+    resident first.
+    Return (k,) float64 [steps], the least `near` of the voxels that were not searched, because the
+    budget was spent or the request was stopped; inf for items that are finished.
+    """
+    absent = data.arrays.where[lists.rows[: lists.starts[-1]], 0] < 0
+    if settle is None or not absent.any():
+        return (yield from load_and_search(data, lists, search, budget, spent, together=together))
+    if together:
+        cold = yield from settle(drop_entries(lists, ~absent))
+        settled = np.diff(cold.starts) == 0
+        lists = drop_entries(lists, absent & settled[items_of(lists)])
+        return (yield from load_and_search(data, lists, search, budget, spent, together=True))
+    left = yield from load_and_search(data, drop_entries(lists, absent), search, budget, spent)
+    lists = yield from settle(drop_entries(lists, ~absent))
+    return np.minimum(left, (yield from load_and_search(data, lists, search, budget, spent)))
+
+
+def load_and_search(
+    data: SceneData,
+    lists: VoxelLists,
+    search: Search,
+    budget: QueryBudget,
+    spent: CostCounter,
+    *,
+    together: bool = False,
+) -> Steps[NDArray[np.float64]]:
+    """Load the voxels of lists, nearest first and as far as the search needs them; return as `resolve`."""
+    residency, where = data.residency, data.arrays.where
+    cursor, ends = lists.starts[:-1].copy(), lists.starts[1:]
+    state: NDArray[np.uint8] = np.zeros(len(where), np.uint8)
+    looked: NDArray[np.bool_] = np.zeros(len(where), bool)
+    while len(open_ := np.flatnonzero(cursor < ends)) and not budget.spent:
+        if together:
+            open_, rows = _whole_items(data, lists, cursor, open_)
+        else:
+            rows = _next_rows(data, lists, cursor, open_)
+        with residency.hold(rows.tolist(), budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
+            state[rows] = np.where(where[rows, 0] < 0, MISSING, HELD)
+            state[list(held.late)] = MISSING  # another thread may be loading them
+            search(lists, open_, cursor, state)
+        spent.add(held, int(looked[rows].sum()))
+        state[rows], looked[rows] = NOT_HELD, True
+        yield
+    left = np.full(len(cursor), np.inf)
+    open_ = np.flatnonzero(cursor < ends)
+    left[open_] = lists.near[cursor[open_]]
+    return left
+
+
+def _next_rows(
+    data: SceneData, lists: VoxelLists, cursor: NDArray[np.int64], open_: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the distinct voxels to hold in the next round, at least one.
+
+    First come the next voxels of the open items, in the order of the items, then resident ones that
+    some item needs later. Those that do not fit in the cache together are left for another round.
+    """
+    where = data.arrays.where
+    ahead = _distinct(lists.rows[cursor[open_]])
+    later: NDArray[np.bool_] = np.zeros(len(where), bool)
+    later[lists.rows[: lists.starts[-1]]] = True
+    later &= where[:, 0] >= 0
+    later[ahead] = False
+    return _that_fit(data, np.concatenate([ahead, np.flatnonzero(later)]))
+
+
+def _whole_items(
+    data: SceneData, lists: VoxelLists, cursor: NDArray[np.int64], open_: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first open items whose voxels fit in the cache together, and these distinct voxels.
+
+    The voxels of a single item may not fit: then as many as do.
+    """
+    counts = lists.starts[open_ + 1] - cursor[open_]
+    ends = np.cumsum(counts)
+    entries = np.arange(ends[-1]) + np.repeat(cursor[open_] - ends + counts, counts)
+    listed = lists.rows[entries]
+    rows = _that_fit(data, _distinct(listed))
+    left_out = np.flatnonzero(~np.isin(listed, rows))
+    whole = len(open_) if not len(left_out) else int(np.searchsorted(ends, left_out[0], side="right"))
+    return open_[: max(1, whole)], rows
+
+
+def _distinct(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the distinct values in the order of their first occurrence."""
+    return rows[np.sort(np.unique(rows, return_index=True)[1])]
+
+
+def _that_fit(data: SceneData, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the first rows that fit in the cache together, at least one."""
+    residency, capacity = data.residency, data.residency.buffer.total_bytes
+    if residency.bytes_of(rows.tolist()) <= capacity:
+        return rows
+    taken = np.cumsum([residency.bytes_of([row]) for row in rows.tolist()])
+    return rows[: max(1, int(np.searchsorted(taken, capacity, side="right")))]
+
+
+def items_of(lists: VoxelLists) -> NDArray[np.int64]:
+    """Return the number of the item of each entry (starts[-1],)."""
+    return np.repeat(np.arange(len(lists.starts) - 1), np.diff(lists.starts))
+
+
+def drop_entries(lists: VoxelLists, dropped: NDArray[np.bool_]) -> VoxelLists:
+    """Return lists without some of their entries. dropped: (starts[-1],) bool."""
+    if not dropped.any():
+        return lists
+    kept = ~dropped
+    before, n = np.concatenate([[0], np.cumsum(kept)]), len(dropped)
+    return lists._replace(starts=before[lists.starts], rows=lists.rows[:n][kept], near=lists.near[:n][kept])
+
+
+def drop_items(lists: VoxelLists, dropped: NDArray[np.bool_]) -> VoxelLists:
+    """Return lists in which some items have no entries. dropped: (k,) bool."""
+    return drop_entries(lists, dropped[items_of(lists)])

@@ -37,7 +37,7 @@ def collide(
 ) -> CollideAnswers:
     """Test whether the avatar touches the scene under each pose.
 
-    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
+    poses: (k, 4, 4) float64, avatar to world, rigid, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
     budget: a limited one is passed to `collide_bounded`. With a tolerance, CONTACT means a pair
     within margin plus tolerance, and CLEAR none within the margin; the answer has bounds.

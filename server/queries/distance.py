@@ -43,7 +43,7 @@ def distance(
 ) -> DistanceAnswers:
     """Compute the distance of the avatar from the scene under each pose, up to `reach` [m].
 
-    poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale.
+    poses: (k, 4, 4) float64, avatar to world, rigid.
     reach: pairs whose spheres are farther apart than this do not count; reach and largest radii
     together are at most 16 m.
     budget: with a tolerance, the pair found may be farther than the nearest one by as much as it

@@ -34,14 +34,12 @@ _ROUNDING = 4.0
 class Motions(NamedTuple):
     """Motions of a sweep, with the dataset's origin at zero.
 
-    first, last: (k, 4, 4).  scales, units, loose: (k,), as in `advance_segments`.  box: of the avatar.
+    first, last: (k, 4, 4).  units: (k,), as in `advance_segments`.  box: of the avatar.
     """
 
     first: NDArray[np.float64]
     last: NDArray[np.float64]
-    scales: NDArray[np.float64]
     units: NDArray[np.int64]
-    loose: NDArray[np.float64]
     box: NDArray[np.float64]
 
 
@@ -126,11 +124,9 @@ def _clear_by_bounds(
     until = np.zeros(len(motions.first))
     for i, (first, last) in enumerate(zip(motions.first, motions.last, strict=True)):
         speed, slip = motion_bounds(first, last, motions.box)
-        held = float(motions.units[i]) + _ROUNDING + 2.0 * slip * UNITS_PER_METRE + float(motions.loose[i])
-        at = slice(i, i + 1)
-        reach = VoxelsInReach(
-            motions.scales[at], motions.units[at], starts, rows, np.zeros((1, 2, 3)), np.zeros(1, bool)
-        )
+        held = float(motions.units[i]) + _ROUNDING + 2.0 * slip * UNITS_PER_METRE
+        units = motions.units[i : i + 1]
+        reach = VoxelsInReach(units, starts, rows, np.zeros((1, 2, 3)), np.zeros(1, bool))
         for _ in range(_MAX_ADVANCES):
             pose_between(first, last, until[i], motions.box, origin, pose[0])
             bound, counts = np.full(1, math.inf), np.zeros((3, 1), np.uint32)

@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
-from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE, VoxelsInReach, check_poses
+from ..kernels.core.voxels_in_reach import VoxelsInReach, check_poses
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
@@ -32,36 +32,18 @@ def _check(
     first: NDArray[np.float64],
     last: NDArray[np.float64],
     other_units: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Check the poses of k motions, and return scales, reaches and their variation, (k,) each.
+) -> NDArray[np.int64]:
+    """Check the poses of k motions, and return the reach (k,) of each [exact units].
 
-    Scale and reach are the larger of those at both ends. The reach is in exact units and includes
-    the scan's largest sphere. The variation bounds how much the reach changes during the motion
-    [exact units].
+    The reach includes the scan's largest sphere.
     """
-    k = len(first)
-    scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some unchanged
-    for end, poses in enumerate((first, last)):
+    units = np.zeros(len(first), np.int64)  # a stop may leave some unchanged
+    for poses in (first, last):
         fault, pose, found = check_poses(
-            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales[end], units[end]
+            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, units
         )
         refuse(fault, pose, found)
-    apart = np.abs(scales[1] - scales[0]) > SIMILARITY_TOLERANCE * scales[0]
-    if apart.any():
-        i = int(apart.argmax())
-        raise BadTransformError(
-            f"motion {i} begins at scale {scales[0, i]:g} and ends at {scales[1, i]:g}: expected one scale "
-            "within 1e-9: a rigid motion changes no size"
-        )
-    # During the motion the scale lies between those of the ends. If both are well within 1e-9 of 1,
-    # it is 1 throughout (voxels_in_reach.py).
-    rigid = np.ones(k, bool)
-    for poses in (first, last):
-        rigid &= np.abs((poses[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3.0 - 1.0) <= SIMILARITY_TOLERANCE
-    most = units.max(axis=0)
-    loose = np.where(rigid, 0.0, most - units.min(axis=0) + 2.0)
-    loose[~rigid] += 2.0 * SIMILARITY_TOLERANCE * scales.max(axis=0)[~rigid] * avatar.radius * UNITS_PER_METRE
-    return scales.max(axis=0), most, loose
+    return units
 
 
 def _from_origin(
@@ -116,8 +98,7 @@ def sweep(
     kernels/motion/screw_motion.py defines the motion, in the dataset's frame: translations are
     t - O (NUMERICS.md N5). Each scan point has the sphere given by the radius model of `data`,
     constant during the motion.
-    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid or of one scale, bits used as
-    given.
+    pose_from, pose_to: (k, 4, 4) float64, avatar to world, rigid, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
     tolerance: how far any avatar point may move between `lower` and `upper` [m]; the tolerance of
     `budget` if that is larger.
@@ -185,7 +166,7 @@ def _sweep(
         )
     k = len(first)
     other_units = data.radius_units + to_units(margin, "margin")
-    scales, units, loose = _check(data, avatar, first, last, other_units)
+    units = _check(data, avatar, first, last, other_units)
     world = first, last
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
@@ -208,7 +189,7 @@ def _sweep(
     while len(which):
         begun = progress.at.copy()
         unproved = bounds.unproved
-        planned = box, first, last, avatar.arrays, scales, units, data.arrays
+        planned = box, first, last, avatar.arrays, units, data.arrays
         needed = plan_segments(*planned, data.broad, which, progress, starts, rows)
         if needed < 0:
             break
@@ -251,7 +232,7 @@ def _sweep(
         near = starts, rows
         if absent is not None:
             near = absent.set_aside(starts, rows, data.arrays.where)
-        around = VoxelsInReach(scales, units, *near, boxes, outside)
+        around = VoxelsInReach(units, *near, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
             chunk = len(part) if budget.deadline == np.inf else _PER_CALL
             if budget.stop:
@@ -263,9 +244,8 @@ def _sweep(
                     if budget.spent:
                         progress.visits[part[at:]] = -1
                     advance_segments(
-                        box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
-                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, scratch,
-                        progress, counts,
+                        box, first, last, avatar.arrays, units, seen.arrays, data.broad, reach.starts, reach.rows,
+                        part[at : at + chunk], tolerance, scratch, progress, counts,
                     )  # fmt: skip
             spent.add(held)
         which = _next_round(which, progress, proved)
@@ -275,7 +255,7 @@ def _sweep(
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
     if absent is not None and absent.rows and not absent.restricted:
-        motions = Motions(first, last, scales, units, loose, box)
+        motions = Motions(first, last, units, box)
         clear = clear_until(
             data, avatar, motions, absent, budget,
             lambda covers, own: _sweep(covers, avatar, pose_from, pose_to, margin, tolerance, budget, None, own),
@@ -293,7 +273,6 @@ def _sweep(
         first,
         last,
         avatar.arrays,
-        scales,
         units,
         data.arrays,
         data.broad,

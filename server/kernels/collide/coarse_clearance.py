@@ -131,7 +131,7 @@ def _copy_unproved_pairs(
     """Implement `copy_unproved_pairs` with its scratch passed in."""
     left = 0
     for i in range(poses.shape[0]):
-        m, scale = poses[i], reach.scales[i]
+        m = poses[i]
         starts[i] = left
         front = 0  # its length; not placed yet, as most poses never need it
         for at in range(reach.starts[i], reach.starts[i + 1]):
@@ -141,7 +141,7 @@ def _copy_unproved_pairs(
             number = np.int64(coarse.slot[voxel])
             if number >= 0 and scene.where[voxel, 0] < 0 and not stopped(scene.stop):
                 if front == 0:
-                    extent, farthest = place_root(avatar, m, scale, placed, scene)
+                    extent, farthest = place_root(avatar, m, placed, scene)
                     set_class_thresholds(
                         by_class,
                         scene.radius_deficit,
@@ -151,7 +151,7 @@ def _copy_unproved_pairs(
                         farthest,
                         scene.voxel_steps,
                     )
-                    front = place_front(avatar, m, scale, placed, scene, extent, bounds)
+                    front = place_front(avatar, m, placed, scene, extent, bounds)
                 if _is_clear(
                     avatar, m, i, scene, coarse, voxel, number, placed, by_class, bounds, front, met, keep
                 ):

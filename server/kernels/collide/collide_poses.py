@@ -66,9 +66,7 @@ U = np.uint64  # see placed_avatar.py
 
 
 @njit_no_refcount
-def _collide_voxel(
-    avatar, m, scale, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch
-):
+def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch):
     """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets.
 
     The scene's tree is descended depth first, each node with a list of
@@ -144,7 +142,7 @@ def _collide_voxel(
                             continue
                     elif first < 0:
                         found = below_touches(
-                            avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch
+                            avatar, m, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch
                         )  # fmt: skip
                         if found != CLEAR:
                             return found
@@ -235,9 +233,9 @@ def _collide_poses(
         if stopped(scene.stop):
             verdict[i] = UNKNOWN
             continue
-        m, scale = poses[i], reach.scales[i]
+        m = poses[i]
         scratch.counters[0], scratch.counters[1] = 0, 0
-        extent, farthest = place_root(avatar, m, scale, placed, scene)
+        extent, farthest = place_root(avatar, m, placed, scene)
         error = set_class_thresholds(
             by_class,
             scene.radius_deficit,
@@ -269,9 +267,9 @@ def _collide_poses(
             if not nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
                 continue
             if count == 0:
-                count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
+                count = place_front(avatar, m, placed, scene, extent, front.bounds)
             found = _collide_voxel(
-                avatar, m, scale, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
+                avatar, m, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
             )
             if found != CLEAR:
                 verdict[i] = found
@@ -314,7 +312,7 @@ def collide_resident(poses, body, radius, other_units, tolerance, held, stop, ro
     avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
     k = poses.shape[0]
     reach = VoxelsInReach(
-        np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside
+        np.empty(k, np.int64), np.zeros(k + 1, np.int64), rows, np.empty((k, 2, 3)), outside
     )
     fault, pose, found, needed = find_reach(poses, avatar, radius, other_units, scene, index, reach)
     if fault != VALID or needed < 0 or needed > rows.shape[0]:

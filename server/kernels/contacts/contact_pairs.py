@@ -249,7 +249,7 @@ def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, 
         if cursor[1] < 0:
             cursor[1], cursor[2] = reach.starts[i], 0
         if cursor[1] < end and options.visits >= 0:
-            extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+            extent, farthest = place_nodes(avatar, poses[i], placed, scene)
             _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
             scratch.bound[0] = listing_bound(
                 state.heap, state.sizes[KEPT], scene.units_per_step, scratch.error[0]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.archive.rigid_pose import RIGID_TOLERANCE
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import KEY_BIAS, MAX_COORDINATE
 from ....schemas.kernels import compiling as nb
@@ -21,11 +22,9 @@ from .scene_arrays import stopped
 POSES_AT_ONCE = 64
 CELLS_AT_ONCE = 1024
 
-SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
-SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 # Coordinates near a pose must be exact in float32, with a bit to spare (collide_poses.py).
 MAX_FRAME_STEPS = 1 << 23
-VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
+VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, SCALED, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
 
 
 class SceneIndex(NamedTuple):
@@ -48,13 +47,12 @@ class SceneIndex(NamedTuple):
 class VoxelsInReach(NamedTuple):
     """Voxels that k poses could touch.
 
-    scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.
+    units: (k,) int64, r_a + r_b + margin in exact units.
     starts: (k + 1,), rows: int64: the voxel rows of pose i are rows[starts[i]:starts[i + 1]].
     boxes: (k, 2, 3) float64, the box of the root sphere and its reach [steps].
     outside: (k,) bool, whether that box extends beyond the scene's box.
     """
 
-    scales: NDArray[np.float64]
     units: NDArray[np.int64]
     starts: NDArray[np.int64]
     rows: NDArray[np.int64]
@@ -63,18 +61,18 @@ class VoxelsInReach(NamedTuple):
 
 
 @njit_no_refcount
-def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
-    """Check that poses (k, 4, 4) float64 are similarities (N6); compute scales and reaches.
+def check_poses(poses, node_radius, radius, other_units, scene, units):
+    """Check that poses (k, 4, 4) float64 are rigid (N6); compute reaches.
 
-    Writes scales (k,) and units (k,) int64, the reach of each pose in exact units.
+    Writes units (k,) int64, the reach of each pose in exact units.
     node_radius: (a,) of the avatar's nodes, root first, may be empty.  radius: of its points [m].
     other_units: the scan's radius plus the margin, exact units.  scene: SceneArrays.
-    A scale within SIMILARITY_TOLERANCE of 1 becomes 1, so that the rounding of a rigid pose does
-    not change a radius.
     Returns (GOOD, 0, 0.0), or the first fault, its pose and the value found. Once scene.stop is
     set, it also returns (GOOD, 0, 0.0), with the output incomplete: the caller must then check the
     stop flag.
     """
+    reach = np.rint(radius * UNITS_PER_METRE) + float(other_units)
+    extent = reach / UNITS_PER_METRE + (node_radius[0] if node_radius.shape[0] else 0.0)
     for i in range(poses.shape[0]):
         if i % POSES_AT_ONCE == 0 and stopped(scene.stop):
             break
@@ -88,9 +86,6 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
         for r in range(3):
             if not abs(m[r, 3]) <= MAX_COORDINATE:
                 return TOO_FAR, i, m[r, 3]
-            for c in range(3):
-                if not abs(m[r, c]) <= 2.0 * LARGEST_SCALE:
-                    return BAD_SCALE, i, m[r, c]
         minor0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
         minor1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
         minor2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
@@ -100,11 +95,6 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
             for c in range(3):
                 square += m[r, c] * m[r, c]
         square /= 3.0
-        scale = math.sqrt(square)
-        # A scale of 1000 is valid, even if its square root is rounded up.
-        least = SMALLEST_SCALE * (1.0 - SIMILARITY_TOLERANCE)
-        if not least <= scale <= LARGEST_SCALE * (1.0 + SIMILARITY_TOLERANCE):
-            return BAD_SCALE, i, scale
         worst = 0.0
         for a in range(3):
             for b in range(3):
@@ -112,16 +102,16 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
                 worst = max(worst, abs(dot - (square if a == b else 0.0)))
         # Factor 2: an entry that is off by the tolerance changes a product of two entries by twice
         # that.
-        if worst > 2.0 * SIMILARITY_TOLERANCE * square:
+        if worst > 2.0 * RIGID_TOLERANCE * square:
             return SHEARED, i, worst / square
         if volume < 0.0:
             return MIRRORED, i, volume
-        scales[i] = 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
-        reach = np.rint(scales[i] * radius * UNITS_PER_METRE) + float(other_units)
+        scale = math.sqrt(square)
+        if not abs(scale - 1.0) <= RIGID_TOLERANCE:
+            return SCALED, i, scale
         if reach > MAX_REACH_UNITS:
             return LONG_REACH, i, reach / UNITS_PER_METRE
         units[i] = np.int64(reach)
-        extent = reach / UNITS_PER_METRE + (node_radius[0] * scales[i] if node_radius.shape[0] else 0.0)
         if extent / scene.step + scene.voxel_steps > MAX_FRAME_STEPS:
             return LARGE_AVATAR, i, extent
     return VALID, 0, 0.0
@@ -179,9 +169,7 @@ def find_reach(poses, avatar, radius, other_units, scene, index, reach):
     exact units. Fills `reach`.
     Returns (fault, pose, value found), as `check_poses` does, and the number of rows needed.
     """
-    fault, pose, found = check_poses(
-        poses, avatar.radius, radius, other_units, scene, reach.scales, reach.units
-    )
+    fault, pose, found = check_poses(poses, avatar.radius, radius, other_units, scene, reach.units)
     if fault != VALID or avatar.radius.shape[0] == 0:
         return fault, pose, found, 0
     return fault, pose, found, voxels_in_reach(poses, avatar, scene, index, reach)
@@ -193,7 +181,7 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
 
     The order depends on the positions alone.
     poses: (k, 4, 4), checked.  avatar: not empty.  scene: SceneArrays.
-    Fills starts, rows, boxes and outside of `reach` from its scales and units. Returns how many
+    Fills starts, rows, boxes and outside of `reach` from its units. Returns how many
     rows are needed; those beyond the capacity are not written. Returns -1 when the scene's stop
     flag is set; `reach` is then not filled.
     The reach is widened by more than the rounding of this function: a millionth of itself, one
@@ -213,9 +201,7 @@ def voxels_in_reach(poses, avatar, scene, index, reach):
         m = poses[i]
         for r in range(3):
             shift[r] = m[r, 3] - scene.origin[r]
-        span = (avatar.radius[0] * reach.scales[i] / step + reach.units[i] / units_per_step) * (
-            1.0 + 1e-6
-        ) + 1.0
+        span = (avatar.radius[0] / step + reach.units[i] / units_per_step) * (1.0 + 1e-6) + 1.0
         span += largest_term(m, shift, x, y, z) / step * 2.0**-49
         cells = 1.0
         outside[i] = False

@@ -22,14 +22,12 @@ MAX_REFUSED = 512
 
 @nb.njit(nogil=True, cache=True)
 def advance_segments(
-    box, first, last, avatar, radius, other_units, scales, units, loose, scene, index, starts, rows, which, tolerance,
-    scratch, progress, counts,
+    box, first, last, avatar, units, scene, index, starts, rows, which, tolerance, scratch, progress, counts
 ):  # fmt: skip
     """Advance the motions numbered in `which` along their segments: one call for all of a piece.
 
-    box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
-    the way.  starts, rows: the voxels of each motion's segment that this piece holds.  tolerance:
-    [m].  scratch: `make_scratch` of the avatar.
+    box, first, last, units: as in `plan_segments`.  starts, rows: the voxels of each motion's segment
+    that this piece holds.  tolerance: [m].  scratch: `make_scratch` of the avatar.
     Lowers progress.lower and upper, sets a witness with upper, of equal ones the first by
     NUMERICS.md N11, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
     A voxel that is not resident makes the motion unknown from where the root sphere's cube reaches
@@ -45,12 +43,10 @@ def advance_segments(
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
         t0, t1 = progress.at[i], progress.end[i]
-        span = place_root_sphere(
-            motion, t0, avatar, scales[i], units[i], scene, moving.pose, moving.shift, begin
-        )
+        span = place_root_sphere(motion, t0, avatar, units[i], scene, moving.pose, moving.shift, begin)
         span = max(
             span,
-            place_root_sphere(motion, t1, avatar, scales[i], units[i], scene, moving.pose, moving.shift, end),
+            place_root_sphere(motion, t1, avatar, units[i], scene, moving.pose, moving.shift, end),
         )
         span += sagitta_of(motion, t1 - t0, scene)
         gap = INFINITE
@@ -60,18 +56,8 @@ def advance_segments(
                 counts[0, i] += np.uint32(1)
                 gap = min(gap, entry_fraction(begin, end, span, index.low[row], index.high[row]))
         moving.counters[0], moving.counters[1], moving.counters[3] = 0, 0, progress.visits[i]
-        sweep = AvatarSweep(
-            motion,
-            avatar,
-            scene,
-            moving,
-            radius,
-            scales[i],
-            other_units,
-            np.int64(units[i]),
-            np.float64(loose[i]),
-        )
-        size = avatar_size(box, scales[i], units[i])
+        sweep = AvatarSweep(motion, avatar, scene, moving, np.int64(units[i]))
+        size = avatar_size(box, units[i])
         near = rows[starts[i] : starts[i + 1]]
         lower, upper, steps = _advance(sweep, t0, t1, progress.upper[i], near, size, tolerance)
         if gap < INFINITE:

@@ -145,7 +145,7 @@ def make_search(avatar, scene, heap):
 def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, counts):
     """Start a search for pose i: all voxels in reach, with bounds from the index."""
     best, placed = search.best, search.placed
-    best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+    best.frame[0], best.frame[1] = place_nodes(avatar, poses[i], placed, scene)
     best.frame[2], best.frame[3] = scene.units_per_step, scene.voxel_steps
     best.units[0] = reach.units[i] + min(goal.early, MAX_REACH_UNITS - reach.units[i])
     best.found[0], best.found[7] = results.square[i], results.deficit[i]
@@ -160,7 +160,7 @@ def _begin_search(poses, avatar, scene, index, reach, i, search, goal, results, 
     set_cut(best.squares if goal.first else best.cut, best.far, best.frame, best.deficit, within)
     search.sizes[0], search.sizes[1], search.status[0] = 0, 0, OPEN
     keys, pairs = search.keys, search.pairs
-    root = avatar.radius[0] * reach.scales[i]
+    root = avatar.radius[0]
     for at in range(reach.starts[i], reach.starts[i + 1]):
         if at % ROWS_AT_ONCE == 0 and stopped(scene.stop):
             results.missing_bound[i] = 0.0  # as though the remaining voxels were missing

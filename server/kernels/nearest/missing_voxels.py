@@ -84,7 +84,7 @@ def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, row
             missing_bound[i] = 0.0
             counts[0, i] += np.uint32(reach.starts[i + 1] - reach.starts[i])
             continue
-        m, scale = poses[i], reach.scales[i]
+        m = poses[i]
         length, error, farthest = 0, 0.0, 0.0  # the front is not placed yet
         for at in range(reach.starts[i], reach.starts[i + 1]):
             if ended or (at % ROWS_AT_ONCE == 0 and stopped(scene.stop)):
@@ -98,15 +98,15 @@ def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, row
                 left += 1
                 continue
             if length == 0:
-                extent, farthest = place_root(avatar, m, scale, placed, scene)
-                length = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
+                extent, farthest = place_root(avatar, m, placed, scene)
+                length = place_front(avatar, m, placed, scene, extent, front.bounds)
                 thresholds = make_thresholds(
                     reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps
                 )
                 error = np.float64(thresholds.error)
                 for r in range(4):
                     root[r] = placed.nodes[r, 0]
-            gap = box_distance(avatar.radius[0] * scale, placed, farthest, scene, index, voxel)
+            gap = box_distance(avatar.radius[0], placed, farthest, scene, index, voxel)
             ended = stopped(scene.stop)  # the nodes of a voxel take some microseconds
             if slots > 0 and coarse.slot[voxel] >= 0 and not ended:
                 slot = np.int64(coarse.slot[voxel])

@@ -62,8 +62,8 @@ def nearest_resident(poses, body, radius, radius_units, reach_units, reach, held
     """
     avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
     outside = np.zeros(1, np.bool_)
-    scales, units = np.empty(1), np.empty(1, np.int64)
-    around = VoxelsInReach(scales, units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)
+    units = np.empty(1, np.int64)
+    around = VoxelsInReach(units, np.zeros(2, np.int64), rows, np.empty((1, 2, 3)), outside)
     fault, pose, found, needed = find_reach(
         poses, avatar, radius, radius_units + reach_units, scene, index, around
     )

@@ -81,7 +81,6 @@ def _clear_of_level(
         parts.append(around.rows[begin:end][parents[begin:end] == row])
     starts = np.concatenate([[0], np.cumsum([len(part) for part in parts])])
     own = around._replace(
-        scales=around.scales[pose_of],
         units=around.units[pose_of],
         starts=starts,
         rows=np.append(np.concatenate(parts), np.int64(-1)),

@@ -46,14 +46,18 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
     ),
     pose_checks.MIRRORED: (
         BadTransformError,
-        "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
+        "mirrors (determinant {:g}): expected a rotation",
     ),
     pose_checks.SHEARED: (
         BadTransformError,
-        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
-        f"most, within 1e-9: {RENORMALISE}",
+        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, within 1e-9: "
+        f"{RENORMALISE}",
     ),
-    pose_checks.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
+    pose_checks.SCALED: (
+        BadTransformError,
+        "scales by {0:.10g}: expected a rigid pose, within 1e-9: add a scaled avatar, "
+        f"add_avatar(..., scale={{0:.10g}}), or remove the scale: {RENORMALISE}",
+    ),
     pose_checks.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
     pose_checks.LONG_REACH: (
         BadRequestError,
@@ -196,7 +200,7 @@ def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
 def _empty_reach(k: int, rows: int) -> VoxelsInReach:
     """Return an empty `VoxelsInReach` for k poses with capacity for `rows` voxel rows."""
     return VoxelsInReach(
-        np.empty(k), np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
+        np.empty(k, np.int64), np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty((k, 2, 3)),
         np.zeros(k, bool),
     )  # fmt: skip
 
@@ -322,7 +326,7 @@ def pieces(
     There is nearly always one piece. A pose whose voxels exceed the budget by themselves appears in
     several pieces, each with a run of its voxels (NUMERICS.md case 23).
     """
-    k = len(reach.scales)
+    k = len(reach.units)
     rows = reach.rows[: reach.starts[k]]
     everything = (distinct_rows(rows, len(residency.where), stop) if k > 1 else rows).tolist()
     capacity = int(residency.buffer.total_bytes * share)

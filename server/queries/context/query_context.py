@@ -44,10 +44,7 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
         BadTransformError,
         "has a last row that is not 0 0 0 1: give row-major 4x4 poses",
     ),
-    pose_checks.MIRRORED: (
-        BadTransformError,
-        "mirrors (determinant {:g}): expected a rotation",
-    ),
+    pose_checks.MIRRORED: (BadTransformError, "mirrors (determinant {:g}): expected a rotation"),
     pose_checks.SHEARED: (
         BadTransformError,
         "shears, or scales its axes differently (by {:g}, relative): expected a rotation, within 1e-9: "

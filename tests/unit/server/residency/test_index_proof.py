@@ -38,7 +38,7 @@ def reach_of(bounds: ProvedBounds, poses: int, rng: np.random.Generator) -> Voxe
     center = rng.uniform(bounds.index.low.min(), bounds.index.high.max(), (poses, 1, 3))
     span = rng.uniform(1.0, 5000.0, (poses, 1, 1))
     return VoxelsInReach(
-        np.ones(poses), np.zeros(poses, np.int64), np.arange(poses + 1) * v, np.tile(np.arange(v), poses),
+        np.zeros(poses, np.int64), np.arange(poses + 1) * v, np.tile(np.arange(v), poses),
         np.concatenate([center - span, center + span], axis=1), np.zeros(poses, bool),
     )  # fmt: skip
 

@@ -52,37 +52,36 @@ def scattered(rng: np.random.Generator, side: int, count: int) -> SceneIndex:
     return SceneIndex(keys[order], low, high, low.min(axis=0), high.max(axis=0))
 
 
-def room(poses: int, rows: int, units: int, scale: float = 1.0) -> VoxelsInReach:
+def room(poses: int, rows: int, units: int) -> VoxelsInReach:
     """A reach to be filled."""
     return VoxelsInReach(
-        np.full(poses, scale), np.full(poses, units), np.full(poses + 1, -1), np.full(rows, -1),
+        np.full(poses, units), np.full(poses + 1, -1), np.full(rows, -1),
         np.full((poses, 2, 3), np.nan), np.ones(poses, bool),
     )  # fmt: skip
 
 
-def spans(poses: NDArray[np.float64], units: int, scale: float) -> tuple[NDArray[np.float64], float]:
+def spans(poses: NDArray[np.float64], units: int) -> tuple[NDArray[np.float64], float]:
     """Where the root's centres are, and how far the reach goes [steps], widened as documented."""
     center = (poses[:, :3, :3] @ AVATAR.center[0] + (poses[:, :3, 3] - SCENE.origin)) / STEP
-    span = (AVATAR.radius[0] * scale / STEP + units / UNITS_PER_STEP) * (1 + 1e-6) + 1.0
+    span = (AVATAR.radius[0] / STEP + units / UNITS_PER_STEP) * (1 + 1e-6) + 1.0
     return center, span
 
 
-@pytest.mark.parametrize("scale", [1.0])
 @pytest.mark.parametrize(("side", "count"), [(2, 20), (3, 150), (12, 60), (2, 1)])
-def test_the_voxels_listed_are_those_whose_box_a_ball_touches(side: int, count: int, scale: float) -> None:
+def test_the_voxels_listed_are_those_whose_box_a_ball_touches(side: int, count: int) -> None:
     rng = np.random.default_rng([side, count])
     index = scattered(rng, side, count)
     poses = []
     for i in range(30):
-        turn = archive_cases.random_rotation(rng) * scale
+        turn = archive_cases.random_rotation(rng)
         at = rng.uniform(-side - 1, side + 1, 3) * VOXEL_STEPS * STEP
         if i % 2:
             at = (index.low[rng.integers(len(index.low))] + rng.uniform(-30, 30, 3)) * STEP
         poses.append(archive_cases.pose_of(turn, SCENE.origin + at - turn @ AVATAR.center[0]))
     stack, units = np.array(poses), int(0.02 * 2**26)
-    reach = room(len(stack), 4000, units, scale)
+    reach = room(len(stack), 4000, units)
     needed = voxels_in_reach(stack, AVATAR, SCENE, index, reach)
-    center, span = spans(stack, units, scale)
+    center, span = spans(stack, units)
     assert needed == reach.starts[-1] and reach.starts[0] == 0
     assert (reach.rows[needed:] == -1).all() and (reach.rows[:needed] >= 0).all()
     met = 0
@@ -99,7 +98,7 @@ def test_the_voxels_listed_are_those_whose_box_a_ball_touches(side: int, count: 
         assert reach.outside[i] == (not inside)
     assert met > 0
     # With room for fewer, those that fit are the same, and as many are said to be needed.
-    few = room(len(stack), needed // 2, units, scale)
+    few = room(len(stack), needed // 2, units)
     assert voxels_in_reach(stack, AVATAR, SCENE, index, few) == needed
     assert few.starts.tolist() == reach.starts.tolist()
     assert few.rows.tolist() == reach.rows[: needed // 2].tolist()

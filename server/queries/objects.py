@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import ObjectsAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
@@ -27,10 +27,6 @@ from .resident_fast_path import collide_fast
 SCENE_GROUP = 1 << 31
 # Pairs tested between two checks of a deadline.
 PAIRS_PER_CHECK = 64
-# Largest distance of an object from the dataset's origin [m]: 2^37 m in exact units do not fit in
-# 63 bits. No object this far away is compared with the scene, but objects are compared with one
-# another everywhere.
-MAX_PLACE = 1e11
 
 
 class CheckedObjects(NamedTuple):
@@ -135,7 +131,6 @@ def _check(
         fault, pose, found = check_poses(array[rows], model.arrays.radius, model.radius, 0, data.arrays, unit)
         refuse(fault, int(rows[pose]), found)
         units[rows] = unit
-        _check_places(model, array, rows, data.arrays.origin)
     if n > 1:
         first, second = (int(row) for row in np.argsort(-units, kind="stable")[:2])
         together = int(units[first] + units[second]) + margin_units
@@ -145,26 +140,6 @@ def _check(
                 "expected at most 16 m: give a smaller margin or radius"
             )
     return CheckedObjects(list(distinct.values()), model_of, array, group, mask, units, margin_units)
-
-
-def _check_places(
-    model: AvatarModel,
-    poses: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    origin: NDArray[np.float64],
-) -> None:
-    """Raise BadTransformError if an object of this avatar is too far away for exact units."""
-    if not len(model.points):
-        return
-    center = np.abs(poses[rows, :3, :3]) @ np.abs(model.arrays.center[0]) + np.abs(
-        poses[rows, :3, 3] - origin
-    )
-    farthest = center.max(axis=1) + model.arrays.radius[0]
-    if (farthest > MAX_PLACE).any():
-        i = int(farthest.argmax())
-        raise BadTransformError(
-            f"object {rows[i]} reaches {farthest[i]:g} m from the dataset's origin: expected within {MAX_PLACE:g} m"
-        )
 
 
 def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:

@@ -167,7 +167,7 @@ def test_thousands_of_small_objects_as_all_pairs_say(data: SceneData, rng: np.ra
     units = naive.placed_units(np.zeros((1, 3)), poses[0], data.arrays.origin)
     units = np.concatenate([naive.placed_units(np.zeros((1, 3)), pose, data.arrays.origin) for pose in poses])
     expected, filtered, near = [], 0, 0
-    reach = 2 * naive_objects.pair_radius(radius, np.eye(4))
+    reach = 2 * naive.reach_units(radius, 0.0, 0.0)
     for i in range(n):
         square = ((units[i + 1 :] - units[i]) ** 2).sum(axis=1)
         let = ((groups[i + 1 :] & masks[i]) > 0) & ((masks[i + 1 :] & groups[i]) > 0)

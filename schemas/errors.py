@@ -40,7 +40,7 @@ class BadRequestError(SolidcloudError):
 
 
 class BadTransformError(BadRequestError):
-    """Pose that is neither rigid nor rigid with a uniform scale (NUMERICS.md N6)."""
+    """Pose that is not rigid (NUMERICS.md N6)."""
 
     code = ErrorCode.BAD_TRANSFORM
 

@@ -175,6 +175,7 @@ class Client(QueryMethods):
         *,
         up: str | None = None,
         units: str | None = None,
+        scale: float = 1.0,
         hollow: bool = False,
     ) -> AvatarInfo:
         """Add an avatar of this client: points (n, 3), the path of a file, or a mesh object.
@@ -186,7 +187,7 @@ class Client(QueryMethods):
         or this one is invalid or without points, ScanError if the file cannot be read,
         TooLargeError beyond the server's limits.
         """
-        shape = avatar_shape(points, radius, up=up, units=units, hollow=hollow)
+        shape = avatar_shape(points, radius, up=up, units=units, scale=scale, hollow=hollow)
         avatar = AddedAvatar(make_positions(shape.points).copy(), shape.radius, shape.inner_points)
         request = avatar.request(name)
         avatars = self._connection.avatars

@@ -285,6 +285,7 @@ class Scene(SceneTiles, SceneQuestions):
         client: str = "",
         up: str | None = None,
         units: str | None = None,
+        scale: float = 1.0,
         hollow: bool = False,
     ) -> AvatarInfo:
         """Add an avatar: points (n, 3), the path of a scan or mesh file, or a mesh object.
@@ -299,13 +300,14 @@ class Scene(SceneTiles, SceneQuestions):
         points, for a mesh a hundredth of the square root of its area.
         up, units: of a file: its axis that points up and its unit, in the words of scan lists, such
         as "y" and "mm"; None: as its format states (glTF: "y"), otherwise "z" and "m".
+        scale: factor of all lengths, the radius too, 0.001 to 1000.
         hollow: leave the inside of a closed mesh empty.
         client: owner; clients may use the same names for different avatars. Adding the same avatar
         again changes nothing. The answer's `description` says what was taken.
         Raise BadRequestError for an avatar without points, or if the name belongs to a different
         one, ScanError if the file cannot be read, TooLargeError beyond the limits.
         """
-        shape = avatar_shape(points, radius, up=up, units=units, hollow=hollow)
+        shape = avatar_shape(points, radius, up=up, units=units, scale=scale, hollow=hollow)
         request = AddAvatarRequest(name, make_positions(shape.points), shape.radius, shape.inner_points)
         model = self._avatars.add(name, request.points, request.radius, client, request.inner_points)
         return describe_avatar(name, model, shape.description)

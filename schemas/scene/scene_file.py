@@ -68,6 +68,7 @@ class AvatarItem(_Part, frozen=True):
     the square root of its area.
     up, units: the axis of the file that points up, and its unit of length; omitted: as its format
     states, otherwise z and m.
+    scale: factor of all lengths, the radius too.
     hollow: leave the inside of a closed mesh empty.
     """
 
@@ -76,6 +77,7 @@ class AvatarItem(_Part, frozen=True):
     radius: Annotated[float, msgspec.Meta(ge=0, le=8)] | None = None
     up: Literal["x", "y", "z"] | None = None
     units: Literal["m", "mm", "cm", "dm", "km", "in", "ft", "us-ft", "yd"] | None = None
+    scale: Annotated[float, msgspec.Meta(ge=0.001, le=1000)] = 1.0
     hollow: bool = False
 
 

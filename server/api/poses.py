@@ -32,7 +32,7 @@ _ROUNDING = 1e-14
 # Least determinant of a matrix for which the nearest rotation is computed. Below it, rounding
 # decides which one that is.
 _LEAST_VOLUME = 1e-9
-# Largest number in a matrix whose nearest rotation is computed. A scale of 1,000 is allowed.
+# Largest number in a matrix whose nearest rotation is computed.
 _LARGEST = 2e3
 # Newton's iteration halves a large deviation in a step, and squares a small one. For all matrices
 # within the two limits above, it ends after fewer steps.
@@ -120,7 +120,7 @@ def from_rotation(rotation: Any, translation: ArrayLike = ORIGIN) -> Floats:
     return renormalise(_join(matrix, translation, "rotation"))
 
 
-def renormalise(poses: ArrayLike, *, within: float = 1e-3, keep_scale: bool = False) -> Floats:
+def renormalise(poses: ArrayLike, *, within: float = 1e-3) -> Floats:
     """Return poses with each rotation replaced by the nearest one, of the least squared difference.
 
     poses: (4, 4) or (k, 4, 4), such as those of float32 numbers or of a product of many matrices.
@@ -128,7 +128,6 @@ def renormalise(poses: ArrayLike, *, within: float = 1e-3, keep_scale: bool = Fa
     the result is the same on every machine.
     within: largest change of a number in a rotation. At 1e-3, a point 1 m from the avatar's origin
     moves by at most 3 mm.
-    keep_scale: keep a uniform scale, which queries accept; otherwise a scale is a deviation.
     Raise BadTransformError for a pose that mirrors, that is farther from a rotation than `within`,
     or whose last row is not 0 0 0 1. The message states the distance.
     """
@@ -143,26 +142,20 @@ def renormalise(poses: ArrayLike, *, within: float = 1e-3, keep_scale: bool = Fa
     )
     largest = np.abs(given).max(axis=(1, 2))
     _refuse(largest > _LARGEST, "holds {:.3g}: expected a rotation", values=largest)
-    scale = np.ones((len(array), 1, 1))
-    if keep_scale:
-        scale[:, 0, 0] = np.sqrt(np.square(given).sum(axis=(1, 2)) / 3)
-    _refuse(scale[:, 0, 0] == 0.0, "scales by 0")
-    rotation = given / scale
-    determinant = (rotation[:, 0] * np.cross(rotation[:, 1], rotation[:, 2])).sum(axis=-1)
+    determinant = (given[:, 0] * np.cross(given[:, 1], given[:, 2])).sum(axis=-1)
     _refuse(determinant < 0.0, "mirrors (determinant {:.3g}): expected a rotation", values=determinant)
     _refuse(
         determinant < _LEAST_VOLUME, "flattens (determinant {:.3g}): expected a rotation", values=determinant
     )
-    nearest = _nearest_rotations(rotation)
-    off = np.abs(nearest - rotation).max(axis=(1, 2), initial=0.0)
+    nearest = _nearest_rotations(given)
+    off = np.abs(nearest - given).max(axis=(1, 2), initial=0.0)
     _refuse(
         ~(off <= within),
-        f"is {{:.3g}} from the nearest rotation: expected at most {within:g} (`within`), or a uniform scale and "
-        "`keep_scale`",
+        f"is {{:.3g}} from the nearest rotation: expected at most {within:g} (`within`)",
         values=off,
     )
     found = array.copy()
-    found[:, :3, :3] = nearest * scale
+    found[:, :3, :3] = nearest
     return found[0] if np.ndim(poses) == 2 else found
 
 

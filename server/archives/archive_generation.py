@@ -3,7 +3,6 @@
 A generation counts its readers; the last one to leave closes its files and releases its memory.
 """
 
-import math
 import threading
 import weakref
 from collections.abc import Callable
@@ -32,8 +31,8 @@ from ..runtime.threads import start_thread
 
 # A request of more poses does not update the user's position: its last pose may be anywhere.
 _MAX_USER_POSES = 8
-# Limits of margin or reach [m] and of an avatar's scale (voxels_in_reach.py refuses other requests).
-_MAX_AROUND, _MIN_SCALE = 16.0, 1e-3
+# Limit of margin or reach [m] (voxels_in_reach.py refuses other requests).
+_MAX_AROUND = 16.0
 _FLOAT64 = np.dtype(np.float64)  # comparing dtypes is faster than comparing with the type
 _NUMBER = (float, int)  # `float | int` would be constructed for each request
 # Voxels within this distance of a user are prefetched, however far its requests reach [m].
@@ -257,14 +256,11 @@ class ArchiveGeneration:
         (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = poses[-1].tolist()
         x, y, z = avatar.arrays.center[0].tolist()
         x, y, z = a * x + b * y + c * z + tx, d * x + e * y + f * z + ty, g * x + h * y + i * z + tz
-        scale = math.sqrt(a * a + d * d + g * g)
         limit = MAX_COORDINATE
-        if not (
-            _MIN_SCALE <= scale <= 1 / _MIN_SCALE and abs(x) <= limit and abs(y) <= limit and abs(z) <= limit
-        ):
+        if not (abs(x) <= limit and abs(y) <= limit and abs(z) <= limit):
             return False
         near = around if around < _USER_REACH else _USER_REACH
-        reach = avatar.bounding_radius * scale + self.data.radius_units / UNITS_PER_METRE + near
+        reach = avatar.bounding_radius + self.data.radius_units / UNITS_PER_METRE + near
         return self.prefetcher.record_pose(user, (x, y, z), reach)
 
     def warm(self, *parts: str) -> None:

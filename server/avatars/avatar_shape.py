@@ -17,6 +17,8 @@ from .mesh_inside import closed_parts, fill_inside
 from .surface_points import cover_surface
 
 _SURFACE = "a surface, with nothing inside"
+# Limits of an avatar's scale.
+_LEAST_SCALE, _MOST_SCALE = 0.001, 1000.0
 
 
 class MeshLike(Protocol):
@@ -32,32 +34,39 @@ def avatar_shape(
     *,
     up: str | None = None,
     units: str | None = None,
+    scale: float = 1.0,
     hollow: bool = False,
 ) -> AvatarShape:
     """Return the shape of an avatar from any source that `add_avatar` accepts.
 
     source: points (n, 3) [m], the path of a scan or mesh file, or a mesh object with `vertices` and
-    `faces`, such as a `trimesh.Trimesh` or a `trimesh.Scene`. A shape is returned as it is.
+    `faces`, such as a `trimesh.Trimesh` or a `trimesh.Scene`. A shape is only scaled.
     radius: of each point's sphere [m]. The surface of a mesh is covered with points such that no
     part of it is farther than the radius from one; None: see `cover_surface`. Points without faces
     are taken as they are.
     up, units: the axis of a file that points up, "x", "y" or "z", and its unit of length, a key of
     METRES (placed_scan.py); None: what its format states, otherwise "z" and "m". A point is scaled
     to metres and turned to z up.
+    scale: factor of all lengths, the radius too.
     hollow: leave the inside of closed meshes empty; see `fill_inside`.
     Raise BadRequestError for an invalid mesh, ScanError for a file that cannot be read or whose
     reader is not installed, TooLargeError for more than MAX_AVATAR_POINTS points.
     """
+    if not _LEAST_SCALE <= scale <= _MOST_SCALE:
+        raise BadRequestError(
+            f"avatar scale {scale!r}: expected {_LEAST_SCALE:g} to {_MOST_SCALE:g}: scale its points instead"
+        )
     if isinstance(source, AvatarShape):
-        return source
-    radius = None if radius is None else float(radius)
+        radius = None if source.radius is None else source.radius * scale
+        return source._replace(points=_scaled(source.points, scale), radius=radius)
+    radius = None if radius is None else float(radius) * scale
     if isinstance(source, str | os.PathLike):
         from .avatar_file import read_triangles_or_points
 
         read = read_triangles_or_points(Path(source), up, units)
         if len(read.triangles):
-            return _mesh_shape(read.triangles, radius, str(source), hollow, read.axes)
-        return AvatarShape(read.points, radius, 0, f"points: {_SURFACE}; {read.axes}")
+            return _mesh_shape(read.triangles * scale, radius, str(source), hollow, read.axes)
+        return AvatarShape(read.points * scale, radius, 0, f"points: {_SURFACE}; {read.axes}")
     if up is not None or units is not None:
         raise BadRequestError(
             "up and units for an avatar that is no file: expected the path of one: turn and scale the points instead"
@@ -65,8 +74,8 @@ def avatar_shape(
     if hasattr(source, "to_mesh") and not hasattr(source, "faces"):
         source = source.to_mesh()  # a trimesh.Scene holds several meshes, each at a pose
     if not hasattr(source, "vertices"):
-        return AvatarShape(source, radius)
-    vertices = make_vectors(source.vertices, "vertices of the mesh")
+        return AvatarShape(_scaled(source, scale), radius)
+    vertices = make_vectors(source.vertices, "vertices of the mesh") * scale
     faces = np.asarray(getattr(source, "faces", ()))
     if not len(faces):
         return AvatarShape(vertices, radius)
@@ -80,6 +89,10 @@ def avatar_shape(
             f"{len(vertices)} vertices, counted from 0"
         )
     return _mesh_shape(vertices[faces], radius, "mesh", hollow)
+
+
+def _scaled(points: Any, scale: float) -> Any:
+    return points if scale == 1.0 else make_vectors(points, "points") * scale
 
 
 def _mesh_shape(

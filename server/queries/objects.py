@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.errors import BadRequestError, BadTransformError
+from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import ObjectsAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
@@ -27,17 +27,13 @@ from .resident_fast_path import collide_fast
 SCENE_GROUP = 1 << 31
 # Pairs tested between two checks of a deadline.
 PAIRS_PER_CHECK = 64
-# Largest distance of an object from the dataset's origin [m]: 2^37 m in exact units do not fit in
-# 63 bits. No object this far away is compared with the scene, but objects are compared with one
-# another everywhere.
-MAX_PLACE = 1e11
 
 
 class CheckedObjects(NamedTuple):
     """Checked objects of a request, n of them.
 
     models: the distinct avatars.  model_of: (n,) int64, index into `models`.  poses: (n, 4, 4).
-    groups, masks: (n,) uint32.  scales: (n,).  units: (n,) int64, scaled radii, exact units.
+    groups, masks: (n,) uint32.  units: (n,) int64, radii, exact units.
     margin_units: of each pair.
     """
 
@@ -46,7 +42,6 @@ class CheckedObjects(NamedTuple):
     poses: NDArray[np.float64]
     groups: NDArray[np.uint32]
     masks: NDArray[np.uint32]
-    scales: NDArray[np.float64]
     units: NDArray[np.int64]
     margin_units: int
 
@@ -129,16 +124,13 @@ def _check(
     numbers = {key: number for number, key in enumerate(distinct)}
     model_of = np.array([numbers[id(avatar)] for avatar in avatars], np.int64)
     margin_units = to_units(margin, "margin")
-    scales, units = np.empty(n), np.empty(n, np.int64)
+    units = np.empty(n, np.int64)
     for number, model in enumerate(distinct.values()):
         rows = np.flatnonzero(model_of == number)
-        scale, unit = np.ones(len(rows)), np.zeros(len(rows), np.int64)
-        fault, pose, found = check_poses(
-            array[rows], model.arrays.radius, model.radius, 0, data.arrays, scale, unit
-        )
+        unit = np.zeros(len(rows), np.int64)
+        fault, pose, found = check_poses(array[rows], model.arrays.radius, model.radius, 0, data.arrays, unit)
         refuse(fault, int(rows[pose]), found)
-        scales[rows], units[rows] = scale, unit
-        _check_places(model, array, rows, scale, data.arrays.origin)
+        units[rows] = unit
     if n > 1:
         first, second = (int(row) for row in np.argsort(-units, kind="stable")[:2])
         together = int(units[first] + units[second]) + margin_units
@@ -147,28 +139,7 @@ def _check(
                 f"objects {first} and {second} have radii and margin that add up to {together / UNITS_PER_METRE:g} m: "
                 "expected at most 16 m: give a smaller margin or radius"
             )
-    return CheckedObjects(list(distinct.values()), model_of, array, group, mask, scales, units, margin_units)
-
-
-def _check_places(
-    model: AvatarModel,
-    poses: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    scales: NDArray[np.float64],
-    origin: NDArray[np.float64],
-) -> None:
-    """Raise BadTransformError if an object of this avatar is too far away for exact units."""
-    if not len(model.points):
-        return
-    center = np.abs(poses[rows, :3, :3]) @ np.abs(model.arrays.center[0]) + np.abs(
-        poses[rows, :3, 3] - origin
-    )
-    farthest = center.max(axis=1) + scales * model.arrays.radius[0]
-    if (farthest > MAX_PLACE).any():
-        i = int(farthest.argmax())
-        raise BadTransformError(
-            f"object {rows[i]} reaches {farthest[i]:g} m from the dataset's origin: expected within {MAX_PLACE:g} m"
-        )
+    return CheckedObjects(list(distinct.values()), model_of, array, group, mask, units, margin_units)
 
 
 def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
@@ -184,7 +155,7 @@ def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[ND
     for number in full:
         rows = np.flatnonzero(checked.model_of == number)
         bound_objects(
-            checked.models[number].arrays, checked.poses, rows, checked.scales, checked.units, origin,
+            checked.models[number].arrays, checked.poses, rows, checked.units, origin,
             checked.margin_units, low, high,
         )  # fmt: skip
     if len(present) < 2:
@@ -238,7 +209,7 @@ def _touching_pairs(
             part = rows[begin : begin + step]
             found = np.empty(len(part), np.uint8)
             touch_pairs(
-                checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.scales, checked.units,
+                checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.units,
                 ordered[part], checked.margin_units, origin, budget.visits, budget.stop.flag, found, counters,
             )  # fmt: skip
             verdict[part] = found

@@ -82,10 +82,10 @@ def path_question(
     poses = kernel_poses(poses)  # copied here at most once, so that no part copies its poses
     around = next(name for name in question.parameters if name in ("margin", "reach"))
     other = to_units(given.setdefault(around, question.defaults[around]), around)
-    scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
+    units = np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(
-        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.stop).arrays, scales, units
+        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.stop).arrays, units
     )
     refuse(fault, pose, found)
 

@@ -7,14 +7,13 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
-from ...schemas.errors import BadRequestError, BadTransformError, TooLargeError
+from ...schemas.errors import BadRequestError, TooLargeError
 from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.reach import VoxelLists
 from ..kernels.core.scene_arrays import NO_LIMIT
-from ..kernels.core.voxels_in_reach import SIMILARITY_TOLERANCE, check_poses
+from ..kernels.core.voxels_in_reach import check_poses
 from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import (
@@ -42,36 +41,18 @@ def _check(
     first: NDArray[np.float64],
     last: NDArray[np.float64],
     other_units: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Check the poses of k motions, and return scales, reaches and their variation, (k,) each.
+) -> NDArray[np.int64]:
+    """Check the poses of k motions, and return the reach (k,) of each [exact units].
 
-    Scale and reach are the larger of those at both ends. The reach is in exact units and includes
-    the scan's largest sphere. The variation bounds how much the reach changes during the motion
-    [exact units].
+    The reach includes the scan's largest sphere.
     """
-    k = len(first)
-    scales, units = np.ones((2, k)), np.zeros((2, k), np.int64)  # a stop may leave some unchanged
-    for end, poses in enumerate((first, last)):
+    units = np.zeros(len(first), np.int64)  # a stop may leave some unchanged
+    for poses in (first, last):
         fault, pose, found = check_poses(
-            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, scales[end], units[end]
+            poses, avatar.arrays.radius, avatar.radius, other_units, data.arrays, units
         )
         refuse(fault, pose, found)
-    apart = np.abs(scales[1] - scales[0]) > SIMILARITY_TOLERANCE * scales[0]
-    if apart.any():
-        i = int(apart.argmax())
-        raise BadTransformError(
-            f"motion {i} begins at scale {scales[0, i]:g} and ends at {scales[1, i]:g}: expected one scale "
-            "within 1e-9: a rigid motion changes no size"
-        )
-    # During the motion the scale lies between those of the ends. If both are well within 1e-9 of 1,
-    # it is 1 throughout (voxels_in_reach.py).
-    rigid = np.ones(k, bool)
-    for poses in (first, last):
-        rigid &= np.abs((poses[:, :3, :3] ** 2).sum(axis=(1, 2)) / 3.0 - 1.0) <= SIMILARITY_TOLERANCE
-    most = units.max(axis=0)
-    loose = np.where(rigid, 0.0, most - units.min(axis=0) + 2.0)
-    loose[~rigid] += 2.0 * SIMILARITY_TOLERANCE * scales.max(axis=0)[~rigid] * avatar.radius * UNITS_PER_METRE
-    return scales.max(axis=0), most, loose
+    return units
 
 
 def _from_origin(
@@ -162,7 +143,7 @@ def sweep_steps(
         )
     k, world = len(first), (first, last)
     other_units = data.radius_units + to_units(margin, "margin")
-    scales, units, loose = _check(data, avatar, first, last, other_units)
+    units = _check(data, avatar, first, last, other_units)
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
         np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
@@ -178,7 +159,7 @@ def sweep_steps(
 
     def search(lists: VoxelLists, *state: NDArray[Any]) -> None:
         advance_segments(
-            box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, data.arrays, lists,
+            box, first, last, avatar.arrays, units, data.arrays, lists,
             *state, tolerance, scratch, progress, counts,
         )  # fmt: skip
 
@@ -196,7 +177,7 @@ def sweep_steps(
     if part is not None:
         progress.at[:] = part.at
     while len(which) and not budget.spent:
-        lists = _plan(data, avatar, box, first, last, scales, units, which, progress)
+        lists = _plan(data, avatar, box, first, last, units, which, progress)
         if lists is None:
             break
         if part is not None:
@@ -212,9 +193,7 @@ def sweep_steps(
     proved[which] = np.minimum(proved[which], progress.at[which])
     until = np.minimum(progress.upper, 1.0)
     lost = np.empty(k)
-    find_unknown_regions(
-        box, first, last, avatar.arrays, scales, units, data.arrays, data.tree, until, outside, lost
-    )
+    find_unknown_regions(box, first, last, avatar.arrays, units, data.arrays, data.tree, until, outside, lost)
     if data.nothing_clear:
         lost[:] = 0.0
     met = lost <= until
@@ -232,7 +211,6 @@ def _plan(
     box: NDArray[np.float64],
     first: NDArray[np.float64],
     last: NDArray[np.float64],
-    scales: NDArray[np.float64],
     units: NDArray[np.int64],
     which: NDArray[np.int64],
     progress: SweepProgress,
@@ -245,7 +223,7 @@ def _plan(
             np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), np.full(k, np.inf)
         )
         needed = plan_segments(
-            box, first, last, avatar.arrays, scales, units, data.arrays, data.tree, which, progress, lists, space, moved
+            box, first, last, avatar.arrays, units, data.arrays, data.tree, which, progress, lists, space, moved
         )  # fmt: skip
         if needed < 0:
             return None

@@ -101,7 +101,7 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints | None) ->
         with error_location(path, f"$.avatars[{number}].file"):
             source = avatar_file if read_points is None else read_points(avatar_file)
             given = {} if read_points else {"up": item.up, "units": item.units}
-            shape = avatar_shape(source, item.radius, hollow=item.hollow, **given)
+            shape = avatar_shape(source, item.radius, scale=item.scale, hollow=item.hollow, **given)
         with error_location(path, f"$.avatars[{number}]"):
             model = make_avatar(make_positions(shape.points), shape.radius, shape.inner_points)
             if meet and model.radius > MAX_BODY_RADIUS:

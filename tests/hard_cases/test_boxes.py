@@ -119,7 +119,7 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
         for pose in poses:
             points = placed_exactly(body, pose, scene)
             in_units = [fractions(point) for point in naive.placed_units(body.points, pose, scene.origin)]
-            _, farthest = place_root(body.arrays, pose, 1.0, placed, scene)
+            _, farthest = place_root(body.arrays, pose, placed, scene)
             for row, (low, high) in enumerate(boxes):
                 square = min(beyond(point, low, high) for point in points)
                 gap = Fraction(box_distance(body.arrays.radius[0], placed, farthest, scene, index, row))
@@ -134,7 +134,7 @@ def test_case_39_boxes_of_voxels_are_no_farther_than_their_points(
                 if units > 1 << 30 or units / UNITS / step + scene.voxel_steps > 1 << 22:
                     continue
                 reach = VoxelsInReach(
-                    np.empty(1), np.empty(1, np.int64), np.zeros(2, np.int64), np.empty(6, np.int64),
+                    np.empty(1, np.int64), np.zeros(2, np.int64), np.empty(6, np.int64),
                     np.empty((1, 2, 3)), np.zeros(1, bool),
                 )  # fmt: skip
                 fault, *_ = find_reach(pose[None], body.arrays, 0.0, units, scene, index, reach)

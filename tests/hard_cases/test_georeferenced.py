@@ -43,7 +43,7 @@ def questions(scene: Scene, shift: NDArray[np.float64], seed: int) -> dict[str, 
     scene.add_avatar("body", body, 0.01)
     scene.add_avatar("box", box, 0.003)
     points = synthetic_scans.make_scan("corner", 3, 300)
-    poses = np.concatenate([archive_cases.near_poses(rng, points, body, count, 0.08, s) for s in (1.0, 0.5)])
+    poses = archive_cases.near_poses(rng, points, body, 2 * count, 0.08)
     poses[:, :3, 3] = dyadic(poses[:, :3, 3]) + shift
     ends = poses[rng.permutation(count)]
     starts = dyadic(rng.uniform(0, 2, (4 * count, 3)))

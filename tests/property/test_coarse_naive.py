@@ -10,7 +10,7 @@ from coarse_tops import Made, least_margin, open_made
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from point_clouds import COUNTS, FAR, KINDS, OFF, SCALES, STEPS, TREES, cloud
+from point_clouds import COUNTS, FAR, KINDS, OFF, STEPS, TREES, cloud
 from sample_sizes import sample
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.radius_model import class_radii
@@ -69,7 +69,6 @@ def judge(
     step=STEPS,
     voxel_steps=st.sampled_from([7, 1000, 70_000, 1 << 21]),
     far=FAR,
-    scale=SCALES,
     off=OFF,
     tree=TREES,
 )
@@ -81,7 +80,6 @@ def test_nothing_in_contact_is_settled(
     step: float,
     voxel_steps: int,
     far: float,
-    scale: float,
     off: float,
     tree: dict[str, Any],
 ) -> None:
@@ -92,13 +90,13 @@ def test_nothing_in_contact_is_settled(
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
     place = off * rng.uniform(-1, 1, 3)
     avatar = make_avatar(
-        cloud(rng, body, 20) * (extent / scale * rng.uniform(0.01, 0.5)) + place,
-        float(step / scale * rng.choice([0, 0.7, 9])),
+        cloud(rng, body, 20) * (extent * rng.uniform(0.01, 0.5)) + place,
+        float(step * rng.choice([0, 0.7, 9])),
     )
     radius = float(step * rng.choice([0, 0.5, 9]))
     with TemporaryDirectory() as folder:
         case = archive_cases.build(
             Path(folder), points, voxel=step * voxel_steps, resolution=step, radius=radius, **tree
         )
-        poses = archive_cases.near_poses(rng, points, avatar.points, 8, extent, scale)
+        poses = archive_cases.near_poses(rng, points, avatar.points, 8, extent)
         judge(open_made(case.archive), None, avatar, poses, rng)

@@ -22,7 +22,6 @@ from point_clouds import (
     FAR,
     KINDS,
     OFF,
-    SCALES,
     STEPS,
     TREES,
     VOXEL_STEPS,
@@ -48,7 +47,6 @@ def build(points: NDArray[np.float64], folder: str, **options: Any) -> archive_c
     step=STEPS,
     voxel_steps=VOXEL_STEPS,
     far=FAR,
-    scale=SCALES,
     off=OFF,
     tree=TREES,
 )
@@ -60,7 +58,6 @@ def test_contact_begins_where_the_definition_says(
     step: float,
     voxel_steps: int,
     far: float,
-    scale: float,
     off: float,
     tree: dict[str, Any],
 ) -> None:
@@ -70,8 +67,8 @@ def test_contact_begins_where_the_definition_says(
     if step <= far * 1e-14:  # float64 holds no such lattice there
         far = 0.0
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
-    avatar = cloud(rng, body, 20) * (extent / scale * rng.uniform(0.01, 0.5)) + off * rng.uniform(-1, 1, 3)
-    radius, scan_radius = step / scale * rng.choice([0, 0.7, 9]), step * rng.choice([0, 0.5, 9])
+    avatar = cloud(rng, body, 20) * (extent * rng.uniform(0.01, 0.5)) + off * rng.uniform(-1, 1, 3)
+    radius, scan_radius = step * rng.choice([0, 0.7, 9]), step * rng.choice([0, 0.5, 9])
     with TemporaryDirectory() as folder:
         case = build(
             points, folder, voxel=step * voxel_steps, resolution=step, radius=float(scan_radius), **tree
@@ -79,11 +76,11 @@ def test_contact_begins_where_the_definition_says(
         with Scene.open(case.archive) as scene:
             info = scene.info()
             scene.add_avatar("avatar", avatar, float(radius))
-            for pose in archive_cases.near_poses(rng, points, avatar, 12, extent, scale):
+            for pose in archive_cases.near_poses(rng, points, avatar, 12, extent):
                 if np.abs(pose[:3, 3]).max() > 1e9:
                     continue
                 least, _ = archive_cases.least_reach(case, avatar, pose, info.origin, step)
-                given_units = naive.reach_units(pose, float(radius), info.radius, 0.0)
+                given_units = naive.reach_units(float(radius), info.radius, 0.0)
                 for reach in (least - 1, least, least + 1):
                     if not max(given_units, 0) <= reach <= 1 << 30:
                         continue
@@ -176,9 +173,7 @@ def test_far_from_the_origin_is_as_at_the_origin(seed: int, shift: tuple[int, in
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (9, 3))
-    poses = np.concatenate(
-        [archive_cases.near_poses(rng, case.points, avatar, 8, 0.3, s) for s in (1.0, 0.4)]
-    )
+    poses = archive_cases.near_poses(rng, case.points, avatar, 16, 0.3)
     expected = case.judge(avatar, 0.05, poses, 0.02)
     assert archive_cases.ask(case, avatar, 0.05, poses, 0.02).tolist() == expected.astype(int).tolist()
     assert expected.any() and not expected.all()

@@ -10,7 +10,7 @@ import pytest
 from contact_cases import ScanCase, compare, open_case, tight
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from point_clouds import COUNTS, FAR, KINDS, SCALES, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
+from point_clouds import COUNTS, FAR, KINDS, STEPS, TREES, VOXEL_STEPS, cloud, signed_permutations
 from sample_sizes import sample
 from solidcloud.schemas.wire.answers import ContactsAnswers
 from solidcloud.server.queries import contacts as contacts_module
@@ -26,7 +26,6 @@ from solidcloud.server.queries.context.query_budget import make_budget
     step=STEPS,
     voxel_steps=VOXEL_STEPS,
     far=FAR,
-    scale=SCALES,
     limit=st.sampled_from([0, 1, 7, 100, 10_000]),
     scan_count=st.sampled_from([0, 1, 3]),
     tree=TREES,
@@ -39,7 +38,6 @@ def test_every_pair_and_cluster_is_the_definitions(
     step: float,
     voxel_steps: int,
     far: float,
-    scale: float,
     limit: int,
     scan_count: int,
     tree: dict[str, Any],
@@ -49,8 +47,8 @@ def test_every_pair_and_cluster_is_the_definitions(
     if step <= far * 1e-14:  # float64 holds no such lattice there
         far = 0.0
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
-    avatar = cloud(rng, body, 40) * (extent / scale * rng.uniform(0.01, 0.5))
-    radius, scan_radius = step / scale * rng.choice([0, 0.7, 9]), step * rng.choice([0, 0.5, 9])
+    avatar = cloud(rng, body, 40) * (extent * rng.uniform(0.01, 0.5))
+    radius, scan_radius = step * rng.choice([0, 0.7, 9]), step * rng.choice([0, 0.5, 9])
     with TemporaryDirectory() as folder:
         case = open_case(
             Path(folder), points, rng, scan_count=max(1, scan_count), kept=scan_count > 0,
@@ -59,7 +57,7 @@ def test_every_pair_and_cluster_is_the_definitions(
         for share in (0.0, 0.02, 0.2, 1.0):
             margin = min(extent * share * rng.uniform(0.5, 1), 10.0)
             distance = rng.choice([None, 0.0, 3 * step, 0.05 * extent, extent])
-            poses = archive_cases.near_poses(rng, points, avatar, 3, margin + radius, scale)
+            poses = archive_cases.near_poses(rng, points, avatar, 3, margin + radius)
             if np.abs(poses[:, :3, 3]).max() <= 1e9:
                 compare(case, avatar, float(radius), poses, limit, float(margin), distance)
 

@@ -18,7 +18,6 @@ from point_clouds import (
     FAR,
     KINDS,
     OFF,
-    SCALES,
     STEPS,
     TREES,
     VOXEL_STEPS,
@@ -39,7 +38,6 @@ from solidcloud.server.scene import Scene
     step=STEPS,
     voxel_steps=VOXEL_STEPS,
     far=FAR,
-    scale=SCALES,
     off=OFF,
     tree=TREES,
 )
@@ -51,7 +49,6 @@ def test_distance_and_witnesses_are_those_of_the_definition(
     step: float,
     voxel_steps: int,
     far: float,
-    scale: float,
     off: float,
     tree: dict[str, Any],
 ) -> None:
@@ -60,9 +57,9 @@ def test_distance_and_witnesses_are_those_of_the_definition(
     if step <= far * 1e-14:  # float64 holds no such lattice there
         far = 0.0
     points = cloud(rng, kind, count) * extent + far * rng.uniform(-1, 1, 3)
-    avatar = cloud(rng, body, 40) * (extent / scale * rng.uniform(0.01, 0.5)) + off * rng.uniform(-1, 1, 3)
-    radius, scan_radius = float(step / scale * rng.choice([0, 0.7, 9])), float(step * rng.choice([0, 0.5, 9]))
-    poses = archive_cases.near_poses(rng, points, avatar, 16, 2 * extent, scale)
+    avatar = cloud(rng, body, 40) * (extent * rng.uniform(0.01, 0.5)) + off * rng.uniform(-1, 1, 3)
+    radius, scan_radius = float(step * rng.choice([0, 0.7, 9])), float(step * rng.choice([0, 0.5, 9]))
+    poses = archive_cases.near_poses(rng, points, avatar, 16, 2 * extent)
     poses = poses[np.abs(poses[:, :3, 3]).max(axis=1) < 1e9]
     reach = float(extent * 10.0 ** rng.uniform(-2, 1))
     with TemporaryDirectory() as folder:
@@ -72,9 +69,7 @@ def test_distance_and_witnesses_are_those_of_the_definition(
         with Scene.open(case.archive) as scene:
             info = scene.info()
             scan = (points, info.origin, step, info.radius)
-            most = (
-                15.9 - max(naive.reach_units(pose, radius, info.radius, 0.0) for pose in poses) / naive.UNITS
-            )
+            most = 15.9 - max(naive.reach_units(radius, info.radius, 0.0) for pose in poses) / naive.UNITS
             if most <= 0:
                 return
             reach = min(reach, most)
@@ -83,7 +78,7 @@ def test_distance_and_witnesses_are_those_of_the_definition(
             compare(scene.distance("avatar", poses, reach), judged, reach)
             for pose, found in list(zip(poses, judged, strict=True))[:4]:
                 # The reach to the very unit, and one less.
-                radii = naive.reach_units(pose, radius, info.radius, 0.0)
+                radii = naive.reach_units(radius, info.radius, 0.0)
                 if found is None or found.square <= radii * radii:
                     continue
                 root = round(found.square**0.5)
@@ -195,9 +190,7 @@ def test_more_ties_than_are_kept_until_the_end(tmp_path: Path, rng: np.random.Ge
 def test_a_few_poses_of_every_kind_of_scan(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     case = archive_cases.build(tmp_path, synthetic_scans.make_scan(kind, 11, 60), radius=0.05)
     avatar = rng.uniform(-0.2, 0.2, (9, 3))
-    poses = np.concatenate(
-        [archive_cases.near_poses(rng, case.points, avatar, 6, 0.5, s) for s in (1.0, 0.4)]
-    )
+    poses = archive_cases.near_poses(rng, case.points, avatar, 12, 0.5)
     with Scene.open(case.archive) as scene:
         info = scene.info()
         scene.add_avatar("avatar", avatar, 0.05)

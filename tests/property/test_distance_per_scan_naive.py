@@ -32,7 +32,7 @@ def judge(
     lattice = case.store.archive.header.lattice
     origin = np.array(lattice.origin)
     whole = naive.lattice_of(case.points, origin, lattice.step)
-    reach = case.radii + naive.reach_units(pose, model.radius, 0.0, margin)
+    reach = case.radii + naive.reach_units(model.radius, 0.0, margin)
     pairs = naive_contacts.pairs_of(whole, case.numbers, lattice.step, origin, model.points, pose, reach)
     margin_units = round(margin * naive.UNITS)
     found: dict[int, float] = {}

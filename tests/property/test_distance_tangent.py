@@ -50,7 +50,7 @@ def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) 
         origin = scene.info().origin
         scan = naive.scan_units(naive.lattice_of(points, origin, step), step)
         least = [int(squares(naive.placed_units(avatar, pose, origin), scan).min()) for pose in poses]
-        judge(scene, poses, least, naive.reach_units(poses[0], 0.02, 0.01, 0.0))
+        judge(scene, poses, least, naive.reach_units(0.02, 0.01, 0.0))
     pairs = len(poses) * len(points) * len(avatar)
     # The near-tangent ones: the points of a sphere, on the lattice, seen from all around its centre.
     out = rng.normal(size=(1000, 3))
@@ -62,7 +62,7 @@ def test_ten_million_pairs_none_wrong(tmp_path: Path, rng: np.random.Generator) 
         origin = scene.info().origin
         scan = naive.scan_units(naive.lattice_of(shell, origin, step), step)
         found = [squares(naive.placed_units(np.zeros((1, 3)), pose, origin), scan) for pose in poses]
-        judge(scene, poses, [int(each.min()) for each in found], naive.reach_units(poses[0], 0.1, 0.1, 0.0))
+        judge(scene, poses, [int(each.min()) for each in found], naive.reach_units(0.1, 0.1, 0.0))
     # Within what float32 may lose of the nearest pair (placed_avatar.py): nothing but the integers tells these apart.
     band = 2 * np.sqrt(3.0) * U32 * (2 * steps) * step * naive.UNITS
     near = sum(int((np.sqrt(each.astype(float)) <= each.min() ** 0.5 + band).sum()) for each in found)

@@ -64,7 +64,7 @@ def draw(seed: int) -> tuple[Drawn, Contacts]:
     for number in range(SCENES):
         lattice = np.rint(cloud(rng, KINDS[(seed + number) % len(KINDS)], POINTS) * 0.25 / STEP)
         lattice += [number * APART, 0, 0]
-        poses.append(archive_cases.near_poses(rng, lattice * STEP, body, 1, 0.03, (1.0, 0.5)[number % 2])[0])
+        poses.append(archive_cases.near_poses(rng, lattice * STEP, body, 1, 0.03)[0])
         lattices.append(lattice.astype(np.int64))
     asked = np.array(poses)
     asked[:, :3, 3] = np.rint(asked[:, :3, 3] * 2.0**20) * 2.0**-20

@@ -43,7 +43,6 @@ def least_margin(a: NDArray[np.int64], scan: NDArray[np.int64], radii: NDArray[n
     body=st.sampled_from(KINDS),
     model=st.sampled_from(radius_class_archives.MODELS),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
-    scale=st.sampled_from([1.0, 0.3]),
     tree=TREES,
 )
 def test_contact_begins_where_the_definition_says(
@@ -53,7 +52,6 @@ def test_contact_begins_where_the_definition_says(
     body: str,
     model: str | None,
     voxel: float,
-    scale: float,
     tree: dict[str, Any],
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -67,9 +65,9 @@ def test_contact_begins_where_the_definition_says(
             info = scene.info()
             scene.add_avatar("avatar", avatar, 0.01)
             b = naive.scan_units(stored, info.lattice_step)
-            poses = archive_cases.near_poses(rng, points, avatar, 12, 0.3, scale)
+            poses = archive_cases.near_poses(rng, points, avatar, 12, 0.3)
             for pose in poses:
-                own = naive.reach_units(pose, 0.01, 0.0, 0.0)
+                own = naive.reach_units(0.01, 0.0, 0.0)
                 least = least_margin(naive.placed_units(avatar, pose, info.origin), b, radii, own)
                 for margin in (least - 1, least, least + 1):
                     if margin < 0:

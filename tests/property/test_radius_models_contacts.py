@@ -30,7 +30,6 @@ from solidcloud.server.queries.context.query_budget import QueryBudget, make_bud
     body=st.sampled_from(KINDS),
     model=st.sampled_from([*radius_class_archives.MODELS, "local", "local+border", "border:0"]),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
-    scale=st.sampled_from([1.0, 0.3]),
     limit=st.sampled_from([0, 1, 7, 10_000]),
     kept=st.booleans(),
     tree=TREES,
@@ -42,7 +41,6 @@ def test_every_pair_and_cluster_is_the_definitions(
     body: str,
     model: str | None,
     voxel: float,
-    scale: float,
     limit: int,
     kept: bool,
     tree: dict[str, Any],
@@ -55,7 +53,7 @@ def test_every_pair_and_cluster_is_the_definitions(
         )
         case = with_model(case, model)
         for margin in (0.0, 0.05, 0.4):
-            poses = archive_cases.near_poses(rng, points, avatar, 3, 0.05 + margin, scale)
+            poses = archive_cases.near_poses(rng, points, avatar, 3, 0.05 + margin)
             distance = rng.choice([None, 0.0, 0.03, 0.5])
             compare(case, avatar, 0.01, poses, limit, margin, distance)
 

@@ -39,7 +39,6 @@ def signed_of(judged: list[naive_distance.Expected | None]) -> NDArray[np.float6
     model=st.sampled_from(MODELS),
     voxel=st.sampled_from([0.07, 0.5, 4.0]),
     step=st.sampled_from([1e-4, archive_cases.BINARY_STEP, 1e-2]),
-    scale=st.sampled_from([1.0, 0.3]),
     tree=TREES,
 )
 def test_distance_is_that_of_the_least_gap(
@@ -50,16 +49,15 @@ def test_distance_is_that_of_the_least_gap(
     model: str | None,
     voxel: float,
     step: float,
-    scale: float,
     tree: dict[str, Any],
 ) -> None:
     rng = np.random.default_rng(seed)
     points, avatar = cloud(rng, kind, count), cloud(rng, body, 30) * 0.3
     radius = float(rng.choice([0.0, 0.01]))
-    poses = archive_cases.near_poses(rng, points, avatar, 12, 0.6, scale)
+    poses = archive_cases.near_poses(rng, points, avatar, 12, 0.6)
     if step == archive_cases.BINARY_STEP:  # all on the lattice: ties abound
         points, avatar = np.rint(points * 16) / 16, np.rint(avatar * 16) / 16
-        poses[:, :3, :3], poses[:, :3, 3] = np.eye(3) * scale, np.rint(poses[:, :3, 3] * 16) / 16
+        poses[:, :3, :3], poses[:, :3, 3] = np.eye(3), np.rint(poses[:, :3, 3] * 16) / 16
     reach = float(10.0 ** rng.uniform(-2, 0.5))
     with TemporaryDirectory() as folder, radius_class_archives.any_classes():
         case = archive_cases.build(

@@ -22,7 +22,6 @@ from solidcloud.server.queries.collide import collide
     kind=st.sampled_from(judged_sweeps.CLOUDS),
     step=st.sampled_from([1e-5, 1e-4, archive_cases.BINARY_STEP, 1e-2]),
     far=st.sampled_from([0.0, 5e5, 6.4e6]),
-    scale=st.sampled_from([1.0, 1.0, 0.3, 7.0]),
     way=st.sampled_from([0.0, 1e-3, 0.1, 2.0]),
     turn=st.sampled_from([0.0, 1e-6, 0.1, np.pi]),
     tolerance=st.sampled_from([1e-6, 1e-6, 1e-3]),
@@ -36,7 +35,6 @@ def test_no_sampled_pose_contradicts_the_answer(
     kind: str,
     step: float,
     far: float,
-    scale: float,
     way: float,
     turn: float,
     tolerance: float,
@@ -45,9 +43,9 @@ def test_no_sampled_pose_contradicts_the_answer(
 ) -> None:
     rng = np.random.default_rng(seed)
     points = synthetic_scans.make_scan(kind, seed, 120) + far
-    avatar, radius = rng.uniform(-0.2, 0.2, (9, 3)) / scale, float(rng.choice([0, 1e-3, 0.03])) / scale
+    avatar, radius = rng.uniform(-0.2, 0.2, (9, 3)), float(rng.choice([0, 1e-3, 0.03]))
     near = float(rng.choice([0.05, 0.3]))
-    first, last = judged_sweeps.motions(rng, points, avatar, 8, near, way, turn, scale)
+    first, last = judged_sweeps.motions(rng, points, avatar, 8, near, way, turn)
     with TemporaryDirectory() as folder:
         case = archive_cases.build(
             Path(folder), points, resolution=step, radius=float(rng.choice([0, 0.01])), **tree
@@ -125,8 +123,8 @@ def test_a_few_motions_of_every_sort(tmp_path: Path, rng: np.random.Generator) -
     avatar = rng.uniform(-0.2, 0.2, (5, 3))
     verdicts = []
     with judged_sweeps.opened(case) as data:
-        for way, turn, scale in ((0.3, 0.0, 1.0), (0.0, 1.0, 1.0), (0.3, 0.5, 0.4)):
-            first, last = judged_sweeps.motions(rng, case.points, avatar, 5, 0.5, way, turn, scale)
+        for way, turn in ((0.3, 0.0), (0.0, 1.0), (0.3, 0.5)):
+            first, last = judged_sweeps.motions(rng, case.points, avatar, 5, 0.5, way, turn)
             answers = judged_sweeps.ask(data, avatar, 0.05, first, last)
             judged_sweeps.judge(case, data, avatar, 0.05, first, last, answers, samples=20)
             verdicts += answers.verdict.tolist()

@@ -84,12 +84,11 @@ def near_poses(
     avatar: NDArray[np.float64],
     count: int,
     farthest: float,
-    scale: float = 1.0,
 ) -> NDArray[np.float64]:
     """Return poses (count, 4, 4) that put an avatar point within `farthest` [m] of a scan point."""
     poses = []
     for _ in range(count):
-        turn = random_rotation(rng) * scale
+        turn = random_rotation(rng)
         away = rng.normal(size=3)
         away *= rng.uniform(0, farthest) / np.linalg.norm(away)
         at = points[rng.integers(len(points))] + away

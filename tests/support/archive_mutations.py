@@ -225,7 +225,7 @@ def _truth(folder: Path, template: Template) -> Iterator[bool]:
     units = scan_units(np.concatenate(parts), lattice.step)
     for pose in template.poses:
         placed = placed_units(AVATAR, pose, lattice.origin)
-        yield touches(placed, units, reach_units(pose, AVATAR_RADIUS, radius, 0.0))
+        yield touches(placed, units, reach_units(AVATAR_RADIUS, radius, 0.0))
 
 
 def judge(template: Template, folder: Path, name: str) -> Outcome:

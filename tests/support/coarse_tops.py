@@ -68,7 +68,6 @@ class Made(NamedTuple):
         """Return the reach of the avatar. margin: exact units."""
         k = len(poses)
         reach = VoxelsInReach(
-            np.empty(k),
             np.empty(k, np.int64),
             np.zeros(k + 1, np.int64),
             np.empty(k * max(1, self.voxels), np.int64),
@@ -168,7 +167,7 @@ def least_margin(
     base = made.store.archive.coordinates[row] * header.lattice.voxel_steps
     b = naive.scan_units(points + base, header.lattice.step)
     a = naive.placed_units(avatar.points, pose, header.lattice.origin)
-    own = naive.reach_units(pose, avatar.radius, 0.0, 0.0)
+    own = naive.reach_units(avatar.radius, 0.0, 0.0)
     found = []
     for radius in np.unique(radii):
         square = naive.least_square(a, b[radii == radius])

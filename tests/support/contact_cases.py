@@ -120,9 +120,9 @@ def expect(
     lattice = naive.lattice_of(case.points, origin, step)
     assert len(answers) == len(answers.pair_starts) - 1 == len(answers.cluster_starts) - 1 == len(poses)
     for i, pose in enumerate(poses):
-        reach = case.radii + naive.reach_units(pose, model.radius, 0.0, margin)
+        reach = case.radii + naive.reach_units(model.radius, 0.0, margin)
         pairs = naive_contacts.pairs_of(lattice, case.numbers, step, origin, model.points, pose, reach)
-        cluster_units = 2 * (naive.reach_units(pose, model.radius, 0.0, margin) + case.data.radius_units)
+        cluster_units = 2 * (naive.reach_units(model.radius, 0.0, margin) + case.data.radius_units)
         if cluster_distance is not None:
             cluster_units = round(cluster_distance * naive.UNITS)
         clusters, of_pair = naive_contacts.clusters_of(pairs, naive_contacts.edge_steps(cluster_units, step))

@@ -37,13 +37,12 @@ def motions(
     near: float,
     way: float,
     turn: float,
-    scale: float = 1.0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return first and last poses (count, 4, 4) of motions, most with rotation.
 
     Each begins within `near` of some scan point.
     """
-    first = archive_cases.near_poses(rng, points, avatar, count, near, scale)
+    first = archive_cases.near_poses(rng, points, avatar, count, near)
     last = first.copy()
     for pose in last:
         pose[:3, :3] = turned(rng, pose[:3, :3], turn)
@@ -147,7 +146,6 @@ def judge(
         if answers.exact[i]:
             assert moved(avatar, *poses) <= tolerance * (1 + 1e-9) + far * 2.0**-45, said
         apart = np.linalg.norm(answers.witness_avatar[i] - answers.witness_cloud[i])
-        scale = np.cbrt(np.linalg.det(poses[1][:3, :3]))
         named = radii[(lattice == naive.lattice_of(answers.witness_cloud[i], *scan[1:3])).all(axis=1)]
         assert len(named), said
-        assert apart <= named[0] + margin + radius * scale + 1e-7 + far * 2.0**-45, said
+        assert apart <= named[0] + margin + radius + 1e-7 + far * 2.0**-45, said

@@ -6,13 +6,10 @@ the integer of its position under the pose. Two spheres touch if |a - b|^2 <= (r
 margin)^2.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 UNITS = 2.0**26  # exact units per metre
-SCALE_TOLERANCE = 1e-9
 
 
 def lattice_of(points: ArrayLike, origin: ArrayLike, step: float) -> NDArray[np.int64]:
@@ -37,22 +34,10 @@ def placed_units(
     return np.stack(columns, axis=1)
 
 
-def scale_of(pose: NDArray[np.float64]) -> float:
-    """Return the uniform scale of a pose: root mean square of its entries; exactly 1 within 1e-9 of 1."""
-    square = 0.0
-    for r in range(3):
-        for c in range(3):
-            square += float(pose[r, c]) * float(pose[r, c])
-    scale = math.sqrt(square / 3.0)
-    return 1.0 if abs(scale - 1.0) <= SCALE_TOLERANCE else scale
-
-
-def reach_units(pose: NDArray[np.float64], avatar_radius: float, scan_radius: float, margin: float) -> int:
+def reach_units(avatar_radius: float, scan_radius: float, margin: float) -> int:
     """Return r_a + r_b + margin in exact units, each rounded once."""
     return (
-        int(np.rint(scale_of(pose) * avatar_radius * UNITS))
-        + int(np.rint(scan_radius * UNITS))
-        + int(np.rint(margin * UNITS))
+        int(np.rint(avatar_radius * UNITS)) + int(np.rint(scan_radius * UNITS)) + int(np.rint(margin * UNITS))
     )
 
 
@@ -94,7 +79,7 @@ def collide(
     body = np.asarray(avatar, np.float64).reshape(-1, 3)
     found = np.zeros(len(poses), bool)
     for i, pose in enumerate(poses):
-        reach = reach_units(pose, avatar_radius, scan_radius, margin)
+        reach = reach_units(avatar_radius, scan_radius, margin)
         a = placed_units(body, pose, origin)
         if not len(a):
             continue

@@ -109,10 +109,10 @@ def distance_by_radii(
     answers: list[Expected | None] = []
     for pose in poses:
         found = nearest(lattice, step, radii, naive.placed_units(avatar, pose, origin))
-        if found.square > (naive.reach_units(pose, avatar_radius, 0.0, reach) + found.radius) ** 2:
+        if found.square > (naive.reach_units(avatar_radius, 0.0, reach) + found.radius) ** 2:
             answers.append(None)
             continue
-        both = naive.reach_units(pose, avatar_radius, 0.0, 0.0) + found.radius
+        both = naive.reach_units(avatar_radius, 0.0, 0.0) + found.radius
         scan = naive.scan_units(np.array([found.lattice]), step)[0].tolist()
         length = math.sqrt(float(found.square))
         normal = [(a - b) / length if length else 0.0 for a, b in zip(found.placed, scan, strict=True)]

@@ -21,7 +21,7 @@ def touching_pairs(
     bodies: (m, 3) points of each object, avatar frame.
     """
     placed = [naive.placed_units(body, pose, origin) for body, pose in zip(bodies, poses, strict=True)]
-    units = [pair_radius(radius, pose) for radius, pose in zip(radii, poses, strict=True)]
+    units = [naive.reach_units(radius, 0.0, 0.0) for radius in radii]
     more = int(np.rint(margin * naive.UNITS))
     found = []
     for i in range(len(placed)):
@@ -47,15 +47,10 @@ def touching_scene(
     b, more = naive.scan_units(lattice, step), int(np.rint(margin * naive.UNITS))
     found = []
     for body, radius, pose in zip(bodies, radii, poses, strict=True):
-        a, own = naive.placed_units(body, pose, origin), pair_radius(radius, pose) + more
+        a, own = naive.placed_units(body, pose, origin), naive.reach_units(radius, 0.0, 0.0) + more
         # All points of one radius at a time.
         found.append(any(_touch(a, b[scan_radii == r], own + int(r)) for r in np.unique(scan_radii)))
     return found
-
-
-def pair_radius(radius: float, pose: NDArray[np.float64]) -> int:
-    """Return a placed radius in exact units."""
-    return int(np.rint(naive.scale_of(pose) * radius * naive.UNITS))
 
 
 def _touch(a: NDArray[np.int64], b: NDArray[np.int64], reach: int) -> bool:

@@ -113,8 +113,8 @@ def _exact_sine_cosine(x: Decimal) -> tuple[Decimal, Decimal]:
 def ideal_pose(first: NDArray[np.float64], last: NDArray[np.float64], t: float) -> NDArray[np.float64]:
     """Return exp(t log(M1 M0^-1)) M0 (4, 4), rounded once.
 
-    The poses are rigid, or of one scale, up to rounding. The rotation is the one nearest to the two
-    given, by its quaternion. What they differ by beyond it is proportional to t.
+    The poses are rigid up to rounding. The rotation is the one nearest to the two given, by its
+    quaternion. What they differ by beyond it is proportional to t.
     """
     with localcontext() as context:
         context.prec = DIGITS + 10
@@ -169,7 +169,7 @@ def touching_pairs(
     b = naive.scan_units(lattice, step)
     a = naive.placed_units(avatar, pose, origin)
     radii = np.broadcast_to(np.rint(np.asarray(scan_radius) * naive.UNITS).astype(np.int64), len(b))
-    rows, own = np.nonzero(_near(a, b, naive.reach_units(pose, avatar_radius, 0.0, margin) + radii).T)
+    rows, own = np.nonzero(_near(a, b, naive.reach_units(avatar_radius, 0.0, margin) + radii).T)
     return list(zip(lattice[rows].tolist(), a[own].tolist(), strict=True))
 
 
@@ -208,6 +208,6 @@ def touching(
     found = []
     for t in np.asarray(fractions):
         pose = pose_at(first, last, float(t))
-        reach = naive.reach_units(pose, avatar_radius, 0.0, margin) + radii
+        reach = naive.reach_units(avatar_radius, 0.0, margin) + radii
         found.append(bool(_near(naive.placed_units(avatar, pose, np.zeros(3)), b, reach).any()))
     return np.array(found, bool)

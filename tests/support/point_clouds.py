@@ -17,13 +17,12 @@ TREES = st.fixed_dictionaries(
     }
 )
 # Parameters of tests against naive answers: points of a scan; the step of its lattice [m]; the edge
-# of a voxel [steps]; the distance of the scan from the origin [m]; the scale of an avatar, and its
-# distance from its own origin [m].
+# of a voxel [steps]; the distance of the scan from the origin [m]; the distance of an avatar from
+# its own origin [m].
 COUNTS = st.sampled_from([1, 2, 33, 300])
 STEPS = st.sampled_from([1e-6, archive_cases.BINARY_STEP, 1e-4, 1e-2, 0.3])
 VOXEL_STEPS = st.sampled_from([1, 7, 1000, 70_000, 1 << 21])
 FAR = st.sampled_from([0.0, 5e5, 6.4e6, 1e8])
-SCALES = st.sampled_from([1.0, 1.0, 1e-3, 0.3, 999.0])
 OFF = st.sampled_from([0.0, 0.0, 1e3, 1e5])
 
 

@@ -39,7 +39,7 @@ def shell(count: int, radius: float) -> NDArray[np.float64]:
     return own / size[:, None] * radius * np.array([1.0, 1.0, 1.5])
 
 
-def turned(w: int, x: int, y: int, z: int, scale: float = 1.0) -> NDArray[np.float64]:
+def turned(w: int, x: int, y: int, z: int) -> NDArray[np.float64]:
     """Return the rotation (3, 3) of a quaternion of integers."""
     n = float(w * w + x * x + y * y + z * z)
     rows = [
@@ -47,18 +47,18 @@ def turned(w: int, x: int, y: int, z: int, scale: float = 1.0) -> NDArray[np.flo
         [2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z],
     ]
-    return np.array(rows) / n * scale
+    return np.array(rows) / n
 
 
 def poses() -> NDArray[np.float64]:
-    """Return poses (k, 4, 4) in, on, near and far from the scene of `wall`, some scaled, one beside it."""
+    """Return poses (k, 4, 4) in, on, near and far from the scene of `wall`, one beside it."""
     places = [
-        (3, 1, 0, 0, (0.5, 0.5, 0.3), 1.0), (5, 1, -2, 1, (1.25, 0.75, 0.3), 1.0), (1, 0, 0, 0, (1.0, 0.75, 0.55), 1.0),
-        (2, 3, 1, -1, (0.22, 1.5, 0.9), 1.0), (7, 0, 2, 3, (1.7, 1.6, 0.345), 1.0), (4, -1, 1, 2, (1.0, 1.0, 0.9), 2.5),
-        (1, 2, 3, 4, (1.2, 1.2, 0.1), 0.5), (9, 1, 1, 1, (-0.26, 1.0, 1.0), 1.0), (1, 1, 0, 0, (9.0, 9.0, 9.0), 1.0),
-        (1, 3, 0, 1, (0.9, 0.7, 0.2), 0.75),
+        (3, 1, 0, 0, (0.5, 0.5, 0.3)), (5, 1, -2, 1, (1.25, 0.75, 0.3)), (1, 0, 0, 0, (1.0, 0.75, 0.55)),
+        (2, 3, 1, -1, (0.22, 1.5, 0.9)), (7, 0, 2, 3, (1.7, 1.6, 0.345)), (4, -1, 1, 2, (1.0, 1.0, 0.9)),
+        (1, 2, 3, 4, (1.2, 1.2, 0.1)), (9, 1, 1, 1, (-0.26, 1.0, 1.0)), (1, 1, 0, 0, (9.0, 9.0, 9.0)),
+        (1, 3, 0, 1, (0.9, 0.7, 0.2)),
     ]  # fmt: skip
-    return np.array([archive_cases.pose_of(turned(*q, s), np.array(at)) for *q, at, s in places])
+    return np.array([archive_cases.pose_of(turned(*q), np.array(at)) for *q, at in places])
 
 
 def loose() -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::simd::Simd;
 
-/// Row-major rotation (nine numbers, a uniform scale allowed in them), then the translation.
+/// Row-major rotation (nine numbers), then the translation.
 pub type Pose = [f32; 12];
 
 /// What the folder held.

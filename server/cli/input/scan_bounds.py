@@ -76,10 +76,9 @@ class BodyPlaces(NamedTuple):
         """Return the corners (k, 3) of world boxes around the bodies at poses (k, 4, 4)."""
         turn = poses[:, :3, :3]
         middle, half = (self.boxes[:, 0] + self.boxes[:, 1]) / 2, (self.boxes[:, 1] - self.boxes[:, 0]) / 2
-        grown = self.radius * np.linalg.norm(turn[:, :, 0], axis=1) + self.reach
         center = np.einsum("kij,kj->ki", turn, np.broadcast_to(middle, (len(poses), 3))) + poses[:, :3, 3]
         extent = np.einsum("kij,kj->ki", np.abs(turn), np.broadcast_to(half, (len(poses), 3)))
-        extent += grown[:, None]
+        extent += (self.radius + self.reach)[:, None]
         return center - extent, center + extent
 
     def _corners(self) -> Vec:

@@ -131,10 +131,10 @@ def _places(begin: SceneContent) -> Iterator[str]:
     yield from _comment(
         "Avatars that all users may use: points of a scan or mesh, in its own frame. radius: of each point's sphere; "
         "default: half the mean closest-point distance, of a mesh a hundredth of the square root of its area. up, "
-        "units: of the file; default: as its format states, otherwise z and m. hollow: whether the inside of a closed "
-        "mesh stays empty."
+        "units: of the file; default: as its format states, otherwise z and m. scale: factor of all lengths; "
+        "default: 1. hollow: whether the inside of a closed mesh stays empty."
     )
-    examples = {"radius": 0.01, "up": "y", "units": "mm", "hollow": True}
+    examples = {"radius": 0.01, "up": "y", "units": "mm", "scale": 0.5, "hollow": True}
     for avatar in begin.avatars or [{}]:
         off = "" if avatar else "#"
         fields = avatar or {"name": "visitor", "file": "visitor.ply"}

@@ -24,7 +24,7 @@ from ..motion.screw_motion import make_motion
 CLEAR, CONTACT, UNKNOWN = 0, 1, 2  # schemas/wire/answers.py Verdict
 # As in node_overlap.py: a pair of trees leaves at most 15 pairs a level on the stack.
 STACK = 2 * 80 * 15 + 16
-# A similarity may shear by SIMILARITY_TOLERANCE, 1e-9, and stretch a radius by as much.
+# A rotation may shear by RIGID_TOLERANCE, 1e-9, and stretch a radius by as much.
 STRETCH = 1.0 + 1e-8
 
 
@@ -63,11 +63,11 @@ def sweep_and_prune(order, low, high, groups, masks, stop, pairs):
 
 
 @nb.njit(nogil=True, cache=True)
-def bound_objects(avatar, poses, which, scales, units, origin, margin_units, low, high):
+def bound_objects(avatar, poses, which, units, origin, margin_units, low, high):
     """Write the boxes low, high (n, 3) float64 of the objects `which` of one avatar, not empty.
 
-    The boxes are relative to the dataset's origin [m].  scales, units: (n,) of all objects, see
-    `check_poses`. Half the margin is added on either side. The boxes are rounded outward by much
+    The boxes are relative to the dataset's origin [m].  units: (n,) of all objects, see `check_poses`.
+    Half the margin is added on either side. The boxes are rounded outward by much
     more than the rounding of placing.
     """
     shift = np.empty(3)
@@ -77,7 +77,7 @@ def bound_objects(avatar, poses, which, scales, units, origin, margin_units, low
         for r in range(3):
             shift[r] = m[r, 3] - origin[r]
         x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
-        extent = avatar.radius[0] * scales[i] * STRETCH
+        extent = avatar.radius[0] * STRETCH
         slack = 2.0 / UNITS_PER_METRE + (largest_term(m, shift, x, y, z) + extent) * 2.0**-49
         extent += np.float64(units[i] + margin_units / 2) / UNITS_PER_METRE + slack
         for r in range(3):
@@ -199,7 +199,7 @@ def _leaves_touch(
 
 
 @nb.njit(nogil=True, cache=True)
-def touch_bodies(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, nodes, at, lanes, counters):
+def touch_bodies(a, ma, b, mb, units, origin, visits, stop, nodes, at, lanes, counters):
     """Return CONTACT or CLEAR for two avatars, neither empty; UNKNOWN if the search ended early.
 
     It ends early when the visits are spent or the stop flag is set. The descent follows [Fig12]
@@ -211,10 +211,9 @@ def touch_bodies(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, no
     shift_a, shift_b = np.empty(3), np.empty(3)
     for r in range(3):
         shift_a[r], shift_b[r] = ma[r, 3] - origin[r], mb[r, 3] - origin[r]
-    grow_a, grow_b = scale_a * STRETCH, scale_b * STRETCH
     p, q = a.center, b.center
-    largest = largest_term(ma, shift_a, p[0, 0], p[0, 1], p[0, 2]) + a.radius[0] * grow_a
-    largest = max(largest, largest_term(mb, shift_b, q[0, 0], q[0, 1], q[0, 2]) + b.radius[0] * grow_b)
+    largest = largest_term(ma, shift_a, p[0, 0], p[0, 1], p[0, 2]) + a.radius[0] * STRETCH
+    largest = max(largest, largest_term(mb, shift_b, q[0, 0], q[0, 1], q[0, 2]) + b.radius[0] * STRETCH)
     # Rounding of two points to units, and of all sums that place a point or a centre.
     error = 2.0 / UNITS_PER_METRE + largest * 2.0**-47
     reach = np.float64(units) / UNITS_PER_METRE + error
@@ -230,7 +229,7 @@ def touch_bodies(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, no
         i, j = nodes[depth, 0], nodes[depth, 1]
         for r in range(6):
             here[r] = at[depth, r]
-        radius_a, radius_b = a.radius[i] * grow_a, b.radius[j] * grow_b
+        radius_a, radius_b = a.radius[i] * STRETCH, b.radius[j] * STRETCH
         dx, dy, dz = here[0] - here[3], here[1] - here[4], here[2] - here[5]
         both = (radius_a + radius_b + reach) * (1.0 + 1e-12)
         if dx * dx + dy * dy + dz * dz > both * both:
@@ -263,12 +262,12 @@ def touch_bodies(a, ma, scale_a, b, mb, scale_b, units, origin, visits, stop, no
 
 
 @nb.njit(nogil=True, cache=True)
-def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits, stop, verdict, counters):
+def touch_pairs(a, b, poses, units, pairs, margin_units, origin, visits, stop, verdict, counters):
     """Decide whether objects pairs[:, 0] of avatar a touch objects pairs[:, 1] of avatar b.
 
     Neither avatar is empty.
-    poses: (n, 4, 4), checked, of all objects.  scales, units: (n,), see `check_poses`; units are
-    without the margin.  pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits
+    poses: (n, 4, 4), checked, of all objects.  units: (n,), see `check_poses`, without the
+    margin.  pairs: (p, 2) int64.  origin: (3,) of the dataset [m].  visits: node visits
     a pair.  stop: (1,) int64, the request's stop flag; once it is set, pairs are UNKNOWN.
     Writes verdict (p,) uint8; adds to counters (2,) int64: node visits, pairs of points tested.
     """
@@ -286,7 +285,7 @@ def touch_pairs(a, b, poses, scales, units, pairs, margin_units, origin, visits,
         own[1] = 0
         reach = units[i] + units[j] + margin_units
         verdict[number] = touch_bodies(
-            a, poses[i], scales[i], b, poses[j], scales[j], reach, origin, visits, stop, nodes, at, lanes, own
+            a, poses[i], b, poses[j], reach, origin, visits, stop, nodes, at, lanes, own
         )
         counters[0] += own[0]
         counters[1] += own[1]

@@ -67,9 +67,7 @@ U = np.uint64  # see placed_avatar.py
 
 
 @njit_no_refcount
-def _collide_voxel(
-    avatar, m, scale, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch
-):
+def _collide_voxel(avatar, m, extent, pose, placed, scene, voxel, location, by_class, front, count, scratch):
     """Return CONTACT, EARLY or CLEAR for one resident voxel, whose root the placed avatar meets.
 
     The scene's tree is descended depth first, each node with a list of
@@ -145,7 +143,7 @@ def _collide_voxel(
                             continue
                     elif first < 0:
                         found = below_touches(
-                            avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch
+                            avatar, m, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch
                         )  # fmt: skip
                         if found != CLEAR:
                             return found
@@ -216,9 +214,9 @@ def _collide_poses(
             continue
         if stopped(scene.stop):
             return
-        m, scale = poses[i], reach.scales[i]
+        m = poses[i]
         scratch.counters[0], scratch.counters[1] = 0, 0
-        extent, farthest = place_root(avatar, m, scale, placed, scene)
+        extent, farthest = place_root(avatar, m, placed, scene)
         error = set_class_thresholds(
             by_class,
             scene.radius_deficit,
@@ -247,21 +245,9 @@ def _collide_poses(
             threshold = by_class.threshold[node_class(ints, location.rows, by_class.mask)]
             if nodes_meet(scene.words, location.rows, x, y, z, nodes[3, 0], threshold):
                 if count == 0:
-                    count = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
+                    count = place_front(avatar, m, placed, scene, extent, front.bounds)
                 found = _collide_voxel(
-                    avatar,
-                    m,
-                    scale,
-                    extent,
-                    i,
-                    placed,
-                    scene,
-                    voxel,
-                    location,
-                    by_class,
-                    front,
-                    count,
-                    scratch,
+                    avatar, m, extent, i, placed, scene, voxel, location, by_class, front, count, scratch
                 )
                 if found != CLEAR:
                     verdict[i], at = found, end

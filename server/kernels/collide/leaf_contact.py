@@ -95,7 +95,7 @@ def leaves_touch(avatar, m, block, placed, scene, voxel, location, row, by_class
 
 
 @njit_no_refcount
-def below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch):
+def below_touches(avatar, m, extent, pose, placed, scene, voxel, location, a, row, by_class, scratch):
     """Return what `leaves_touch` finds for a scene leaf node and a node of the avatar's front.
 
     The avatar's node is descended depth first. This is for avatars whose front is not their leaf
@@ -103,7 +103,7 @@ def below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location
     """
     words, below = scene.words, scratch.below
     threshold = by_class.threshold[node_class(scene.ints, row, by_class.mask)]
-    steps = scale / scene.step
+    per_step = 1.0 / scene.step
     below[0] = a
     depth = 1
     while depth > 0 and not should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
@@ -114,7 +114,7 @@ def below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location
         if a_first < 0:
             block = np.int64(~a_first)
             if avatar.inner_points > 0 and not _may_touch(
-                avatar, m, steps, extent, placed, scene, location, a, row, threshold, scratch
+                avatar, m, per_step, extent, placed, scene, location, a, row, threshold, scratch
             ):
                 continue
             place_block_once(avatar, m, pose, block, placed, scene)
@@ -126,7 +126,7 @@ def below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location
                     return found
             continue
         x, y, z = place_node(avatar, m, a, placed, scene)
-        radius = node_reach(avatar.radius[a], steps, extent)
+        radius = node_reach(avatar.radius[a], per_step, extent)
         if nodes_meet(words, row, x - location.x, y - location.y, z - location.z, radius, threshold):
             for i in range(avatar.count[a]):
                 below[depth] = a_first + i
@@ -135,7 +135,7 @@ def below_touches(avatar, m, scale, extent, pose, placed, scene, voxel, location
 
 
 @njit_no_refcount
-def _may_touch(avatar, m, steps, extent, placed, scene, location, a, row, threshold, scratch):
+def _may_touch(avatar, m, per_step, extent, placed, scene, location, a, row, threshold, scratch):
     """Return whether a point of a scene leaf node is near a leaf node of the avatar.
 
     A scene leaf node of scattered points may hold much of the inside of a filled mesh without a
@@ -158,5 +158,5 @@ def _may_touch(avatar, m, steps, extent, placed, scene, location, a, row, thresh
         x,
         y,
         z,
-        node_reach(avatar.radius[a], steps, extent) + threshold,
+        node_reach(avatar.radius[a], per_step, extent) + threshold,
     )

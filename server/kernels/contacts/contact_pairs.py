@@ -232,7 +232,7 @@ def gather_contacts(poses, avatar, scene, reach, which, cursor, held, options, s
         if stopped(scene.stop) or state_of(held, rows[cursor[i]]) == NOT_HELD:
             return state
         state.sizes[POSE] = i
-        extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
+        extent, farthest = place_nodes(avatar, poses[i], placed, scene)
         _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
         scratch.bound[0] = listing_bound(
             state.heap, state.sizes[KEPT], scene.units_per_step, scratch.error[0]

@@ -132,40 +132,40 @@ def lattice_to_units(steps, units_per_step):
 
 
 @njit_no_refcount
-def place_root(avatar, m, scale, placed, scene):
+def place_root(avatar, m, placed, scene):
     """Choose the frame and place an avatar's root; fill placed.frame, shift and node 0.
 
     Returns (extent, farthest) for `make_thresholds`, of the whole avatar.
     """
     per_step = 1.0 / scene.step
     x, y, z = avatar.center[0, 0], avatar.center[0, 1], avatar.center[0, 2]
-    extent = avatar.radius[0] * scale * per_step + 1.0
+    extent = avatar.radius[0] * per_step + 1.0
     for r in range(3):
         placed.shift[r] = m[r, 3] - scene.origin[r]
         root = place(m, placed.shift, r, x, y, z)
         placed.frame[r] = np.int64(np.rint(root * per_step))
         placed.nodes[r, 0] = np.float32((root - np.float64(placed.frame[r]) * scene.step) * per_step)
-    placed.nodes[3, 0] = node_reach(avatar.radius[0], scale * per_step, extent)
+    placed.nodes[3, 0] = node_reach(avatar.radius[0], per_step, extent)
     return extent, largest_term(m, placed.shift, x, y, z) * per_step + extent
 
 
 @njit_no_refcount
-def node_reach(radius, steps, extent):
+def node_reach(radius, per_step, extent):
     """Return the radius [steps] of a placed node, rounded outward.
 
-    steps: lattice steps a metre of the avatar. The slack of 1e-6 covers the float32 centre, which
+    per_step: lattice steps a metre. The slack of 1e-6 covers the float32 centre, which
     is off by at most U32 of `extent`, and the radius, off by U32 of itself.
     """
-    return np.float32(radius * steps * (1.0 + 1e-6) + extent * 1e-6)
+    return np.float32(radius * per_step * (1.0 + 1e-6) + extent * 1e-6)
 
 
 @njit_no_refcount
-def place_nodes(avatar, m, scale, placed, scene):
+def place_nodes(avatar, m, placed, scene):
     """Place all nodes of an avatar; fill placed.frame, shift and nodes.
 
     Returns (extent, farthest), as `place_root` does.
     """
-    extent, farthest = place_root(avatar, m, scale, placed, scene)
+    extent, farthest = place_root(avatar, m, placed, scene)
     step = scene.step
     per_step = 1.0 / step
     nodes = placed.nodes
@@ -175,7 +175,7 @@ def place_nodes(avatar, m, scale, placed, scene):
             world = place(m, placed.shift, r, avatar.center[i, 0], avatar.center[i, 1], avatar.center[i, 2])
             nodes[r, i] = np.float32((world - base) * per_step)
     for i in range(1, avatar.center.shape[0]):
-        nodes[3, i] = node_reach(avatar.radius[i], scale * per_step, extent)
+        nodes[3, i] = node_reach(avatar.radius[i], per_step, extent)
     return extent, farthest
 
 
@@ -200,7 +200,7 @@ def pad_list(bounds, begin, end):
 
 
 @njit_no_refcount
-def place_front(avatar, m, scale, placed, scene, extent, bounds):
+def place_front(avatar, m, placed, scene, extent, bounds):
     """Place the front, after `place_root`, as the first list of `bounds`. Returns its length."""
     step = scene.step
     per_step = 1.0 / step
@@ -214,7 +214,7 @@ def place_front(avatar, m, scale, placed, scene, extent, bounds):
             world = ((m0 * front[0, i] + m1 * front[1, i]) + m2 * front[2, i]) + shift
             bounds[r, i] = np.float32((world - base) * per_step)
     for i in range(n):
-        bounds[3, i] = node_reach(front[3, i], scale * per_step, extent)
+        bounds[3, i] = node_reach(front[3, i], per_step, extent)
     pad_list(bounds, n, (n + LANES - 1) // LANES * LANES)
     return n
 

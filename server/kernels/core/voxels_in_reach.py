@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....schemas.archive.rigid_pose import RIGID_TOLERANCE
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.kernels import compiling as nb
@@ -19,24 +20,21 @@ POSES_AT_ONCE = 64
 # Voxels in reach of a query of one item that is answered in one call.
 MAX_ROWS_OF_ONE = 64
 
-SIMILARITY_TOLERANCE = 1e-9  # NUMERICS.md N6
-SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 # Coordinates near a pose must be exact in float32, with a bit to spare (collide_poses.py).
 MAX_FRAME_STEPS = 1 << 23
-VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, BAD_SCALE, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
+VALID, NOT_FINITE, BAD_LAST_ROW, MIRRORED, SHEARED, SCALED, TOO_FAR, LONG_REACH, LARGE_AVATAR = range(9)
 
 
 class VoxelsInReach(NamedTuple):
     """Voxels that k poses could touch.
 
-    scales: (k,) float64.  units: (k,) int64, r_a + r_b + margin in exact units.
+    units: (k,) int64, r_a + r_b + margin in exact units.
     lists: the voxels; `near` bounds the distance between centres, and `unseen` is that of scans that
     were left out.
     boxes: (k, 2, 3) float64, the box of the root sphere and its reach [steps].
     outside: (k,) bool, whether that box extends beyond the scene's box.
     """
 
-    scales: NDArray[np.float64]
     units: NDArray[np.int64]
     lists: VoxelLists
     boxes: NDArray[np.float64]
@@ -62,7 +60,7 @@ def make_reach(k: int, rows: int) -> VoxelsInReach:
     lists = VoxelLists(
         np.zeros(k + 1, np.int64), np.empty(rows, np.int64), np.empty(rows), np.full(k, np.inf)
     )
-    return VoxelsInReach(np.empty(k), np.empty(k, np.int64), lists, np.empty((k, 2, 3)), np.zeros(k, bool))
+    return VoxelsInReach(np.empty(k, np.int64), lists, np.empty((k, 2, 3)), np.zeros(k, bool))
 
 
 def make_one_reach() -> OneReach:
@@ -72,18 +70,18 @@ def make_one_reach() -> OneReach:
 
 
 @njit_no_refcount
-def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
-    """Check that poses (k, 4, 4) float64 are similarities (N6); compute scales and reaches.
+def check_poses(poses, node_radius, radius, other_units, scene, units):
+    """Check that poses (k, 4, 4) float64 are rigid (N6); compute reaches.
 
-    Writes scales (k,) and units (k,) int64, the reach of each pose in exact units.
+    Writes units (k,) int64, the reach of each pose in exact units.
     node_radius: (a,) of the avatar's nodes, root first, may be empty.  radius: of its points [m].
     other_units: the scan's radius plus the margin, exact units.  scene: SceneArrays.
-    A scale within SIMILARITY_TOLERANCE of 1 becomes 1, so that the rounding of a rigid pose does
-    not change a radius.
     Returns (GOOD, 0, 0.0), or the first fault, its pose and the value found. Once scene.stop is
     set, it also returns (GOOD, 0, 0.0), with the output incomplete: the caller must then check the
     stop flag.
     """
+    reach = np.rint(radius * UNITS_PER_METRE) + float(other_units)
+    extent = reach / UNITS_PER_METRE + (node_radius[0] if node_radius.shape[0] else 0.0)
     for i in range(poses.shape[0]):
         if i % POSES_AT_ONCE == 0 and stopped(scene.stop):
             break
@@ -97,9 +95,6 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
         for r in range(3):
             if not abs(m[r, 3]) <= MAX_COORDINATE:
                 return TOO_FAR, i, m[r, 3]
-            for c in range(3):
-                if not abs(m[r, c]) <= 2.0 * LARGEST_SCALE:
-                    return BAD_SCALE, i, m[r, c]
         minor0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
         minor1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
         minor2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
@@ -109,11 +104,6 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
             for c in range(3):
                 square += m[r, c] * m[r, c]
         square /= 3.0
-        scale = math.sqrt(square)
-        # A scale of 1000 is valid, even if its square root is rounded up.
-        least = SMALLEST_SCALE * (1.0 - SIMILARITY_TOLERANCE)
-        if not least <= scale <= LARGEST_SCALE * (1.0 + SIMILARITY_TOLERANCE):
-            return BAD_SCALE, i, scale
         worst = 0.0
         for a in range(3):
             for b in range(3):
@@ -121,16 +111,16 @@ def check_poses(poses, node_radius, radius, other_units, scene, scales, units):
                 worst = max(worst, abs(dot - (square if a == b else 0.0)))
         # Factor 2: an entry that is off by the tolerance changes a product of two entries by twice
         # that.
-        if worst > 2.0 * SIMILARITY_TOLERANCE * square:
+        if worst > 2.0 * RIGID_TOLERANCE * square:
             return SHEARED, i, worst / square
         if volume < 0.0:
             return MIRRORED, i, volume
-        scales[i] = 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
-        reach = np.rint(scales[i] * radius * UNITS_PER_METRE) + float(other_units)
+        scale = math.sqrt(square)
+        if not abs(scale - 1.0) <= RIGID_TOLERANCE:
+            return SCALED, i, scale
         if reach > MAX_REACH_UNITS:
             return LONG_REACH, i, reach / UNITS_PER_METRE
         units[i] = np.int64(reach)
-        extent = reach / UNITS_PER_METRE + (node_radius[0] * scales[i] if node_radius.shape[0] else 0.0)
         if extent / scene.step + scene.voxel_steps > MAX_FRAME_STEPS:
             return LARGE_AVATAR, i, extent
     return VALID, 0, 0.0
@@ -144,9 +134,7 @@ def find_reach(poses, avatar, radius, other_units, scene, tree, reach):
     exact units. Fills `reach`.
     Returns (fault, pose, value found), as `check_poses` does, and the number of rows needed.
     """
-    fault, pose, found = check_poses(
-        poses, avatar.radius, radius, other_units, scene, reach.scales, reach.units
-    )
+    fault, pose, found = check_poses(poses, avatar.radius, radius, other_units, scene, reach.units)
     if fault != VALID or avatar.radius.shape[0] == 0:
         return fault, pose, found, 0
     return fault, pose, found, voxels_in_reach(poses, avatar, scene, tree, reach)
@@ -172,7 +160,7 @@ def voxels_in_reach(poses, avatar, scene, tree, reach):
         for r in range(3):
             shift[r] = m[r, 3] - scene.origin[r]
         rounding = largest_term(m, shift, x, y, z) / scene.step * 2.0**-49
-        root = avatar.radius[0] * reach.scales[i] / scene.step
+        root = avatar.radius[0] / scene.step
         span = (root + reach.units[i] / scene.units_per_step) * (1.0 + 1e-6) + 1.0 + rounding
         outside[i] = False
         for r in range(3):

@@ -11,7 +11,6 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import lattice_to_units, pair_square, place, to_units
 from ..core.scene_arrays import LANES, point_class
-from ..core.voxels_in_reach import SIMILARITY_TOLERANCE
 from .screw_motion import pose_at
 
 INFINITE = np.inf
@@ -78,25 +77,13 @@ def _deficit_of(scene, pair):
 
 
 @njit_no_refcount
-def _scale_of(pose):
-    """Return the scale of a pose, as `check_poses` computes it."""
-    square = 0.0
-    for r in range(3):
-        for c in range(3):
-            square += pose[r, c] * pose[r, c]
-    scale = math.sqrt(square / 3.0)
-    return 1.0 if abs(scale - 1.0) <= SIMILARITY_TOLERANCE else scale
-
-
-@njit_no_refcount
 def touches_at(sweep, t, pair):
     """Return whether one pair (as in MovingAvatar) is in contact under M(t), by NUMERICS.md N5."""
     scene, moving = sweep.scene, sweep.moving
     pose_at(sweep.motion, t, moving.pose)
     for r in range(3):
         moving.shift[r] = moving.pose[r, 3] - scene.origin[r]
-    own = np.int64(np.rint(_scale_of(moving.pose) * sweep.radius * UNITS_PER_METRE))
-    units = own + sweep.other_units - _deficit_of(scene, pair)
+    units = sweep.units - _deficit_of(scene, pair)
     block, lane, voxel, lane_at, block_at, j = pair
     square = pair_square(sweep.avatar, moving.pose, block, lane, moving, scene, voxel, lane_at, block_at, j)
     return square >= 0 and square <= units * units

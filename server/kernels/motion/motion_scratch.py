@@ -13,20 +13,17 @@ from .sweep_segments import PlanSpace, SweepProgress, make_plan_space
 class OneMotion(NamedTuple):
     """Arrays of one motion, as those of k in sweep_segments.py and sweep_advance.py; scratch.
 
-    first, last: (1, 4, 4).  counts: (4, 1).  which: (1,), zero.  loose: (1,), zero.
+    first, last: (1, 4, 4).  counts: (4, 1).  which: (1,), zero.
     origin: (3,), zero.  pose: (4, 4).  The others are (1,).
     """
 
     first: NDArray[np.float64]
     last: NDArray[np.float64]
-    scales: NDArray[np.float64]
     units: NDArray[np.int64]
-    units_from: NDArray[np.int64]
     progress: SweepProgress
     counts: NDArray[np.uint32]
     which: NDArray[np.int64]
     cursor: NDArray[np.int64]
-    loose: NDArray[np.float64]
     moved: NDArray[np.float64]
     origin: NDArray[np.float64]
     pose: NDArray[np.float64]
@@ -68,8 +65,7 @@ def make_scratch(avatar):
         np.zeros(1),
     )
     one = OneMotion(
-        np.empty((1, 4, 4)), np.empty((1, 4, 4)), np.empty(1), np.empty(1, np.int64), np.empty(1, np.int64),
-        progress, np.zeros((4, 1), np.uint32), np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1),
-        np.empty(1), np.zeros(3), np.empty((4, 4)),
+        np.empty((1, 4, 4)), np.empty((1, 4, 4)), np.empty(1, np.int64), progress, np.zeros((4, 1), np.uint32),
+        np.zeros(1, np.int64), np.zeros(1, np.int64), np.empty(1), np.zeros(3), np.empty((4, 4)),
     )  # fmt: skip
     return MotionScratch(make_moving(avatar), make_plan_space(), one)

@@ -84,21 +84,15 @@ class AvatarSweep(NamedTuple):
     """One motion of one avatar in one scene.
 
     motion: ScrewMotion.  avatar: Avatar.  scene: SceneArrays.  moving: MovingAvatar.
-    radius: of the avatar's points [m].  scale: of the poses.
-    In exact units: other_units: the scan's largest radius plus the margin; units: these plus the
-    avatar's radius at either end, the larger; loose: how much that may vary on the way. The reach
-    of a pair is less by its `SceneArrays.radius_deficit`.
+    units: the radii of the avatar and of the scan's largest sphere plus the margin, exact units. The
+    reach of a pair is less by its `SceneArrays.radius_deficit`.
     """
 
     motion: ScrewMotion
     avatar: Avatar
     scene: SceneArrays
     moving: MovingAvatar
-    radius: float
-    scale: float
-    other_units: int
     units: np.int64
-    loose: float
 
 
 class AvatarChord(NamedTuple):
@@ -206,7 +200,7 @@ def _turn_block(avatar, block, moving):
 
 
 @njit_no_refcount
-def place_nodes(avatar, scale, speed, moving, scene):
+def place_nodes(avatar, speed, moving, scene):
     """Place an avatar's nodes at both ends of a chord; fill shifts, frame and nodes.
 
     speed: the farthest any point moves on the chord [m]. Returns (extent, farthest) for
@@ -258,11 +252,10 @@ def place_nodes(avatar, scale, speed, moving, scene):
             nodes[7, i] = _inverse(x, y, z)
             longest = max(longest, np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
     longest = math.sqrt(longest) * (1.0 + 1e-6)
-    extent = avatar.radius[0] * scale * per_step + 1.0 + longest
+    extent = avatar.radius[0] * per_step + 1.0 + longest
     for i in range(count):
-        # The added 1e-6 is that of placed_avatar.py; it also covers a scale within 1e-9 of 1, or of
-        # the other end's.
-        nodes[3, i] = np.float32(avatar.radius[i] * scale * per_step * (1.0 + 1e-6) + extent * 1e-6)
+        # The added 1e-6 is that of placed_avatar.py; it also covers a pose that is rigid within 1e-9.
+        nodes[3, i] = np.float32(avatar.radius[i] * per_step * (1.0 + 1e-6) + extent * 1e-6)
     if translation:
         # A coordinate is rounded to float32 three times instead of once: turned, offset and their
         # sum. Its float64 terms are rounded eleven times instead of four.

@@ -1,6 +1,6 @@
 """Screw motions: the pose at a fraction of the way between two poses, and its speed and curvature.
 
-Definition: R0, R1 are the upper left 3x3 of the two poses (both contain the scale), p0, p1 their
+Definition: R0, R1 are the upper left 3x3 of the two poses (rotations within 1e-9), p0, p1 their
 translations, and E(a) is the rotation by `a` about the axis u of the shorter rotation that takes R0
 to R1, by the angle A. The translation p1 - p0 = along + across, with `along` parallel to u. Then
 
@@ -131,7 +131,7 @@ def _quaternion(first, last):
 
 @nb.njit(nogil=True, cache=True)
 def make_motion(first, last, box, origin):
-    """Compute the screw motion between two checked poses (4, 4) of one scale.
+    """Compute the screw motion between two checked poses (4, 4).
 
     box: (2, 3), least and greatest coordinates of the avatar's points [m].  origin: (3,) of the
     dataset, world [m].

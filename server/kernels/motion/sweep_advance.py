@@ -23,14 +23,12 @@ MAX_REFUSED = 512
 
 @nb.njit(nogil=True, cache=True)
 def advance_segments(
-    box, first, last, avatar, radius, other_units, scales, units, loose, scene, lists, which, cursor, state, tolerance,
-    scratch, progress, counts,
+    box, first, last, avatar, units, scene, lists, which, cursor, state, tolerance, scratch, progress, counts
 ):  # fmt: skip
     """Advance the motions numbered in `which` along their segments, each through voxels from its cursor on.
 
-    box, first, last, scales, units: as in `plan_segments`.  loose: (k,), how much units may vary on
-    the way.  lists: the voxels of each motion's segment.  cursor, state: as in `collide_poses`.
-    tolerance: [m].  scratch: `make_scratch` of the avatar.
+    box, first, last, units: as in `plan_segments`.  lists: the voxels of each motion's segment.
+    cursor, state: as in `collide_poses`.  tolerance: [m].  scratch: `make_scratch` of the avatar.
     Lowers progress.lower and upper, sets a witness with upper, of equal ones the first by
     NUMERICS.md N11, and adds to counts (4, k): voxels missing, node visits, point tests, advances.
     A missing voxel makes the motion unknown from where the root sphere's cube reaches it, or from
@@ -52,18 +50,8 @@ def advance_segments(
                 gap = min(gap, near[at] / progress.way[i] if progress.way[i] > 0.0 else 0.0)
             at += 1
         moving.counters[0], moving.counters[1], moving.counters[3] = 0, 0, progress.visits[i]
-        sweep = AvatarSweep(
-            motion,
-            avatar,
-            scene,
-            moving,
-            radius,
-            scales[i],
-            other_units,
-            np.int64(units[i]),
-            np.float64(loose[i]),
-        )
-        size = avatar_size(box, scales[i], units[i])
+        sweep = AvatarSweep(motion, avatar, scene, moving, np.int64(units[i]))
+        size = avatar_size(box, units[i])
         lower, upper, steps = _advance(
             sweep, t0, t1, progress.upper[i], rows[begin:at], state, size, tolerance
         )

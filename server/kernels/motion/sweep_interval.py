@@ -303,11 +303,11 @@ def search(sweep, t0, t1, rows, state):
     pose_at(motion, t1, moving.ends[1])
     length = t1 - t0
     sagitta = motion.bend * length * length / 8.0 * UNITS_PER_METRE
-    band = (0.8661 + sweep.loose + sagitta + 2.0 * motion.slip * UNITS_PER_METRE) * (1.0 + 1e-9)
+    band = (0.8661 + sagitta + 2.0 * motion.slip * UNITS_PER_METRE) * (1.0 + 1e-9)
     chord = AvatarChord(
         t0, t1, np.float64(sweep.units) - band, np.float64(sweep.units) + band, sagitta <= LEAST_SAGITTA
     )
-    extent, farthest = place_nodes(sweep.avatar, sweep.scale, motion.speed * length, moving, scene)
+    extent, farthest = place_nodes(sweep.avatar, motion.speed * length, moving, scene)
     widest = np.int64(math.ceil(chord.outer)) + 1
     for c in range(scene.radius_deficit.shape[0]):
         thresholds = make_thresholds(

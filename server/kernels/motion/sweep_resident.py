@@ -12,7 +12,7 @@ from ....schemas.wire.answers import Verdict
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.reach import all_resident
 from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, SceneArrays, stopped
-from ..core.voxels_in_reach import SIMILARITY_TOLERANCE, VALID, check_poses
+from ..core.voxels_in_reach import VALID, check_poses
 from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
 from .screw_motion import make_motion, pose_at
 from .sweep_advance import advance_segments
@@ -37,20 +37,10 @@ def box_of(avatar):
 
 
 @nb.njit(nogil=True, cache=True)
-def _rigid(pose):
-    """Return whether a pose is well within what server/queries/sweep.py accepts as scale 1."""
-    square = 0.0
-    for r in range(3):
-        for c in range(3):
-            square += pose[r, c] * pose[r, c]
-    return abs(square / 3.0 - 1.0) <= 0.5 * SIMILARITY_TOLERANCE
-
-
-@nb.njit(nogil=True, cache=True)
 def sweep_resident(
     pose_from, pose_to, body, scratch, radius, other_units, box, held, stop, unknown_everywhere, tolerance, skin, result,
 ):  # fmt: skip
-    """Sweep one motion if it is short, of scale 1, and all voxels in its reach are resident.
+    """Sweep one motion if it is short and all voxels in its reach are resident.
 
     pose_from, pose_to: (4, 4) world, unchecked.  body, held: references to the arrays of an avatar
     that is not empty, and of the scene.  scratch: `make_scratch` of the avatar.  box: `box_of` the
@@ -65,19 +55,14 @@ def sweep_resident(
     """
     avatar, scene, tree, lists = body.avatar, held.scene, held.tree, held.one.reach.lists
     one, origin = scratch.one, scene.origin
-    first, last, scales, units, progress, counts = (
-        one.first, one.last, one.scales, one.units, one.progress, one.counts,
-    )  # fmt: skip
+    first, last, units, progress, counts = one.first, one.last, one.units, one.progress, one.counts
     for r in range(4):
         for c in range(4):
             first[0, r, c], last[0, r, c] = pose_from[r, c], pose_to[r, c]
-    fault, _, _ = check_poses(first, avatar.radius, radius, other_units, scene, scales, one.units_from)
-    if fault != VALID or not _rigid(first[0]):
-        return _NOT_ANSWERED
-    fault, _, _ = check_poses(last, avatar.radius, radius, other_units, scene, scales, units)
-    if fault != VALID or not _rigid(last[0]):
-        return _NOT_ANSWERED
-    units[0] = max(units[0], one.units_from[0])
+    for poses in (first, last):
+        fault, _, _ = check_poses(poses, avatar.radius, radius, other_units, scene, units)
+        if fault != VALID:
+            return _NOT_ANSWERED
     for r in range(3):
         first[0, r, 3] -= origin[r]
         last[0, r, 3] -= origin[r]
@@ -90,7 +75,7 @@ def sweep_resident(
     for n in range(4):
         counts[n, 0] = np.uint32(0)
     needed = plan_segments(
-        box, first, last, avatar, scales, units, from_zero, tree, one.which, progress, lists, scratch.space, one.moved,
+        box, first, last, avatar, units, from_zero, tree, one.which, progress, lists, scratch.space, one.moved,
     )  # fmt: skip
     if not all_resident(scene.where, lists.rows, needed) or (needed > 0 and progress.end[0] < 1.0):
         return _NOT_ANSWERED
@@ -98,7 +83,7 @@ def sweep_resident(
     if needed > 0:
         progress.lower[0], one.cursor[0] = progress.end[0], 0
         advance_segments(
-            box, first, last, avatar, radius, other_units, scales, units, one.loose, from_zero, lists, one.which,
+            box, first, last, avatar, units, from_zero, lists, one.which,
             one.cursor, held.one.all_held, tolerance, scratch, progress, counts,
         )  # fmt: skip
         if progress.visits[0] < 0 or stopped(stop):
@@ -109,9 +94,7 @@ def sweep_resident(
         proved = 0.0
     elif tree.unknown.shape[0] > 0:
         until, outside, unknown_from = np.full(1, min(upper, 1.0)), np.zeros(1, np.bool_), np.empty(1)
-        find_unknown_regions(
-            box, first, last, avatar, scales, units, from_zero, tree, until, outside, unknown_from
-        )
+        find_unknown_regions(box, first, last, avatar, units, from_zero, tree, until, outside, unknown_from)
         if unknown_from[0] <= until[0]:
             proved = min(proved, unknown_from[0])
     result[LOWER], result[UPPER], result[SPEED], result[ENDED] = proved, upper, progress.speed[0], OPEN

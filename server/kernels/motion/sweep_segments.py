@@ -79,7 +79,7 @@ def avatar_box(avatar):
 
 
 @njit_no_refcount
-def avatar_size(box, scale, units):
+def avatar_size(box, units):
     """Return the size of an avatar with its reach, across [m].
 
     The result does not depend on the order of its points or on its tree.
@@ -87,7 +87,7 @@ def avatar_size(box, scale, units):
     square = 0.0
     for r in range(3):
         square += (box[1, r] - box[0, r]) ** 2
-    return math.sqrt(square) * scale + 2.0 * np.float64(units) / UNITS_PER_METRE + 1e-6
+    return math.sqrt(square) + 2.0 * np.float64(units) / UNITS_PER_METRE + 1e-6
 
 
 @njit_no_refcount
@@ -105,7 +105,7 @@ def longest_part(motion, most, sagitta):
 
 
 @njit_no_refcount
-def place_root_sphere(motion, t, avatar, scale, units, scene, pose, shift, center):
+def place_root_sphere(motion, t, avatar, units, scene, pose, shift, center):
     """Place the avatar's root sphere under M(t): center (3,) [steps]; pose and shift are scratch.
 
     Returns the radius with the reach, widened as in `voxels_in_reach`; a motion that stands still
@@ -117,7 +117,7 @@ def place_root_sphere(motion, t, avatar, scale, units, scene, pose, shift, cente
         shift[r] = pose[r, 3] - scene.origin[r]
     for r in range(3):
         center[r] = place(pose, shift, r, x, y, z) / scene.step
-    span = (avatar.radius[0] * scale / scene.step + units / scene.units_per_step) * (1.0 + 1e-6) + 1.0
+    span = (avatar.radius[0] / scene.step + units / scene.units_per_step) * (1.0 + 1e-6) + 1.0
     return span + largest_term(pose, shift, x, y, z) / scene.step * 2.0**-49
 
 
@@ -133,11 +133,11 @@ def sagitta_of(motion, length, scene):
 
 
 @nb.njit(nogil=True, cache=True)
-def plan_segments(box, first, last, avatar, scales, units, scene, tree, which, progress, lists, space, moved):
+def plan_segments(box, first, last, avatar, units, scene, tree, which, progress, lists, space, moved):
     """Plan the next segment of each motion in `which` that reaches any voxel, and list its voxels.
 
-    box: `avatar_box`.  first, last: (k, 4, 4), checked.  scales, units: (k,), the larger value of
-    the two ends.  space: scratch.  moved: (w,) float64, one for each of `which`; scratch.
+    box: `avatar_box`.  first, last: (k, 4, 4), checked.  units: (k,), as `check_poses` writes them.
+    space: scratch.  moved: (w,) float64, one for each of `which`; scratch.
     Reads progress.at and advances it to the start of the segment; everything before is out of reach
     of all voxels. Writes end, speed and way. `at` becomes 1 for a motion with nothing left in reach,
     which gets no rows. Fills starts, rows and near of `lists`, with no rows for motions not in
@@ -156,7 +156,7 @@ def plan_segments(box, first, last, avatar, scales, units, scene, tree, which, p
         next_start = i + 1
         motion = make_motion(first[i], last[i], box, scene.origin)
         progress.speed[i] = motion.speed
-        size = avatar_size(box, scales[i], units[i])
+        size = avatar_size(box, units[i])
         most = min(_SEGMENT_SIZES * size + _SEGMENT_MORE, _SEGMENT_STEPS * scene.step)
         segment = longest_part(motion, most, _SEGMENT_BEND * size)
         t, length, before = progress.at[i], 1.0, count
@@ -164,10 +164,8 @@ def plan_segments(box, first, last, avatar, scales, units, scene, tree, which, p
             # Far away, the whole remaining way is tried first, then half of it ...
             length = min(max(length, segment), 1.0 - t)
             stop = 1.0 if t + length >= 1.0 - 1e-12 else t + length
-            span = place_root_sphere(motion, t, avatar, scales[i], units[i], scene, pose, shift, begin)
-            span = max(
-                span, place_root_sphere(motion, stop, avatar, scales[i], units[i], scene, pose, shift, end)
-            )
+            span = place_root_sphere(motion, t, avatar, units[i], scene, pose, shift, begin)
+            span = max(span, place_root_sphere(motion, stop, avatar, units[i], scene, pose, shift, end))
             span += sagitta_of(motion, stop - t, scene)
             if entry_fraction(begin, end, span, tree.scene[:1], tree.scene[1:], 0) < INFINITE:
                 if length > segment * (1.0 + 1e-9):
@@ -196,7 +194,7 @@ def plan_segments(box, first, last, avatar, scales, units, scene, tree, which, p
 
 
 @nb.njit(nogil=True, cache=True)
-def find_unknown_regions(box, first, last, avatar, scales, units, scene, tree, until, outside, unknown_from):
+def find_unknown_regions(box, first, last, avatar, units, scene, tree, until, outside, unknown_from):
     """Find where motions leave the scene's bounds or meet unknown boxes, for each over [0, until].
 
     Writes outside (k,) bool, whether the reach leaves the scene's bounds, and unknown_from (k,)
@@ -213,15 +211,13 @@ def find_unknown_regions(box, first, last, avatar, scales, units, scene, tree, u
         if stopped(scene.stop):
             unknown_from[i] = 0.0
             continue
-        size = avatar_size(box, scales[i], units[i])
+        size = avatar_size(box, units[i])
         parts = int(min(1024.0, math.ceil(math.sqrt(motion.bend / size) * until[i]))) + 1
         parts = 1 if motion.bend == 0.0 else parts
         for part in range(parts):
             t0, t1 = until[i] * part / parts, until[i] * (part + 1) / parts
-            span = place_root_sphere(motion, t0, avatar, scales[i], units[i], scene, pose, shift, begin)
-            span = max(
-                span, place_root_sphere(motion, t1, avatar, scales[i], units[i], scene, pose, shift, end)
-            )
+            span = place_root_sphere(motion, t0, avatar, units[i], scene, pose, shift, begin)
+            span = max(span, place_root_sphere(motion, t1, avatar, units[i], scene, pose, shift, end))
             span += sagitta_of(motion, t1 - t0, scene)
             for r in range(3):
                 outside[i] |= min(begin[r], end[r]) - span < tree.scene[0, r]

@@ -235,7 +235,7 @@ def nearest_by_scan(poses, avatar, scene, reach, cursor, state, margin_units, ne
         make_class_thresholds(scene.radius_deficit), np.empty((STACK, 2), np.int64), np.empty(3, np.float32),
         np.empty(LANES, np.float32), np.empty(LANES, np.bool_), counts,
     )  # fmt: skip
-    extent, farthest = place_nodes(avatar, m, reach.scales[0], placed, scene)
+    extent, farthest = place_nodes(avatar, m, placed, scene)
     scratch.frame[0], scratch.frame[1] = extent, farthest
     scratch.frame[2], scratch.frame[3] = scene.units_per_step, np.float64(scene.voxel_steps)
     set_class_thresholds(

@@ -94,14 +94,14 @@ def make_nearest_scratch():
 
 
 @njit_no_refcount
-def place_all(avatar, m, scale, placed, scene, bounds):
+def place_all(avatar, m, placed, scene, bounds):
     """Place an avatar: root and nodes below its front into placed.nodes, the front in `bounds`.
 
     The front becomes the first list of `bounds`. Fills placed.frame and shift. Returns (extent,
     farthest) for `make_thresholds` and the length of the list.
     """
-    extent, farthest = place_root(avatar, m, scale, placed, scene)
-    count = place_front(avatar, m, scale, placed, scene, extent, bounds)
+    extent, farthest = place_root(avatar, m, placed, scene)
+    count = place_front(avatar, m, placed, scene, extent, bounds)
     if avatar.first[avatar.front_first] < 0:
         return extent, farthest, count  # only points are below
     center, radius, nodes, shift = avatar.center, avatar.radius, placed.nodes, placed.shift
@@ -110,7 +110,7 @@ def place_all(avatar, m, scale, placed, scene, bounds):
         for r in range(3):
             world = place(m, shift, r, center[a, 0], center[a, 1], center[a, 2])
             nodes[r, a] = np.float32((world - np.float64(placed.frame[r]) * scene.step) * per_step)
-        nodes[3, a] = node_reach(radius[a], scale * per_step, extent)
+        nodes[3, a] = node_reach(radius[a], per_step, extent)
     return extent, farthest, count
 
 
@@ -362,9 +362,7 @@ def _nearest_poses(
             continue
         if stopped(scene.stop):
             return
-        best.frame[0], best.frame[1], count = place_all(
-            avatar, poses[i], reach.scales[i], placed, scene, front.bounds
-        )
+        best.frame[0], best.frame[1], count = place_all(avatar, poses[i], placed, scene, front.bounds)
         best.units[0], best.units[1] = reach.units[i], reach.units[i]
         best.found[0] = nearest.square[i]
         for r in range(6):

@@ -183,7 +183,7 @@ def is_clear_of_bodies(walk, standing, pose):
     units, poses = standing.units + standing.units + standing.margin_units, standing.poses
     for at in range(_near_bodies(standing, walk.own, pose, pose)):
         verdict = touch_bodies(
-            avatar, pose, 1.0, avatar, poses[standing.rows[at]], 1.0, units, standing.origin, NO_LIMIT, walk.stop,
+            avatar, pose, avatar, poses[standing.rows[at]], units, standing.origin, NO_LIMIT, walk.stop,
             standing.nodes, standing.at, standing.lanes, standing.scratch.counters,
         )  # fmt: skip
         if verdict != CLEAR:

@@ -31,16 +31,17 @@ _POSE_FAULTS: dict[int, tuple[type[SolidcloudError], str]] = {
         BadTransformError,
         "has a last row that is not 0 0 0 1: give row-major 4x4 poses",
     ),
-    pose_checks.MIRRORED: (
-        BadTransformError,
-        "mirrors (determinant {:g}): expected a rotation, with a uniform scale at most",
-    ),
+    pose_checks.MIRRORED: (BadTransformError, "mirrors (determinant {:g}): expected a rotation"),
     pose_checks.SHEARED: (
         BadTransformError,
-        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, with a uniform scale at "
-        f"most, within 1e-9: {RENORMALISE}",
+        "shears, or scales its axes differently (by {:g}, relative): expected a rotation, within 1e-9: "
+        f"{RENORMALISE}",
     ),
-    pose_checks.BAD_SCALE: (BadTransformError, "scales by {:g}: expected 0.001 to 1000"),
+    pose_checks.SCALED: (
+        BadTransformError,
+        "scales by {0:.10g}: expected a rigid pose, within 1e-9: add a scaled avatar, "
+        f"add_avatar(..., scale={{0:.10g}}), or remove the scale: {RENORMALISE}",
+    ),
     pose_checks.TOO_FAR: (BadTransformError, "translates by {:g} m: expected within 1e9 m"),
     pose_checks.LONG_REACH: (
         BadRequestError,

@@ -52,7 +52,7 @@ def unknown_gaps(data: SceneData, reach: VoxelsInReach) -> NDArray[np.float64]:
 
     The bound is inf without regions of scans that were left out.
     """
-    k = len(reach.scales)
+    k = len(reach.units)
     if data.nothing_clear:
         return np.zeros(k)
     # The boxes enclose the avatar's centres and the reach around them.

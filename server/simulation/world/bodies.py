@@ -357,7 +357,6 @@ class Bodies:
         if not len(shape.model.points):
             return found
         poses = np.concatenate([pose[None], self.poses[rows]])
-        scales = np.ones(len(poses))
         units = np.array([shape.units, *(self.shapes[row].units for row in rows.tolist())], np.int64)
         numbers = self.numbers[rows]
         for number in np.unique(numbers).tolist():
@@ -368,7 +367,7 @@ class Bodies:
             pairs = np.stack([np.zeros(len(at), np.int64), at + 1], axis=1)
             verdict = np.empty(len(at), np.uint8)
             touch_pairs(
-                shape.model.arrays, model.arrays, poses, scales, units, pairs, margin_units, self.origin, NO_LIMIT,
+                shape.model.arrays, model.arrays, poses, units, pairs, margin_units, self.origin, NO_LIMIT,
                 stop.flag, verdict, self.scratch.counters,
             )  # fmt: skip
             found[at] = verdict == CONTACT

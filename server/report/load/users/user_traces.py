@@ -227,9 +227,8 @@ def centers(trace: Trace, avatar: AvatarModel, margin: float = 0.0) -> Centers:
     margin: added to its reach: the radius of the scan's points, and a query's own margin [m].
     """
     local = np.append(avatar.arrays.center[0], 1.0)
-    scale = np.linalg.norm(trace.pose[:, :3, 0], axis=1)
     center = trace.pose[:, :3] @ local
-    reach = avatar.arrays.radius[0] * scale + avatar.radius + margin
+    reach = avatar.arrays.radius[0] + avatar.radius + margin
     return Centers(trace.user, trace.time, center, reach, jumps(trace.user, trace.time, center))
 
 

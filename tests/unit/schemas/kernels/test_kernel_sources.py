@@ -60,7 +60,7 @@ def test_an_edit_invalidates_what_depends_on_it_and_no_more(copy: Path) -> None:
     assert changed("schemas/kernels/compiling.py") == set(MODULES)
     assert changed("builder/kernels/trees/pack_tree.py") == {"builder.kernels.trees.pack_tree"}
     # A constant of a module that holds no kernel.
-    assert changed("schemas/archive/voxel_grid.py") == {
+    assert changed("schemas/archive/units.py") == {
         "server.kernels.collide.collide_poses",
         "server.kernels.motion.contact_times",
     }

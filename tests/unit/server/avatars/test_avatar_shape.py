@@ -47,7 +47,7 @@ def test_an_array_is_taken_as_it_is() -> None:
     assert avatar_shape(POINTS, 0.1).points is POINTS
     assert avatar_shape(POINTS.tolist()) == (POINTS.tolist(), None, 0, "")
     shape = avatar_shape(BOX, 0.1)
-    assert avatar_shape(shape) is shape
+    assert avatar_shape(shape).points is shape.points
     with pytest.raises(BadRequestError, match="up and units for an avatar that is no file"):
         avatar_shape(BOX, 0.1, up="y")
 
@@ -67,6 +67,31 @@ def test_a_mesh_file_is_solid(scene: Scene, tmp_path: Path, kind: str) -> None:
         assert scene.collide(hollow.name, at(0.0)).verdict.tolist() == [0], "a surface, and nothing inside"
         assert hollow.points == info.points - info.inner_points and hollow.inner_points == 0
     assert np.array_equal(avatar_shape(file, 0.1).points, avatar_shape(BOX, 0.1).points)
+
+
+@pytest.mark.parametrize("scale", [1.02, 0.001, 1000.0])
+def test_a_scaled_avatar_is_the_one_whose_points_were_multiplied(tmp_path: Path, scale: float) -> None:
+    BOX.export(tmp_path / "box.stl")
+    np.savetxt(tmp_path / "body.xyz", POINTS)
+    vertices, faces = BOX.vertices * scale, BOX.faces
+    for source, by_hand in (
+        (POINTS, POINTS * scale),
+        (avatar_shape(POINTS, 0.1), avatar_shape(POINTS * scale, 0.1 * scale)),
+        (tmp_path / "body.xyz", POINTS * scale),
+        (BOX, Mesh(vertices, faces)),
+        (tmp_path / "box.stl", Mesh(vertices, faces)),
+        (trimesh.PointCloud(POINTS), POINTS * scale),
+    ):
+        found, expected = avatar_shape(source, 0.1, scale=scale), avatar_shape(by_hand, 0.1 * scale)
+        assert np.array_equal(found.points, expected.points)
+        assert found.radius == expected.radius and found.inner_points == expected.inner_points
+    assert avatar_shape(POINTS, scale=scale).radius is None, "measured on the scaled points"
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, 0.0009, 1001.0, np.nan, np.inf])
+def test_a_scale_out_of_range_is_refused(scale: float) -> None:
+    with pytest.raises(BadRequestError, match=r"avatar scale .*: expected 0\.001 to 1000"):
+        avatar_shape(POINTS, 0.1, scale=scale)
 
 
 def test_points_of_a_file_are_taken_as_they_are(tmp_path: Path) -> None:
@@ -223,12 +248,13 @@ def test_a_mesh_of_a_scene_file_is_solid(scene: Scene, tmp_path: Path) -> None:
             scene.add_avatar("al", BOX, 0.02), description=""
         )
         assert opened.collide("al", np.concatenate([at(0.25), at(0.0)])).verdict.tolist() == [1, 1]
-    file.write_text(file.read_text() + 'hollow = true\nup = "y"\nunits = "cm"\n')
+    file.write_text(file.read_text() + 'hollow = true\nup = "y"\nunits = "cm"\nscale = 2\n')
     with Scene.open(file) as opened:
         assert opened.info().avatars[0].description.startswith("mesh, hollow: a surface")
         assert opened.info().avatars[0].description.endswith("; y up, unit cm")
     with Scene.open(file, read_points=lambda _: POINTS) as opened:
-        assert opened.info().avatars[0].points == len(POINTS)
+        found = opened.info().avatars[0]
+        assert (found.points, found.radius) == (len(POINTS), 0.04)
 
 
 def test_a_file_of_a_scene_without_points_is_refused_with_its_place(scene: Scene, tmp_path: Path) -> None:

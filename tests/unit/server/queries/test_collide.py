@@ -138,7 +138,11 @@ def changed(row: int, column: int, value: float) -> NDArray[np.float64]:
         (changed(2, 2, -1.0), BadTransformError, "pose 1 mirrors"),
         (changed(3, 0, 0.5), BadTransformError, "pose 1 has a last row that is not 0 0 0 1"),
         (changed(0, 3, 2e9), BadTransformError, "pose 1 translates by 2e"),
-        (np.diag([2e3, 2e3, 2e3, 1.0])[None], BadTransformError, "pose 0 scales by"),
+        (
+            np.diag([1.02, 1.02, 1.02, 1.0])[None],
+            BadTransformError,
+            r"pose 0 scales by 1\.02: expected a rigid pose, .*: add a scaled avatar, add_avatar\(.*scale=1\.02\)",
+        ),
         (np.eye(3), BadRequestError, "shape"),
         (np.zeros((2, 4, 3)), BadRequestError, "shape"),
         ([[["a"] * 4] * 4], BadRequestError, "expected an array of numbers"),

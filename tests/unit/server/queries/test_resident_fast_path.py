@@ -79,11 +79,8 @@ def test_what_is_no_quick_question_is_answered_as_well(tmp_path: Path, rng: np.r
         )
         long = last.copy()
         long[:, :3, 3] += [60.0, 0, 0]
-        large = first.copy()
-        large[:, :3, :3] *= 2.0
         probe = ResidentQueries(make_avatar([[0.0, 0, 0], [0.1, 0, 0]], 0.05))
         same(probe, data, first, long)
-        same(probe, data, large, large)
         spent = QueryBudget(visits=0)
         assert probe.sweep(data, first[0], last[0], 1e-6, spent).verdict != Verdict.CLEAR
         unseen = data._replace(unknown_everywhere=True)

@@ -33,7 +33,7 @@ def margins(case: archive_cases.Case, scene: Scene, name: str) -> list[tuple[int
     points, radius = query_scenes.AVATARS[name]
     for i, pose in enumerate(query_scenes.poses()):
         least, _ = archive_cases.least_reach(case, points, pose, info.origin, info.lattice_step)
-        margin = least - naive.reach_units(pose, radius, info.radius, 0.0)
+        margin = least - naive.reach_units(radius, info.radius, 0.0)
         if 0 < margin < 2**28:
             found.append((i, margin * UNIT))
     return found

@@ -54,30 +54,26 @@ def placed(
     model: AvatarModel, pose: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
     """An avatar's points in exact units; where its root's centre is, from the origin, and the root's radius [m]."""
-    scale = naive.scale_of(pose)
     center = pose[:3, :3] @ model.arrays.center[0] + (pose[:3, 3] - ORIGIN)
-    return naive.placed_units(model.points, pose, ORIGIN), center, float(model.arrays.radius[0]) * scale
+    return naive.placed_units(model.points, pose, ORIGIN), center, float(model.arrays.radius[0])
 
 
-@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e8, 1.0)])
+@pytest.mark.parametrize("far", [0.0, 1e8])
 def test_boxes_hold_the_spheres_and_half_the_margin_and_little_more(
-    rng: np.random.Generator, far: float, scale: float
+    rng: np.random.Generator, far: float
 ) -> None:
     model = make_avatar(rng.uniform(-1, 1, (20, 3)) + np.array([5, 0, 0]), 0.125)
     poses = np.array(
         [
-            archive_cases.pose_of(
-                archive_cases.random_rotation(rng) * scale, rng.uniform(-1, 1, 3) * far + ORIGIN
-            )
+            archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1, 1, 3) * far + ORIGIN)
             for _ in range(4)
         ]
     )
-    scales = np.array([naive.scale_of(pose) for pose in poses])
-    units = np.array([naive.reach_units(pose, model.radius, 0.0, 0.0) for pose in poses])
+    units = np.array([naive.reach_units(model.radius, 0.0, 0.0) for pose in poses])
     low, high = np.full((4, 3), 9e99), np.full((4, 3), 9e99)
     margin = 1_000_001  # of it half a unit is in either box
     which = np.array([3, 0, 1])
-    kernel.bound_objects(model.arrays, poses, which, scales, units, ORIGIN, margin, low, high)
+    kernel.bound_objects(model.arrays, poses, which, units, ORIGIN, margin, low, high)
     assert (low[2] == 9e99).all() and (high[2] == 9e99).all()
     for i in which:
         points, center, radius = placed(model, poses[i])
@@ -86,7 +82,7 @@ def test_boxes_hold_the_spheres_and_half_the_margin_and_little_more(
         assert (high[i] / UNIT >= points.max(axis=0) + reach).all()
         # Not larger than the root's ball with reach by more than rounding: its bounds and two units, widened by 1e-8.
         extent = radius * (1 + 1e-8) + reach * UNIT
-        size = np.abs(poses[i][:3, 3]).max() + 20 * scale
+        size = np.abs(poses[i][:3, 3]).max() + 20
         slack = 2 * UNIT + size * 2.0**-49
         assert np.abs(low[i] - (center - extent)).max() <= 2 * slack
         assert np.abs(high[i] - (center + extent)).max() <= 2 * slack
@@ -101,7 +97,6 @@ class Asked:
 
     def __init__(self, a: AvatarModel, b: AvatarModel, poses: NDArray[np.float64]) -> None:
         self.a, self.b, self.poses = a, b, poses
-        self.scales = np.array([naive.scale_of(pose) for pose in poses])
         one, other = (naive.placed_units(m.points, p, ORIGIN) for m, p in zip((a, b), poses, strict=True))
         square = naive.least_square(one, other)
         self.least = math.isqrt(square - 1) + 1 if square else 0
@@ -112,15 +107,13 @@ class Asked:
         verdict, counters = np.full(1, 9, np.uint8), np.array([100, 200])
         a, b, pair = (self.b, self.a, [1, 0]) if turned else (self.a, self.b, [0, 1])
         kernel.touch_pairs(
-            a.arrays, b.arrays, self.poses, self.scales, units, np.array([pair]), reach - int(units.sum()),
+            a.arrays, b.arrays, self.poses, units, np.array([pair]), reach - int(units.sum()),
             ORIGIN, visits, NO_STOP.flag, verdict, counters,
         )  # fmt: skip
         return int(verdict[0]), int(counters[0]) - 100, int(counters[1]) - 200
 
 
-def asked(
-    seed: int, counts: tuple[int, int], far: float = 0.0, scale: float = 1.0, apart: float = 1.2
-) -> Asked:
+def asked(seed: int, counts: tuple[int, int], far: float = 0.0, apart: float = 1.2) -> Asked:
     """Two shells of so many points whose middles are `apart` from each other, `far` from the origin [m]."""
     rng = np.random.default_rng(seed)
     models = []
@@ -129,10 +122,9 @@ def asked(
         models.append(make_avatar(0.5 * points / np.sqrt((points * points).sum(axis=1))[:, None], 0.0))
     away = rng.normal(size=3)
     at = rng.uniform(-1, 1, 3) * far
-    away *= apart * scale / math.sqrt(float(away @ away))
+    away *= apart / math.sqrt(float(away @ away))
     poses = [
-        archive_cases.pose_of(archive_cases.random_rotation(rng) * scale, ORIGIN + at + d)
-        for d in (0 * away, away)
+        archive_cases.pose_of(archive_cases.random_rotation(rng), ORIGIN + at + d) for d in (0 * away, away)
     ]
     return Asked(*models, np.array(poses))
 
@@ -141,11 +133,9 @@ COUNTS = [(1, 1), (5, 40), (33, 33), (300, 8)]
 
 
 @pytest.mark.parametrize("counts", COUNTS)
-@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e8, 1.0)])
-def test_contact_begins_at_the_unit_the_definition_says(
-    counts: tuple[int, int], far: float, scale: float
-) -> None:
-    case = asked(sum(counts), counts, far, scale)
+@pytest.mark.parametrize("far", [0.0, 1e8])
+def test_contact_begins_at_the_unit_the_definition_says(counts: tuple[int, int], far: float) -> None:
+    case = asked(sum(counts), counts, far)
     for turned in (False, True):
         assert case.ask(case.least, turned=turned)[0] == kernel.CONTACT
         assert case.ask(case.least - 1, turned=turned)[0] == kernel.CLEAR
@@ -184,7 +174,7 @@ def test_pairs_after_the_stop_are_unknown_and_not_examined() -> None:
     for expected in (kernel.CLEAR, kernel.UNKNOWN):
         verdict, counters = np.full(len(pairs), 99, np.uint8), np.zeros(2, np.int64)
         kernel.touch_pairs(
-            model.arrays, model.arrays, poses, np.ones(n), np.full(n, 2**23), pairs, 0, ORIGIN, 1 << 40, stop.flag,
+            model.arrays, model.arrays, poses, np.full(n, 2**23), pairs, 0, ORIGIN, 1 << 40, stop.flag,
             verdict, counters,
         )  # fmt: skip
         assert (verdict == expected).all()

@@ -29,8 +29,8 @@ def check(
     poses: NDArray[np.float64], node_radius: float = 1.0, radius: float = 0.0, others: int = 0
 ) -> tuple[int, int, float]:
     """The fault, the pose that has it, and the figure found."""
-    scales, units = np.full(len(poses), np.nan), np.zeros(len(poses), np.int64)
-    return pose_checks.check_poses(poses, np.array([node_radius]), radius, others, LATTICE, scales, units)
+    units = np.zeros(len(poses), np.int64)
+    return pose_checks.check_poses(poses, np.array([node_radius]), radius, others, LATTICE, units)
 
 
 def entry(row: int, column: int, value: float) -> NDArray[np.float64]:
@@ -42,9 +42,7 @@ def entry(row: int, column: int, value: float) -> NDArray[np.float64]:
 
 def test_a_mirrored_pose_is_told_whatever_its_axes(rng: np.random.Generator) -> None:
     for _ in range(60):
-        pose = archive_cases.pose_of(
-            archive_cases.random_rotation(rng) * rng.uniform(0.1, 9), rng.uniform(-1, 1, 3)
-        )
+        pose = archive_cases.pose_of(archive_cases.random_rotation(rng), rng.uniform(-1, 1, 3))
         assert check(pose[None])[0] == pose_checks.VALID
         pose[:3, rng.integers(3)] *= -1
         fault, index, volume = check(pose[None])
@@ -70,11 +68,20 @@ def test_every_entry_is_looked_at_and_the_figure_is_what_was_found(row: int, col
             beyond = sign * np.nextafter(1e9, np.inf)
             assert check(entry(row, column, beyond)) == (pose_checks.TOO_FAR, 1, beyond)
     else:
-        # Two thousand is what no entry of a pose of scale 1,000 can be; beyond it nothing more is computed.
-        for value in (np.nextafter(2000.0, np.inf), -1e200):
-            assert check(entry(row, column, value)) == (pose_checks.BAD_SCALE, 1, value)
-        assert check(entry(row, column, 1999.0))[0] in (pose_checks.SHEARED, pose_checks.BAD_SCALE)
-        assert check(entry(row, column, 1999.0))[2] != 1999.0
+        for value in (1999.0, -1e200):  # the square of the second is infinite
+            fault, index, _ = check(entry(row, column, value))
+            assert fault in (pose_checks.SHEARED, pose_checks.MIRRORED, pose_checks.SCALED) and index == 1
+
+
+def test_a_scale_is_told_by_its_size_from_a_thousand_millionth_on(rng: np.random.Generator) -> None:
+    turn = archive_cases.random_rotation(rng)
+    for scale in (0.0, 1e-3, 0.5, 1 - 1.05e-9, 1 + 1.05e-9, 1.02, 1e3):
+        fault, index, found = check(archive_cases.pose_of(turn * scale, np.zeros(3))[None])
+        assert (fault, index) == (pose_checks.SCALED, 0) and found == pytest.approx(scale, rel=1e-15)
+        mirrored = np.diag([-scale, scale, scale, 1.0])[None]
+        assert check(mirrored)[0] == (pose_checks.MIRRORED if scale else pose_checks.SCALED)
+    for scale in (1 - 0.95e-9, 1 + 0.95e-9):
+        assert check(archive_cases.pose_of(turn * scale, np.zeros(3))[None])[0] == pose_checks.VALID
 
 
 @pytest.mark.parametrize(("row", "column"), [(r, c) for r in range(3) for c in range(3)])
@@ -98,9 +105,6 @@ def test_the_reach_ends_at_sixteen_metres_to_the_unit() -> None:
     assert check(np.eye(4)[None], radius=15.0, others=1 << 26)[0] == pose_checks.VALID
     said = check(np.eye(4)[None], radius=15.0, others=(1 << 26) + 1)
     assert said == (pose_checks.LONG_REACH, 0, 16 + 1 / UNITS)
-    doubled = np.diag([2.0, 2, 2, 1])[None]
-    assert check(doubled, radius=8.0)[0] == pose_checks.VALID
-    assert check(doubled, radius=8.0, others=1)[0] == pose_checks.LONG_REACH
 
 
 def test_an_avatar_ends_where_float32_does_to_the_step() -> None:
@@ -108,9 +112,5 @@ def test_an_avatar_ends_where_float32_does_to_the_step() -> None:
     assert check(np.eye(4)[None], 1015.0, 1.0)[0] == pose_checks.VALID
     said = check(np.eye(4)[None], 1015.0 + 2.0**-13, 1.0)
     assert said == (pose_checks.LARGE_AVATAR, 0, 1016.0 + 2.0**-13)
-    doubled = np.diag([2.0, 2, 2, 1])[None]
-    assert check(doubled, 507.5, 0.5)[0] == pose_checks.VALID
-    assert check(doubled, 507.5 + 2.0**-13, 0.5)[0] == pose_checks.LARGE_AVATAR
-    scales, units = np.empty(1), np.empty(1, np.int64)
-    said = pose_checks.check_poses(np.eye(4)[None], np.empty(0), 1.0, 0, LATTICE, scales, units)
+    said = pose_checks.check_poses(np.eye(4)[None], np.empty(0), 1.0, 0, LATTICE, np.empty(1, np.int64))
     assert said == (pose_checks.VALID, 0, 0.0), "an avatar without nodes has no extent but its reach"

@@ -25,19 +25,17 @@ class Lattice(NamedTuple):
 SCENE = Lattice(np.array([7.0, -50.0, 300.0]), STEP)
 
 
-@pytest.mark.parametrize(("far", "scale"), [(0.0, 1.0), (1e6, 1.0)])
+@pytest.mark.parametrize("far", [0.0, 1e6])
 @pytest.mark.parametrize(("way", "more"), [(0.0, 0.0), (0.05, 0.0), (3.0, 2.0)])
 @pytest.mark.parametrize("turns", [True, False])
 def test_an_avatar_is_placed_at_both_ends(
-    rng: np.random.Generator, far: float, scale: float, way: float, more: float, turns: bool
+    rng: np.random.Generator, far: float, way: float, more: float, turns: bool
 ) -> None:
     """more: by how much farther than its nodes' centres some point may go, a part of the speed given [m]."""
     model = make_avatar(rng.uniform(-0.4, 0.4, (100, 3)), 0.01)
     avatar, found = model.arrays, kernel.make_moving(model.arrays)
     at = SCENE.origin + rng.uniform(-1, 1, 3) * far
-    ends = [
-        archive_cases.pose_of(archive_cases.random_rotation(rng) * scale, at + d * way) for d in (-1.0, 1.0)
-    ]
+    ends = [archive_cases.pose_of(archive_cases.random_rotation(rng), at + d * way) for d in (-1.0, 1.0)]
     if not way:
         ends[1] = ends[0]
     elif not turns:
@@ -51,7 +49,7 @@ def test_an_avatar_is_placed_at_both_ends(
     ways = exact[1] - exact[0]
     fastest = float(np.sqrt((ways**2).sum(axis=1)).max())
     speed = (fastest + more / STEP) * STEP if more else fastest * STEP * 0.5
-    extent, farthest = kernel.place_nodes(avatar, scale, speed, found, SCENE)
+    extent, farthest = kernel.place_nodes(avatar, speed, found, SCENE)
 
     assert found.shifts.tolist() == [shift.tolist() for shift in shifts]
     assert found.frame.tolist() == np.rint((exact[0][0] + exact[1][0]) / 2).astype(int).tolist()
@@ -60,7 +58,7 @@ def test_an_avatar_is_placed_at_both_ends(
         for pose, shift in zip(ends, shifts, strict=True)
     )
     longest = max(fastest, speed / STEP) * (1 + 1e-6)
-    size = avatar.radius[0] * scale / STEP + 1 + longest
+    size = avatar.radius[0] / STEP + 1 + longest
     # Without a turn, a coordinate is the sum of two that were rounded.
     roundings = 1 if moved else 3
     assert extent == pytest.approx(roundings * size + kernel.CHORD_ERROR * longest, rel=1e-7)
@@ -73,7 +71,7 @@ def test_an_avatar_is_placed_at_both_ends(
         [1 / s if s > 1e-20 else 0.0 for s in (found.nodes[4:7].astype(float) ** 2).sum(axis=0)]
     )
     assert np.abs(found.nodes[7] - inverse).max() <= 8 * U32 * inverse.max()
-    wide = found.nodes[3] - avatar.radius * scale / STEP
+    wide = found.nodes[3] - avatar.radius / STEP
     assert (wide >= size * U32).all() and wide.max() <= 3e-6 * size
     assert (found.stamp == -1).all()
     for block in range(len(avatar.points)):
@@ -100,7 +98,7 @@ def test_an_avatar_is_turned_once_for_each_orientation_and_step(rng: np.random.G
         )
         for moving in (kept, fresh):
             moving.ends[0], moving.ends[1] = begin, end
-            kernel.place_nodes(avatar, 1.0, 2.0, moving, scene)
+            kernel.place_nodes(avatar, 2.0, moving, scene)
             for block in range(len(avatar.points)):
                 kernel.place_block(avatar, block, moving, scene)
         for name in ("nodes", "lanes", "displacements", "frame"):

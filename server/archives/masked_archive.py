@@ -48,12 +48,10 @@ class MaskedArchive(Archive):
         folder: str | os.PathLike[str],
         boxes: Sequence[ArrayLike],
         pose: ArrayLike | None = None,
-        key: bytes | None = None,
     ) -> None:
         """Open the archive in `folder`, at `pose` in the world; None: at the identity.
 
         boxes: (2, 3) each, low and high, world [m]. The voxels that they intersect are read.
-        key: see `Archive`.
         Raise FormatError as `Archive` does, and for a voxel that cannot be read. Raise
         SolidcloudError if there is no disk space for the rebuilt records, BadRequestError if the
         boxes contain all points. A corrupt record is no error here: the request that loads the
@@ -66,7 +64,7 @@ class MaskedArchive(Archive):
         self._end = 0
         self._rebuilt: dict[int, _Place] = {}
         self._corrupt: dict[int, CorruptError] = {}
-        super().__init__(folder, key)
+        super().__init__(folder)
         try:
             self._mask()
         except BaseException:
@@ -112,8 +110,6 @@ class MaskedArchive(Archive):
             )
         now = {row: at for at, row in enumerate(kept.tolist())}
         self.voxels, self.coordinates = voxels[kept], self.coordinates[kept]
-        if self._digests is not None:
-            self._digests = self._digests[kept]
         self._rebuilt = {now[row]: place for row, place in rebuilt.items()}
         self._corrupt = {now[row]: said for row, said in corrupt.items()}
 
@@ -204,11 +200,6 @@ class MaskedArchive(Archive):
                 "free disk space, or set TMPDIR"
             ) from error
         return frames
-
-    def _check_digest(self, row: int, part: int, frames: tuple[bytes, ...]) -> None:
-        """Check a record that is as stored; those rebuilt are in a file that nobody else has."""
-        if row not in self._rebuilt:
-            super()._check_digest(row, part, frames)
 
     def _read_frame(self, row: int, i: int) -> bytes:
         """Return the frame of dataset `i` of a voxel, from the temporary file if it was rebuilt."""

@@ -126,12 +126,9 @@ def _sample(archive: Archive, most: int, read: int) -> _Sample:
 
 
 def _read_preview(archive: Archive) -> _Sample | None:
-    """Return the points of an archive's preview; None if there is none of this archive.
-
-    A seal does not cover the preview, so that of an archive checked with a key is not read.
-    """
+    """Return the points of an archive's preview; None if there is none of this archive."""
     path, header = archive.folder / PREVIEW_NAME, archive.header
-    if archive.key is not None or not path.exists():
+    if not path.exists():
         return None
     try:
         found = read_sample(path, _kept(header), _STAMP)

@@ -14,13 +14,13 @@ from ...archives.masked_archive import MaskedArchive
 from ...residency.voxel_store import OpenStore, VoxelStore
 
 
-def store_without(effect: Through, pose: ArrayLike | None = None, key: bytes | None = None) -> OpenStore:
+def store_without(effect: Through, pose: ArrayLike | None = None) -> OpenStore:
     """Return a function that opens an archive's folder without the points in the boxes.
 
     It is for `Scene.open(..., open_store=...)`.
     pose: (4, 4), the archive's pose in the world, because boxes are in world coordinates; None: the
-    identity.  key: as for `Archive`.
+    identity.
     """
     boxes = [(box.low, box.high) for box in effect.boxes]
-    masked = partial(MaskedArchive, boxes=boxes, pose=pose, key=key)
+    masked = partial(MaskedArchive, boxes=boxes, pose=pose)
     return partial(VoxelStore, open_archive=masked)

@@ -54,8 +54,8 @@ ALLOWED = {
     "server/cli/output": "residency",
     "server/queries/context": "kernels runtime avatars residency",
     "server/queries": "kernels runtime avatars residency queries/context",
-    "server/archives": "observability runtime avatars residency queries/context queries",
-    "server/tiles": "archives",
+    "server/archives": "kernels observability runtime avatars residency queries/context queries",
+    "server/tiles": "residency archives",
     "server/simulation/world": "kernels runtime scene_interface.py avatars queries/context queries archives",
     "server/simulation/effects": (
         "runtime avatars residency queries/context queries archives simulation/world"
@@ -104,10 +104,9 @@ ALLOWED = {
     "server/api": "client.py scene.py",
 }
 
-# From server to builder: an avatar is read and its tree built, an archive without some of its points built, and the
-# points of a record listed, by the builder's code.
+# From server to builder: an avatar is read and its tree built, and the points of a record listed, by the builder's
+# code.
 CROSSING = {
-    "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
     "server/viewer/users": ("builder/synthetic/figure",),
     "server/tiles": ("builder/voxel/record_points",),

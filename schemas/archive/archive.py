@@ -48,11 +48,8 @@ class Archive:
     """Archive opened for reading. Several threads may share it; it is a context manager.
 
     header: see Header.  voxels: the index's rows, sorted by key.
-    is_as_stored: whether the points are those of the folder, which its level describes.
     coordinates: (v, 3) int64, voxel coordinates.
     """
-
-    is_as_stored = True
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the archive in `folder`.

@@ -75,7 +75,7 @@ def open_level(archive: Archive) -> Archive | None:
     does not describe the voxels of the archive.
     """
     folder = archive.folder / LEVEL_FOLDER
-    if not archive.is_as_stored or not (folder / INDEX_NAME).is_file():
+    if not (folder / INDEX_NAME).is_file():
         return None
     level = Archive(folder)
     header, described = level.header, archive.header

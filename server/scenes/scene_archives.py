@@ -1,7 +1,7 @@
 """Finding, checking and opening the archives and avatars that a scene file names.
 
-Errors name the file and the place in it. masked_archive.py is imported only for scenes with the
-effect `through`.
+Errors name the file and the place in it. The code of an effect is imported only for
+scenes with it.
 """
 
 from collections.abc import Callable, Iterator

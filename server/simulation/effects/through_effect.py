@@ -1,8 +1,8 @@
 """Effect `through`: named boxes where contact is ignored, such as a door or a portal.
 
-The scan points in the boxes, borders included, are masked (server/archives/masked_archive.py):
-every query answers as for a scan that never had them. The effect acts when the scene is opened and
-has no runner, because it does nothing in a frame.
+The scan points in the boxes, borders included, are masked (server/archives/masked_store.py):
+every query answers as for a scan that never had them. The effect acts when a voxel is loaded and has
+no runner, because it does nothing in a frame.
 """
 
 from functools import partial
@@ -10,8 +10,8 @@ from functools import partial
 from numpy.typing import ArrayLike
 
 from ....schemas.scene.effect_table import Through
-from ...archives.masked_archive import MaskedArchive
-from ...residency.voxel_store import OpenStore, VoxelStore
+from ...archives.masked_store import MaskedStore
+from ...residency.voxel_store import OpenStore
 
 
 def store_without(effect: Through, pose: ArrayLike | None = None) -> OpenStore:
@@ -22,5 +22,4 @@ def store_without(effect: Through, pose: ArrayLike | None = None) -> OpenStore:
     identity.
     """
     boxes = [(box.low, box.high) for box in effect.boxes]
-    masked = partial(MaskedArchive, boxes=boxes, pose=pose)
-    return partial(VoxelStore, open_archive=masked)
+    return partial(MaskedStore, boxes=boxes, pose=pose)

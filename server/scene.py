@@ -11,7 +11,6 @@ from typing import Any
 from msgspec import structs
 from numpy.typing import ArrayLike
 
-from ..schemas.archive.seal import read_archive_key
 from ..schemas.errors import BadRequestError, SolidcloudError
 from ..schemas.scene.scene_file import SceneFile, read_scene, scene_name, scene_of
 from ..schemas.wire.key_expressions import User, check_name
@@ -29,7 +28,7 @@ from .avatars.client_avatars import check_owner
 from .observability.request_stats import RequestStats
 from .queries.context.query_context import SceneData
 from .residency.voxel_cache import VoxelCache
-from .residency.voxel_store import OpenStore
+from .residency.voxel_store import OpenStore, VoxelStore
 from .runtime.process_heap import give_back_freed_memory
 from .runtime.stop_flag import NO_STOP, StopFlag
 from .scene_interface import EVERYBODY, AvatarLimits, AvatarShape, list_avatars
@@ -40,7 +39,6 @@ from .scenes.scene_archives import (
     is_scene_file,
     open_archives,
     read_avatars,
-    sealed_store,
 )
 from .scenes.scene_questions import SceneQuestions
 from .scenes.scene_tiles import SceneTiles
@@ -95,7 +93,6 @@ class Scene(SceneTiles, SceneQuestions):
         radius_model: str | None = None,
         read_points: ReadPoints | None = None,
         coarse_bytes: int | None = None,
-        archive_key: str | Path | None = None,
     ) -> "Scene":
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
 
@@ -110,26 +107,21 @@ class Scene(SceneTiles, SceneQuestions):
         `add_avatar`.
         coarse_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
         tolerance before voxels are loaded; None: a sixteenth, 0: none.
-        archive_key: file with the key with which all archives must be sealed, now and at each
-        reload; refused with `open_store`. None: do not look at seals (`solidcloud seal`).
         Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
         invalid scene file or a budget that is too small.
         """
         path = Path(path)
-        key = None if archive_key is None else read_archive_key(Path(archive_key))
-        if key is not None and open_store is not None:
-            raise BadRequestError(f"{path}: expected one of open_store and archive_key")
         if is_scene_file(path):
             if open_store is not None or radius_model is not None:
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
-            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes, key)
+            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes)
         metrics = RequestStats()
         archive = PlacedArchive.open(
             path,
             name,
             budget_bytes=budget_bytes,
             policy=policy,
-            open_store=open_store or sealed_store(key),
+            open_store=open_store or VoxelStore,
             radius_model=radius_model,
             took=metrics.loaded,
             coarse_bytes=coarse_bytes,
@@ -145,18 +137,17 @@ class Scene(SceneTiles, SceneQuestions):
         policy: str,
         read_points: ReadPoints | None,
         coarse_bytes: int | None,
-        key: bytes | None,
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
         file = read_scene(path)
         name = name or scene_name(file, path)
-        found = find_archives(file, path, key)
+        found = find_archives(file, path)
         avatars = read_avatars(file, path, read_points)
         own = {each.info.name: each.shape for each in avatars}
         metrics = RequestStats()
         with ExitStack() as stack:
             archives = open_archives(
-                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes, key
+                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes
             )
             for archive in archives:
                 stack.callback(archive.close)

@@ -19,7 +19,7 @@ ALLOWED = {
     "schemas/archive": "errors.py kernels process",
     "schemas/wire": "archive errors.py",
     "schemas/scene": "archive errors.py process wire",
-    "builder/kernels/neighbours": "kernels/points kernels/trees",
+    "builder/kernels/neighbours": "kernels/points",
     "builder/build_limits.py": "config.py",
     "builder/run": "build_limits.py",
     "builder/sources/formats": "kernels sources/common",
@@ -54,8 +54,8 @@ ALLOWED = {
     "server/cli/output": "residency",
     "server/queries/context": "kernels runtime avatars residency",
     "server/queries": "kernels runtime avatars residency queries/context",
-    "server/archives": "observability runtime avatars residency queries/context queries",
-    "server/tiles": "archives",
+    "server/archives": "kernels observability runtime avatars residency queries/context queries",
+    "server/tiles": "residency archives",
     "server/simulation/world": "kernels runtime scene_interface.py avatars queries/context queries archives",
     "server/simulation/effects": (
         "runtime avatars residency queries/context queries archives simulation/world"
@@ -104,15 +104,12 @@ ALLOWED = {
     "server/api": "client.py scene.py",
 }
 
-# From server to builder: an avatar is read and its tree built, an archive without some of its points built, and the
-# points of a record listed, by the builder's code.
+# From server to builder: an avatar is read, and the points of a record listed, by the builder's code.
 CROSSING = {
-    "server/archives": ("builder/voxel/masked_voxel",),
     "server/pictures": ("builder/voxel/record_points",),
     "server/viewer/users": ("builder/synthetic/figure",),
     "server/tiles": ("builder/voxel/record_points",),
     "server/avatars": (
-        "builder/voxel/point_hierarchy",
         "builder/sources/common/scan",
         "builder/sources/placed_scan",
         "builder/sources/scan_files",
@@ -328,7 +325,7 @@ def test_a_stray_import_is_named(file: str, source: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("file", "source"),
     [
-        ("server/avatars/avatar_model.py", "from ...builder.voxel.point_hierarchy import build_local"),
+        ("server/avatars/avatar_file.py", "from ...builder.sources.placed_scan import METRES"),
         ("server/report/walk/demo_walk.py", "from ....builder.pipeline import build_archive"),
         ("server/cli/main.py", "from ...builder.passes.verify import verify_archive"),
         ("server/kernels/collide/collide_poses.py", "from ....schemas.kernels import compiling as nb"),

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import INDEX_NAME, SHARD_FOLDER, Header, Source
 from ...schemas.archive.level import LEVEL_FOLDER
-from ...schemas.archive.seal import SEAL_NAME
 from ...schemas.archive.vtkhdf import PREVIEW_NAME
 from ...schemas.errors import BadRequestError, CorruptError, FormatError
 from ...schemas.process.new_file import sync_path
@@ -259,8 +258,7 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
     If the process is killed before the index is renamed, the archive is the old one, and the next
     run deletes the new shards. If it is killed afterwards, the archive is the new one, and the next
     run deletes the old shards. An existing preview and an existing level are replaced slightly
-    later; until then they name the old generation. A seal is removed: it is not that of the new index,
-    and no reader with a key would take it for one.
+    later; until then they name the old generation.
     """
     shards, preview = change.target / SHARD_FOLDER, change.folder / PREVIEW_NAME
     level = change.target / LEVEL_FOLDER
@@ -286,7 +284,6 @@ def publish(change: Change, new: list[str], named: set[str]) -> None:
                 with suppress(OSError):
                     (shards / name).unlink()
         raise
-    (change.target / SEAL_NAME).unlink(missing_ok=True)
     if preview.exists():
         os.replace(preview, change.target / PREVIEW_NAME)
     if level.exists():

@@ -93,7 +93,7 @@ def rebuild(change: Change, spec: ChangeSpec, check: Callable[[], None] = lambda
     unchanged.
     """
     before = change.archive.header
-    header = replace(spec.header, generation=before.generation + 1, radius_now=None, is_sealed=False)
+    header = replace(spec.header, generation=before.generation + 1, radius_now=None)
     rebuilt, read = affected_voxels(change.archive, spec.boxes)
     built, there = _points_after(change, rebuilt, spec.added)
     for counts in (change.points[read], there if change.reads_all else built):

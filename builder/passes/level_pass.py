@@ -67,15 +67,13 @@ def write_level(
     folder: Path,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    target: Path | None = None,
 ) -> None:
-    """Write the level of the archive in `folder` to the folder `target`, in place of what is there.
+    """Write the level of the archive in `folder` to its folder LEVEL_FOLDER, in place of what is there.
 
-    target: None for the folder where readers of the archive look for it.
     Progress advances by the points of the archive. Without its index, which is written last, a level
     does not exist. Raise CorruptError if a record cannot be read.
     """
-    target = folder / LEVEL_FOLDER if target is None else target
+    target = folder / LEVEL_FOLDER
     shutil.rmtree(target, ignore_errors=True)
     (target / SHARD_FOLDER).mkdir(parents=True)
     with Archive(folder) as archive:
@@ -147,7 +145,6 @@ def _level_header(header: Header, steps: int, rows: NDArray, counts: list[NDArra
         generation=0,
         radius_now=None,
         is_level=True,
-        is_sealed=False,
     )
 
 

@@ -51,7 +51,7 @@ _WORK, _DEEP_WORK, _EXACT_WORK = 1 / 60, 1 / 10, 10
 class _Unit(NamedTuple):
     """Voxels to check. asked: nodes of each voxel to verify exactly; None: none.
 
-    summed: compute the sum of their points' positions.  key: of the archive's seal.
+    summed: compute the sum of their points' positions.
     """
 
     folder: Path
@@ -60,7 +60,6 @@ class _Unit(NamedTuple):
     asked: list[NDArray[np.int64]] | None
     summed: bool
     points: int
-    key: bytes | None = None
 
 
 class _Found(NamedTuple):
@@ -88,7 +87,6 @@ def verify_archive(
     progress: Progress | None = None,
     executor: Executor | None = None,
     places: int | None = None,
-    key: bytes | None = None,
 ) -> VerifyReport:
     """Read every record and check it.
 
@@ -98,8 +96,6 @@ def verify_archive(
     sample: verify only this many of them, spread over the archive; None: all.
     executor: runs the work; None: this process.
     places: the `position_hash` that all points must have (run_files.py); None: not known.
-    key: of the seal that the archive must have (schemas/archive/seal.py). The records of a sealed
-    archive are compared with their digests without a key too.
 
     A job holds one voxel: 12 bytes per point of it, 16 with intensities, and 40 if bounds are
     verified. Raise FormatError or CorruptError only if the index itself cannot be used,
@@ -109,7 +105,7 @@ def verify_archive(
     if sample is not None and (not exact or sample < 1):
         raise BadRequestError(f"--sample {sample}: expected 1 or more, and --exact with it")
     progress = progress or Silent()
-    with Archive(folder, key) as archive:
+    with Archive(folder) as archive:
         header = archive.header
         counts = archive.voxels["rows"].astype(np.int64)
         notes = _strangers(archive)
@@ -123,14 +119,13 @@ def verify_archive(
             asked[rows.start : rows.stop] if asked is not None else None,
             places is not None,
             int(counts[rows.start : rows.stop, 2].sum()),
-            key,
         )
         for rows in voxel_ranges(counts[:, 2], jobs_of(executor))
     ]
     progress.start("verify", header.points, "points")
     with unchanged(folder, header):  # because each unit opens the archive again
         results = list(run_units(executor, _verify_rows, units, progress, lambda unit: unit.points))
-        with Archive(folder, key) as archive:
+        with Archive(folder) as archive:
             of_level, about_level = level_faults(archive, executor, deep=deep)
     progress.finish()
     found = [
@@ -206,7 +201,7 @@ def _verify_rows(unit: _Unit) -> _Found:
     points = proved = places = 0
     damaged: set[Path] = set()
     classes = np.zeros(RADIUS_CLASSES, np.int64)
-    with Archive(unit.folder, unit.key, digests=True) as archive:
+    with Archive(unit.folder) as archive:
         for i, row in enumerate(unit.rows):
             known = len(faults)
             check_interrupt()
@@ -279,7 +274,7 @@ def level_faults(archive: Archive, executor: Executor | None, *, deep: bool) -> 
         return [], [f"{folder}: belongs to another archive or generation"]
     level.close()
     points = archive.voxels["rows"][:, 2].astype(np.int64)
-    faults = list(verify_archive(folder, executor=executor, key=archive.key).faults)
+    faults = list(verify_archive(folder, executor=executor).faults)
     if deep and not faults:
         faults += check_level(archive.folder, executor, voxel_ranges(points, jobs_of(executor)), points)
     return faults, []

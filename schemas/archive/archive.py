@@ -10,7 +10,6 @@ import os
 import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -31,14 +30,12 @@ from .index import (
     DATASETS,
     FORMAT_VERSIONS,
     INDEX_NAME,
-    RECORD_DIGEST,
     SHARD_FOLDER,
     SHARD_NAME,
     index_digest,
     read_header,
 )
 from .index_limits import check_columns, check_layout, check_voxels
-from .seal import check_seal, frames_digest
 from .voxel import Links, VoxelData
 from .voxel_grid import voxel_coordinates
 
@@ -51,25 +48,15 @@ class Archive:
     """Archive opened for reading. Several threads may share it; it is a context manager.
 
     header: see Header.  voxels: the index's rows, sorted by key.
-    is_as_stored: whether the points are those of the folder, which its level describes.
-    key: of the seal with which the archive was checked, or None.
     coordinates: (v, 3) int64, voxel coordinates.
     """
 
-    is_as_stored = True
-
-    def __init__(
-        self, folder: str | os.PathLike[str], key: bytes | None = None, *, digests: bool = False
-    ) -> None:
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the archive in `folder`.
 
-        key: refuse an archive that is not sealed with this key, and records that are not those
-        sealed (seal.py); None: do not look at seals.
-        digests: compare records with the digests of a seal without a key too.
         Raises FormatError or CorruptError naming the file and the fault.
         """
-        self.folder, self.key = Path(folder), key
-        self._compares_digests = digests or key is not None
+        self.folder = Path(folder)
         self._descriptors: list[int] = []
         while True:
             index = self._index_identity()
@@ -97,13 +84,8 @@ class Archive:
                 f"{self.folder}: no archive here ({INDEX_NAME} not found): build one with `solidcloud build`"
             )
         try:
-            found = read_index(path)
-            columns = found.columns
-            if self.key is not None:
-                has = RECORD_DIGEST in columns
-                check_seal(self.folder, self.key, found.version, found.digest, has_digests=has)
-            self._digests = columns.get(RECORD_DIGEST) if self._compares_digests else None
-            self.header = read_header(found.archive_id, columns)
+            archive_id, columns = read_index(path)
+            self.header = read_header(archive_id, columns)
             self.voxels = columns["voxels"]
             self._shape_dtype = self.header.point_dtype
             self._shards = [
@@ -183,24 +165,7 @@ class Archive:
 
         Raises CorruptError, naming file, voxel and dataset, if a frame is not the one in the index.
         """
-        frames = self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
-        if self._digests is not None:
-            self._check_digest(row, 0, frames[:2])
-            self._check_digest(row, 1, frames[2:])
-        return frames
-
-    def _check_digest(self, row: int, part: int, frames: tuple[bytes, ...]) -> None:
-        """Compare the hierarchy (part 0) or the points (1) of a voxel with its digest.
-
-        Raises CorruptError.
-        """
-        assert self._digests is not None
-        if not np.array_equal(frames_digest(frames), self._digests[row, part]):
-            raise CorruptError(
-                f"{self.where(row)}: {('cells and nodes', 'points')[part]} that are not those sealed: fetch the shard "
-                "again",
-                (self.shard_path(int(self.voxels["shard"][row])),),
-            )
+        return self._read_frame(row, 0), self._read_frame(row, 1), self._read_frame(row, 2)
 
     def _read_frame(self, row: int, i: int) -> bytes:
         """Read the frame of dataset `i` of a voxel, as `read_frames` does."""
@@ -262,13 +227,10 @@ class Archive:
 
         Raises CorruptError naming the location.
         """
-        cells, nodes = self._read_frame(row, 0), self._read_frame(row, 1)
-        if self._digests is not None:
-            self._check_digest(row, 0, (cells, nodes))
         with self.locating(row):
             return decompress_tree(
-                cells,
-                nodes,
+                self._read_frame(row, 0),
+                self._read_frame(row, 1),
                 self._shape(row),
                 int(self.voxels["key"][row]),
                 self.header.archive_id,
@@ -341,17 +303,8 @@ def _open_dataset(file: h5py.File, name: bytes) -> h5d.DatasetID | None:
     return found if plain else None
 
 
-class FoundIndex(NamedTuple):
-    """Content of an index. digest: `index_digest` of the datasets."""
-
-    version: int
-    archive_id: bytes
-    columns: dict[str, NDArray]
-    digest: bytes
-
-
-def read_index(path: Path) -> FoundIndex:
-    """Return an index with every dataset, checked with `check_columns`.
+def read_index(path: Path) -> tuple[bytes, dict[str, NDArray]]:
+    """Return the archive id and every dataset of an index, checked with `check_columns`.
 
     Datasets that link elsewhere, or that claim more bytes than the file has, are refused. Raises
     FormatError or CorruptError naming the file, ValueError for an invalid number, and any error of
@@ -391,10 +344,9 @@ def read_index(path: Path) -> FoundIndex:
             if columns[name].size:
                 dataset.read(h5s.ALL, h5s.ALL, columns[name])
         archive_id = _number_attribute(file, "archive_id", "|u1", (16,)).tobytes()
-        digest = index_digest(archive_id, columns)
-        if digest != _number_attribute(file, "sha256", "|u1", (32,)).tobytes():
+        if index_digest(archive_id, columns) != _number_attribute(file, "sha256", "|u1", (32,)).tobytes():
             raise CorruptError(
                 f"{path}: checksum differs from the one stored: damaged, restore or rebuild it"
             )
     check_columns(version, columns)
-    return FoundIndex(version, archive_id, columns, digest)
+    return archive_id, columns

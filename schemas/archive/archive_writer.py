@@ -22,7 +22,6 @@ from ..process.new_hdf5_file import hdf5_file, new_hdf5_file
 from .codec import CELL_DTYPE, NODE_DTYPE, Record, voxel_point_dtype
 from .index import (
     DATASETS,
-    INDEX_COLUMNS,
     INDEX_NAME,
     VOXEL_DTYPE,
     Header,
@@ -150,19 +149,11 @@ def write_index(folder: Path, header: Header, voxels: NDArray, shards: list[tupl
     shards: name and bytes of each, in the order of their numbers.
     """
     columns = index_columns(header, voxels, shards)
-    write_columns(folder / INDEX_NAME, header.format_version, header.archive_id, columns)
-
-
-def write_columns(path: Path, version: int, archive_id: bytes, columns: dict[str, NDArray]) -> bytes:
-    """Write an index of these datasets, in the order of INDEX_COLUMNS; return its checksum."""
-    digest = index_digest(archive_id, columns)
-    with new_hdf5_file(path) as file:
+    with new_hdf5_file(folder / INDEX_NAME) as file:
         file.attrs["format"] = np.bytes_("solidcloud")
-        file.attrs["format_version"] = np.uint32(version)
+        file.attrs["format_version"] = np.uint32(header.format_version)
         file.attrs["units"] = np.bytes_("m")
-        file.attrs["archive_id"] = np.frombuffer(archive_id, np.uint8)
-        file.attrs["sha256"] = np.frombuffer(digest, np.uint8)
-        for name in INDEX_COLUMNS:
-            if name in columns:
-                file.create_dataset(name, data=columns[name])
-    return digest
+        file.attrs["archive_id"] = np.frombuffer(header.archive_id, np.uint8)
+        file.attrs["sha256"] = np.frombuffer(index_digest(header.archive_id, columns), np.uint8)
+        for name, column in columns.items():
+            file.create_dataset(name, data=column)

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from .codec import point_dtype
 from .index_texts import read_texts
 from .radius_model import RADIUS_CLASSES
-from .seal import DIGEST_BYTES
 from .voxel_grid import Lattice
 
 # Names of an archive's files, and of the datasets of each record in a shard.
@@ -29,8 +28,6 @@ DATASETS = ("cells", "nodes", "points")
 # Versions that this software reads. It writes the lowest version that can represent the header.
 FORMAT_VERSIONS = (1, 2, 3, 5)
 
-# The dataset that a seal adds, whose values are no function of the header; and the version it needs.
-RECORD_DIGEST, SEALED_VERSION = "record_digest", 5
 # Most flags of the dataset `columns`; an index without the last columns has fewer.
 COLUMN_FLAGS = 7
 
@@ -128,8 +125,7 @@ class Header:
     radius_now: `radius` as measured over the points of this generation; None in generation 0, where
     it equals `radius`, and if the radius was given.
     is_level: whether the points and classes are those of a level (level.py).
-    rgb, classification: whether the points have these columns.  is_sealed: whether the index has
-    digests of its records (seal.py).
+    rgb, classification: whether the points have these columns.
     """
 
     archive_id: bytes
@@ -159,7 +155,6 @@ class Header:
     is_level: bool = False
     rgb: bool = False
     classification: bool = False
-    is_sealed: bool = False
 
     @property
     def radius_class(self) -> bool:
@@ -180,7 +175,7 @@ class Header:
     @property
     def format_version(self) -> int:
         """Return the lowest format version that can represent this header."""
-        if self.is_level or self.rgb or self.classification or self.is_sealed:
+        if self.is_level or self.rgb or self.classification:
             return 5
         if self.generation:
             return 3
@@ -270,7 +265,6 @@ INDEX_COLUMNS = {
     "texts": IndexColumn(_U1, (-1,), lambda header: np.frombuffer(_texts(header), _U1)),
     "shards": IndexColumn(SHARD_DTYPE, (-1,)),
     "voxels": IndexColumn(VOXEL_DTYPE, (-1,)),
-    RECORD_DIGEST: IndexColumn(_U1, (-1, 2, DIGEST_BYTES), requires="is_sealed"),
 }
 
 
@@ -279,7 +273,6 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
 
     voxels: VOXEL_DTYPE rows sorted by key.
     shards: name and bytes of each, in the order of their numbers.
-    A sealed archive's digests are not among them.
     """
     tables = {
         "shards": np.array([(name.encode(), size) for name, size in shards], SHARD_DTYPE),
@@ -288,8 +281,7 @@ def index_columns(header: Header, voxels: NDArray, shards: list[tuple[str, int]]
     columns = {}
     for name, column in INDEX_COLUMNS.items():
         if column.values is None:
-            if name in tables:
-                columns[name] = tables[name]
+            columns[name] = tables[name]
         elif not column.requires or getattr(header, column.requires):
             value = np.asarray(column.values(header), column.dtype)
             # Any other array keeps its shape, so that a reader refuses a wrong one.
@@ -360,5 +352,4 @@ def read_header(archive_id: bytes, columns: dict[str, NDArray]) -> Header:
         is_level="level" in columns,
         rgb=held[5],
         classification=held[6],
-        is_sealed=RECORD_DIGEST in columns,
     )

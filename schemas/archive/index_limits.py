@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .codec import CELL_DTYPE, CELL_EXPANSION, NODE_DTYPE, NODE_EXPANSION
-from .index import COLUMN_FLAGS, INDEX_COLUMNS, RECORD_DIGEST, SEALED_VERSION
+from .index import COLUMN_FLAGS, INDEX_COLUMNS
 from .voxel import MAX_DEGREE, MAX_LEAF, MAX_LEVELS, MIN_DEGREE
 from .voxel_grid import MAX_COORDINATE, MAX_VOXEL_STEPS, MIN_STEP, voxel_coordinates
 from .zstd_frame import ANY_EXPANSION
@@ -117,16 +117,10 @@ def _check_point_columns(version: int, columns: dict[str, NDArray]) -> None:
             [*columns["level"].tolist(), *kept],
             "1, and no column but intensity, rgb, classification",
         )
-    is_sealed = RECORD_DIGEST in columns
-    held = {
-        "is_sealed": is_sealed,
-        "radius_class": classes or is_level,
-        "generation": later,
-        "is_level": is_level,
-    }
+    held = {"radius_class": classes or is_level, "generation": later, "is_level": is_level}
     if any((name in columns) != held[requires] for name, requires in _OPTIONAL.items()):
         _refuse("datasets", [name for name in _OPTIONAL if name in columns], f"those of columns {kept}")
-    expected = SEALED_VERSION if is_level or colours or is_sealed else 3 if later else 2 if classes else 1
+    expected = 5 if is_level or colours else 3 if later else 2 if classes else 1
     if version != expected:
         _refuse("format_version", version, f"{expected}, from the datasets")
     degree, leaf = columns["tree"].tolist()
@@ -192,8 +186,6 @@ def check_voxels(columns: dict[str, NDArray], point_bytes: int) -> None:
         or key[-1] >= 1 << 63
     ):
         _refuse("voxels", "is inconsistent", "ascending keys of 63 bits, shards that exist")
-    if RECORD_DIGEST in columns and len(columns[RECORD_DIGEST]) != len(voxels):
-        _refuse(RECORD_DIGEST, f"of {len(columns[RECORD_DIGEST])} voxels", f"those of {len(voxels)}")
     _check_frames(voxels, sizes[voxels["shard"]])
     _check_rows(columns, point_bytes)
     _check_bounds(columns)

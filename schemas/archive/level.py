@@ -71,14 +71,13 @@ def cover_units() -> NDArray[np.int64]:
 def open_level(archive: Archive) -> Archive | None:
     """Open the level of an archive; return None if there is none, or only that of other points.
 
-    The level of an archive that was opened with a key must be sealed with it.
     Raises FormatError or CorruptError, naming the file, for a level that cannot be read, or that
     does not describe the voxels of the archive.
     """
     folder = archive.folder / LEVEL_FOLDER
-    if not archive.is_as_stored or not (folder / INDEX_NAME).is_file():
+    if not (folder / INDEX_NAME).is_file():
         return None
-    level = Archive(folder, archive.key)
+    level = Archive(folder)
     header, described = level.header, archive.header
     if header.archive_id != level_id(described):
         level.close()

@@ -9,8 +9,8 @@ import sys
 NAME = "solidcloud"
 # Subcommands, by which messages name the command; server/cli/main.py declares them.
 VERBS = (
-    *("accuracy", "add", "build", "doctor", "export", "info", "inspect", "level", "loadtest", "make", "plan"),
-    *("query", "reload", "remove", "replay", "scene", "seal", "serve", "top", "validate", "view"),
+    *("accuracy", "add", "build", "doctor", "export", "info", "inspect", "loadtest", "make", "plan"),
+    *("query", "reload", "remove", "replay", "scene", "serve", "top", "validate", "view"),
 )
 _MENTION = re.compile(rf"(?<![\w./-]){NAME} (?=(?:{'|'.join(VERBS)})\b|--)")
 

@@ -1,20 +1,19 @@
-"""Avatar: the user's body as spheres, with a hierarchy built by the code that builds a voxel's."""
+"""Avatar: the user's body as spheres, with their hierarchy (avatar_tree.py)."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...builder.voxel.point_hierarchy import build_local, mean_closest_distance
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_positions
 from ...schemas.wire.scene_messages import AvatarInfo
 from ..kernels.core.placed_avatar import MAX_FRONT, Avatar
 from ..kernels.core.scene_arrays import LANES
+from .avatar_tree import bound_nodes, mean_spacing, pack_points
 
-# Children per node of an avatar's tree; as for voxels, see BuildConfig.degree.
-DEGREE = 8
 # Largest front of a filled mesh, most of whose nodes are inside. With 256, `distance` takes 1.2
 # times as long near a scan, and `collide` 0.8 to 1.2 times (bench_engine, `filled`).
 FILLED_FRONT = 32
@@ -74,44 +73,39 @@ def make_avatar(points: ArrayLike, radius: float | None = None, inner_points: in
             0,
         )
         return AvatarModel(array, float(radius or 0.0), empty, np.empty((0, LANES), np.int32), 0.0)
-    local = build_local(array, leaf=LANES, degree=DEGREE)
+    tree = pack_points(array)
     if radius is None:
-        radius = mean_closest_distance(local) / 2
+        radius = mean_spacing(tree) / 2
         if radius == 0.0:
             raise BadRequestError(
                 "avatar of a single distinct point has no closest-point distance: give a radius"
             )
-    tree, bounds = local.hierarchy.tree, local.hierarchy.bounds
-    leaves = int(tree.levels[-2])
-    first = np.empty(len(tree.begin), np.int32)
-    first[:leaves] = (
-        1 + np.concatenate([[0], np.cumsum(tree.count[:leaves], dtype=np.int64)[:-1]]) if leaves else 0
-    )
-    first[leaves:] = ~np.arange(len(tree.begin) - leaves)
-    # Unused lanes of a block repeat its last point.
-    last = tree.end[leaves:, None] - 1
-    rows = tree.order[np.minimum(tree.begin[leaves:, None] + np.arange(LANES), last)]
-    lanes = array[rows].transpose(0, 2, 1)
+    center, node_radius = bound_nodes(tree)
     # Rounding moves a point by less than sqrt(3) lattice steps. Two more steps in the radius
     # therefore enclose the given points, including the rounding of these sums.
-    center = np.asarray(local.low + bounds.center * local.step)
-    node_radius = np.asarray((bounds.radius + 2) * local.step, np.float64)
+    center, node_radius = tree.low + center * tree.step, (node_radius + 2) * tree.step
+    sizes = np.array([len(starts) - 1 for starts in tree.levels])
+    begins = np.concatenate([[0], np.cumsum(sizes)])
+    children = [np.searchsorted(below, above) for above, below in pairwise(tree.levels)]
+    first = [begin + each[:-1] for begin, each in zip(begins[1:], children, strict=False)]
+    counts = [np.diff(each) for each in (*children, tree.levels[-1])]
+    # Unused lanes of a block repeat its last point.
+    lane = tree.levels[-1][:-1, None] + np.minimum(np.arange(LANES), counts[-1][:, None] - 1)
+    rows = np.ascontiguousarray(tree.order[lane], np.int32)
     # The flat list of nodes is the deepest level that fits: the leaf nodes, up to some 8,000
     # points.
-    sizes = np.diff(tree.levels)
     level = int(np.flatnonzero(sizes <= (FILLED_FRONT if inner_points else MAX_FRONT))[-1])
-    front = slice(int(tree.levels[level]), int(tree.levels[level + 1]))
+    front = slice(int(begins[level]), int(begins[level + 1]))
     arrays = Avatar(
         center,
         node_radius,
-        first,
-        tree.count.astype(np.int32),
-        np.ascontiguousarray(lanes),
+        np.concatenate([*first, ~np.arange(sizes[-1])]).astype(np.int32),
+        np.concatenate(counts).astype(np.int32),
+        np.ascontiguousarray(array[rows].transpose(0, 2, 1)),
         # `concatenate` may return another memory order, and numba would recompile every kernel.
         np.ascontiguousarray(np.concatenate([center[front].T, node_radius[None, front]])),
         front.start,
         inner_points,
     )
-    rows = np.ascontiguousarray(rows, np.int32)
     bounding_radius = float(node_radius[0]) + float(radius)
     return AvatarModel(array, float(radius), arrays, rows, bounding_radius, inner_points)

@@ -32,10 +32,8 @@ from .commands.archives import build_command as build
 from .commands.archives import export_command as export
 from .commands.archives import info_validate_command as info_validate
 from .commands.archives import inspect_command as inspect
-from .commands.archives import level_command as level
 from .commands.archives import make_command as make
 from .commands.archives import plan_command as plan
-from .commands.archives import seal_command as seal
 from .commands.command_options import print_error
 from .output.compile_notice import compile_notices
 
@@ -65,8 +63,6 @@ for verb in (
     build.build,
     info_validate.info,
     info_validate.validate,
-    level.level,
-    seal.seal,
     serve.serve,
     accuracy.accuracy,
     query.query,

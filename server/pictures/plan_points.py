@@ -43,7 +43,8 @@ def read_plan_points(
     box. Raise BadRequestError if the scene is closed.
     """
     with ExitStack() as stack:
-        opened = [stack.enter_context(archive.take()).store.archive for archive in archives]
+        stores = [stack.enter_context(archive.take()).store for archive in archives]
+        opened = [store.archive for store in stores]
         each = [_boxes(archive, placed) for archive, placed in zip(opened, archives, strict=True)]
         boxes = np.concatenate(each)
         which = np.repeat(np.arange(len(each)), [len(found) for found in each])
@@ -65,6 +66,7 @@ def read_plan_points(
                 voxel_points(voxel, links) + archive.coordinates[row].astype(np.int64) * lattice.voxel_steps
             )
             points = lattice.to_world(steps)
+            points = points[~stores[which[k]].hides(points)]
             points = points if placed.pose is None else transform_points(placed.pose, points)
             blocks.append(points[((points >= low) & (points <= high)).all(axis=1)])
         return PlanPoints(np.concatenate(blocks), boxes[left])

@@ -45,7 +45,7 @@ def open_level_store(store: VoxelStore, budget_bytes: int, coarse_bytes: int | N
             f"{coarse_bytes} bytes for the level of detail: expected 0 to {budget_bytes}, of which they are a part: "
             "give a smaller --coarse-bytes or a larger --cache"
         )
-    level = None if coarse_bytes == 0 else open_level(store.archive)
+    level = open_level(store.archive) if coarse_bytes != 0 and store.is_as_stored else None
     if level is None:
         return None
     found = VoxelStore(level.folder, lambda _: level)

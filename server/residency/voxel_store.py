@@ -26,7 +26,10 @@ class VoxelStore:
     """Voxels of an archive by index row.
 
     archive: see schemas/archive/archive.py.  sizes: (v,) int64, bytes of each decoded voxel.
+    is_as_stored: whether the points are all of the archive's, which its level describes.
     """
+
+    is_as_stored = True
 
     def __init__(
         self,
@@ -45,6 +48,15 @@ class VoxelStore:
             with_scan=header.scan_index,
             with_class=header.radius_class,
         )
+
+    def hides(
+        self, points: NDArray[np.float64], radii: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Return which spheres (n,) this store leaves out: none.
+
+        points: (n, 3), archive frame [m].  radii: (n,) or all of them [m].
+        """
+        return np.zeros(len(points), bool)
 
     def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
         """Read, check and lay out the voxel of index row `row` at byte `offset` of the arena.

@@ -1,12 +1,11 @@
 """Finding, checking and opening the archives and avatars that a scene file names.
 
-Errors name the file and the place in it. masked_archive.py is imported only for scenes with the
-effect `through`.
+Errors name the file and the place in it. The code of an effect is imported only for
+scenes with it.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +13,6 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from ...schemas.archive.archive import Archive
 from ...schemas.archive.radius_model import class_radii
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.errors import BadRequestError, SolidcloudError
@@ -64,17 +62,17 @@ def is_scene_file(path: Path) -> bool:
     return path.suffix == SUFFIX and not path.is_dir()
 
 
-def find_archives(file: SceneFile, path: Path, key: bytes | None = None) -> list[FoundArchive]:
+def find_archives(file: SceneFile, path: Path) -> list[FoundArchive]:
     """Return the archives that a scene file names, after checking their indexes.
 
     Also checks that each archive stores what the scene file requires.
-    path: of the scene file, for errors and for relative paths.  key: of the archives' seals.
+    path: of the scene file, for errors and for relative paths.
     Raises FormatError, CorruptError or BadRequestError.
     """
     found = []
     for number, item in enumerate(file.archives):
         with error_location(path, f"$.archives[{number}].path"):
-            store = sealed_store(key)(_resolve_relative(path, item.path))
+            store = VoxelStore(_resolve_relative(path, item.path))
         try:
             header = store.archive.header
             if file.radius_model is not None:
@@ -114,12 +112,7 @@ def read_avatars(file: SceneFile, path: Path, read_points: ReadPoints | None) ->
     return found
 
 
-def sealed_store(key: bytes | None) -> Callable[..., VoxelStore]:
-    """Return `VoxelStore`, for archives that must be sealed with a key if one is given."""
-    return VoxelStore if key is None else partial(VoxelStore, open_archive=partial(Archive, key=key))
-
-
-def store_opener(file: SceneFile, number: int, key: bytes | None = None) -> OpenStore:
+def store_opener(file: SceneFile, number: int) -> OpenStore:
     """Return the function that opens the folder of archive `number`.
 
     It leaves out the points that the effect `through` removes.
@@ -128,8 +121,8 @@ def store_opener(file: SceneFile, number: int, key: bytes | None = None) -> Open
         if isinstance(effect, Through):
             from ..simulation.effects.through_effect import store_without
 
-            return store_without(effect, file.archives[number].pose, key)
-    return sealed_store(key)
+            return store_without(effect, file.archives[number].pose)
+    return VoxelStore
 
 
 def share_budget(budget_bytes: int, sizes: list[NDArray[np.int64]]) -> list[int]:
@@ -162,13 +155,12 @@ def open_archives(
     policy: str,
     took: Callable[[float], None],
     coarse_bytes: int | None = None,
-    key: bytes | None = None,
 ) -> list[PlacedArchive]:
     """Open the archives of a scene, which the caller closes.
 
     name: of the scene.  budget_bytes: limit of decoded voxels, all archives together.
     policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
-    [s].  coarse_bytes: of the budget for levels, see `Scene.open`.  key: of the archives' seals.
+    [s].  coarse_bytes: of the budget for levels, see `Scene.open`.
     Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """
     with error_location(path, "$.archives"):
@@ -182,7 +174,7 @@ def open_archives(
                     name,
                     budget_bytes=budget,
                     policy=policy,
-                    open_store=store_opener(file, number, key),
+                    open_store=store_opener(file, number),
                     radius_model=file.radius_model,
                     pose=item.pose,
                     took=took,

@@ -28,7 +28,7 @@ class SceneTiles:
         """
         request = OverviewRequest(limit)
         with ExitStack() as stack:
-            opened = [stack.enter_context(archive.take()).store.archive for archive in self.archives]
+            opened = [stack.enter_context(archive.take()).store for archive in self.archives]
             return read_overview(request, self.archives, opened)
 
     def voxels(self, place: ArrayLike, reach: float | None = None, limit: int = 4096) -> VoxelsAnswer:
@@ -55,7 +55,7 @@ class SceneTiles:
         placed = self.archives[request.archive]
         with placed.take() as opened:
             try:
-                return read_tile(request, placed, opened.store.archive, opened.level_archive)
+                return read_tile(request, placed, opened.store, opened.level_archive)
             except OSError as error:
                 raise CorruptError(
                     f"voxel {request.voxel}: cannot be read ({error}): check the disk"

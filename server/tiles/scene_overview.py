@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...builder.voxel.record_points import voxel_points
-from ...schemas.archive.archive import Archive
 from ...schemas.archive.index import Header
 from ...schemas.archive.vtkhdf import PREVIEW_NAME, read_sample
 from ...schemas.errors import CorruptError
 from ...schemas.wire.overview_messages import OverviewAnswer, OverviewRequest
 from ..archives.placed_archive import PlacedArchive
+from ..residency.voxel_store import VoxelStore
 
 log = logging.getLogger(__name__)
 
@@ -56,17 +56,17 @@ class _Sample(NamedTuple):
 
 
 def read_overview(
-    request: OverviewRequest, placed: Sequence[PlacedArchive], archives: Sequence[Archive]
+    request: OverviewRequest, placed: Sequence[PlacedArchive], stores: Sequence[VoxelStore]
 ) -> OverviewAnswer:
     """Sample the points of archives. placed: their places in the scene."""
-    headers = [archive.header for archive in archives]
+    headers = [store.archive.header for store in stores]
     points = [header.points for header in headers]
     total = sum(points)
     # Exact integers: a share is that of the archive's points, and all shares add up to the limit.
     ends = [request.limit * sum(points[: k + 1]) // total for k in range(len(points))]
     samples = [
-        _sample(archive, end - begin, _READ_POINTS * archive.header.points // total)
-        for archive, begin, end in zip(archives, [0, *ends[:-1]], ends, strict=True)
+        _sample(store, end - begin, _READ_POINTS * store.archive.header.points // total)
+        for store, begin, end in zip(stores, [0, *ends[:-1]], ends, strict=True)
     ]
     names = [name for name in _COLUMNS if any(name in _kept(header) for header in headers)]
     columns = {name: _joined(name, samples, name in names) for name in _COLUMNS}
@@ -84,7 +84,7 @@ def read_overview(
         low,
         high,
         np.array(points, np.uint64),
-        np.array([len(archive.voxels) for archive in archives], np.uint32),
+        np.array([len(store.archive.voxels) for store in stores], np.uint32),
         np.array([len(header.sources) for header in headers], np.uint32),
         np.cumsum([0, *(len(sample.points) for sample in samples)]).astype(np.uint32),
         np.array([sample.is_preview for sample in samples]),
@@ -117,21 +117,18 @@ def _joined(name: str, samples: Sequence[_Sample], is_kept: bool) -> NDArray:
     )
 
 
-def _sample(archive: Archive, most: int, read: int) -> _Sample:
+def _sample(store: VoxelStore, most: int, read: int) -> _Sample:
     """Return at most `most` points of an archive. read: points to read without a preview, at most."""
-    found = _read_preview(archive)
+    found = _read_preview(store)
     if found is None:
-        found = _read_voxels(archive, read)
+        found = _read_voxels(store, read)
     return found.thinned(most)
 
 
-def _read_preview(archive: Archive) -> _Sample | None:
-    """Return the points of an archive's preview; None if there is none of this archive.
-
-    A seal does not cover the preview, so that of an archive checked with a key is not read.
-    """
-    path, header = archive.folder / PREVIEW_NAME, archive.header
-    if archive.key is not None or not path.exists():
+def _read_preview(store: VoxelStore) -> _Sample | None:
+    """Return the points of an archive's preview; None if there is none of this archive."""
+    path, header = store.archive.folder / PREVIEW_NAME, store.archive.header
+    if not path.exists():
         return None
     try:
         found = read_sample(path, _kept(header), _STAMP)
@@ -146,19 +143,16 @@ def _read_preview(archive: Archive) -> _Sample | None:
     # The preview is rounded, and not written by this process.
     kept = np.asarray(np.isfinite(found.points).all(axis=1))
     sample = sample.where(kept)._replace(points=np.clip(found.points[kept], low, high))
-    if not archive.is_as_stored:
-        from ..archives.masked_archive import MaskedArchive  # loads the builder's code
-
-        assert isinstance(archive, MaskedArchive)
-        sample = sample.where(np.logical_not(archive.is_masked(sample.points)))
+    sample = sample.where(~store.hides(sample.points))
     return sample if len(sample.points) else None
 
 
-def _read_voxels(archive: Archive, most: int) -> _Sample:
+def _read_voxels(store: VoxelStore, most: int) -> _Sample:
     """Return the points of voxels that are spread over an archive, at most `most` points.
 
     A voxel that cannot be read is left out.
     """
+    archive = store.archive
     columns, lattice = _kept(archive.header), archive.header.lattice
     counts = archive.voxels["rows"][:, 2].astype(np.int64)
     found = [
@@ -179,7 +173,8 @@ def _read_voxels(archive: Archive, most: int) -> _Sample:
         own = {name: np.asarray(getattr(voxel, _COLUMNS[name][0])) for name in columns}
         found.append(_Sample(places, own, False))
     joined = {name: np.concatenate([each.columns[name] for each in found]) for name in columns}
-    return _Sample(np.concatenate([each.points for each in found]), joined, False)
+    sample = _Sample(np.concatenate([each.points for each in found]), joined, False)
+    return sample.where(~store.hides(sample.points))
 
 
 def _spread(counts: NDArray[np.int64], most: int) -> list[int]:

@@ -21,6 +21,7 @@ from ...schemas.errors import BadRequestError, BusyError, TooLargeError
 from ...schemas.wire.request_limits import MAX_MESSAGE_BYTES
 from ...schemas.wire.tile_messages import LEVEL_DETAIL, TileAnswer, TileRequest
 from ..archives.placed_archive import PlacedArchive
+from ..residency.voxel_store import VoxelStore
 
 Steps = NDArray[np.int64]
 # Coordinates of a tile have this many bits.
@@ -42,13 +43,16 @@ _large = threading.Lock()
 
 
 def read_tile(
-    request: TileRequest, placed: PlacedArchive, archive: Archive, level: Archive | None = None
+    request: TileRequest, placed: PlacedArchive, store: VoxelStore, level: Archive | None = None
 ) -> TileAnswer:
     """Read a tile of an archive. placed: its place in the scene.  level: its level of detail.
+
+    What the store hides is left out: points, and spheres as a whole.
 
     Raise BadRequestError if there is no such voxel, TooLargeError for a voxel or an answer over the
     limits, BusyError if other large voxels are being read, CorruptError if it cannot be read.
     """
+    archive = store.archive
     row = _row_of(archive, request.voxel)
     header = archive.header
     lattice = header.lattice
@@ -76,6 +80,10 @@ def read_tile(
             nodes = transpose_columns(tree.nodes)
             cells, unit = transpose_columns(tree.cells), top_shift(lattice.voxel_steps)
             places, radii = _spheres(nodes, cells, tree.links, request.level, unit)
+        corner = np.array(request.voxel, np.int64) * lattice.voxel_steps
+        reach = radii * lattice.step if len(radii) else 0.0
+        shown = ~store.hides(lattice.to_world(places + corner), reach)
+        places, radii = places[shown], radii[shown[: len(radii)]]
         # Half a unit is what rounding a centre may move it.
         spheres = -(-radii >> shift) + (shift > 0)
         return TileAnswer(
@@ -85,7 +93,7 @@ def read_tile(
             header.radius,
             np.clip((places + (1 << shift >> 1)) >> shift, 0, (1 << _BITS) - 1).astype(np.uint16),
             np.clip(spheres, 0, (1 << _BITS) - 1).astype(np.uint16),
-            *(_column(values, kind, kept) for values, kind in zip(columns, _KINDS, strict=True)),
+            *(_column(values, kind, kept, shown) for values, kind in zip(columns, _KINDS, strict=True)),
         )
 
 
@@ -205,8 +213,8 @@ def _spheres(tree: Nodes, cells: LeafCells, links: Links, level: int, shift: int
     return centers, radii
 
 
-def _column(values: NDArray | None, kind: np.dtype, kept: slice) -> NDArray:
-    """Return the kept values of a column, none if the archive does not keep it."""
+def _column(values: NDArray | None, kind: np.dtype, kept: slice, shown: NDArray[np.bool_]) -> NDArray:
+    """Return the shown ones of the kept values of a column, none if the archive does not keep it."""
     if values is None:
         return np.empty((0, *kind.shape), kind.base)
-    return np.ascontiguousarray(values[kept])
+    return np.ascontiguousarray(values[kept][shown])

@@ -58,7 +58,7 @@ HELPERS = {
     "server.simulation.world.separation_cache": {"proximity", "contacts", "uncertainty"},
     "server.queries.distance_per_scan": {"uncertainty"},
     "server.kernels.nearest.nearest_by_scan": {"uncertainty"},
-    "server.archives.masked_archive": {"through"},
+    "server.archives.masked_store": {"through"},
     "server.simulation.world.bodies": {"objects", "crowd"},
     "server.simulation.world.body_obstacles": {"objects", "crowd"},
     "server.kernels.bodies.body_sweep": {"objects", "crowd"},

@@ -10,7 +10,6 @@ import zstandard
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.codec import CELL_DTYPE, NODE_DTYPE, point_dtype
 from solidcloud.schemas.archive.index import index_digest
-from solidcloud.schemas.archive.seal import frames_digest
 from solidcloud.schemas.archive.zstd_frame import pack
 
 Columns = dict[str, NDArray]
@@ -80,7 +79,7 @@ def _frame(folder: Path, columns: Columns, voxel: int, i: int) -> bytes:
 
 
 def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) -> None:
-    """Append another frame to its shard, and let the index refer to it, with its digest if it has any."""
+    """Append another frame to its shard, and let the index refer to it."""
     entry, shards = columns["voxels"][voxel], columns["shards"]
     number = int(entry["shard"])
     with open(folder / "shards" / shards["name"][number].decode(), "ab") as file:
@@ -89,10 +88,6 @@ def put_frame(folder: Path, columns: Columns, voxel: int, i: int, frame: bytes) 
         shards["bytes"][number] = file.tell()
     entry["frame_bytes"][i] = len(frame)
     entry["frame_checksum"][i] = int.from_bytes(frame[-4:], "little")
-    if "record_digest" in columns:
-        part = (2,) if i == 2 else (0, 1)
-        frames = [_frame(folder, columns, voxel, each) for each in part]
-        columns["record_digest"][voxel, int(i == 2)] = frames_digest(frames)
 
 
 def put_rows(folder: Path, columns: Columns, voxel: int, i: int, rows: NDArray) -> None:

@@ -1,4 +1,4 @@
-"""Two scans and two boxes, and scenes without the points in the boxes, for tests of masked archives."""
+"""Two scans and two boxes, and scenes without the points in the boxes, for tests of masked stores."""
 
 import hashlib
 from pathlib import Path

@@ -1,5 +1,5 @@
 """Kernels over neighbouring points: spacing, radius classes, filters.
 
-May import builder.kernels.points, builder.kernels.trees, schemas.
+May import builder.kernels.points, schemas.
 Begin with nearest_neighbours.py.
 """

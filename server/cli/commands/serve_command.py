@@ -41,13 +41,6 @@ def serve(
             "new key, which clients of the same user find automatically."
         ),
     ] = None,
-    archive_key: Annotated[
-        Path | None,
-        typer.Option(
-            help="File with the key with which the archives must be sealed (solidcloud seal); default: serve "
-            "archives with and without seals."
-        ),
-    ] = None,
     log: Annotated[
         Path | None,
         typer.Option(
@@ -98,7 +91,6 @@ def serve(
     import sys
     from contextlib import ExitStack
 
-    from ....schemas.archive.seal import read_archive_key
     from ....schemas.kernels.compiling import has_compiled, kernel_files, without_linear_algebra
     from ...scene import Scene
     from ...simulation.replay import recorded
@@ -126,8 +118,6 @@ def serve(
     )
     budget = parse_bytes(cache, "--cache")
     coarse = None if coarse_bytes is None else parse_bytes(coarse_bytes, "--coarse-bytes")
-    if archive_key is not None:
-        read_archive_key(archive_key)
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # until `serve_scenes` waits for signals
@@ -139,9 +129,7 @@ def serve(
             rehearse(what, files)
         start.enter_context(warmed_in_parallel(what))
         scene = stack.enter_context(
-            Scene.open(
-                what, name, budget_bytes=budget, policy=policy, coarse_bytes=coarse, archive_key=archive_key
-            )
+            Scene.open(what, name, budget_bytes=budget, policy=policy, coarse_bytes=coarse)
         )
         if log is not None:
             stack.enter_context(recorded(scene, what, log))

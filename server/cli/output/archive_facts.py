@@ -93,11 +93,9 @@ def archive_details(store: "VoxelStore") -> dict[str, Any]:
     scans: for each source that declares any of them, its number and: scanner (origin [m]), crs,
     units, up.
     preview: size of the ParaView file in bytes; None if it does not exist.
-    sealed: whether it has a seal, which only `validate` with its key checks.
     warnings: sentences about scans that look wrong.
     """
     from ....builder.sources.coincident_scans import coincident_sources
-    from ....schemas.archive.seal import SEAL_NAME
     from ....schemas.archive.vtkhdf import PREVIEW_NAME
 
     archive = store.archive
@@ -116,7 +114,6 @@ def archive_details(store: "VoxelStore") -> dict[str, Any]:
             if not source.fault and (said := _source_details(source))
         ],
         "preview": preview.stat().st_size if preview.exists() else None,
-        "sealed": (archive.folder / SEAL_NAME).exists(),
         "warnings": list(coincident_sources(archive.header.sources)),
     }
 
@@ -147,7 +144,5 @@ def detail_facts(details: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "system", f"{' '.join(crs.split())[:300]} ({scans} of the scans)"
     if details["preview"] is not None:
         yield "preview", f"preview.vtkhdf for ParaView, {bytes_text(details['preview'])}"
-    if details["sealed"]:
-        yield "seal", "found; `solidcloud validate --archive-key FILE` checks it"
     for warning in details["warnings"]:
         yield "warning", warning

@@ -1,6 +1,7 @@
 """Checks and description of a scene file, for `solidcloud scene check`."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from ....schemas.scene.effect_table import Objects, Through, Uncertainty, effect_name
 from ....schemas.scene.scene_file import SceneFile, identity, read_scene, scene_name, up_of
 from ...archives.archive_info import run_order
+from ...archives.masked_store import MaskedStore
 from ...archives.rigid_transform import transform_boxes
 from ...scenes.scene_archives import (
     FoundArchive,
@@ -44,7 +46,8 @@ class Checked(NamedTuple):
 def check_scene_file(path: Path, read_points: ReadPoints | None = None) -> Checked:
     """Read a scene file and everything it names.
 
-    Raises the same errors as `Scene.open`, except those about budgets.
+    Raises the same errors as `Scene.open`, except those about budgets, and CorruptError or OSError
+    for a voxel that a box of `through` meets.
     """
     file = read_scene(path)
     name = scene_name(file, path)
@@ -118,14 +121,14 @@ def scene_json(checked: Checked) -> dict[str, Any]:
 
 def _removed_points(file: SceneFile, path: Path, archives: list[FoundArchive]) -> int:
     """Return the number of scan points that the effect `through` removes."""
-    if not any(isinstance(effect, Through) for effect in file.effects):
-        return 0
     left_out = 0
     for number, found in enumerate(archives):
-        with error_location(path, f"$.archives[{number}]"):
-            store = store_opener(file, number)(found.folder)
-        left_out += found.info.points - int(store.archive.voxels["rows"][:, 2].sum(dtype=np.int64))
-        store.close()
+        with (
+            error_location(path, f"$.archives[{number}]"),
+            closing(store_opener(file, number)(found.folder)) as store,
+        ):
+            if isinstance(store, MaskedStore):
+                left_out += store.count_hidden()
     return left_out
 
 

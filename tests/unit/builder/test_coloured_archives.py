@@ -24,7 +24,6 @@ from solidcloud.builder.passes.verify import verify_archive
 from solidcloud.builder.voxel.record_points import voxel_points
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.archive.level import open_level
-from solidcloud.server.archives.masked_archive import MaskedArchive
 
 KEEP = frozenset({"scan", "intensity", "rgb", "classification"})
 GRID = {"resolution": 0.001, "radius": 0.001}
@@ -167,22 +166,6 @@ def test_representatives_have_the_columns_of_the_points_that_they_are(tmp_path: 
         with level:
             assert not level.header.scan_index
             assert level.header.intensity and level.header.rgb and level.header.classification
-
-
-def test_a_voxel_without_some_points_keeps_the_colours_of_the_rest(tmp_path: Path) -> None:
-    truth = joined(coloured(16, 2000), stacked(17))
-    build([write_las(tmp_path / "a.las", truth)], tmp_path / "a", keep=KEEP, **GRID)
-    low, high = np.array([0.2005, 0.2005, 0.2005]), np.array([1.3005, 1.1005, 1.4005])
-    stays = ~((truth.xyz >= low) & (truth.xyz <= high)).all(axis=1)
-    rows = []
-    with MaskedArchive(tmp_path / "a", [np.stack([low, high])]) as archive:
-        lattice = archive.header.lattice
-        for row in range(len(archive.voxels)):
-            voxel, links = archive.read_voxel(row)
-            steps = voxel_points(voxel, links) + archive.coordinates[row] * lattice.voxel_steps
-            rows.append(Coloured(lattice.to_world(steps), voxel.rgb, voxel.classification))
-    expected = Coloured(*(column[stays] for column in truth))
-    assert np.array_equal(table(joined(*rows)), table(expected))
 
 
 # --- export -------------------------------------------------------------------------------------------------

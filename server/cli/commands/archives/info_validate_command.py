@@ -1,6 +1,5 @@
 """`solidcloud info` and `validate`: describe and check an archive."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -50,23 +49,17 @@ def validate(
     jobs: Annotated[
         int, typer.Option(min=0, help="Worker processes; 0: one per core, fewer for a small archive.")
     ] = 0,
-    archive_key: Annotated[
-        Path | None,
-        typer.Option(help="File with the key with which the archive must be sealed (solidcloud seal)."),
-    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check every record of an archive. Exit code 3 if one is broken."""
     from .....builder.passes.verify import verify_archive, verify_jobs
     from .....builder.run.executor import ProcessExecutor
-    from .....schemas.archive.seal import read_archive_key
     from ...output.progress_display import progress_listener
 
-    key = None if archive_key is None else read_archive_key(archive_key)
     jobs = verify_jobs(archive, jobs, deep=deep, exact=exact)
     with progress_listener() as bars, ProcessExecutor(jobs) as executor:
         report = verify_archive(
-            archive, deep=deep, exact=exact, sample=sample, progress=bars, executor=executor, key=key
+            archive, deep=deep, exact=exact, sample=sample, progress=bars, executor=executor
         )
     if as_json:
         print_json(report._asdict())

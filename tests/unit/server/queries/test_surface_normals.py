@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import archive_cases
@@ -18,7 +17,7 @@ import synthetic_scans
 from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError, CorruptError
 from solidcloud.server.archives.archive_generation import ArchiveGeneration
-from solidcloud.server.archives.masked_archive import MaskedArchive
+from solidcloud.server.archives.masked_store import MaskedStore
 from solidcloud.server.kernels.core.normal_codes import LINE, THICK
 from solidcloud.server.kernels.rays.near_points import voxels_in_box
 from solidcloud.server.queries.context.query_context import with_stop
@@ -288,7 +287,7 @@ def test_what_is_left_out_has_no_say(tmp_path: Path) -> None:
     rest = archive_cases.build(tmp_path, case.points[stays], voxel=0.9, radius=0.01)
     with asked(rest.archive) as (_, normals):
         expected = [normals.at(place, UP, REACH) for place in places[stays]]
-    store = VoxelStore(case.archive, partial(MaskedArchive, boxes=[box]))
+    store = MaskedStore(case.archive, [box])
     with asked(case.archive, store=store) as (_, normals):
         found = [normals.at(place, UP, REACH) for place in places[stays]]
     assert str(found) == str(expected) != str(whole)

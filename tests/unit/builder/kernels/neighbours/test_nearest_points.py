@@ -1,13 +1,11 @@
-"""Test the closest point by descent on trees made by hand, and the nearest boxes by brute force."""
+"""Test the closest points of a record, and the nearest boxes, by brute force."""
 
 import numpy as np
 import pytest
 from opened_records import open_points, open_scan, points_of
 from solidcloud.builder.kernels.neighbours.nearest_points import (
     FAR,
-    SearchTree,
     closest_in_record,
-    closest_other,
     make_box_tree,
     near_boxes,
 )
@@ -18,57 +16,10 @@ from solidcloud.schemas.archive.codec import DecompressedRecord
 pytestmark = pytest.mark.interpreted
 
 
-def tree_of(points: np.ndarray, leaf: int = 3, degree: int = 3) -> SearchTree:
-    """A tree over points in the order given, bounds rounded up, level by level from the root."""
-    runs = [(a, min(a + leaf, len(points))) for a in range(0, len(points), leaf)]
-    levels = [[(a, b, a, b - a, True) for a, b in runs]]
-    while len(levels[0]) > 1:
-        below = levels[0]
-        groups = [(i, min(i + degree, len(below))) for i in range(0, len(below), degree)]
-        levels.insert(0, [(below[i][0], below[j - 1][1], i, j - i, False) for i, j in groups])
-    rows, begins = [], np.cumsum([0, *map(len, levels)]).tolist()
-    for level, behind in zip(levels, begins[1:], strict=False):
-        rows += [(a, b, first if last else behind + first, n, last) for a, b, first, n, last in level]
-    center = np.array([(points[a:b].min(axis=0) + points[a:b].max(axis=0)) // 2 for a, b, *_ in rows])
-    radius = [
-        int(np.ceil(np.sqrt(((points[a:b] - c) ** 2).sum(axis=1).max())))
-        for (a, b, *_), c in zip(rows, center, strict=True)
-    ]
-    return SearchTree(
-        center, np.array(radius), np.array([r[2] for r in rows], np.int32),
-        np.array([r[3] for r in rows], np.uint8), np.array([r[4] for r in rows]), points,
-    )  # fmt: skip
-
-
 def brute(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
     """Squared distances to the closest distinct points."""
     d2 = ((queries[:, None] - points) ** 2).sum(axis=2)
     return np.where(d2 > 0, d2, FAR).min(axis=1)
-
-
-@pytest.mark.parametrize("side", [4, 30, 1000, 1 << 20])
-@pytest.mark.parametrize("count", [1, 2, 9, 60])
-def test_the_closest_is_that_of_brute_force(side: int, count: int) -> None:
-    rng = np.random.default_rng([side, count])
-    points = rng.integers(0, side, (count, 3))
-    points = points[np.lexsort(points.T)]
-    queries = np.concatenate([points, rng.integers(-side, 2 * side, (40, 3))])
-    best = np.full(len(queries), FAR)
-    closest_other(tree_of(points), queries, best)
-    expected = brute(points, queries)
-    assert best.tolist() == expected.tolist()
-    known = np.clip(expected - rng.integers(-1, 2, len(queries)), 0, FAR)
-    lowered = known.copy()
-    closest_other(tree_of(points), queries, lowered)
-    assert lowered.tolist() == np.minimum(known, expected).tolist()
-
-
-def test_far_apart_nothing_overflows() -> None:
-    """Distances whose squares take 62 bits, where a bound's square would not fit."""
-    points = np.array([[0, 0, 0], [1 << 30, 0, 0], [1 << 30, 1 << 30, 1 << 30]])
-    best = np.full(3, FAR)
-    closest_other(tree_of(points, leaf=1), points, best)
-    assert best.tolist() == [1 << 60, 1 << 60, 2 << 60]
 
 
 def asked(

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
+from point_hierarchy import Bounds, build_hierarchy
 from solidcloud.builder.kernels.trees.bounding_sphere import ceil_sqrt, least_variance
-from solidcloud.builder.voxel.point_hierarchy import Bounds, build_hierarchy
 from synthetic_scans import WITH_POINTS, make_steps
 
 

@@ -4,11 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
+from point_hierarchy import Hierarchy, build_hierarchy
 from solidcloud.builder.config import BuildConfig
 from solidcloud.builder.kernels.trees.build_tree import enlarge_bounds
-from solidcloud.builder.voxel.point_hierarchy import build_hierarchy
 from solidcloud.builder.voxel.voxel_octree import CellTrees, build_trees
-from synthetic_scans import make_steps
+from synthetic_scans import WITH_POINTS, make_steps
 
 pytestmark = pytest.mark.interpreted
 
@@ -28,6 +28,38 @@ def cells(with_slab: bool = True) -> tuple[list[np.ndarray], CellTrees]:
     starts = np.cumsum([0, *map(len, points)])
     config = BuildConfig(leaf=8, degree=3, with_slab=with_slab)
     return points, build_trees(local, starts[:-1], LOG2, config)
+
+
+def loose_nodes(hierarchy: Hierarchy) -> list[int]:
+    """Nodes that do not enclose their points, judged with Python integers."""
+    tree, bounds, loose = hierarchy.tree, hierarchy.bounds, []
+    for node in range(len(tree.begin)):
+        points = hierarchy.points[tree.begin[node] : tree.end[node]].astype(object)
+        apart = points - bounds.center[node].astype(object)
+        normal = bounds.normal[node].astype(object)
+        along = (apart * normal).sum(axis=1)
+        if (
+            max((apart * apart).sum(axis=1)) > int(bounds.radius[node]) ** 2
+            or int(bounds.slab[node, 0]) > min(along)
+            or max(along) > int(bounds.slab[node, 1])
+        ):
+            loose.append(node)
+    return loose
+
+
+@pytest.mark.parametrize("kind", WITH_POINTS)
+@pytest.mark.parametrize(("leaf", "degree", "with_slab"), [(32, 8, True), (4, 2, True), (8, 3, False)])
+def test_every_node_encloses_its_points(kind: str, leaf: int, degree: int, with_slab: bool) -> None:
+    points = make_steps(kind, 3, 300, 1 << 16)
+    hierarchy = build_hierarchy(points, leaf=leaf, degree=degree, with_slab=with_slab)
+    assert np.array_equal(hierarchy.points, points[hierarchy.tree.order])
+    assert not loose_nodes(hierarchy)
+    assert hierarchy.bounds.normal.any() == (with_slab and len(points) > 2)
+
+
+def test_coordinates_of_an_avatars_lattice_are_enclosed() -> None:
+    points = make_steps("noise", 3, 200, 1 << 23)
+    assert not loose_nodes(build_hierarchy(points, leaf=16, degree=4, highest=1 << 23))
 
 
 @pytest.mark.parametrize("with_slab", [True, False])

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from point_hierarchy import Tree, build_hierarchy
 from solidcloud.builder.kernels.trees.pack_tree import max_nodes, node_counts, pack_tree
-from solidcloud.builder.voxel.point_hierarchy import Tree, build_hierarchy
 from synthetic_scans import make_steps
 
 pytestmark = pytest.mark.interpreted

@@ -185,8 +185,6 @@ ORDER = (
 # floors, and avatars wedged under slopes. 4: motions of avatars in contact, and motion commands
 # that last for more than a frame. 5: normals count the points of all voxels.
 MOTION_VERSION = 5
-# Effects needed for safety: never skipped, whatever a frame's budget.
-NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})
 
 
 def effect_name(effect: AnyEffect) -> str:

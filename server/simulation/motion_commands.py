@@ -1,7 +1,7 @@
 """Meaning of motion commands: how long a frame lasts, and to which pose it leads."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
@@ -80,22 +80,20 @@ def run_frames(
     body: Body,
     up: Vec,
     bodies: "Bodies | None",
-    skip: Collection[str] | None,
 ) -> Moved:
     """Run the frames of a user's motion command, nearly always one. If one fails, undo those before it.
 
     run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may
-    meet, or None.  skip: as for `run`.
+    meet, or None.
     """
     if len(durations) == 1:
-        return run(body, target_pose(command, body.pose, durations[0], up), durations[0], skip=skip)
+        return run(body, target_pose(command, body.pose, durations[0], up), durations[0])
     body_before = replace(body, effect_state=dict(body.effect_state))
     bodies_before = None if bodies is None else bodies.snapshot()
     moves: list[Moved] = []
     try:
         for seconds in durations:
-            moves.append(run(body, target_pose(command, body.pose, seconds, up), seconds, skip=skip))
-            skip = moves[-1].skipped  # the first decides for all: a log has one list
+            moves.append(run(body, target_pose(command, body.pose, seconds, up), seconds))
             if bodies is not None:
                 bodies[body.user] = body
     except BaseException:

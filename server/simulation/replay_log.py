@@ -90,14 +90,13 @@ class Reloaded(msgspec.Struct, frozen=True, tag="reloaded"):
 class TurnResult(msgspec.Struct, frozen=True, array_like=True):
     """Result of a turn.
 
-    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.  skipped: skipped effects.
+    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.
     opened: number of reloads of each archive when the user last moved; empty if it never moved.
     kept: the body after a frame that lacked voxels and did not wait for them; None for all others.
     """
 
     pose: bytes
     error: str = ""
-    skipped: list[str] = []
     opened: list[int] = []
     kept: BodyRecord | None = None
 
@@ -122,8 +121,7 @@ def turn_result(
     """Return the logged form of an outcome. opened, kept: as in `TurnResult`."""
     if isinstance(outcome.state, SolidcloudError):
         return TurnResult(b"", str(outcome.state.code))
-    skipped = list(outcome.state.skipped)
-    return TurnResult(pose_bytes(outcome.state.pose), "", skipped, list(opened), kept)
+    return TurnResult(pose_bytes(outcome.state.pose), "", list(opened), kept)
 
 
 class FrameLog:

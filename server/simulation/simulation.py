@@ -8,7 +8,7 @@ poses, bit for bit: a clock is read only to report how long a frame took.
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
@@ -195,7 +195,6 @@ class Simulation:
         self,
         turns: Sequence[FrameCommand],
         now: float | None = None,
-        skips: Sequence[Collection[str]] | None = None,
         stops: Sequence[StopFlag] | None = None,
         kept: Sequence[BodyRecord | None] | None = None,
     ) -> list[FrameResult]:
@@ -205,8 +204,6 @@ class Simulation:
         pose. The outcome of a refused command is its error; the others are simulated.
         now: time on the caller's clock [s]. Users without a command for SILENT_SECONDS are removed
         first; None: no user is removed.
-        skips: for each turn, the effects to skip, as in a recorded frame; None: those that do not
-        fit the frame's budget.
         stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
         ExpiredError.
         kept: for a replay: for each turn, a recorded result that is taken without a simulation, or
@@ -218,14 +215,13 @@ class Simulation:
             self._frames += 1
             outcomes, opened, records = [], [], []
             for number, turn in enumerate(turns):
-                skip = None if skips is None else skips[number]
                 stop = NO_STOP if stops is None else stops[number]
                 # In a replay, a frame without a record lacked nothing: it gives what a wait would give.
                 budget = _frame_budget(turn.wish.late if kept is None else WAIT, stop)
                 given = None if kept is None else kept[number]
                 used: list[bytes] = []
                 with recording_avatars(used):
-                    state = self._simulate_turn(turn, now, skip, budget, given)
+                    state = self._simulate_turn(turn, now, budget, given)
                 there = self._present.get(turn.user)
                 about = b"".join(used) if there is None else there.body.avatar.digest
                 outcomes.append(FrameResult(turn.user, state, about))
@@ -240,14 +236,13 @@ class Simulation:
         self,
         turn: FrameCommand,
         now: float | None,
-        skip: Collection[str] | None,
         budget: QueryBudget,
         given: BodyRecord | None,
     ) -> State | SolidcloudError:
         """Simulate the frame of one user; return its state, or the error of a refused command."""
         begin = time.perf_counter()
         try:
-            moved = self._simulate_command(turn.user, turn.wish, now, skip, budget, given)
+            moved = self._simulate_command(turn.user, turn.wish, now, budget, given)
         except SolidcloudError as error:
             return error
         except StoppedError:
@@ -270,7 +265,6 @@ class Simulation:
         user: User,
         command: Wish,
         now: float | None,
-        skip: Collection[str] | None,
         budget: QueryBudget,
         given: BodyRecord | None,
     ) -> Moved:
@@ -287,7 +281,7 @@ class Simulation:
             if given is None:
                 run = partial(self._pipeline.run, budget=budget)
                 durations = frame_durations(command, present.time)
-                moved = run_frames(run, command, durations, present.body, self._up, self._bodies, skip)
+                moved = run_frames(run, command, durations, present.body, self._up, self._bodies)
             else:
                 moved = take_record(given, present.body, self.world, self._bodies)
             undo.pop_all()

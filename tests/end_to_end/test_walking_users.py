@@ -158,7 +158,7 @@ effects = [
     {{ effect = "stop" }}, {{ effect = "sweep" }}, {{ effect = "slide" }}, {{ effect = "ground" }},
     {{ effect = "crowd" }}, {{ effect = "proximity" }},
 ]
-limits = {{ users = 4, frame_visits = 3000 }}
+limits = {{ users = 4 }}
 """
 
 

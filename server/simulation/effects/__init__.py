@@ -9,8 +9,7 @@ scene declares, in this order:
 3. `slide`: continue the remaining motion along the touched surfaces.
 4. `step`: try to climb low obstacles with the motion that still remains.
 5. `ground`: as the last motion, lower the avatar to the ground, or let it fall.
-6. `proximity`, `contacts`, `uncertainty`: report about the final pose. The most expensive comes
-   last, because a small budget skips the last effects first.
+6. `proximity`, `contacts`, `uncertainty`: report about the final pose.
 
 `through` does nothing in a frame: it changes the scene once, when it is opened.
 

@@ -11,18 +11,16 @@ class EffectTimes:
 
     def __init__(self, names: Iterable[str]) -> None:
         """Begin at 0. names: of the effects, in the order in which they run."""
-        self._counts = {name: [0, 0, 0.0] for name in names}
+        self._counts = {name: [0, 0.0] for name in names}
         self._lock = threading.Lock()
 
-    def add(self, ran: list[tuple[str, float]], skipped: list[str]) -> None:
-        """Count a frame. ran: effects that ran, with their times [s].  skipped: those that did not."""
+    def add(self, ran: list[tuple[str, float]]) -> None:
+        """Count a frame. ran: its effects with their times [s]."""
         with self._lock:
             for name, seconds in ran:
                 count = self._counts[name]
                 count[0] += 1
-                count[2] += seconds
-            for name in skipped:
-                self._counts[name][1] += 1
+                count[1] += seconds
 
     def stats(self) -> list[EffectStats]:
         """Return the counts of each effect, in the order in which they run."""

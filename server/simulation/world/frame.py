@@ -120,7 +120,7 @@ class Frame:
     hits: hits that ended motions, in order.
     obstacles: obstacles besides the scan.
     fall_speed, on_ground: new values of `Body`.
-    simulated, skipped: names of effects.  reports: fields of `Moved`.
+    simulated: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
     apart: whether it is proved that no obstacle is touched at `pose`.
     walks, walk_hits: for walk_call.py: whether a part has run, and the hits that Python answered with, by
@@ -143,7 +143,6 @@ class Frame:
     fall_speed: float = 0.0
     on_ground: bool = False
     simulated: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
     reports: dict[str, Any] = field(default_factory=dict)
     effect_state: dict[str, Any] = field(default_factory=dict)
     apart: bool = False

@@ -5,7 +5,6 @@ A generation counts its readers; the last one to leave closes its files and rele
 
 import math
 import threading
-import weakref
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Self
@@ -16,7 +15,7 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, FormatError
-from ...schemas.wire.warming_parts import MOTION, PARTS
+from ...schemas.wire.warming_parts import PARTS
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.level_of_detail import open_level_data, with_level
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
@@ -134,13 +133,11 @@ class ArchiveGeneration:
             level_filler(self._level),
             coarse_filler(coarse, store) if coarse is not None and coarse.has_room_for_all else None,
         )
-        weak = weakref.ref(self)  # the prefetcher's thread must not keep a generation alive
         self.prefetcher = Prefetcher(
             residency,
             around,
             prefetch=ahead,
             idle=fill,
-            running_requests=lambda: (opened := weak()) is not None and opened._readers > 1,
             level=None if self._level is None else self._level.residency,
         )
         figure = make_scene_data(store.archive, residency, bounds, coarse)
@@ -274,12 +271,11 @@ class ArchiveGeneration:
         self.data.bounds.trees()  # made before the first load, which tightens the bounds
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
-        x, y, z = place = archive.header.lattice.to_world(corner).tolist()
+        place = archive.header.lattice.to_world(corner).tolist()
         if self._level is not None:  # the kernels that lay a voxel of it out
             with self._level.residency.hold([int(np.argmin(self._level.store.sizes))]):
                 pass
         for part in parts or PARTS:
-            self.prefetcher.warm((x, y, z), predict=part == MOTION)
             warm_engines(self.data, place, part)
 
     def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ..collide.collide_poses import collide_resident
 from ..core.voxels_in_reach import VALID
-from ..motion.motion_end import longest_way
+from ..motion.motion_end import MAX_UNDECIDED, longest_way
 from ..motion.sweep_resident import (
     AVATAR,
     CLOUD,
@@ -40,7 +40,6 @@ from .walk_state import (
     HAS_POINT,
     KNOWN,
     LANDS,
-    MAX_UNDECIDED,
     MISSED,
     NAMED,
     NEAREST,

@@ -22,9 +22,6 @@ from ..motion.sweep_resident import COLUMNS
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
-# If a motion is undecided for more than this distance before its contact, it ends where the
-# undecided part begins [m].
-MAX_UNDECIDED = 1e-4
 # Columns of a row of the tape. The first are those of `sweep_resident`. Then, for a hit: its verdict,
 # number of its archive (-1: not of the scan), whether the centres of the touching spheres, the
 # touching point, the end and the normal are known, the normal (3,), whether it is of a named body

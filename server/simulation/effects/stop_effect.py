@@ -11,19 +11,45 @@ with a clear end is taken, if the rule for users in contact permits the way to i
 leads, also without `sweep`, and the verdict reports whether it is still in contact. It stays if its
 pose or a candidate is unknown because voxels are not in memory yet, for a frame that does not wait
 for them.
+
+In a scene where no other effect moves avatars or obstructs them, this file follows the motion command.
+In others the kernel `walk_frame` does, which this file neither imports nor compiles.
 """
 
-from ....schemas.scene.effect_table import Stop, Sweep
+from typing import Any
+
+import numpy as np
+
+from ....schemas.scene.effect_table import Contacts, Proximity, Stop, Sweep, Through, Uncertainty
+from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_model import make_avatar
+from ...kernels.motion.motion_end import MIN_MOTION, skin_fraction
 from ..world.collision_world import World
-from ..world.frame import Frame, Vec, find_touched, is_clear, record_hit, translated
-from ..world.frame_walk import FOLLOW
+from ..world.frame import (
+    Body,
+    Frame,
+    Hit,
+    Pose,
+    Vec,
+    find_first_hit,
+    find_touched,
+    is_clear,
+    max_displacement,
+    record_hit,
+    translated,
+)
 from ..world.leaving import leave, leaving_pose
-from ..world.vectors import norm
+from ..world.vectors import norm, rotate_back
 
 # Longest displacement of an escape from contact [m], and the distances that are tried.
 MAX_ESCAPE = 0.5
 _ESCAPE_DISTANCES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MAX_ESCAPE)
+# First step back from a pose that turns out not to be clear [m], and its growth factor, as in
+# kernels/walk/walk_motions.py.
+FIRST_STEP_BACK, STEP_GROWTH = 1e-7, 4.0
+# Effects that neither move an avatar nor obstruct it.
+_STILL = (Stop, Proximity, Contacts, Uncertainty, Through)
 
 
 class StopRunner:
@@ -31,17 +57,89 @@ class StopRunner:
 
     name = "stop"
 
-    def __init__(self, continuous: bool) -> None:
-        """Create the effect. continuous: whether the effect `sweep` follows the motion command."""
-        self._continuous = continuous
+    def __init__(self, world: World, effect: Stop) -> None:
+        """Create the effect, and compile what its frames need."""
+        effects = world.file.effects
+        self._skin, self._tolerance = float(effect.skin), float(sweep_tolerance(world.file))
+        self._alone = all(isinstance(each, _STILL) for each in effects)
+        self._continuous = any(isinstance(each, Sweep) for each in effects)
+        if self._alone:
+            self._warm(world)
+        else:
+            world.walker.warm()
 
     def run(self, frame: Frame) -> None:
         """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             escape_contact(frame)
-        if not self._continuous:
-            frame.world.walker.run(frame, FOLLOW)
+        if self._alone:
+            self._follow(frame)
+        elif not self._continuous:
+            frame.world.walker.follow(frame)
+
+    def _warm(self, world: World) -> None:
+        """Compile the kernels of a motion that begins in contact."""
+        body = Body("", make_avatar([[0.0, 0.0, 0.0]], 0.1), np.eye(4))
+        frame, to = Frame(body, np.eye(4), 0.0, world, pose=body.pose), translated(body.pose, world.up)
+        hit = Hit(0.5, Verdict.CONTACT, world.up, -world.up)
+        with world:
+            find_first_hit(frame, to, self._tolerance, self._skin)
+            self._settle_before(frame, to, hit)
+
+    def _follow(self, frame: Frame) -> None:
+        """Move towards the commanded pose; an avatar in contact that cannot do both moves, then turns."""
+        hit = self._advance(frame, frame.target)
+        if hit is not None and frame.verdict == Verdict.CONTACT:
+            moved = frame.pose.copy()
+            moved[:3, 3] = frame.target[:3, 3]
+            if (moved != frame.target).any():
+                frame.hits.pop()
+                if self._advance(frame, moved) is None:
+                    self._advance(frame, frame.target)
+        frame.remaining = frame.target[:3, 3] - frame.pose[:3, 3]
+        if frame.verdict == Verdict.CONTACT and not frame.clear:  # it began in contact
+            frame.verdict = frame.world.collide(frame.body.avatar, frame.pose, frame.budget)
+            frame.clear = frame.verdict == Verdict.CLEAR
+
+    def _advance(self, frame: Frame, to: Pose) -> Hit | None:
+        """Move to a pose if nothing is touched there, in contact as far as possible; return what ended it."""
+        if frame.pose.tobytes() == to.tobytes():
+            return None
+        leaves = frame.verdict == Verdict.CONTACT
+        hit = find_first_hit(frame, to, self._tolerance, self._skin) if leaves else find_touched(frame, to)
+        if hit is None:
+            frame.pose, frame.clear = to.copy(), frame.clear or not leaves
+            return None
+        if leaves and hit.end is not None:
+            frame.pose = hit.end.copy()
+        elif leaves:
+            self._settle_before(frame, to, hit)
+        if hit.unloaded:
+            hit = hit._replace(rest=norm(to[:3, 3] - frame.pose[:3, 3]))
+        record_hit(frame, hit)
+        return hit
+
+    def _settle_before(self, frame: Frame, to: Pose, hit: Hit) -> None:
+        """Move to the pose the skin before a hit on the way to a pose, or to a clear one before it.
+
+        The avatar stays if the way is shorter than MIN_MOTION.
+        """
+        way, avatar, begin = max_displacement(frame, to), frame.body.avatar, frame.pose
+        share = 0.0
+        if way > 0.0 and self._skin > 0.0:
+            share = self._skin / way
+            if hit.avatar is not None and hit.cloud is not None:
+                there = frame.world.between(avatar, begin, to, min(hit.fraction, 1.0))[0]
+                point = rotate_back(there, hit.avatar - there[:3, 3])
+                share = skin_fraction(begin, to, hit.avatar, hit.cloud, point, way, self._skin)
+        fraction, back = hit.fraction - share, 0.0
+        while (fraction - back) * way >= MIN_MOTION:
+            pose, same = frame.world.between(avatar, begin, to, fraction - back)
+            if is_clear(frame, pose, proved=same and fraction - back < hit.fraction):
+                frame.pose = pose
+                return
+            back = max(STEP_GROWTH * back, FIRST_STEP_BACK / way)
 
 
 def escape_contact(frame: Frame) -> None:
@@ -78,7 +176,6 @@ def _escape_displacements(frame: Frame, *, touches: bool) -> list[Vec]:
     return ways
 
 
-def make(effect: Stop, world: World) -> StopRunner:
+def make(effect: Stop, world: Any) -> StopRunner:
     """Create the effect of a scene."""
-    world.walker.warm()
-    return StopRunner(any(isinstance(each, Sweep) for each in world.file.effects))
+    return StopRunner(world, effect)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.walk.walk_state import MAX_UNDECIDED
+from ...kernels.motion.motion_end import MAX_UNDECIDED
 from ...queries.context.query_budget import EXACT, QueryBudget
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 

@@ -90,6 +90,10 @@ class Walker:
             self._no_bodies = no_bodies()
         self._code = Held(None)
 
+    def follow(self, frame: Frame) -> None:
+        """Run the part FOLLOW."""
+        self.run(frame, FOLLOW)
+
     def run(self, frame: Frame, parts: int) -> None:
         """Run parts of a frame (bits of FOLLOW to GROUND), each once and in their order.
 

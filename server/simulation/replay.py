@@ -80,7 +80,7 @@ class Replayed(NamedTuple):
 def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
     """Simulate the frames of a log, with a new simulation of the same scene.
 
-    A result that depended on voxels not in memory is taken from the log (body_record.py). The
+    A result that depended on voxels not in memory is taken from the log (`BodyRecord`). The
     replay ends where the log's scene was reloaded. Raises the errors of reading the records, and
     BadRequestError for a log of other rules of motion, or whose avatars are not those of the scene.
     """

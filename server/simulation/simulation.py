@@ -6,13 +6,16 @@ poses, bit for bit: a clock is read only to report how long a frame took.
 """
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
+import msgspec
 import numpy as np
 
 from ...schemas.archive.pose_arrays import one_pose
@@ -23,8 +26,9 @@ from ...schemas.errors import (
     ExpiredError,
     InternalError,
     SolidcloudError,
+    UnknownAvatarError,
 )
-from ...schemas.scene.scene_file import SceneFile
+from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
 from ...schemas.wire.motion_messages import (
@@ -40,14 +44,15 @@ from ...schemas.wire.motion_messages import (
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ...schemas.wire.stats import EffectStats
 from ..archives.placed_archive import PlacedArchive
+from ..archives.rigid_transform import transform_points
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import LateVoxels, QueryBudget
+from ..queries.within import within
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
-from .body_record import BodyRecord, record_of, take_record
-from .motion_commands import first_pose, frame_durations, run_frames
-from .world.frame import Body, Pose
-from .world.vectors import norm, unit_vector
+from .replay_log import BodyRecord, record_of, take_record
+from .world.frame import MAX_TOUCHED, Body, Pose, Vec
+from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
     from .effects.effect_pipeline import Pipeline
@@ -56,6 +61,11 @@ if TYPE_CHECKING:  # a scene that is only queried imports neither
 
 log = logging.getLogger(__name__)
 
+# Limit on the duration of a frame [s]. A motion command that is due for longer takes several.
+LONGEST_FRAME = 0.1
+# After a pause of more than this, a viewer continues as after one of LONGEST_FRAME [s]: it stood
+# still, and did not send two motion commands a second.
+LONGEST_PAUSE = 0.5
 # A user that has sent no motion command for this long is removed with its body [s].
 SILENT_SECONDS = 30.0
 # Client of the avatars of `warm`; no real client has this name.
@@ -376,3 +386,114 @@ def _make_body(user: User, avatar: AvatarModel, pose: Pose) -> Body:
 def _public_name(user: User) -> str:
     """Return a name that other users and logs may see: the client's id is a secret."""
     return f"{public_id(user.client)}/{user.avatar}"
+
+
+def frame_durations(command: Wish, before: float | None) -> list[float]:
+    """Return how long each of the frames of a motion command lasts [s]; there is at least one.
+
+    before: time of the user's previous command, on its clock; None: it is the first.
+    """
+    if before is None:
+        return [FRAME_SECONDS]
+    seconds = max(command.time - before, 0.0)
+    if seconds > LONGEST_PAUSE:
+        seconds = LONGEST_FRAME
+    count = max(1, math.ceil(seconds / LONGEST_FRAME - 1e-9))  # times of clients are rounded
+    return [min(seconds / count, LONGEST_FRAME)] * count
+
+
+def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
+    """Return the target pose (4, 4) of a motion command given at `pose`. up: (3,) unit vector.
+
+    A velocity applies for the duration of the frame.
+    """
+    if command.velocity is None:
+        return check_rigid(command.pose[0], "pose")
+    there = pose.copy()
+    there[:3, 3] += np.array(command.velocity) * seconds
+    if command.turn and seconds:
+        there[:3, :3] = orthonormalize(multiply(rotation_matrix(up, command.turn * seconds), pose))
+    return there
+
+
+def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
+    """Return the pose at which users enter."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
+    pose[:3, 3] = spawn.position
+    return pose
+
+
+def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
+    """Return the pose at which a user enters with its first command.
+
+    Raise UnknownAvatarError if neither the scene's spawn nor the command gives one.
+    """
+    if spawn is not None:
+        return spawn_pose(spawn, up)
+    if command.velocity is not None:
+        raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
+    return check_rigid(command.pose[0].copy(), "pose")
+
+
+def run_frames(
+    run: Callable[..., Moved],
+    command: Wish,
+    durations: list[float],
+    body: Body,
+    up: Vec,
+    bodies: "Bodies | None",
+) -> Moved:
+    """Run the frames of a user's motion command, nearly always one. If one fails, undo those before it.
+
+    run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may
+    meet, or None.
+    """
+    if len(durations) == 1:
+        return run(body, target_pose(command, body.pose, durations[0], up), durations[0])
+    body_before = replace(body, effect_state=dict(body.effect_state))
+    bodies_before = None if bodies is None else bodies.snapshot()
+    moves: list[Moved] = []
+    try:
+        for seconds in durations:
+            moves.append(run(body, target_pose(command, body.pose, seconds, up), seconds))
+            if bodies is not None:
+                bodies[body.user] = body
+    except BaseException:
+        for each in fields(body):
+            setattr(body, each.name, getattr(body_before, each.name))
+        if bodies is not None and bodies_before is not None:
+            bodies.restore(bodies_before)
+        raise
+    touched = {(each.what, each.place): each for moved in moves for each in moved.touched}
+    last = moves[-1]
+    return msgspec.structs.replace(
+        last,
+        left=last.left if command.velocity is None else sum(moved.left for moved in moves),
+        touched=list(touched.values())[:MAX_TOUCHED],
+        stepped=sum(moved.stepped for moved in moves),
+        unknown=any(moved.unknown for moved in moves),
+    )
+
+
+def make_simulation(scene: SimulatedScene, file: SceneFile) -> Simulation:
+    """Return the simulation of a scene's frames, with the effects that `file` declares."""
+    # Imported here, because a scene that is only queried needs neither effects nor their kernels.
+    from .effects.effect_pipeline import make_pipeline
+    from .world.collision_world import World
+
+    world = World(scene, file)
+    pipeline = make_pipeline(file, world)
+    return Simulation(scene, file, pipeline, pipeline.bodies, partial(_find_scan_point, world))
+
+
+def _find_scan_point(world: Any) -> Any:
+    """Return some scan point of a world, (3,) [m]; its archive's least corner if none is found."""
+    with world as held:
+        archive, data, pose = held[0].opened.store.archive, held[0].data, held[0].placed.pose
+        lattice = archive.header.lattice
+        corner = archive.coordinates[0] * lattice.voxel_steps + archive.voxels["low"][0]
+        place = lattice.to_world(corner[None])
+        found = within(data, place, min(16.0, 2 * lattice.voxel_size)).cloud_point
+        place = found if np.isfinite(found).all() else place
+        return (place if pose is None else transform_points(pose, place))[0]

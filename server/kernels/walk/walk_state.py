@@ -3,7 +3,7 @@
 The frame's code asks queries, such as sweeps, one after the other. Each answer is a row of the tape.
 If a query cannot be answered in compiled code, because voxels have to be loaded or bodies are in the
 way, the frame is left with `AskedError`. Python writes the answer to the tape and calls the kernel
-again (server/simulation/world/walk_call.py). The kernel repeats the frame from its beginning, with
+again (server/simulation/world/frame_walk.py). The kernel repeats the frame from its beginning, with
 the known answers. Nothing in a frame depends on anything but its start and these answers, so it
 arrives at the same query again. There is therefore one implementation of a frame, whatever is in
 memory.

@@ -1,6 +1,6 @@
-"""Effects of a scene. Only the effects that a scene declares are imported (NUMERICS.md case 31).
+"""Effects of a scene. Only the files of those that a scene declares are imported (NUMERICS.md case 31).
 
-Each effect is one file, named as in the scene file, whose `make(effect, world)` returns a `Runner`.
+The function `make(effect, world)` of an effect's file returns a `Runner`.
 The code that effects share is in simulation/world/. effect_pipeline.py runs the effects that a
 scene declares, in this order:
 

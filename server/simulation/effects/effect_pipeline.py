@@ -1,10 +1,12 @@
 """Effect pipeline: runs one frame through the effects that a scene declares, in their order.
 
-Effects that the scene does not declare are not imported, called or reported (NUMERICS.md case 31).
+Files of effects that the scene does not declare are not imported (NUMERICS.md case 31).
 """
 
 import importlib
+import threading
 import time
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,41 @@ from ....schemas.scene.effect_table import ORDER, effect_name
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import Verdict
 from ....schemas.wire.motion_messages import FRAME_SECONDS, Moved, Touched
+from ....schemas.wire.stats import EffectStats
 from ...queries.context.query_budget import EXACT, QueryBudget
 from ...runtime.stop_flag import NO_STOP, StoppedError
 from ..world.collision_world import World
 from ..world.frame import MAX_TOUCHED, Body, Frame, Hit, Pose, Runner, Vec
 from ..world.vectors import norm
-from .effect_times import EffectTimes
+
+# The file of each effect.
+_FILES = {
+    "objects": "body_effects", "crowd": "body_effects", "stop": "stop_effect", "sweep": "motion_effects",
+    "slide": "motion_effects", "step": "motion_effects", "ground": "motion_effects",
+    "proximity": "report_effects", "contacts": "report_effects", "uncertainty": "uncertainty_effect",
+}  # fmt: skip
+
+
+class EffectTimes:
+    """Frames and seconds by effect. Thread-safe."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        """Begin at 0. names: of the effects, in the order in which they run."""
+        self._counts = {name: [0, 0.0] for name in names}
+        self._lock = threading.Lock()
+
+    def add(self, ran: list[tuple[str, float]]) -> None:
+        """Count a frame. ran: its effects with their times [s]."""
+        with self._lock:
+            for name, seconds in ran:
+                count = self._counts[name]
+                count[0] += 1
+                count[1] += seconds
+
+    def stats(self) -> list[EffectStats]:
+        """Return the counts of each effect, in the order in which they run."""
+        with self._lock:
+            return [EffectStats(name, *count) for name, count in self._counts.items()]  # type: ignore[arg-type]
 
 
 class Pipeline:
@@ -182,7 +213,7 @@ def make_pipeline(file: SceneFile, world: World) -> Pipeline:
     """Create the pipeline of a scene: import each declared effect and create its runner."""
     declared = {effect_name(effect): effect for effect in file.effects}
     runners: list[Runner] = [
-        importlib.import_module(f".{name}_effect", __package__).make(declared[name], world)
+        importlib.import_module(f".{_FILES[name]}", __package__).make(declared[name], world)
         for name in ORDER
         if name in declared
     ]

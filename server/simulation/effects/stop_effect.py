@@ -16,6 +16,7 @@ In a scene where no other effect moves avatars or obstructs them, this file foll
 In others the kernel `walk_frame` does, which this file neither imports nor compiles.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,6 @@ from ....schemas.scene.effect_table import Contacts, Proximity, Stop, Sweep, Thr
 from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import make_avatar
-from ...kernels.motion.motion_end import MIN_MOTION, skin_fraction
 from ..world.collision_world import World
 from ..world.frame import (
     Body,
@@ -32,22 +32,17 @@ from ..world.frame import (
     Hit,
     Pose,
     Vec,
-    find_first_hit,
     find_touched,
     is_clear,
-    max_displacement,
     record_hit,
     translated,
 )
-from ..world.leaving import leave, leaving_pose
-from ..world.vectors import norm, rotate_back
+from ..world.leaving import find_first_hit, leave, leaving_pose, settle_before
+from ..world.vectors import norm
 
 # Longest displacement of an escape from contact [m], and the distances that are tried.
 MAX_ESCAPE = 0.5
 _ESCAPE_DISTANCES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MAX_ESCAPE)
-# First step back from a pose that turns out not to be clear [m], and its growth factor, as in
-# kernels/walk/walk_motions.py.
-FIRST_STEP_BACK, STEP_GROWTH = 1e-7, 4.0
 # Effects that neither move an avatar nor obstruct it.
 _STILL = (Stop, Proximity, Contacts, Uncertainty, Through)
 
@@ -61,22 +56,22 @@ class StopRunner:
         """Create the effect, and compile what its frames need."""
         effects = world.file.effects
         self._skin, self._tolerance = float(effect.skin), float(sweep_tolerance(world.file))
-        self._alone = all(isinstance(each, _STILL) for each in effects)
         self._continuous = any(isinstance(each, Sweep) for each in effects)
-        if self._alone:
+        self._walk: Callable[[Frame], None] | None = None
+        if all(isinstance(each, _STILL) for each in effects):
             self._warm(world)
         else:
-            world.walker.warm()
+            self._walk = _walk_in(world)
 
     def run(self, frame: Frame) -> None:
         """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             escape_contact(frame)
-        if self._alone:
+        if self._walk is None:
             self._follow(frame)
         elif not self._continuous:
-            frame.world.walker.follow(frame)
+            self._walk(frame)
 
     def _warm(self, world: World) -> None:
         """Compile the kernels of a motion that begins in contact."""
@@ -85,7 +80,7 @@ class StopRunner:
         hit = Hit(0.5, Verdict.CONTACT, world.up, -world.up)
         with world:
             find_first_hit(frame, to, self._tolerance, self._skin)
-            self._settle_before(frame, to, hit)
+            settle_before(frame, to, hit, self._skin)
 
     def _follow(self, frame: Frame) -> None:
         """Move towards the commanded pose; an avatar in contact that cannot do both moves, then turns."""
@@ -114,32 +109,20 @@ class StopRunner:
         if leaves and hit.end is not None:
             frame.pose = hit.end.copy()
         elif leaves:
-            self._settle_before(frame, to, hit)
+            settle_before(frame, to, hit, self._skin)
         if hit.unloaded:
             hit = hit._replace(rest=norm(to[:3, 3] - frame.pose[:3, 3]))
         record_hit(frame, hit)
         return hit
 
-    def _settle_before(self, frame: Frame, to: Pose, hit: Hit) -> None:
-        """Move to the pose the skin before a hit on the way to a pose, or to a clear one before it.
 
-        The avatar stays if the way is shorter than MIN_MOTION.
-        """
-        way, avatar, begin = max_displacement(frame, to), frame.body.avatar, frame.pose
-        share = 0.0
-        if way > 0.0 and self._skin > 0.0:
-            share = self._skin / way
-            if hit.avatar is not None and hit.cloud is not None:
-                there = frame.world.between(avatar, begin, to, min(hit.fraction, 1.0))[0]
-                point = rotate_back(there, hit.avatar - there[:3, 3])
-                share = skin_fraction(begin, to, hit.avatar, hit.cloud, point, way, self._skin)
-        fraction, back = hit.fraction - share, 0.0
-        while (fraction - back) * way >= MIN_MOTION:
-            pose, same = frame.world.between(avatar, begin, to, fraction - back)
-            if is_clear(frame, pose, proved=same and fraction - back < hit.fraction):
-                frame.pose = pose
-                return
-            back = max(STEP_GROWTH * back, FIRST_STEP_BACK / way)
+def _walk_in(world: World) -> Callable[[Frame], None]:
+    """Return the function that follows a motion command by the kernel `walk_frame`, compiled."""
+    from ..world.frame_walk import FOLLOW, walker_of
+
+    walker = walker_of(world)
+    walker.warm()
+    return lambda frame: walker.run(frame, FOLLOW)
 
 
 def escape_contact(frame: Frame) -> None:

@@ -1,6 +1,5 @@
 """One frame of one user: its state, the hits that end motions, and the motions of effects."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -9,7 +8,6 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.motion.motion_end import MAX_UNDECIDED
 from ...queries.context.query_budget import EXACT, QueryBudget
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
@@ -123,7 +121,7 @@ class Frame:
     simulated: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
     apart: whether it is proved that no obstacle is touched at `pose`.
-    walks, walk_hits: for walk_call.py: whether a part has run, and the hits that Python answered with, by
+    walks, walk_hits: for frame_walk.py: whether a part has run, and the hits that Python answered with, by
     their row.  visits: node visits of each part in its last call.
     leaving: the last pose in contact from which a motion began (leaving.py), or None.
     """
@@ -184,38 +182,6 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
     The avatar has at least one sphere.
     """
     return dot(pose[:3, 3], up) + min_height(avatar.points, rotate_back(pose, up)) - avatar.radius
-
-
-def find_first_hit(
-    frame: Frame, to: Pose, tolerance: float, skin: float = -1.0, *, below: bool = False
-) -> Hit | None:
-    """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
-
-    skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
-    below: for a search for ground, leave out bodies beside the avatar.
-    """
-    found, lacked = None, frame.lacked
-    swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
-    if frame.verdict == Verdict.CONTACT and begins_in_contact(swept) and is_translation(frame.pose, to):
-        found = frame.world.leave(frame, to, skin)
-    elif swept.verdict != Verdict.CLEAR:
-        sure = swept.verdict == Verdict.CONTACT
-        if sure and not swept.exact:
-            sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
-        if sure:
-            found = Hit(
-                swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive, None, swept.point, False,
-                0.0, swept.end,
-            )  # fmt: skip
-        else:
-            found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
-    until = math.inf if found is None else found.fraction
-    return first_body_hit(frame, to, tolerance, until, below=below) or found
-
-
-def begins_in_contact(swept: Any) -> bool:
-    """Return whether a `SweepResult` says that the scan is touched where the motion begins."""
-    return bool(swept.verdict == Verdict.CONTACT and swept.upper == 0.0)
 
 
 def is_translation(pose: Pose, to: Pose) -> bool:

@@ -20,7 +20,7 @@ import sys
 from solidcloud.schemas.scene.effect_table import *
 from solidcloud.schemas.scene.scene_file import ArchiveItem, SceneFile
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.make_simulation import make_simulation
+from solidcloud.server.simulation.simulation import make_simulation
 import numpy as np
 file = SceneFile(format=1, archives=[ArchiveItem(path="x")], effects=[Stop(), {effects}])
 with Scene.open(sys.argv[1]) as scene:

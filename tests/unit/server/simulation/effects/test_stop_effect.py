@@ -19,6 +19,7 @@ from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.simulation.effects import stop_effect
 from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
 from solidcloud.server.simulation.world.collision_world import World
 
@@ -164,8 +165,9 @@ def test_alone_it_moves_like_the_kernel_that_other_effects_need(
         for alone in (True, False):
             world = World(SimpleNamespace(archives=archives), game.pipeline.file)
             plays.append(Play(game.scene, world, make_pipeline(game.pipeline.file, world)))
-            runner: Any = plays[-1].pipeline.groups[0][0]
-            runner._alone = alone
+            if not alone:
+                runner: Any = plays[-1].pipeline.groups[0][0]
+                runner._walk = stop_effect._walk_in(world)
         for turn in range(30):
             avatar = (BALL, effect_rooms.person())[turn % 2]
             start = at(*rng.uniform(-0.5, 0.5, 3) * [0.5, 1.0, 1.0], angle=rng.uniform(0, 6))

@@ -50,7 +50,7 @@ from ..queries.context.query_budget import LateVoxels, QueryBudget
 from ..queries.within import within
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
-from .replay_log import BodyRecord, record_of, take_record
+from .replay_log import BodyRecord, FrameLog, record_of, take_record
 from .world.frame import MAX_TOUCHED, Body, Pose, Vec
 from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
@@ -84,23 +84,6 @@ class SimulatedScene(Protocol):
         self, name: str, points: Any, radius: float | None = None, *, client: str = ""
     ) -> AvatarInfo: ...
     def forget_client(self, client: str) -> None: ...
-
-
-class Recorder(Protocol):
-    """Receiver of all inputs that determine the results of frames, in order; see replay_log.py."""
-
-    def entered(self, user: User, avatar: AvatarModel) -> None: ...
-    def ended(self, users: list[User]) -> None: ...
-    def dropped(self, client: str) -> None: ...
-    def frame(
-        self,
-        number: int,
-        turns: Sequence[FrameCommand],
-        outcomes: Sequence[FrameResult],
-        opened: Sequence[Sequence[int]],
-        kept: Sequence["BodyRecord | None"],
-    ) -> None: ...
-    def reloaded(self, generation: int) -> None: ...
 
 
 class _Presence:
@@ -138,7 +121,7 @@ class Simulation:
         self._up = unit_vector(file.up)
         self._present: dict[User, _Presence] = {}
         self._bodies, self._place = bodies, place
-        self._recorder: Recorder | None = None
+        self._recorder: FrameLog | None = None
         self._frames = 0
         self._frame = threading.Lock()  # held for a frame; bodies change only while it is held
 
@@ -161,7 +144,7 @@ class Simulation:
         """Return what each effect has cost so far, in the order in which they run."""
         return self._pipeline.times.stats()
 
-    def record(self, recorder: Recorder | None) -> None:
+    def record(self, recorder: FrameLog | None) -> None:
         """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""
         with self._frame:
             self._recorder = recorder

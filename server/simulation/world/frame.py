@@ -47,40 +47,6 @@ class Hit(NamedTuple):
     end: Pose | None = None
 
 
-class Obstacle(Protocol):
-    """Bodies that move and block: the other users, the dynamic objects. See body_obstacles.py.
-
-    One obstacle may represent many bodies: `Hit.what` names the one. A body that was touched when
-    the frame began blocks only motions that go deeper into it, so that an avatar can get free. For
-    other motions, neither `sweep` nor `touches` reports it.
-    """
-
-    name: str
-
-    def sweep(
-        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
-    ) -> Hit | None:
-        """Return the hit that ends the motion at this obstacle, or None.
-
-        Nothing is touched before the hit's fraction. below: leave out bodies beside the avatar.
-        """
-
-    def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """Return a hit if an avatar at a pose touches this obstacle, or None."""
-
-    def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
-        """Return whether an avatar at a pose touches this obstacle.
-
-        Bodies that were touched when the frame began count too.
-        """
-
-    def give_way(self, frame: "Frame", hit: Hit, to: Pose) -> bool:
-        """Move the body that ended a motion, if possible; return whether to try the motion again.
-
-        Called for each hit. The avatar is at frame.pose and on its way to `to`.
-        """
-
-
 @dataclass(slots=True)
 class Body:
     """State of a user between frames.
@@ -116,7 +82,7 @@ class Frame:
     clear: whether nothing is touched at `pose`.
     remaining: (3,), part of the commanded translation that is not completed yet [m].
     hits: hits that ended motions, in order.
-    obstacles: obstacles besides the scan.
+    obstacles: besides the scan, each a `BodyObstacle` (body_obstacles.py).
     fall_speed, on_ground: new values of `Body`.
     simulated: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
@@ -137,7 +103,7 @@ class Frame:
     clear: bool = False
     remaining: Vec = field(default_factory=lambda: np.zeros(3))
     hits: list[Hit] = field(default_factory=list)
-    obstacles: list[Obstacle] = field(default_factory=list)
+    obstacles: list[Any] = field(default_factory=list)
     fall_speed: float = 0.0
     on_ground: bool = False
     simulated: list[str] = field(default_factory=list)

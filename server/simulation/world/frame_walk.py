@@ -227,7 +227,7 @@ class WalkCall:
             np.array(asked[state.HIT_PAIR : state.HIT_POINT]).reshape(2, 3),
             self._frame.obstacles[0],
         )
-        hit = obstacle.name_hit(at, asked[state.HIT_FRACTION], pair, (block, lane))  # type: ignore[attr-defined]
+        hit = obstacle.name_hit(at, asked[state.HIT_FRACTION], pair, (block, lane))
         if hit is None:
             self._answer(state.BODIES_SWEPT, row, asked, to)
             return

@@ -303,8 +303,8 @@ class UserTracks:
         new = each[self._distance_plan[each] != number]
         if len(new):
             far = np.full(len(new), np.inf)
-            for place in paths.reshape(-1, 3):
-                np.minimum(far, self._gaps(place, new)[1], out=far)
+            for path in paths:
+                np.minimum(far, self._gaps(path[:, None], new)[1].min(axis=0), out=far)
             self._distances[new], self._distance_plan[new] = far * self._step, number
         return self._distances[each]
 

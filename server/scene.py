@@ -43,8 +43,7 @@ from .scenes.scene_archives import (
 from .scenes.scene_questions import SceneQuestions
 from .scenes.scene_tiles import SceneTiles
 from .simulation.local_session import LocalSession
-from .simulation.make_simulation import make_simulation
-from .simulation.simulation import Simulation
+from .simulation.simulation import Simulation, make_simulation
 
 DEFAULT_BUDGET = 512 << 20
 

@@ -37,7 +37,6 @@ ALLOWED = {
         "build_limits.py config.py kernels synthetic sources/common run sources spool voxel passes pipeline.py"
     ),
     "server/kernels/collide": "kernels/core",
-    "server/kernels/prediction": "kernels/core",
     "server/kernels/rays": "kernels/core",
     "server/scene_interface.py": "runtime",
     "server/kernels/contacts": "kernels/core",

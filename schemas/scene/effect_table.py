@@ -1,11 +1,11 @@
-"""Table of the effects that a scene file may declare: options, order, and which are never skipped.
+"""Table of the effects that a scene file may declare: options and order.
 
 To add an effect:
 
 1. declare its options here as a class, and add it to `AnyEffect` and `ORDER`;
-2. write server/simulation/effects/<name>_effect.py, with the function `make`; it is found by the
-name; 3. describe its options in SCENE.md, and a report, if it adds one to a frame's answer, in
-WIRE.md.
+2. write its runner in a file of server/simulation/effects whose function `make` returns it, and name
+   the file in effect_pipeline.py;
+3. describe its options in SCENE.md, and a report, if it adds one to a frame's answer, in WIRE.md.
 
 The parser of scene files, the pipeline of frames, `info` and `solidcloud scene new` read this
 table. Bounds of options catch values in other units: a step of 200, a skin of 2.
@@ -185,8 +185,6 @@ ORDER = (
 # floors, and avatars wedged under slopes. 4: motions of avatars in contact, and motion commands
 # that last for more than a frame. 5: normals count the points of all voxels.
 MOTION_VERSION = 5
-# Effects needed for safety: never skipped, whatever a frame's budget.
-NEVER_SKIPPED = frozenset({"stop", "sweep", "objects", "crowd"})
 
 
 def effect_name(effect: AnyEffect) -> str:

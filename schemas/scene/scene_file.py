@@ -109,15 +109,10 @@ class SceneLimits(_Part, frozen=True):
     """Limits of a scene's cost.
 
     users: number of users at the same time.
-    frame_ms: time for one user's frame; effects that exceed it are skipped, except `stop`, `sweep`,
-    `objects` and `crowd`.
-    frame_visits: the same limit in node visits, independent of a clock.
     longest_move: farthest motion of a frame [m].
     """
 
     users: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64
-    frame_ms: Annotated[float, msgspec.Meta(gt=0, le=10_000)] | None = None
-    frame_visits: Annotated[int, msgspec.Meta(gt=0, le=1 << 62)] | None = None
     longest_move: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 100.0
 
 

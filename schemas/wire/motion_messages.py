@@ -230,7 +230,6 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     of the way is not known to be clear.
     left: length of the commanded motion not carried out [m].  touched: obstacles that stopped it.
     simulated: effects, in the order in which they ran.
-    skipped: effects for which the frame's budget was too small.
     stepped: height climbed by `step` [m].
     ground, proximity, contacts, uncertainty, objects, crowd: the report of each effect.
     unknown: whether the frame needed data that could not be examined. With it, any of these fields
@@ -244,7 +243,6 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
     left: float = 0.0
     touched: list[Touched] = []
     simulated: list[str] = []
-    skipped: list[str] = []
     stepped: float = 0.0
     ground: GroundReport | None = None
     proximity: ProximityReport | None = None
@@ -265,8 +263,6 @@ class Moved(msgspec.Struct, frozen=True, eq=False, kw_only=True, omit_defaults=T
             parts.append(f"{self.unloaded:.4g} m not in memory yet")
         if self.touched:
             parts.append(f"{len(self.touched)} obstacle{'s' * (len(self.touched) != 1)}")
-        if self.skipped:
-            parts.append(f"without {', '.join(self.skipped)}")
         return ", ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:

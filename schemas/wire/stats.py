@@ -91,14 +91,12 @@ class AvatarStats(msgspec.Struct, frozen=True):
 class EffectStats(msgspec.Struct, frozen=True):
     """Cost of one effect in the frames of all users since the scene was opened.
 
-    frames: in which it ran.  skipped: frames whose budget was too small for it.
-    seconds: that it took in all of them. Divide differences between two answers by those of
-    `frames` for its time in a frame.
+    frames: in which it ran.  seconds: that it took in all of them. Divide differences between two
+    answers by those of `frames` for its time in a frame.
     """
 
     effect: str
     frames: int = 0
-    skipped: int = 0
     seconds: float = 0.0
 
 

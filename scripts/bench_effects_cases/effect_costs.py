@@ -138,9 +138,10 @@ class Stage:
         timed: time each effect, which adds a tenth of a microsecond to each.
         """
         world, pipeline = self.pipeline(effects)
-        plain = pipeline.runners
+        plain = pipeline.groups
+        alone = [Timed(runner) for group in plain for runner in group]
         if timed:
-            pipeline.runners = [Timed(runner) for runner in plain]
+            pipeline.groups = [[runner] for runner in alone]
         body = Body("bench/one", self.avatar, self.poses[0].copy())
         took = np.empty(len(self.poses))
         places = np.empty((len(self.poses), 3))
@@ -153,8 +154,8 @@ class Stage:
             places[number] = moved.pose[0, :3, 3]
         found = Walk(took, places=places, visits=world.visits - before)
         if timed:
-            found.effects = {each.name: np.array(each.seconds) for each in pipeline.runners}  # type: ignore[attr-defined]
-            pipeline.runners = plain
+            found.effects = {each.name: np.array(each.seconds) for each in alone}
+            pipeline.groups = plain
         return found
 
     def crowd(self, effects: Sequence[AnyEffect], users: int) -> Floats:

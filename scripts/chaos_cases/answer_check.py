@@ -159,8 +159,8 @@ def _bounds(got: Any, truth: Any, rows: Any) -> list[str]:
 
 
 def _judge_moved(got: Moved, truth: Moved) -> Judgement:
-    """Judge one frame. A frame with skipped effects or unknown answers is not judged."""
-    if got.unknown or got.skipped or not got.simulated:
+    """Judge one frame. A frame with unknown answers is not judged."""
+    if got.unknown or not got.simulated:
         return Judgement(0, 1, 0, [])
     faults = []
     if got.verdict != truth.verdict:

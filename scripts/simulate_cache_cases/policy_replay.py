@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from solidcloud.server.residency.eviction import EvictionPolicy, make_policy
 from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions
+from solidcloud.server.residency.prefetch import SILENCE
 
 from .replay_requests import NOBODY, Requests, Town
 
@@ -167,7 +168,10 @@ class Replay:
         asked = requests.asked
         somebody = np.flatnonzero(asked.user != NOBODY)
         users = [("", str(user)) for user in asked.user[somebody].tolist()]
-        times, centers, reaches = asked.time[somebody], asked.center[somebody], asked.reach[somebody]
+        places = [tuple(place) for place in asked.center[somebody].tolist()]
+        poses = list(
+            zip(users, asked.time[somebody].tolist(), places, asked.reach[somebody].tolist(), strict=True)
+        )
         scans, every = asked.scan.copy(), asked.time.tolist()
         plans = plan_turns(every, self.loading.plan_seconds)
         seen = 0
@@ -178,8 +182,8 @@ class Replay:
                 self.plan(now)
             upto = int(np.searchsorted(somebody, end, side="right"))
             some = slice(seen, upto)
-            scans[somebody[some]] |= self.tracks.record_poses(
-                users[some], times[some], centers[some], reaches[some]
+            scans[somebody[some]] |= np.array(
+                [self.tracks.record_pose(*pose) for pose in poses[some]], np.bool_
             )
             seen = upto
             if begin >= 0:
@@ -293,9 +297,9 @@ class Replay:
     def plan(self, now: float) -> None:
         """Update the prefetch queue and the users' positions."""
         self.planned = now
-        self.tracks.expire(now)
+        self.tracks.expire(now, SILENCE)
         wanted = self.tracks.plan(now, self.usual)
-        self.kept = frozenset(self.tracks.kept(now).tolist())
+        self.kept = frozenset(self.tracks.kept(now, SILENCE).tolist())
         if self.prefetch:
             self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
             resident = self.resident

@@ -13,6 +13,8 @@ from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, Pref
 # User id of sweeps, which belong to no user and have no position; duration of one sweep through all
 # voxels [s].
 NOBODY, SWEEP_SECONDS = -1, 10.0
+# Requests whose voxels one call lists.
+AT_ONCE = 1000
 
 
 class Town(NamedTuple):
@@ -67,16 +69,20 @@ class Requests(NamedTuple):
 
 
 def requests_of(town: Town, asked: Centers) -> Requests:
-    """Return the voxels that each request of a trace needs, by one kernel call."""
-    starts, flat = town.user_tracks().rows_in_reach(asked.center, asked.reach)
-    every, bounds = flat.tolist(), starts.tolist()
-    rows = [every[a:b] for a, b in pairwise(bounds)]
+    """Return the voxels that each request of a trace needs."""
+    tracks, every, of = town.user_tracks(), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for begin in range(0, len(asked.center), AT_ONCE):
+        some = slice(begin, begin + AT_ONCE)
+        ball, found = tracks.rows_in_reach(asked.center[some], asked.reach[some])
+        every.append(found)
+        of.append(begin + ball)
+    flat, request = np.concatenate(every), np.concatenate(of)
+    bounds = np.searchsorted(request, np.arange(len(asked.center) + 1)).tolist()
+    rows = [flat[a:b].tolist() for a, b in pairwise(bounds)]
     users, who = np.unique(asked.user, return_inverse=True)
     began = np.full(len(users), np.inf)
     np.minimum.at(began, who, asked.time)
-    return Requests(
-        asked, rows, flat, np.repeat(np.arange(len(rows)), np.diff(starts)), asked.time < began[who] + 1.0
-    )  # fmt: skip
+    return Requests(asked, rows, flat, request, asked.time < began[who] + 1.0)
 
 
 def with_sweeps(town: Town, asked: Centers, sweeps: int) -> Centers:

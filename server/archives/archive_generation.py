@@ -4,7 +4,6 @@ A generation counts its readers; the last one to leave closes its files and rele
 """
 
 import threading
-import weakref
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Self
@@ -15,11 +14,10 @@ from ...schemas.archive.archive import Archive
 from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError, FormatError
-from ...schemas.wire.warming_parts import MOTION, PARTS
+from ...schemas.wire.warming_parts import PARTS
 from ..avatars.avatar_model import AvatarModel
-from ..kernels.prediction.track_prediction import SceneIndex
 from ..queries.context.level_of_detail import open_level_data, with_level
-from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
+from ..queries.context.query_context import SceneData, make_scene_data, make_tree, with_radius_model
 from ..queries.engine_table import warm_engines
 from ..residency.eviction import make_policy, prefetches
 from ..residency.level_store import level_filler, open_level_store
@@ -107,20 +105,8 @@ class ArchiveGeneration:
         The other parameters are as in `__init__`.
         """
         store = self.store
-        header, lattice, coords = (
-            store.archive.header,
-            store.archive.header.lattice,
-            store.archive.coordinates,
-        )
-        base = coords * lattice.voxel_steps
-        index = SceneIndex(
-            store.archive.voxels["key"].astype(np.uint64),
-            base + store.archive.voxels["low"],
-            base + store.archive.voxels["high"],
-            header.low,
-            header.high,
-        )
-        around = UserTracks(index, lattice.voxel_steps, lattice.origin, lattice.step)
+        lattice, tree = store.archive.header.lattice, make_tree(store.archive)
+        around = UserTracks(tree, lattice.origin, lattice.step)
         ahead = prefetches(policy)
         if self._level is not None:
             budget_bytes -= self._level.bytes
@@ -133,16 +119,14 @@ class ArchiveGeneration:
         )
         residency.on_load_time = took
         fill = level_filler(self._level)
-        weak = weakref.ref(self)  # the prefetcher's thread must not keep a generation alive
         self.prefetcher = Prefetcher(
             residency,
             around,
             prefetch=ahead,
             idle=fill,
-            running_requests=lambda: (opened := weak()) is not None and opened._readers > 1,
             level=None if self._level is None else self._level.residency,
         )
-        figure = make_scene_data(store.archive, residency)
+        figure = make_scene_data(store.archive, residency, tree)
         level = None
         if self._level is not None:
             level = open_level_data(
@@ -268,12 +252,11 @@ class ArchiveGeneration:
         archive = self.store.archive
         row = int(np.argmin(self.store.sizes))
         corner = archive.coordinates[row] * archive.header.lattice.voxel_steps + archive.voxels["low"][row]
-        x, y, z = place = archive.header.lattice.to_world(corner).tolist()
+        place = archive.header.lattice.to_world(corner).tolist()
         if self._level is not None:  # the kernels that lay a voxel of it out
             with self._level.residency.hold([int(np.argmin(self._level.store.sizes))]):
                 pass
         for part in parts or PARTS:
-            self.prefetcher.warm((x, y, z), predict=part == MOTION)
             warm_engines(self.data, place, part)
 
     def load_voxels_of(self, other: "ArchiveGeneration", stopped: Callable[[], bool]) -> None:

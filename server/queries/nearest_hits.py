@@ -11,7 +11,7 @@ from ...schemas.archive.units import UNITS_PER_METRE
 from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_vectors
-from ..kernels.core.reach import Items, VoxelLists, list_reach
+from ..kernels.core.reach import Items, VoxelLists, find_lists
 from ..kernels.rays.rays import ClosestHits
 from .context.query_budget import CostCounter, QueryBudget
 from .context.query_context import SceneData
@@ -97,7 +97,7 @@ def _list(
     Boxes grow by the largest sphere, by one step, and by more than the rounding: 2^-46 of the
     largest number.
     """
-    tree, k, per_step = data.tree, len(at_units), data.arrays.units_per_step
+    tree, per_step = data.tree, data.arrays.units_per_step
     begin, reach = at_units / per_step, reach_units / per_step
     far = np.maximum(np.abs(begin).max(axis=1, initial=reach), np.abs(tree.scene).max(initial=0.0))
     slack = 1.0 + far * 2.0**-46
@@ -106,15 +106,7 @@ def _list(
     else:
         span = radius_units / per_step + slack
         items = Items(begin, begin + direction * (reach + slack)[:, None], span, span)
-    capacity = max(64, 8 * k)
-    while True:
-        lists = VoxelLists(
-            np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), np.empty(k)
-        )
-        needed = list_reach(tree, items, data.arrays.stop, lists)
-        if needed <= capacity:
-            return lists
-        capacity = needed
+    return find_lists(tree, items, data.arrays.stop)
 
 
 def found_units(best: ClosestHits) -> NDArray[np.float64]:

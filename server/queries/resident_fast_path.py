@@ -31,7 +31,6 @@ from ..kernels.motion.motion_scratch import make_scratch
 from ..kernels.motion.sweep_resident import box_of, pose_between, sweep_resident
 from ..kernels.nearest import nearest_resident as _nearest
 from ..kernels.nearest.nearest_resident import nearest_resident
-from ..kernels.walk.walk_state import make_walk_avatar
 from ..residency.voxel_cache import VoxelCache
 from .collide import collide
 from .context.query_budget import EXACT, QueryBudget
@@ -272,6 +271,9 @@ class ResidentQueries:
     def walking(self) -> Any:
         """Return the avatar's arrays for the kernel `walk_frame`."""
         if self._walking is None:
+            # Imported here: only effects that walk need it.
+            from ..kernels.walk.walk_state import make_walk_avatar
+
             scratch = self._scratch
             if scratch is None:  # not used, but of this type
                 scratch = make_scratch(make_avatar([[0.0, 0.0, 0.0]], 0.1).arrays)

@@ -10,40 +10,47 @@ when they take it; no lock is taken while it is held. `path_distances` takes no 
 that evicts holds its own.
 """
 
+import math
 import threading
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..kernels.prediction.track_prediction import (
-    PredictionLimits,
-    SceneIndex,
-    rows_in_reach,
-    write_path_distances,
-)
-from ..kernels.prediction.user_tracks import (
-    COUNT,
-    LAST,
-    MAX_SPEED,
-    PIECES,
-    RELATIVE_SLACK,
-    TRACK_WORDS,
-    PredictionOptions,
-    plan_tracks,
-    record_pose,
-    record_poses,
-    rows_kept,
-)
+from ..kernels.core.reach import Items, VoxelTree, find_lists
+from ..runtime.stop_flag import NO_STOP
 
 User = tuple[str, str]
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-# A user without a pose for this long is assumed to have left [s].
-EXPIRY = 10.0
-# Initial and largest capacity in users, 2 KB each. The capacity doubles when it is exhausted; at
-# the largest, a new user replaces the one whose last pose is the oldest.
-INITIAL_USERS, MAX_USERS = 16, 4096
+# At most this many users, 2 KB each; a new user replaces the one whose last pose is the oldest.
+MAX_USERS = 4096
+# A displacement since the last pose of more than MAX_SPEED times the time passed (at most
+# MAX_PAUSE), plus SLACK, is a teleport. Nobody walks, runs or drives indoors at MAX_SPEED [m/s].
+# SLACK allows for poses that arrive late and all at once [m].
+MAX_SPEED, MAX_PAUSE, SLACK = 15.0, 1.0, 1.0
+# Without a pose for this long, a user is assumed to stand at the last one [s].
+STALE = 0.5
+# The least time between two stored poses [s], and the number of stored poses: at 90 poses a second,
+# more than half a second. If a client sends poses as fast as they are answered, most are dropped.
+LEAST_GAP, MAX_POSES = 0.005, 64
+# Typical values of poses that look like a walk: scatter of clock and position together [m], and
+# speeds [m/s] and accelerations [m/s²] of people. The fit relies on them where poses are few or
+# close in time, and needs no special cases.
+SCATTER, USUAL_SPEED, USUAL_ACCELERATION = 0.02, 3.0, 2.0
+# Straight pieces of a predicted path, and how many of them one box of grid cells encloses.
+PIECES, PIECES_OF_BOX = 16, 4
+# A voxel counts as touched when the distance is this much more than the reach [m]; steps of a search
+# for the moment of touching, which needs one a piece and few more.
+GRAZE, MAX_TOUCH_STEPS = 0.001, 3 * PIECES
+# Largest number of grid cells one call looks up: some 0.1 s, reached only with voxels far smaller
+# than the reach or hundreds of fast users. The last cells of each box are then omitted.
+MAX_CELLS = 1 << 19
+# A reach is widened by this share of itself, and by one step: by more than the rounding of the
+# computations with it.
+RELATIVE_SLACK = 1e-6
 
 
 class PrefetchOptions(NamedTuple):
@@ -52,7 +59,10 @@ class PrefetchOptions(NamedTuple):
     loads: horizon as a multiple of the time one load takes, clamped to `least` and `most` [s].
     ring: width of the ring around a user's position, beyond reach, whose voxels are wanted [m].
     settled: time a user must have been present without a teleport before the ring counts [s].
-    most_wanted: rows a user.  motion: limits of predictions.
+    most_wanted: rows a user.
+    history: poses older than this before the last are ignored [s].  speed: at most [m/s].
+    acceleration: at most [m/s²].  fade: the acceleration falls to 1/e in this time [s], which makes
+    the far part of the path straight.
     """
 
     # Measured with scripts/simulate_cache in a town of 4e7 points (1,215 voxels of 8 m), 8 users
@@ -77,7 +87,10 @@ class PrefetchOptions(NamedTuple):
     # 1,354 voxels.
     settled: float = 2.0
     most_wanted: int = 128
-    motion: PredictionLimits = PredictionLimits(history=0.5, speed=MAX_SPEED, acceleration=6.0, fade=0.5)
+    history: float = 0.5
+    speed: float = MAX_SPEED
+    acceleration: float = 6.0
+    fade: float = 0.5
 
     def horizon(self, load_seconds: float) -> float:
         """Return how far ahead to look when one load takes `load_seconds` [s]."""
@@ -96,8 +109,57 @@ class PredictedVoxels(NamedTuple):
     first.
     """
 
-    rows: NDArray[np.int64]
-    need: NDArray[np.float64]
+    rows: Integers
+    need: Floats
+
+
+class _Track:
+    """Last poses of a user.
+
+    poses: (MAX_POSES, 4), time [s] and position [m], a ring buffer; time -inf: none.
+    last, before: times of the last pose and of that before it.  center: the last position.
+    since: time of the first pose or the last teleport.  reach: of the last pose [m].
+    """
+
+    __slots__ = ("at", "before", "center", "last", "poses", "reach", "since")
+
+    def __init__(self) -> None:
+        self.poses = np.zeros((MAX_POSES, 4))
+        self.center, self.reach, self.at = (0.0, 0.0, 0.0), 0.0, 0
+        self.restart(-math.inf)
+
+    def restart(self, now: float) -> None:
+        """Drop all poses."""
+        self.poses[:, 0] = self.last = self.before = -math.inf
+        self.since = now
+
+    def record(self, now: float, center: tuple[float, float, float], reach: float) -> bool:
+        """Store a pose; see `UserTracks.record_pose`."""
+        passed, teleport = now - self.last, False
+        if passed == math.inf:
+            self.since = now
+        elif passed < 0.0:
+            if passed > -MAX_PAUSE:
+                return False
+            self.restart(now)
+        elif math.dist(center, self.center) > MAX_SPEED * min(passed, MAX_PAUSE) + SLACK:
+            teleport = True
+            self.restart(now)
+        if now - self.before >= LEAST_GAP:
+            self.at, self.before = (self.at + 1) % MAX_POSES, self.last
+        self.poses[self.at] = now, *center
+        self.last, self.center, self.reach = now, center, reach
+        return teleport
+
+
+class _Users(NamedTuple):
+    """Tracks of u users at one time: poses (u, MAX_POSES, 4), others (u,), as in `_Track`."""
+
+    poses: Floats
+    centers: Floats
+    reaches: Floats
+    last: Floats
+    since: Floats
 
 
 class UserTracks:
@@ -105,37 +167,26 @@ class UserTracks:
 
     def __init__(
         self,
-        index: SceneIndex,
-        voxel_steps: int,
+        tree: VoxelTree,
         origin: ArrayLike,
         step: float,
         ahead: PrefetchOptions = PREFETCH_OPTIONS,
     ) -> None:
         """Begin without users.
 
-        voxel_steps: edge of a voxel [steps].  origin (3,), step: of the lattice [m].
+        tree: boxes around the points of the scene's voxels.  origin (3,), step: of the lattice [m].
         """
         self.ahead = ahead
-        self._index, self._step = index, step
-        self._options = PredictionOptions(
-            0.0, ahead.ring, ahead.settled, ahead.most_wanted, np.array(origin, np.float64), step, voxel_steps,
-            ahead.motion,
-        )  # fmt: skip
+        self._tree, self._step = tree, step
+        self._origin = np.array(origin, np.float64)
         self._lock = threading.Lock()
-        self._users: dict[User, int] = {}  # user -> its row in `_tracks`, ascending
-        self._tracks = np.zeros((INITIAL_USERS, TRACK_WORDS))
+        self._users: dict[User, _Track] = {}
         # The predicted paths of the last plan [steps] and the plan's number; replaced, never
         # written. `_distances` is the distance of each row from these paths [m], valid where
         # `_distance_plan` equals the plan's number. The system commits the pages of both as rows
         # are queried.
         self._planned_paths = np.empty((0, PIECES + 1, 3)), 1
         self._distance_plan, self._distances = np.zeros(len(index.keys), np.int64), np.zeros(len(index.keys))
-
-    def without_users(self) -> "UserTracks":
-        """Return tracks with the same options and no users."""
-        return UserTracks(
-            self._index, self._options.voxel_steps, self._options.origin, self._step, self.ahead
-        )
 
     @property
     def users(self) -> list[User]:
@@ -149,76 +200,36 @@ class UserTracks:
         A pose older than the last one is ignored, unless it is so old that its time must come from
         another clock: then the track of the user restarts.
         """
-        x, y, z = center
         with self._lock:
-            row = self._users.get(user)
-            if row is None:
-                row = self._add(user)
-            return bool(record_pose(self._tracks, row, now, x, y, z, reach))
+            track = self._users.get(user)
+            if track is None:
+                if len(self._users) == MAX_USERS:
+                    del self._users[min(self._users, key=lambda each: self._users[each].last)]
+                track = self._users[user] = _Track()
+            return track.record(now, center, reach)
 
-    def record_poses(
-        self,
-        users: Sequence[User],
-        times: NDArray[np.float64],
-        centers: NDArray[np.float64],
-        reaches: NDArray[np.float64],
-    ) -> NDArray[np.bool_]:
-        """Call `record_pose` for n poses in order; return whether each is a teleport (n,).
-
-        n is at most MAX_USERS.
-        """
-        teleports = np.empty(len(users), np.bool_)
+    def _drop(self, gone: Callable[[User, _Track], bool]) -> None:
+        """Remove the users that satisfy `gone`."""
         with self._lock:
-            known = self._users
-            rows = [known[user] if user in known else self._add(user) for user in users]
-            record_poses(self._tracks, np.array(rows, np.int64), times, centers, reaches, teleports)
-        return teleports
-
-    def _add(self, user: User) -> int:
-        """Add a user and return its row."""
-        count = len(self._users)
-        if count == MAX_USERS:
-            silent = int(np.argmin(self._tracks[:count, LAST]))
-            self._drop(lambda row: row == silent)
-            count -= 1
-        if count == len(self._tracks):
-            grown = np.zeros((2 * count, TRACK_WORDS))
-            grown[:count] = self._tracks
-            self._tracks = grown
-        self._tracks[count, COUNT] = 0
-        self._users[user] = count
-        return count
-
-    def _drop(self, gone: Callable[[int], bool]) -> None:
-        """Remove the users whose rows satisfy `gone`; the others move up, in order."""
-        left = [(user, row) for user, row in self._users.items() if not gone(row)]
-        if len(left) < len(self._users):
-            self._tracks[: len(left)] = self._tracks[[row for _, row in left]]
-            self._users = {user: row for row, (user, _) in enumerate(left)}
-
-    def leave(self, user: User) -> None:
-        """Remove a user, if it is known."""
-        with self._lock:
-            row = self._users.get(user)
-            self._drop(lambda other: other == row)
+            self._users = {user: track for user, track in self._users.items() if not gone(user, track)}
 
     def leave_client(self, client: str) -> None:
         """Remove all users of a client."""
-        with self._lock:
-            rows = {row for user, row in self._users.items() if user[0] == client}
-            self._drop(rows.__contains__)
+        self._drop(lambda each, _: each[0] == client)
 
-    def expire(self, now: float, after: float = EXPIRY) -> None:
+    def expire(self, now: float, after: float) -> None:
         """Remove users whose last pose is more than `after` seconds old."""
-        with self._lock:
-            silent = now - self._tracks[: len(self._users), LAST] > after
-            if silent.any():
-                self._drop(lambda row: bool(silent[row]))
+        self._drop(lambda _, track: now - track.last > after)
 
-    def _snapshot(self) -> NDArray[np.float64]:
-        """Return a copy of the tracks, which kernels read without the lock."""
+    def _snapshot(self) -> _Users:
+        """Return a copy of the tracks."""
         with self._lock:
-            return self._tracks[: len(self._users)].copy()
+            tracks = list(self._users.values())
+            return _Users(
+                np.array([each.poses for each in tracks]).reshape(-1, MAX_POSES, 4),
+                np.array([each.center for each in tracks]).reshape(-1, 3),
+                *(np.array([getattr(each, name) for each in tracks]) for name in ("reach", "last", "since")),
+            )
 
     def plan(self, now: float, load_seconds: float) -> PredictedVoxels:
         """Predict the voxels that users will need.
@@ -228,48 +239,125 @@ class UserTracks:
         load_seconds: current time to load one voxel including queueing, an upper percentile of the
         measured times.
         """
-        options = self._options._replace(horizon=self.ahead.horizon(load_seconds))
-        rows, need, paths = plan_tracks(self._snapshot(), now, options, self._index)
+        ahead, users, voxels = self.ahead, self._snapshot(), max(self._tree.voxels, 1)
+        horizon, late = ahead.horizon(load_seconds), np.maximum(now - users.last, 0.0)
+        seconds = np.where(late <= STALE, late + horizon, 0.0)
+        paths = (_predict_paths(users, ahead, seconds) - self._origin) / self._step
         self._planned_paths = paths, self._planned_paths[1] + 1
-        order = np.argsort(need, kind="stable")
-        return PredictedVoxels(rows[order], need[order])
+        reaches = self._spans(users.reaches)
+        rings = np.where(now - users.since >= ahead.settled, ahead.ring / self._step, 0.0)
+        # Boxes of four pieces each, and one around the start.
+        parts = [paths[:, at : at + PIECES_OF_BOX + 1] for at in range(0, PIECES, PIECES_OF_BOX)]
+        wide = np.stack([reaches] * len(parts) + [reaches + rings], axis=1)[:, :, None]
+        low = np.stack([part.min(axis=1) for part in [*parts, paths[:, :1]]], axis=1) - wide
+        high = np.stack([part.max(axis=1) for part in [*parts, paths[:, :1]]], axis=1) + wide
+        box, row = self._voxels_in(low.reshape(-1, 3), high.reshape(-1, 3))
+        user, row = np.divmod(np.unique(box // (len(parts) + 1) * voxels + row), voxels)
+        touch = self._first_touch(paths, reaches, user, row)
+        need = np.maximum(np.minimum(touch, PIECES) * (seconds / PIECES)[user] - late[user], 0.0)
+        need[touch == np.inf] = np.inf
+        # Voxels of the ring: beyond the horizon, up to twice the horizon at its outer edge.
+        beyond = self._gaps(paths[user, 0], row)[1] - reaches[user]
+        ring = rings[user]
+        around = (touch == np.inf) & (beyond <= ring) & (ring > 0.0)
+        need[around] = horizon * (1.0 + np.maximum(beyond[around], 0.0) / ring[around])
+        order = np.lexsort((row, need, user))
+        order = order[need[order] < np.inf]
+        count = np.bincount(user[order], minlength=len(paths))
+        rank = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+        order = order[rank < ahead.most_wanted]
+        order = order[np.argsort(need[order], kind="stable")]
+        first = np.sort(np.unique(row[order], return_index=True)[1])
+        return PredictedVoxels(row[order[first]], need[order[first]])
 
-    def kept(self, now: float, after: float = EXPIRY) -> NDArray[np.int64]:
+    def kept(self, now: float, after: float) -> Integers:
         """Return the rows (n,), ascending, that users can touch at their current positions.
 
         Users whose last pose is more than `after` seconds old are ignored.
         """
-        return np.unique(rows_kept(self._snapshot(), now, after, self._options, self._index))
+        users = self._snapshot()
+        present = now - users.last <= after
+        return np.unique(self.rows_in_reach(users.centers[present], users.reaches[present])[1])
 
-    def rows_in_reach(
-        self, centers: NDArray[np.float64], reaches: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return starts (k + 1,) and rows of the voxels that each of k balls can touch.
+    def rows_in_reach(self, centers: Floats, reaches: Floats) -> tuple[Integers, Integers]:
+        """Return the voxels that balls can touch: (n,) numbers of balls, ascending, and (n,) rows.
 
         centers: (k, 3) [m].  reaches: the radii (k,) [m].
         """
-        options = self._options
-        steps = np.ascontiguousarray((centers - options.origin) / options.step)
-        spans = np.ascontiguousarray(reaches / options.step * (1.0 + RELATIVE_SLACK) + 1.0)
-        starts, needed = np.zeros(len(steps) + 1, np.int64), 8 * len(steps) + 8
-        while True:
-            rows = np.empty(needed, np.int64)
-            needed = rows_in_reach(steps, spans, self._index, options.voxel_steps, starts, rows)
-            if needed <= len(rows):
-                return starts, rows[:needed]
+        places, spans = (centers - self._origin) / self._step, self._spans(reaches)
+        ball, row = self._voxels_in(places - spans[:, None], places + spans[:, None])
+        near = self._gaps(places[ball], row)[1] <= spans[ball]
+        return ball[near], row[near]
 
-    def path_distances(self, rows: ArrayLike) -> NDArray[np.float64]:
-        """Return the distance (n,) of each row's box from the nearest user's predicted path [m].
+    def _spans(self, reaches: Floats) -> Floats:
+        """Convert reaches [m] to steps, widened by more than the rounding of their uses."""
+        return reaches / self._step * (1.0 + RELATIVE_SLACK) + 1.0
 
-        The paths are those of the last plan; without users the distance is inf. Not thread-safe.
-        Distances are cached until the next plan: for 10,000 rows and 8 users, computing them takes
-        a millisecond, and looking them up some 20 µs (scripts/bench_cache).
+    def _gaps(self, places: Floats, row: Integers) -> tuple[Floats, Floats]:
+        """Return the vectors (n, 3) to places from the boxes of rows (n,), and their lengths [steps]."""
+        low, high = self._tree.low[row], self._tree.high[row]
+        away: Floats = np.minimum(places - low, 0.0) + np.maximum(places - high, 0.0)
+        return away, np.sqrt((away * away).sum(axis=-1))
+
+    def _voxels_in(self, low: Floats, high: Floats) -> tuple[Integers, Integers]:
+        """Return the voxels near boxes (k, 3) [steps]: (n,) numbers of boxes, ascending, and (n,) rows."""
+        center, span = 0.5 * (low + high), 0.5 * np.sqrt(((high - low) ** 2).sum(axis=1))
+        lists = find_lists(self._tree, Items(center, center, span, span), NO_STOP.flag)
+        return np.repeat(np.arange(len(low)), np.diff(lists.starts)), lists.rows[: lists.starts[-1]]
+
+    def _first_touch(self, paths: Floats, reaches: Floats, user: Integers, row: Integers) -> Floats:
+        """Return when users' balls first touch voxels: (n,) number of pieces, 0 to PIECES; inf: never.
+
+        The moment is never late. user, row: (n,), pairs. The distance is convex along a piece, so
+        that Newton's step from before the moment does not pass it.
         """
-        each = np.asarray(rows, np.int64)
-        paths, number = self._planned_paths
-        new = each[self._distance_plan[each] != number]
-        if len(new):
-            far = np.empty(len(new))
-            write_path_distances(paths, new, self._index, far)
-            self._distances[new], self._distance_plan[new] = far * self._step, number
-        return self._distances[each]
+        at, touch, left = np.zeros(len(row)), np.full(len(row), np.inf), np.arange(len(row))
+        for _ in range(MAX_TOUCH_STEPS):
+            if not len(left):
+                return touch
+            now, who = at[left], user[left]
+            piece = np.minimum(now.astype(np.int64), PIECES - 1)
+            begin = paths[who, piece]
+            way = paths[who, piece + 1] - begin
+            away, gap = self._gaps(begin + (now - piece)[:, None] * way, row[left])
+            more, nearing = gap - reaches[who], -(away * way).sum(axis=1)
+            touches = more <= GRAZE / self._step
+            touch[left[touches]] = now[touches]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                after = np.where(nearing > 0.0, now + more * gap / nearing, np.inf)
+            at[left] = np.minimum(after, piece + 1)
+            left = left[~touches & (now < PIECES)]
+        touch[left] = at[left]  # it comes nearer so slowly that it may as well touch
+        return touch
+
+
+def _limit(vectors: Floats, most: float) -> Floats:
+    """Return vectors (..., 3), shortened to a length of at most `most`."""
+    lengths = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    limited: Floats = vectors * np.minimum(1.0, most / np.maximum(lengths, 1e-300))
+    return limited
+
+
+def _predict_paths(users: _Users, ahead: PrefetchOptions, seconds: Floats) -> Floats:
+    """Return predicted positions (u, PIECES + 1, 3) [m], from the last pose to `seconds` (u,) after it.
+
+    The times are evenly spaced. The motion is a least-squares fit of p + v t + a t²/2 over the last
+    `history` seconds, with v and a drawn towards 0 by SCATTER over USUAL_*. For one pose, or poses
+    at one time, both are 0. The acceleration fades and never makes the user faster than `speed`. The
+    speed at the middle of a piece represents the whole piece.
+    """
+    t = users.poses[:, :, 0] - users.last[:, None]
+    used = t >= -ahead.history
+    t = np.where(used, t, 0.0)
+    terms: Any = np.stack([used, t, t * t / 2], axis=1)  # (u, 3, MAX_POSES)
+    # Relative to the last position: no precision is lost far from the origin.
+    away = users.poses[:, :, 1:] - users.centers[:, None]
+    normal = terms @ terms.transpose(0, 2, 1)
+    normal += np.diag([0.0, (SCATTER / USUAL_SPEED) ** 2, (SCATTER / USUAL_ACCELERATION) ** 2])
+    fit = np.linalg.solve(normal, terms @ away)
+    velocity, acceleration = _limit(fit[:, 1], ahead.speed), _limit(fit[:, 2], ahead.acceleration)
+    step = seconds / PIECES
+    middle = (np.arange(PIECES) + 0.5) * step[:, None]
+    gained = ahead.fade * (1.0 - np.exp(-middle / ahead.fade))
+    speed = _limit(velocity[:, None] + acceleration[:, None] * gained[:, :, None], ahead.speed)
+    return np.cumsum(np.concatenate([users.centers[:, None], speed * step[:, None, None]], axis=1), axis=1)

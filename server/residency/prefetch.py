@@ -22,8 +22,8 @@ from .voxel_states import BackgroundLoad
 log = logging.getLogger(__name__)
 
 # Least time between two plans [s], in which a user at 5 m/s moves a quarter of a metre. The pause
-# after a plan is also at least PLAN_REST times the plan's duration: 0.2 ms for 64 users, 3 ms for
-# 512 (scripts/bench_cache), most of it without the interpreter's lock.
+# after a plan is also at least PLAN_REST times the plan's duration: 0.7 ms for 8 users, 1.7 for 64, 12
+# for 512 (scripts/bench_cache), mostly with the interpreter's lock.
 PLAN_SECONDS, PLAN_REST = 0.05, 10.0
 # The voxels of a user are kept for this long after its last pose [s]. A voxel whose prefetch failed
 # is not prefetched again for as long.
@@ -36,10 +36,6 @@ IDLE_REST = 4.0
 # Share of the budget that is kept for users' current positions; the rest is available to all
 # requests.
 KEPT_SHARE = 0.5
-# The first plan compiles for 4 s where nothing is compiled yet (scripts/bench_compile). It begins when
-# no request is running, so that the first answer does not wait for it: asked every ANSWER_REST [s], at
-# most for FIRST_ANSWER_SECONDS after the first pose.
-ANSWER_REST, FIRST_ANSWER_SECONDS = 0.02, 120.0
 # Quantile of the measured load times that predictions assume.
 LOAD_TIME_QUANTILE = 0.9
 
@@ -62,7 +58,6 @@ class Prefetcher:
         *,
         prefetch: bool = True,
         idle: Callable[[], bool] | None = None,
-        running_requests: Callable[[], bool] | None = None,
         clock: Callable[[], float] = time.perf_counter,
         level: VoxelCache | None = None,
     ) -> None:
@@ -71,7 +66,6 @@ class Prefetcher:
         prefetch: whether to prefetch; if False, load only owed voxels and keep users' voxels.
         idle: called repeatedly when there is nothing to load, until it returns False; each call
         does some milliseconds of work.
-        running_requests: returns whether requests are running; the first plan waits for them.
         clock: returns the time [s].
         level: cache of the level of detail, whose owed loads are done before those of `residency`.
         """
@@ -82,8 +76,6 @@ class Prefetcher:
         self._thread: threading.Thread | None = None
         self._stopped = self._seen = False
         self._idle = idle
-        self._running_requests = running_requests  # None once a plan was made
-        self._first_seen = math.inf
         self._failed: dict[int, float] = {}  # row -> time; a request for the voxel tries again
         self._caches = [residency] if level is None else [level, residency]
         for cache in self._caches:
@@ -118,22 +110,6 @@ class Prefetcher:
         self._seen = True
         self._wake()
         return jumped
-
-    def warm(self, center: tuple[float, float, float], *, predict: bool) -> None:
-        """Record a pose of a dummy user, so that the kernels are compiled before the first user.
-
-        predict: also make a plan, and let the first plan wait for no request. The tracks of users
-        are not touched.
-        """
-        user, tracks = ("", ""), self._tracks.without_users()
-        tracks.record_pose(user, self._clock(), center, 1.0)
-        if predict:
-            self._running_requests = None
-            tracks.plan(self._clock(), 0.0)
-            tracks.kept(self._clock())
-            tracks.path_distances([0])
-            tracks.leave(user)
-            tracks.plan(self._clock(), 0.0)
 
     def leave_client(self, client: str) -> None:
         """Stop keeping and prefetching voxels for a client's avatars."""
@@ -170,9 +146,7 @@ class Prefetcher:
         due = -math.inf
         while True:
             now = self._clock()
-            if self._seen and now >= due and self._waits_for_first_answer(now):
-                due = now + ANSWER_REST
-            elif self._seen and now >= due:
+            if self._seen and now >= due:
                 self._seen = False
                 need, due = self._planned(now)
                 queue = deque(need.items() if self._prefetch else ())
@@ -190,17 +164,6 @@ class Prefetcher:
             if not self._work.wait(SILENCE if self._residency.kept else None):
                 self._seen = True
             self._work.clear()
-
-    def _waits_for_first_answer(self, now: float) -> bool:
-        """Return whether the first plan is still to wait for running requests."""
-        running = self._running_requests  # read once: `warm` may set it
-        if running is None:
-            return False
-        self._first_seen = min(self._first_seen, now)
-        if now < self._first_seen + FIRST_ANSWER_SECONDS and running():
-            return True
-        self._running_requests = None
-        return False
 
     def _rest(self, seconds: float) -> None:
         """Pause; an owed load or `stop` ends the pause."""

@@ -2,5 +2,5 @@
 
 May import server.archives, server.avatars, server.queries, server.queries.context, server.runtime,
 server/scene_interface.py, server.simulation.effects, server.simulation.world, schemas.
-Begin with simulation.py; make_simulation.py makes one from a scene file.
+Begin with simulation.py.
 """

@@ -80,9 +80,8 @@ class Replayed(NamedTuple):
 def replay(simulation: Simulation, records: Iterable[Record]) -> Replayed:
     """Simulate the frames of a log, with a new simulation of the same scene.
 
-    Each frame skips the effects that the logged one skipped, because that depended on a clock. A
-    result that depended on voxels not in memory is taken from the log (body_record.py). The replay
-    ends where the log's scene was reloaded. Raises the errors of reading the records, and
+    A result that depended on voxels not in memory is taken from the log (`BodyRecord`). The
+    replay ends where the log's scene was reloaded. Raises the errors of reading the records, and
     BadRequestError for a log of other rules of motion, or whose avatars are not those of the scene.
     """
     avatars = _LoggedAvatars(simulation)
@@ -121,8 +120,8 @@ def _differences(simulation: Simulation, record: FrameRecord) -> list[TurnDiffer
     ended = StopFlag()
     ended.set("ended early when it was logged")
     stops = [ended if logged.error == ErrorCode.EXPIRED else NO_STOP for logged in record.said]
-    skips, kept = [logged.skipped for logged in record.said], [logged.kept for logged in record.said]
-    outcomes = simulation.step(turns, skips=skips, stops=stops, kept=kept)
+    kept = [logged.kept for logged in record.said]
+    outcomes = simulation.step(turns, stops=stops, kept=kept)
     return [
         TurnDifference(record.number, outcome.user, logged, found)
         for outcome, logged in zip(outcomes, record.said, strict=True)

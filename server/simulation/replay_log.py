@@ -6,6 +6,9 @@ A file begins with MAGIC. A record is a head of 12 bytes and a body. The head co
 little-endian uint32: the length of the body, the CRC-32 of these four bytes, and the CRC-32 of the
 body. The body is MessagePack. Each record is written by one unbuffered call. After a server was
 killed, all records but the last are therefore complete.
+
+A frame that lacked voxels and did not wait for them depends on what was in memory, which no replay can
+repeat. The log therefore holds the state of the body after it, and a replay takes it from there.
 """
 
 import logging
@@ -13,18 +16,24 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import msgspec
 import numpy as np
 
 from ...schemas.errors import BadRequestError, CorruptError, FormatError, SolidcloudError
 from ...schemas.process.os_errors import write_error_words
+from ...schemas.wire.answers import Verdict
 from ...schemas.wire.encoding import avatar_digest, encode
 from ...schemas.wire.key_expressions import User
+from ...schemas.wire.motion_messages import Moved
 from ..avatars.avatar_model import AvatarModel
+from ..runtime.stop_flag import NO_STOP
 from ..scene_interface import FrameCommand, FrameResult
-from .body_record import BodyRecord, pose_bytes
+from .world.frame import Body, Pose
+
+if TYPE_CHECKING:  # only scenes whose users can collide import it
+    from .world.bodies import Bodies
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +41,10 @@ MAGIC = b"solidcloud frames 1\n"
 _HEAD = struct.Struct("<III")
 # Limit on a record. A frame of a thousand users takes 1 MB, an avatar of a million points 24 MB.
 _MAX_BYTES = 1 << 28
+# Name under which the effect `ground` keeps the plane that the avatar stands on.
+_GROUND = "ground"
+# Name under which it keeps the place where the avatar was raised last.
+_RAISED = "ground raised"
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
@@ -87,17 +100,43 @@ class Reloaded(msgspec.Struct, frozen=True, tag="reloaded"):
     generation: int
 
 
+class BodyRecord(msgspec.Struct, frozen=True, array_like=True):
+    """State of a body between frames, as in `Body`, and of the objects that users push.
+
+    pose: as in `TurnResult`.  ground: point and normal of the plane that it stands on, 6 float64,
+    little-endian; b"" for none.  pushed: poses of the objects that users push, by name.
+    raised: place where `ground` raised it last, 3 float64, little-endian; b"" for none.
+    """
+
+    pose: bytes
+    fall_speed: float
+    on_ground: bool
+    clear: bool
+    ground: bytes = b""
+    pushed: dict[str, bytes] = {}
+    raised: bytes = b""
+
+
+def pose_bytes(pose: Any) -> bytes:
+    """Return the logged form of a pose (4, 4): its float64 bytes, little-endian."""
+    return np.ascontiguousarray(pose, "<f8").tobytes()
+
+
+def _pose(data: bytes) -> Pose:
+    """Return the pose (4, 4) of its logged form."""
+    return np.frombuffer(data, "<f8").reshape(4, 4).astype(np.float64)
+
+
 class TurnResult(msgspec.Struct, frozen=True, array_like=True):
     """Result of a turn.
 
-    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.  skipped: skipped effects.
+    pose: (4, 4) float64, little-endian; b"" if refused.  error: code.
     opened: number of reloads of each archive when the user last moved; empty if it never moved.
     kept: the body after a frame that lacked voxels and did not wait for them; None for all others.
     """
 
     pose: bytes
     error: str = ""
-    skipped: list[str] = []
     opened: list[int] = []
     kept: BodyRecord | None = None
 
@@ -116,14 +155,57 @@ _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)
 
 
+def record_of(body: Body, bodies: "Bodies | None") -> BodyRecord:
+    """Return the record of a body. bodies: of the scene; None if users cannot collide."""
+    stood, raised = body.effect_state.get(_GROUND), body.effect_state.get(_RAISED)
+    pushed = {}
+    if bodies is not None:
+        from .world.bodies import PUSHED
+
+        for row in np.flatnonzero(bodies.kinds == PUSHED).tolist():
+            pushed[bodies.names[row]] = pose_bytes(bodies.poses[row])
+    return BodyRecord(
+        pose_bytes(body.pose),
+        body.fall_speed,
+        body.on_ground,
+        body.clear,
+        b"" if stood is None else stood.astype("<f8").tobytes(),
+        pushed,
+        b"" if raised is None else raised.astype("<f8").tobytes(),
+    )
+
+
+def take_record(record: BodyRecord, body: Body, world: Any, bodies: "Bodies | None") -> Moved:
+    """Set a body, and the objects that users push, to a record; return the frame's result.
+
+    The verdict is CONTACT if the record states that the pose is clear and it touches the scan.
+    """
+    world.begin(NO_STOP)
+    body.pose, body.generations = _pose(record.pose), world.generations()
+    body.fall_speed, body.on_ground, body.clear = record.fall_speed, record.on_ground, record.clear
+    body.effect_state.pop(_GROUND, None)
+    if record.ground:
+        body.effect_state[_GROUND] = np.frombuffer(record.ground, "<f8").astype(np.float64)
+    body.effect_state.pop(_RAISED, None)
+    if record.raised:
+        body.effect_state[_RAISED] = np.frombuffer(record.raised, "<f8").astype(np.float64)
+    if bodies is not None:
+        bodies.begin()
+        for name, pose in record.pushed.items():
+            row = bodies.row_of(name, user=False)
+            if row >= 0:
+                bodies.put(row, _pose(pose))
+    verdict = world.collide(body.avatar, body.pose) if record.clear else Verdict.UNKNOWN
+    return Moved(pose=body.pose[None].copy(), verdict=int(verdict), unknown=True)
+
+
 def turn_result(
     outcome: FrameResult, opened: Sequence[int] = (), kept: BodyRecord | None = None
 ) -> TurnResult:
     """Return the logged form of an outcome. opened, kept: as in `TurnResult`."""
     if isinstance(outcome.state, SolidcloudError):
         return TurnResult(b"", str(outcome.state.code))
-    skipped = list(outcome.state.skipped)
-    return TurnResult(pose_bytes(outcome.state.pose), "", skipped, list(opened), kept)
+    return TurnResult(pose_bytes(outcome.state.pose), "", list(opened), kept)
 
 
 class FrameLog:

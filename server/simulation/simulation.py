@@ -6,13 +6,16 @@ poses, bit for bit: a clock is read only to report how long a frame took.
 """
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
+import msgspec
 import numpy as np
 
 from ...schemas.archive.pose_arrays import one_pose
@@ -23,8 +26,9 @@ from ...schemas.errors import (
     ExpiredError,
     InternalError,
     SolidcloudError,
+    UnknownAvatarError,
 )
-from ...schemas.scene.scene_file import SceneFile
+from ...schemas.scene.scene_file import SceneFile, Spawn
 from ...schemas.wire.answers import Verdict
 from ...schemas.wire.key_expressions import User, public_id
 from ...schemas.wire.motion_messages import (
@@ -40,14 +44,15 @@ from ...schemas.wire.motion_messages import (
 from ...schemas.wire.scene_messages import AvatarInfo, SceneInfo
 from ...schemas.wire.stats import EffectStats
 from ..archives.placed_archive import PlacedArchive
+from ..archives.rigid_transform import transform_points
 from ..avatars.avatar_model import AvatarModel
 from ..queries.context.query_budget import LateVoxels, QueryBudget
+from ..queries.within import within
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ..scene_interface import FrameCommand, FrameResult, recording_avatars
-from .body_record import BodyRecord, record_of, take_record
-from .motion_commands import first_pose, frame_durations, run_frames
-from .world.frame import Body, Pose
-from .world.vectors import norm, unit_vector
+from .replay_log import BodyRecord, FrameLog, record_of, take_record
+from .world.frame import MAX_TOUCHED, Body, Pose, Vec
+from .world.vectors import multiply, norm, orthonormalize, rotation_matrix, unit_vector
 
 if TYPE_CHECKING:  # a scene that is only queried imports neither
     from .effects.effect_pipeline import Pipeline
@@ -56,6 +61,11 @@ if TYPE_CHECKING:  # a scene that is only queried imports neither
 
 log = logging.getLogger(__name__)
 
+# Limit on the duration of a frame [s]. A motion command that is due for longer takes several.
+LONGEST_FRAME = 0.1
+# After a pause of more than this, a viewer continues as after one of LONGEST_FRAME [s]: it stood
+# still, and did not send two motion commands a second.
+LONGEST_PAUSE = 0.5
 # A user that has sent no motion command for this long is removed with its body [s].
 SILENT_SECONDS = 30.0
 # Client of the avatars of `warm`; no real client has this name.
@@ -74,23 +84,6 @@ class SimulatedScene(Protocol):
         self, name: str, points: Any, radius: float | None = None, *, client: str = ""
     ) -> AvatarInfo: ...
     def forget_client(self, client: str) -> None: ...
-
-
-class Recorder(Protocol):
-    """Receiver of all inputs that determine the results of frames, in order; see replay_log.py."""
-
-    def entered(self, user: User, avatar: AvatarModel) -> None: ...
-    def ended(self, users: list[User]) -> None: ...
-    def dropped(self, client: str) -> None: ...
-    def frame(
-        self,
-        number: int,
-        turns: Sequence[FrameCommand],
-        outcomes: Sequence[FrameResult],
-        opened: Sequence[Sequence[int]],
-        kept: Sequence["BodyRecord | None"],
-    ) -> None: ...
-    def reloaded(self, generation: int) -> None: ...
 
 
 class _Presence:
@@ -128,7 +121,7 @@ class Simulation:
         self._up = unit_vector(file.up)
         self._present: dict[User, _Presence] = {}
         self._bodies, self._place = bodies, place
-        self._recorder: Recorder | None = None
+        self._recorder: FrameLog | None = None
         self._frames = 0
         self._frame = threading.Lock()  # held for a frame; bodies change only while it is held
 
@@ -151,7 +144,7 @@ class Simulation:
         """Return what each effect has cost so far, in the order in which they run."""
         return self._pipeline.times.stats()
 
-    def record(self, recorder: Recorder | None) -> None:
+    def record(self, recorder: FrameLog | None) -> None:
         """Record every frame from now on with `recorder`; None ends it. Call it before users enter."""
         with self._frame:
             self._recorder = recorder
@@ -195,7 +188,6 @@ class Simulation:
         self,
         turns: Sequence[FrameCommand],
         now: float | None = None,
-        skips: Sequence[Collection[str]] | None = None,
         stops: Sequence[StopFlag] | None = None,
         kept: Sequence[BodyRecord | None] | None = None,
     ) -> list[FrameResult]:
@@ -205,8 +197,6 @@ class Simulation:
         pose. The outcome of a refused command is its error; the others are simulated.
         now: time on the caller's clock [s]. Users without a command for SILENT_SECONDS are removed
         first; None: no user is removed.
-        skips: for each turn, the effects to skip, as in a recorded frame; None: those that do not
-        fit the frame's budget.
         stops: for each turn, a stop flag. The user of a stopped turn stays, and the outcome is
         ExpiredError.
         kept: for a replay: for each turn, a recorded result that is taken without a simulation, or
@@ -218,14 +208,13 @@ class Simulation:
             self._frames += 1
             outcomes, opened, records = [], [], []
             for number, turn in enumerate(turns):
-                skip = None if skips is None else skips[number]
                 stop = NO_STOP if stops is None else stops[number]
                 # In a replay, a frame without a record lacked nothing: it gives what a wait would give.
                 budget = _frame_budget(turn.wish.late if kept is None else WAIT, stop)
                 given = None if kept is None else kept[number]
                 used: list[bytes] = []
                 with recording_avatars(used):
-                    state = self._simulate_turn(turn, now, skip, budget, given)
+                    state = self._simulate_turn(turn, now, budget, given)
                 there = self._present.get(turn.user)
                 about = b"".join(used) if there is None else there.body.avatar.digest
                 outcomes.append(FrameResult(turn.user, state, about))
@@ -240,14 +229,13 @@ class Simulation:
         self,
         turn: FrameCommand,
         now: float | None,
-        skip: Collection[str] | None,
         budget: QueryBudget,
         given: BodyRecord | None,
     ) -> State | SolidcloudError:
         """Simulate the frame of one user; return its state, or the error of a refused command."""
         begin = time.perf_counter()
         try:
-            moved = self._simulate_command(turn.user, turn.wish, now, skip, budget, given)
+            moved = self._simulate_command(turn.user, turn.wish, now, budget, given)
         except SolidcloudError as error:
             return error
         except StoppedError:
@@ -270,7 +258,6 @@ class Simulation:
         user: User,
         command: Wish,
         now: float | None,
-        skip: Collection[str] | None,
         budget: QueryBudget,
         given: BodyRecord | None,
     ) -> Moved:
@@ -287,7 +274,7 @@ class Simulation:
             if given is None:
                 run = partial(self._pipeline.run, budget=budget)
                 durations = frame_durations(command, present.time)
-                moved = run_frames(run, command, durations, present.body, self._up, self._bodies, skip)
+                moved = run_frames(run, command, durations, present.body, self._up, self._bodies)
             else:
                 moved = take_record(given, present.body, self.world, self._bodies)
             undo.pop_all()
@@ -382,3 +369,114 @@ def _make_body(user: User, avatar: AvatarModel, pose: Pose) -> Body:
 def _public_name(user: User) -> str:
     """Return a name that other users and logs may see: the client's id is a secret."""
     return f"{public_id(user.client)}/{user.avatar}"
+
+
+def frame_durations(command: Wish, before: float | None) -> list[float]:
+    """Return how long each of the frames of a motion command lasts [s]; there is at least one.
+
+    before: time of the user's previous command, on its clock; None: it is the first.
+    """
+    if before is None:
+        return [FRAME_SECONDS]
+    seconds = max(command.time - before, 0.0)
+    if seconds > LONGEST_PAUSE:
+        seconds = LONGEST_FRAME
+    count = max(1, math.ceil(seconds / LONGEST_FRAME - 1e-9))  # times of clients are rounded
+    return [min(seconds / count, LONGEST_FRAME)] * count
+
+
+def target_pose(command: Wish, pose: Pose, seconds: float, up: Vec) -> Pose:
+    """Return the target pose (4, 4) of a motion command given at `pose`. up: (3,) unit vector.
+
+    A velocity applies for the duration of the frame.
+    """
+    if command.velocity is None:
+        return check_rigid(command.pose[0], "pose")
+    there = pose.copy()
+    there[:3, 3] += np.array(command.velocity) * seconds
+    if command.turn and seconds:
+        there[:3, :3] = orthonormalize(multiply(rotation_matrix(up, command.turn * seconds), pose))
+    return there
+
+
+def spawn_pose(spawn: Spawn, up: Vec) -> Pose:
+    """Return the pose at which users enter."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrix(up, math.radians(spawn.heading))
+    pose[:3, 3] = spawn.position
+    return pose
+
+
+def first_pose(command: Wish, spawn: Spawn | None, up: Vec) -> Pose:
+    """Return the pose at which a user enters with its first command.
+
+    Raise UnknownAvatarError if neither the scene's spawn nor the command gives one.
+    """
+    if spawn is not None:
+        return spawn_pose(spawn, up)
+    if command.velocity is not None:
+        raise UnknownAvatarError("the avatar has no pose yet, and the scene has no spawn: begin with a pose")
+    return check_rigid(command.pose[0].copy(), "pose")
+
+
+def run_frames(
+    run: Callable[..., Moved],
+    command: Wish,
+    durations: list[float],
+    body: Body,
+    up: Vec,
+    bodies: "Bodies | None",
+) -> Moved:
+    """Run the frames of a user's motion command, nearly always one. If one fails, undo those before it.
+
+    run: `Pipeline.run` with a budget.  durations: of `frame_durations`.  bodies: those that may
+    meet, or None.
+    """
+    if len(durations) == 1:
+        return run(body, target_pose(command, body.pose, durations[0], up), durations[0])
+    body_before = replace(body, effect_state=dict(body.effect_state))
+    bodies_before = None if bodies is None else bodies.snapshot()
+    moves: list[Moved] = []
+    try:
+        for seconds in durations:
+            moves.append(run(body, target_pose(command, body.pose, seconds, up), seconds))
+            if bodies is not None:
+                bodies[body.user] = body
+    except BaseException:
+        for each in fields(body):
+            setattr(body, each.name, getattr(body_before, each.name))
+        if bodies is not None and bodies_before is not None:
+            bodies.restore(bodies_before)
+        raise
+    touched = {(each.what, each.place): each for moved in moves for each in moved.touched}
+    last = moves[-1]
+    return msgspec.structs.replace(
+        last,
+        left=last.left if command.velocity is None else sum(moved.left for moved in moves),
+        touched=list(touched.values())[:MAX_TOUCHED],
+        stepped=sum(moved.stepped for moved in moves),
+        unknown=any(moved.unknown for moved in moves),
+    )
+
+
+def make_simulation(scene: SimulatedScene, file: SceneFile) -> Simulation:
+    """Return the simulation of a scene's frames, with the effects that `file` declares."""
+    # Imported here, because a scene that is only queried needs neither effects nor their kernels.
+    from .effects.effect_pipeline import make_pipeline
+    from .world.collision_world import World
+
+    world = World(scene, file)
+    pipeline = make_pipeline(file, world)
+    return Simulation(scene, file, pipeline, pipeline.bodies, partial(_find_scan_point, world))
+
+
+def _find_scan_point(world: Any) -> Any:
+    """Return some scan point of a world, (3,) [m]; its archive's least corner if none is found."""
+    with world as held:
+        archive, data, pose = held[0].opened.store.archive, held[0].data, held[0].placed.pose
+        lattice = archive.header.lattice
+        corner = archive.coordinates[0] * lattice.voxel_steps + archive.voxels["low"][0]
+        place = lattice.to_world(corner[None])
+        found = within(data, place, min(16.0, 2 * lattice.voxel_size)).cloud_point
+        place = found if np.isfinite(found).all() else place
+        return (place if pose is None else transform_points(pose, place))[0]

@@ -65,7 +65,7 @@ class FloorPipeline:
     def __init__(self):
         self.frames = 0
 
-    def run(self, body, wish, seconds, budget=None, *, skip=None):
+    def run(self, body, wish, seconds, budget=None):
         self.frames += 1
         if body.name.endswith("/crash"):
             raise RuntimeError("a secret of the server's own")
@@ -79,8 +79,7 @@ class FloorPipeline:
             touched = [Touched((0.0, 0.0, 0.0))] * 2000
         body.pose = pose
         left = float(pose[2, 3] - wish[2, 3])
-        skipped = sorted(skip) if skip else []
-        return Moved(pose=pose[None], left=left, touched=touched, simulated=["stop"], skipped=skipped)
+        return Moved(pose=pose[None], left=left, touched=touched, simulated=["stop"])
 
 
 def floor_simulation(name="floor", users=64, **fields):

@@ -110,10 +110,10 @@ def holding(simulation):
     gate, entered = threading.Event(), threading.Event()
     run = simulation._pipeline.run
 
-    def held(body, aim, seconds, budget, *, skip=None):
+    def held(body, aim, seconds, budget):
         entered.set()
         assert gate.wait(DEADLINE)
-        return run(body, aim, seconds, budget, skip=skip)
+        return run(body, aim, seconds, budget)
 
     simulation._pipeline.run = held
     return gate, entered

@@ -21,9 +21,9 @@ from solidcloud.server.client import Client
 from solidcloud.server.report.walk.server_process import served
 from solidcloud.server.scene import Scene
 from solidcloud.server.scene_interface import FrameCommand
-from solidcloud.server.simulation.make_simulation import make_simulation
 from solidcloud.server.simulation.replay import recorded, replay
 from solidcloud.server.simulation.replay_log import MAGIC, FrameRecord, read_log
+from solidcloud.server.simulation.simulation import make_simulation
 from solidcloud.server.zenoh_server.serve_loop import serving
 from solidcloud.server.zenoh_server.server_config import ServerConfig
 
@@ -158,7 +158,7 @@ effects = [
     {{ effect = "stop" }}, {{ effect = "sweep" }}, {{ effect = "slide" }}, {{ effect = "ground" }},
     {{ effect = "crowd" }}, {{ effect = "proximity" }},
 ]
-limits = {{ users = 4, frame_visits = 3000 }}
+limits = {{ users = 4 }}
 """
 
 

@@ -80,15 +80,13 @@ def unknown_line(answers: Any, unanswered: int) -> str:
 def move_line(label: str, moved: Moved) -> str:
     """Format the result of a frame.
 
-    The line has the verdict, final position, remaining motion, first obstacle and skipped effects.
+    The line has the verdict, final position, remaining motion and first obstacle.
     """
     line = f"{label}  {VERDICT_NAMES[moved.verdict]:<8}at {_point_text(moved.pose[0, :3, 3])}"
     if moved.left:
         line += f", {moved.left:.4f} m left"
     if moved.touched:
         line += f", touching {_point_text(np.array(moved.touched[0].place))}"
-    if moved.skipped:
-        line += f", without {', '.join(moved.skipped)}"
     return line
 
 

@@ -172,13 +172,10 @@ def _places(begin: SceneContent) -> Iterator[str]:
 
 def _limits() -> Iterator[str]:
     """Yield the limits."""
-    yield from _comment(
-        "users: maximum at a time. frame_ms, frame_visits: budget of one user's frame, for effects that are not "
-        "needed for safety; default: no limit. longest_move: maximum motion of a frame."
-    )
+    yield from _comment("users: maximum at a time. longest_move: maximum motion of a frame.")
     yield "#[limits]"
     for name, value in msgspec.to_builtins(SceneLimits()).items():
-        yield f"#{name} = {toml_value({'frame_ms': 5.0, 'frame_visits': 20_000}[name] if value is None else value)}"
+        yield f"#{name} = {toml_value(value)}"
     yield ""
 
 

@@ -98,6 +98,20 @@ np.concatenate(lows), np.concatenate(highs), np.concatenate(below), len(low), sc
     )  # fmt: skip
 
 
+def find_lists(tree: VoxelTree, items: Items, stop: NDArray[np.int64]) -> VoxelLists:
+    """Return the voxels in reach of k items; see `list_reach`."""
+    k = len(items.span)
+    capacity = max(64, 8 * k)
+    while True:
+        lists = VoxelLists(
+            np.zeros(k + 1, np.int64), np.empty(capacity, np.int64), np.empty(capacity), np.empty(k)
+        )
+        needed = list_reach(tree, items, stop, lists)
+        if needed <= capacity:
+            return lists
+        capacity = needed
+
+
 @njit_no_refcount
 def state_of(state, voxel):
     """Return the state of a voxel."""

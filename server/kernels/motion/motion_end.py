@@ -11,6 +11,9 @@ from ..core.kernel_decorators import njit_no_refcount
 # Least length of a motion [m]. With shorter ones a pushing avatar would tremble by the error of
 # `lower`.
 MIN_MOTION = 2e-5
+# If a motion is undecided for more than this distance before its contact, it ends where the
+# undecided part begins [m].
+MAX_UNDECIDED = 1e-4
 # Limit on the distance by which a motion stops before a contact, as a multiple of `skin`. In a
 # grazing motion, the distance that keeps `skin` from the wall would be long.
 MAX_SKIN_FACTOR = 4.0

@@ -1,4 +1,4 @@
-"""Search for ground below a walking avatar, and vertical motions; see effects/ground_effect.py."""
+"""Search for ground below a walking avatar, and vertical motions; see effects/motion_effects.py."""
 
 from typing import NamedTuple
 

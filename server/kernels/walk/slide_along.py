@@ -1,4 +1,4 @@
-"""Slide along the touched surfaces, their creases and corners; see effects/slide_effect.py."""
+"""Slide along the touched surfaces, their creases and corners; see effects/motion_effects.py."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Stand on the ground or fall; see effects/ground_effect.py."""
+"""Stand on the ground or fall; see effects/motion_effects.py."""
 
 from ....schemas.kernels import compiling as nb
 from ..motion.sweep_resident import LOWER

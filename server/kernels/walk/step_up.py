@@ -1,4 +1,4 @@
-"""Climb a step; see effects/step_effect.py."""
+"""Climb a step; see effects/motion_effects.py."""
 
 import numpy as np
 

@@ -8,7 +8,7 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ..collide.collide_poses import collide_resident
 from ..core.voxels_in_reach import VALID
-from ..motion.motion_end import longest_way
+from ..motion.motion_end import MAX_UNDECIDED, longest_way
 from ..motion.sweep_resident import (
     AVATAR,
     CLOUD,
@@ -40,7 +40,6 @@ from .walk_state import (
     HAS_POINT,
     KNOWN,
     LANDS,
-    MAX_UNDECIDED,
     MISSED,
     NAMED,
     NEAREST,
@@ -94,7 +93,7 @@ def count_visits(walk, visits, missed):
 
 @nb.njit(nogil=True, cache=True)
 def ask_at(walk, query, place):
-    """Ask about a place; see `WalkCall._answer` in walk_call.py for the numbers that each query gives."""
+    """Ask about a place; see `WalkCall._answer` in frame_walk.py for the numbers that each query gives."""
     for r in range(3):
         walk.memory.asked[r] = place[r]
     ask(walk.memory, query)
@@ -257,7 +256,7 @@ def nearest_point(walk, place, reach):
 
 @nb.njit(nogil=True, cache=True)
 def lands(walk, reach, stood):
-    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in walk_call.py.
+    """Return the row that says whether the avatar would land if it fell, see `_write_landing` in frame_walk.py.
 
     reach: distance below that is free [m].  stood: whether it stood in the last frame.
     """

@@ -3,7 +3,7 @@
 The frame's code asks queries, such as sweeps, one after the other. Each answer is a row of the tape.
 If a query cannot be answered in compiled code, because voxels have to be loaded or bodies are in the
 way, the frame is left with `AskedError`. Python writes the answer to the tape and calls the kernel
-again (server/simulation/world/walk_call.py). The kernel repeats the frame from its beginning, with
+again (server/simulation/world/frame_walk.py). The kernel repeats the frame from its beginning, with
 the known answers. Nothing in a frame depends on anything but its start and these answers, so it
 arrives at the same query again. There is therefore one implementation of a frame, whatever is in
 memory.
@@ -22,9 +22,6 @@ from ..motion.sweep_resident import COLUMNS
 
 CLEAR, CONTACT, UNKNOWN = int(Verdict.CLEAR), int(Verdict.CONTACT), int(Verdict.UNKNOWN)
 
-# If a motion is undecided for more than this distance before its contact, it ends where the
-# undecided part begins [m].
-MAX_UNDECIDED = 1e-4
 # Columns of a row of the tape. The first are those of `sweep_resident`. Then, for a hit: its verdict,
 # number of its archive (-1: not of the scan), whether the centres of the touching spheres, the
 # touching point, the end and the normal are known, the normal (3,), whether it is of a named body

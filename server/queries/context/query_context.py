@@ -123,13 +123,22 @@ def to_units(metres: float, what: str) -> int:
     return round(metres * UNITS_PER_METRE)  # half to even
 
 
-def make_scene_data(archive: Archive, residency: VoxelCache) -> SceneData:
-    """Make the data of an archive whose voxels `residency` holds, with the archive's single radius."""
+def make_tree(archive: Archive) -> VoxelTree:
+    """Make the boxes around the points of an archive's voxels, as the index states them."""
+    header, voxels = archive.header, archive.voxels
+    base = archive.coordinates * header.lattice.voxel_steps
+    bounds = np.array([header.low, header.high])
+    return make_voxel_tree(base + voxels["low"], base + voxels["high"], bounds, header.unknown)
+
+
+def make_scene_data(archive: Archive, residency: VoxelCache, tree: VoxelTree | None = None) -> SceneData:
+    """Make the data of an archive whose voxels `residency` holds, with the archive's single radius.
+
+    tree: `make_tree` of the archive; None: make it.
+    """
     header = archive.header
+    tree = make_tree(archive) if tree is None else tree
     lattice = header.lattice
-    base, voxels = archive.coordinates * lattice.voxel_steps, archive.voxels
-    scene = np.array([header.low, header.high])
-    tree = make_voxel_tree(base + voxels["low"], base + voxels["high"], scene, header.unknown)
     arrays = SceneArrays(
         *residency.buffer.arena,
         residency.where,
@@ -143,7 +152,7 @@ def make_scene_data(archive: Archive, residency: VoxelCache) -> SceneData:
         NO_STOP.flag,
     )
     return SceneData(
-        residency, arrays, tree, voxels["key"].astype(np.uint64), to_units(header.radius, "radius of the archive"),
+        residency, arrays, tree, archive.voxels["key"].astype(np.uint64), to_units(header.radius, "radius of the archive"),
         header.unknown, header.unknown_everywhere, header.scan_index, SceneReferences(),
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
-"""Effects of a scene. Only the effects that a scene declares are imported (NUMERICS.md case 31).
+"""Effects of a scene. Only the files of those that a scene declares are imported (NUMERICS.md case 31).
 
-Each effect is one file, named as in the scene file, whose `make(effect, world)` returns a `Runner`.
+The function `make(effect, world)` of an effect's file returns a `Runner`.
 The code that effects share is in simulation/world/. effect_pipeline.py runs the effects that a
 scene declares, in this order:
 
@@ -9,8 +9,7 @@ scene declares, in this order:
 3. `slide`: continue the remaining motion along the touched surfaces.
 4. `step`: try to climb low obstacles with the motion that still remains.
 5. `ground`: as the last motion, lower the avatar to the ground, or let it fall.
-6. `proximity`, `contacts`, `uncertainty`: report about the final pose. The most expensive comes
-   last, because a small budget skips the last effects first.
+6. `proximity`, `contacts`, `uncertainty`: report about the final pose.
 
 `through` does nothing in a frame: it changes the scene once, when it is opened.
 

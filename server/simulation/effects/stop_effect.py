@@ -11,19 +11,40 @@ with a clear end is taken, if the rule for users in contact permits the way to i
 leads, also without `sweep`, and the verdict reports whether it is still in contact. It stays if its
 pose or a candidate is unknown because voxels are not in memory yet, for a frame that does not wait
 for them.
+
+In a scene where no other effect moves avatars or obstructs them, this file follows the motion command.
+In others the kernel `walk_frame` does, which this file neither imports nor compiles.
 """
 
-from ....schemas.scene.effect_table import Stop, Sweep
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ....schemas.scene.effect_table import Contacts, Proximity, Stop, Sweep, Through, Uncertainty
+from ....schemas.scene.scene_file import sweep_tolerance
 from ....schemas.wire.answers import Verdict
+from ...avatars.avatar_model import make_avatar
 from ..world.collision_world import World
-from ..world.frame import Frame, Vec, find_touched, is_clear, record_hit, translated
-from ..world.frame_walk import FOLLOW
-from ..world.leaving import leave, leaving_pose
+from ..world.frame import (
+    Body,
+    Frame,
+    Hit,
+    Pose,
+    Vec,
+    find_touched,
+    is_clear,
+    record_hit,
+    translated,
+)
+from ..world.leaving import find_first_hit, leave, leaving_pose, settle_before
 from ..world.vectors import norm
 
 # Longest displacement of an escape from contact [m], and the distances that are tried.
 MAX_ESCAPE = 0.5
 _ESCAPE_DISTANCES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, MAX_ESCAPE)
+# Effects that neither move an avatar nor obstruct it.
+_STILL = (Stop, Proximity, Contacts, Uncertainty, Through)
 
 
 class StopRunner:
@@ -31,17 +52,77 @@ class StopRunner:
 
     name = "stop"
 
-    def __init__(self, continuous: bool) -> None:
-        """Create the effect. continuous: whether the effect `sweep` follows the motion command."""
-        self._continuous = continuous
+    def __init__(self, world: World, effect: Stop) -> None:
+        """Create the effect, and compile what its frames need."""
+        effects = world.file.effects
+        self._skin, self._tolerance = float(effect.skin), float(sweep_tolerance(world.file))
+        self._continuous = any(isinstance(each, Sweep) for each in effects)
+        self._walk: Callable[[Frame], None] | None = None
+        if all(isinstance(each, _STILL) for each in effects):
+            self._warm(world)
+        else:
+            self._walk = _walk_in(world)
 
     def run(self, frame: Frame) -> None:
         """Escape from contact if necessary; without `sweep`, move to the commanded pose."""
         frame.clear = frame.body.clear and frame.body.generations == frame.generations
         if not frame.clear:
             escape_contact(frame)
-        if not self._continuous:
-            frame.world.walker.run(frame, FOLLOW)
+        if self._walk is None:
+            self._follow(frame)
+        elif not self._continuous:
+            self._walk(frame)
+
+    def _warm(self, world: World) -> None:
+        """Compile the kernels of a motion that begins in contact."""
+        body = Body("", make_avatar([[0.0, 0.0, 0.0]], 0.1), np.eye(4))
+        frame, to = Frame(body, np.eye(4), 0.0, world, pose=body.pose), translated(body.pose, world.up)
+        hit = Hit(0.5, Verdict.CONTACT, world.up, -world.up)
+        with world:
+            find_first_hit(frame, to, self._tolerance, self._skin)
+            settle_before(frame, to, hit, self._skin)
+
+    def _follow(self, frame: Frame) -> None:
+        """Move towards the commanded pose; an avatar in contact that cannot do both moves, then turns."""
+        hit = self._advance(frame, frame.target)
+        if hit is not None and frame.verdict == Verdict.CONTACT:
+            moved = frame.pose.copy()
+            moved[:3, 3] = frame.target[:3, 3]
+            if (moved != frame.target).any():
+                frame.hits.pop()
+                if self._advance(frame, moved) is None:
+                    self._advance(frame, frame.target)
+        frame.remaining = frame.target[:3, 3] - frame.pose[:3, 3]
+        if frame.verdict == Verdict.CONTACT and not frame.clear:  # it began in contact
+            frame.verdict = frame.world.collide(frame.body.avatar, frame.pose, frame.budget)
+            frame.clear = frame.verdict == Verdict.CLEAR
+
+    def _advance(self, frame: Frame, to: Pose) -> Hit | None:
+        """Move to a pose if nothing is touched there, in contact as far as possible; return what ended it."""
+        if frame.pose.tobytes() == to.tobytes():
+            return None
+        leaves = frame.verdict == Verdict.CONTACT
+        hit = find_first_hit(frame, to, self._tolerance, self._skin) if leaves else find_touched(frame, to)
+        if hit is None:
+            frame.pose, frame.clear = to.copy(), frame.clear or not leaves
+            return None
+        if leaves and hit.end is not None:
+            frame.pose = hit.end.copy()
+        elif leaves:
+            settle_before(frame, to, hit, self._skin)
+        if hit.unloaded:
+            hit = hit._replace(rest=norm(to[:3, 3] - frame.pose[:3, 3]))
+        record_hit(frame, hit)
+        return hit
+
+
+def _walk_in(world: World) -> Callable[[Frame], None]:
+    """Return the function that follows a motion command by the kernel `walk_frame`, compiled."""
+    from ..world.frame_walk import FOLLOW, walker_of
+
+    walker = walker_of(world)
+    walker.warm()
+    return lambda frame: walker.run(frame, FOLLOW)
 
 
 def escape_contact(frame: Frame) -> None:
@@ -78,7 +159,6 @@ def _escape_displacements(frame: Frame, *, touches: bool) -> list[Vec]:
     return ways
 
 
-def make(effect: Stop, world: World) -> StopRunner:
+def make(effect: Stop, world: Any) -> StopRunner:
     """Create the effect of a scene."""
-    world.walker.warm()
-    return StopRunner(any(isinstance(each, Sweep) for each in world.file.effects))
+    return StopRunner(world, effect)

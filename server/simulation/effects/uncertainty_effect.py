@@ -44,7 +44,7 @@ from ...queries.context.query_context import SceneData
 from ...queries.distance_per_scan import ANY_SCAN, separation_per_scan
 from ...queries.resident_fast_path import distance_fast
 from ..world.frame import Frame
-from ..world.separation_cache import is_farther_than, nearest
+from .report_effects import is_farther_than, nearest
 
 # Number of standard deviations beyond which a scan is omitted.
 MAX_SIGMAS = 4.0

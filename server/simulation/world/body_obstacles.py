@@ -45,7 +45,11 @@ class _FirstHit(NamedTuple):
 
 
 class BodyObstacle:
-    """Bodies of some kinds, as obstacles for one mover and one frame."""
+    """Bodies of some kinds, as obstacles for one mover and one frame.
+
+    `Hit.what` names the body. A body that was touched when the frame began blocks only motions that
+    go deeper into it. For other motions, neither `sweep` nor `touches` reports it.
+    """
 
     def __init__(
         self, name: str, bodies: Bodies, wanted: int, mover: str, model: AvatarModel, start: Pose,
@@ -71,8 +75,9 @@ class BodyObstacle:
     def sweep(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
     ) -> Hit | None:
-        """Return the hit that ends the motion first; of equals, that of the lowest row.
+        """Return the hit that ends the motion first; of equals, that of the lowest row; None if none does.
 
+        Nothing is touched before the hit's fraction.
         below: leave out bodies beside the avatar.
         """
         hit = self._sweep(avatar, pose_from, pose_to, tolerance, below=below)
@@ -175,7 +180,11 @@ class BodyObstacle:
             return bool(len(rows) and bodies.touching(shape, pose, rows, 0, self._stop).any())
 
     def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
-        """Return False: none of these bodies gives way."""
+        """Move the body that ended a motion, if possible; return whether to try the motion again.
+
+        Called for each hit. The avatar is at frame.pose and on its way to `to`. None of these bodies
+        gives way.
+        """
         return False
 
     def _in_reach(self, shape: Shape, first: Pose, last: Pose) -> NDArray[np.int64]:

@@ -6,8 +6,8 @@ directly.
 """
 
 import threading
-from functools import cached_property
-from typing import Any
+from collections import OrderedDict
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,32 +17,59 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.errors import CorruptError
 from ....schemas.scene.scene_file import SceneFile
 from ....schemas.wire.answers import ContactsAnswers, DistanceAnswers, Verdict, WithinAnswers
+from ...archives.archive_generation import ArchiveGeneration
 from ...archives.placed_archive import PlacedArchive
-from ...archives.rigid_transform import rotate_vectors, transform_points
+from ...archives.rigid_transform import rotate_vectors, transform_points, transform_poses
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.normal_codes import MAX_NORMAL_REACH
 from ...queries.contacts import contacts
 from ...queries.context.query_budget import EXACT, QueryBudget
-from ...queries.context.query_context import with_stop
+from ...queries.context.query_context import SceneData, with_stop
 from ...queries.resident_fast_path import ResidentQueries, SweepResult, distance_fast
 from ...queries.within import within
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from ...scene_interface import EVERYBODY
-from .avatar_probes import AvatarProbes
 from .frame import Hit, Pose, Vec
-from .held_archive import (
-    SPARSE_FACTOR,
-    HeldArchive,
-    normals_of,
-    swept_in_world,
-    to_archive,
-    to_world,
-    touched_in_archive,
-)
-from .least_answer import comes_first, merge_distances, merge_swept
 from .vectors import min_height, unit_vector
 
 _NO_ORIGIN = np.zeros(3)
+# If the points near a touched one form no surface, because the scan is sparse, the reach of its
+# normal is multiplied by this factor.
+SPARSE_FACTOR = 3.0
+# Limit on the avatars (of users and objects) for which a thread keeps a `ResidentQueries`.
+_MAX_PROBES = 256
+# Limit on the points of these avatars, some 100 MB a thread: those of dropped avatars also count.
+_MAX_PROBED_POINTS = 1 << 20
+
+
+class HeldArchive(NamedTuple):
+    """Archive generation that a thread holds. data: with the scene's radius model."""
+
+    opened: ArchiveGeneration
+    data: SceneData
+    placed: PlacedArchive
+
+
+class AvatarProbes:
+    """The last avatars of one thread, each with its `ResidentQueries`."""
+
+    def __init__(self) -> None:
+        self._probes: OrderedDict[int, ResidentQueries] = OrderedDict()
+        self._points = 0
+
+    def of(self, avatar: AvatarModel) -> ResidentQueries:
+        """Return the `ResidentQueries` of an avatar."""
+        probes, key = self._probes, id(avatar.points)
+        probe = probes.get(key)
+        if probe is None or probe.avatar.arrays is not avatar.arrays or probe.avatar.radius != avatar.radius:
+            if probe is not None:
+                self._points -= len(probes.pop(key).avatar.points)
+            probe = probes[key] = ResidentQueries(avatar)
+            self._points += len(avatar.points)
+            while len(probes) > 1 and (len(probes) > _MAX_PROBES or self._points > _MAX_PROBED_POINTS):
+                _, oldest = probes.popitem(last=False)
+                self._points -= len(oldest.avatar.points)
+        return probe
 
 
 class _Held(threading.local):
@@ -62,7 +89,10 @@ class World:
     """Collision world of one scene. Thread-safe.
 
     file: the scene file.  up: (3,) unit vector against gravity.  archives: of the scene.
+    walker: see `walker_of` in frame_walk.py.
     """
+
+    walker: Any = None
 
     def __init__(self, scene: Any, file: SceneFile) -> None:
         """Create the world of a scene, an object with `archives` and `avatar` such as `Scene`."""
@@ -177,31 +207,17 @@ class World:
         are those of the earliest contact, of simultaneous ones that with the least witness.
         skin: see `ResidentQueries.sweep`; `end` is known only for a single archive.
         """
-        held = self._held
-        probe = held.probes.of(avatar)
-        if self._alone and held.depth:
-            swept = probe.sweep(held.seen[0].data, pose_from, pose_to, tolerance, budget, skin)
-            self.count(swept.visits, swept.unknown)
-            return swept
+        found, probe = None, self._held.probes.of(avatar)
         with self as seen:
-            found: SweepResult | None = None
             for number, each in enumerate(seen):
-                swept = probe.sweep(
-                    each.data, to_archive(each, pose_from), to_archive(each, pose_to), tolerance, budget
-                )
+                begin, end = to_archive(each, pose_from), to_archive(each, pose_to)
+                swept = probe.sweep(each.data, begin, end, tolerance, budget, skin if self._alone else -1.0)
                 self.count(swept.visits, swept.unknown)
                 if not self._alone:
                     swept = swept_in_world(swept, each, number)
                 found = swept if found is None else merge_swept(found, swept)
         assert found is not None
         return found
-
-    def leave(self, frame: Any, to: Pose, skin: float) -> Hit | None:
-        """Return the hit that ends a translation of an avatar in contact; see leaving.py."""
-        # Imported here: only scenes with `stop` need it (NUMERICS.md, case 31).
-        from .leaving import leave
-
-        return leave(frame, to, skin)
 
     def between(
         self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, fraction: float
@@ -220,14 +236,6 @@ class World:
     def probe(self, avatar: AvatarModel) -> ResidentQueries:
         """Return this thread's `ResidentQueries` of an avatar."""
         return self._held.probes.of(avatar)
-
-    @cached_property
-    def walker(self) -> Any:
-        """Return the `Walker` of the scene."""
-        # Imported here: only effects that move an avatar need it.
-        from .frame_walk import Walker
-
-        return Walker(self)
 
     def lowest_height(self) -> float:
         """Return the height of the lowest corner of the archives' boxes, spheres included [m]."""
@@ -402,3 +410,107 @@ class World:
                 held.unknown = True
                 return np.zeros(len(directions))
         return found
+
+
+def normals_of(seen: HeldArchive) -> Any:
+    """Return the `Normals` of an archive generation."""
+    kept = seen.opened.kept
+    normals = kept.get("normals")
+    if normals is None:
+        # Imported here: only some effects need normals.
+        from ...queries.surface_normals import Normals
+
+        normals = kept.setdefault("normals", Normals(seen.data, seen.opened.store.archive))
+    return normals
+
+
+def touched_in_archive(
+    seen: HeldArchive, cloud: Vec, ways: NDArray[np.float64]
+) -> tuple[Vec, NDArray[np.float64]]:
+    """Return a scan point (3,) and directions (k, 3) of the world in an archive's frame."""
+    inverse = seen.placed.inverse
+    if inverse is None:
+        return cloud, ways
+    return transform_points(inverse, cloud[None])[0], rotate_vectors(inverse, ways)
+
+
+def to_archive(seen: HeldArchive, pose: Pose) -> Pose:
+    """Return a pose of the world in an archive's frame."""
+    inverse = seen.placed.inverse
+    return pose if inverse is None else transform_poses(inverse, pose[None])[0]
+
+
+def to_world(seen: HeldArchive, place: NDArray[np.float64]) -> Vec:
+    """Return a point (3,) of an archive in the world frame."""
+    pose = seen.placed.pose
+    return place if pose is None else transform_points(pose, place[None])[0]
+
+
+def swept_in_world(swept: SweepResult, seen: HeldArchive, number: int) -> SweepResult:
+    """Return an archive's answer about a motion, in the world frame."""
+    if swept.avatar is None or swept.cloud is None:
+        return swept._replace(archive=number)
+    return swept._replace(
+        archive=number, avatar=to_world(seen, swept.avatar), cloud=to_world(seen, swept.cloud)
+    )
+
+
+def comes_first(
+    value: float, witness: tuple[Vec | None, ...], other: float, other_witness: tuple[Vec | None, ...]
+) -> bool:
+    """Return whether an answer replaces that of an earlier archive (NUMERICS.md N11).
+
+    value, witness: of the answer.  other, other_witness: of the earlier archive. The lesser value
+    comes first; of equal values, that with the least witness: scan point, then avatar centre, as in
+    merge_answers.py.
+    """
+    if value != other:
+        return value < other
+    for own, place in zip(witness, other_witness, strict=True):
+        if own is None or place is None:
+            return False
+        one, two = own.tolist(), place.tolist()
+        if one != two:
+            return bool(one < two)
+    return False
+
+
+def merge_swept(one: SweepResult, other: SweepResult) -> SweepResult:
+    """Return the merged answer of two archives about a motion."""
+    other_first = comes_first(other.upper, (other.cloud, other.avatar), one.upper, (one.cloud, one.avatar))
+    first = other if other_first else one
+    lower = min(one.lower, other.lower)
+    verdict = Verdict.CLEAR if lower >= 1.0 else Verdict.UNKNOWN
+    if first.upper < np.inf:
+        verdict = Verdict.CONTACT
+    exact = first.exact and lower >= first.lower
+    return first._replace(
+        verdict=verdict,
+        lower=lower,
+        exact=exact,
+        visits=one.visits + other.visits,
+        unknown=one.unknown or other.unknown,
+    )
+
+
+def merge_distances(one: DistanceAnswers, other: DistanceAnswers) -> DistanceAnswers:
+    """Return the merged answer of two archives about a distance."""
+    other_first = comes_first(
+        float(other.signed_distance[0]), (other.witness_cloud[0], other.witness_avatar[0]),
+        float(one.signed_distance[0]), (one.witness_cloud[0], one.witness_avatar[0]),
+    )  # fmt: skip
+    first = other if other_first else one
+    verdicts = {int(one.verdict[0]), int(other.verdict[0])}
+    verdict = Verdict.CONTACT if Verdict.CONTACT in verdicts else max(verdicts)
+    lower = min(one.lower[0], other.lower[0])
+    return msgspec.structs.replace(
+        first,
+        verdict=np.array([verdict], np.uint8),
+        lower=np.array([lower]),
+        upper=np.array([min(one.upper[0], other.upper[0])]),
+        exact=np.array([bool(first.exact[0]) and lower >= first.lower[0]]),
+        outside=one.outside & other.outside,
+        voxels_missing=one.voxels_missing + other.voxels_missing,
+        node_visits=one.node_visits + other.node_visits,
+        point_tests=one.point_tests + other.point_tests,
+    )

@@ -1,6 +1,5 @@
 """One frame of one user: its state, the hits that end motions, and the motions of effects."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -9,7 +8,6 @@ from numpy.typing import NDArray
 
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
-from ...kernels.walk.walk_state import MAX_UNDECIDED
 from ...queries.context.query_budget import EXACT, QueryBudget
 from .vectors import dot, frobenius_norm, min_height, norm, rotate, rotate_back
 
@@ -49,40 +47,6 @@ class Hit(NamedTuple):
     end: Pose | None = None
 
 
-class Obstacle(Protocol):
-    """Bodies that move and block: the other users, the dynamic objects. See body_obstacles.py.
-
-    One obstacle may represent many bodies: `Hit.what` names the one. A body that was touched when
-    the frame began blocks only motions that go deeper into it, so that an avatar can get free. For
-    other motions, neither `sweep` nor `touches` reports it.
-    """
-
-    name: str
-
-    def sweep(
-        self, avatar: AvatarModel, pose_from: Pose, pose_to: Pose, tolerance: float, *, below: bool = False
-    ) -> Hit | None:
-        """Return the hit that ends the motion at this obstacle, or None.
-
-        Nothing is touched before the hit's fraction. below: leave out bodies beside the avatar.
-        """
-
-    def touches(self, avatar: AvatarModel, pose: Pose) -> Hit | None:
-        """Return a hit if an avatar at a pose touches this obstacle, or None."""
-
-    def overlaps(self, avatar: AvatarModel, pose: Pose) -> bool:
-        """Return whether an avatar at a pose touches this obstacle.
-
-        Bodies that were touched when the frame began count too.
-        """
-
-    def give_way(self, frame: "Frame", hit: Hit, to: Pose) -> bool:
-        """Move the body that ended a motion, if possible; return whether to try the motion again.
-
-        Called for each hit. The avatar is at frame.pose and on its way to `to`.
-        """
-
-
 @dataclass(slots=True)
 class Body:
     """State of a user between frames.
@@ -118,12 +82,12 @@ class Frame:
     clear: whether nothing is touched at `pose`.
     remaining: (3,), part of the commanded translation that is not completed yet [m].
     hits: hits that ended motions, in order.
-    obstacles: obstacles besides the scan.
+    obstacles: besides the scan, each a `BodyObstacle` (body_obstacles.py).
     fall_speed, on_ground: new values of `Body`.
-    simulated, skipped: names of effects.  reports: fields of `Moved`.
+    simulated: names of effects.  reports: fields of `Moved`.
     effect_state: entries for `Body.effect_state`.
     apart: whether it is proved that no obstacle is touched at `pose`.
-    walks, walk_hits: for walk_call.py: whether a part has run, and the hits that Python answered with, by
+    walks, walk_hits: for frame_walk.py: whether a part has run, and the hits that Python answered with, by
     their row.  visits: node visits of each part in its last call.
     leaving: the last pose in contact from which a motion began (leaving.py), or None.
     """
@@ -139,11 +103,10 @@ class Frame:
     clear: bool = False
     remaining: Vec = field(default_factory=lambda: np.zeros(3))
     hits: list[Hit] = field(default_factory=list)
-    obstacles: list[Obstacle] = field(default_factory=list)
+    obstacles: list[Any] = field(default_factory=list)
     fall_speed: float = 0.0
     on_ground: bool = False
     simulated: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
     reports: dict[str, Any] = field(default_factory=dict)
     effect_state: dict[str, Any] = field(default_factory=dict)
     apart: bool = False
@@ -185,38 +148,6 @@ def lowest_height(avatar: AvatarModel, pose: Pose, up: Vec) -> float:
     The avatar has at least one sphere.
     """
     return dot(pose[:3, 3], up) + min_height(avatar.points, rotate_back(pose, up)) - avatar.radius
-
-
-def find_first_hit(
-    frame: Frame, to: Pose, tolerance: float, skin: float = -1.0, *, below: bool = False
-) -> Hit | None:
-    """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
-
-    skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
-    below: for a search for ground, leave out bodies beside the avatar.
-    """
-    found, lacked = None, frame.lacked
-    swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
-    if frame.verdict == Verdict.CONTACT and begins_in_contact(swept) and is_translation(frame.pose, to):
-        found = frame.world.leave(frame, to, skin)
-    elif swept.verdict != Verdict.CLEAR:
-        sure = swept.verdict == Verdict.CONTACT
-        if sure and not swept.exact:
-            sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
-        if sure:
-            found = Hit(
-                swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive, None, swept.point, False,
-                0.0, swept.end,
-            )  # fmt: skip
-        else:
-            found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
-    until = math.inf if found is None else found.fraction
-    return first_body_hit(frame, to, tolerance, until, below=below) or found
-
-
-def begins_in_contact(swept: Any) -> bool:
-    """Return whether a `SweepResult` says that the scan is touched where the motion begins."""
-    return bool(swept.verdict == Verdict.CONTACT and swept.upper == 0.0)
 
 
 def is_translation(pose: Pose, to: Pose) -> bool:

@@ -1,5 +1,9 @@
-"""Motions of an avatar that begin in contact with the scan (schemas/SCENE.md, "A user in contact")."""
+"""First hits of motions, and motions that begin in contact with the scan.
 
+The rule for those is in schemas/SCENE.md, "A user in contact".
+"""
+
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,11 +13,21 @@ from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.wire.answers import Verdict
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.bodies import leave_contact as kernel
-from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MIN_MOTION
+from ...kernels.motion.motion_end import MAX_SKIN_FACTOR, MAX_UNDECIDED, MIN_MOTION, skin_fraction
 from ...queries.context.query_budget import QueryBudget
 from ...queries.context.query_context import parts_that_fit
-from .frame import Frame, Hit, Pose, Vec, translated
-from .held_archive import HeldArchive, to_archive, to_world
+from .collision_world import HeldArchive, to_archive, to_world
+from .frame import (
+    Frame,
+    Hit,
+    Pose,
+    Vec,
+    first_body_hit,
+    is_clear,
+    is_translation,
+    max_displacement,
+    translated,
+)
 from .vectors import dot, norm, rotate, rotate_back
 
 # Points this much farther than a motion reaches are gathered with it, for the next motions [m].
@@ -26,6 +40,9 @@ _HULL = "hull"
 _LEAVES = 0.2
 # A motion may lead over a plane by this share of its length, which is rounding.
 _ROUNDING = 1e-8
+# First step back from a pose that turns out not to be clear [m], and its growth factor, as in
+# kernels/walk/walk_motions.py.
+_FIRST_STEP_BACK, _STEP_GROWTH = 1e-7, 4.0
 
 
 class _Gathered(NamedTuple):
@@ -206,3 +223,57 @@ def leave(frame: Frame, to: Pose, skin: float = -1.0) -> Hit | None:
     skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
     """
     return leaving_pose(frame, norm(to[:3, 3] - frame.pose[:3, 3])).sweep(to, skin)
+
+
+def find_first_hit(
+    frame: Frame, to: Pose, tolerance: float, skin: float = -1.0, *, below: bool = False
+) -> Hit | None:
+    """Return the first hit of the motion from frame.pose to a pose with scene or obstacles.
+
+    skin: distance to keep from the hit [m], for `Hit.end`; negative: not requested.
+    below: for a search for ground, leave out bodies beside the avatar.
+    """
+    found, lacked = None, frame.lacked
+    swept = frame.world.sweep(frame.body.avatar, frame.pose, to, tolerance, frame.budget, skin)
+    if frame.verdict == Verdict.CONTACT and begins_in_contact(swept) and is_translation(frame.pose, to):
+        found = leave(frame, to, skin)
+    elif swept.verdict != Verdict.CLEAR:
+        sure = swept.verdict == Verdict.CONTACT
+        if sure and not swept.exact:
+            sure = max_displacement(frame, to) * (swept.upper - swept.lower) <= MAX_UNDECIDED
+        if sure:
+            found = Hit(
+                swept.lower, swept.verdict, swept.avatar, swept.cloud, "", swept.archive, None, swept.point, False,
+                0.0, swept.end,
+            )  # fmt: skip
+        else:
+            found = Hit(swept.lower, Verdict.UNKNOWN, None, None, unloaded=frame.lacked > lacked)
+    until = math.inf if found is None else found.fraction
+    return first_body_hit(frame, to, tolerance, until, below=below) or found
+
+
+def begins_in_contact(swept: Any) -> bool:
+    """Return whether a `SweepResult` says that the scan is touched where the motion begins."""
+    return bool(swept.verdict == Verdict.CONTACT and swept.upper == 0.0)
+
+
+def settle_before(frame: Frame, to: Pose, hit: Hit, skin: float) -> None:
+    """Move to the pose the skin before a hit on the way to a pose (4, 4), or to a clear one before it.
+
+    The avatar stays if the way is shorter than MIN_MOTION. The kernel `walk_frame` does the same.
+    """
+    way, avatar, begin = max_displacement(frame, to), frame.body.avatar, frame.pose
+    share = 0.0
+    if way > 0.0 and skin > 0.0:
+        share = skin / way
+        if hit.avatar is not None and hit.cloud is not None:
+            there = frame.world.between(avatar, begin, to, min(hit.fraction, 1.0))[0]
+            point = rotate_back(there, hit.avatar - there[:3, 3])
+            share = skin_fraction(begin, to, hit.avatar, hit.cloud, point, way, skin)
+    fraction, back = hit.fraction - share, 0.0
+    while (fraction - back) * way >= MIN_MOTION:
+        pose, same = frame.world.between(avatar, begin, to, fraction - back)
+        if is_clear(frame, pose, proved=same and fraction - back < hit.fraction):
+            frame.pose = pose
+            return
+        back = max(_STEP_GROWTH * back, _FIRST_STEP_BACK / way)

@@ -82,8 +82,7 @@ def sample(before: Reading, now: Reading) -> dict[str, Any] | None:
     """Return what happened between two readings; None if the server began anew between them.
 
     time: of the second reading [s].  effects: [name, mean seconds in a frame, frames in which it ran
-    a second, frames a second for which the budget was too small].  frames: of all users, a second.
-    rates: of each counter of the cache, a second.  totals: the counters.
+    a second].  frames: of all users, a second.  rates: of each counter of the cache, a second.  totals: the counters.
     """
     seconds = now.time - before.time
     old, new = before.stats, now.stats
@@ -98,19 +97,17 @@ def sample(before: Reading, now: Reading) -> dict[str, Any] | None:
     if began_anew or seconds <= 0:
         return None
     changes = [
-        (each.effect, each.seconds - was.seconds, each.frames - was.frames, each.skipped - was.skipped)
+        (each.effect, each.seconds - was.seconds, each.frames - was.frames)
         for each, was in ran
         if was is not None
     ]
-    # An effect that was skipped, or had nothing to do, took no time in that frame.
-    frames = max((ran + skipped for _, _, ran, skipped in changes), default=0)
+    frames = max((ran for _, _, ran in changes), default=0)
     return {
         "time": now.time,
         "roundTrip": now.round_trip,
         "frames": frames / seconds,
         "effects": [
-            [name, spent / frames if frames else 0.0, count / seconds, skipped / seconds]
-            for name, spent, count, skipped in changes
+            [name, spent / frames if frames else 0.0, count / seconds] for name, spent, count in changes
         ],
         "rates": {name: count / seconds for name, count in counts.items()},
         "totals": {name: getattr(new, name) for name in _COUNTERS},

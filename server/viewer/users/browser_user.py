@@ -125,7 +125,6 @@ def state_fields(state: State, frame: ViewFrame) -> dict[str, Any]:
         "unknown": state.unknown,
         "unloaded": state.unloaded,
         "stepped": state.stepped,
-        "skipped": state.skipped,
         "seconds": state.seconds,
         "roundTrip": time.monotonic() - state.time,
         "touched": [

@@ -31,7 +31,7 @@ export function addEffectsPanel(app) {
   });
   app.on("statistics", ({ samples }) => {
     const last = samples.at(-1);
-    if (last) costs = new Map(last.effects.map(([name, seconds, ran, skipped]) => [name, { seconds, ran, skipped }]));
+    if (last) costs = new Map(last.effects.map(([name, seconds]) => [name, seconds]));
     if (seen()) show();
   });
   app.whenSeen(seen, show);
@@ -57,7 +57,7 @@ export function addEffectsPanel(app) {
     }));
     text.textContent = switchable
       ? "A switch opens the scene anew with other effects, for all users; it takes some seconds. Your scene file stays as it is."
-      : "This viewer has not started the server, and a session cannot skip effects: they are shown only. To change them, edit [[effects]] in the scene file and start the server again.";
+      : "This viewer has not started the server, and a session cannot leave out effects: they are shown only. To change them, edit [[effects]] in the scene file and start the server again.";
   }
 
   /** Switch an effect, with those that it requires, or without those that require it. */
@@ -88,11 +88,8 @@ export function addEffectsPanel(app) {
       input.checked = app.switching ? app.switching.has(name) : on;
       const found = costs.get(name);
       if (!on) cost.textContent = "off";
-      else if (!found) cost.textContent = name === "through" ? "at start" : "–";
-      else {
-        const skipped = found.skipped ? `, ${found.skipped.toFixed(0)}/s skipped` : "";
-        cost.textContent = `${(1e3 * found.seconds).toFixed(3)} ms${skipped}`;
-      }
+      else if (found === undefined) cost.textContent = name === "through" ? "at start" : "–";
+      else cost.textContent = `${(1e3 * found).toFixed(3)} ms`;
     }
   }
 }

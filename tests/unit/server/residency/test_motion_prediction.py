@@ -5,14 +5,12 @@ import pytest
 from numpy.typing import NDArray
 from solidcloud.schemas.archive.voxel_grid import voxel_keys
 from solidcloud.server.kernels.core.voxels_in_reach import SceneIndex
-from solidcloud.server.kernels.prediction.user_tracks import STALE
 from solidcloud.server.residency.motion_prediction import (
     PREFETCH_OPTIONS,
+    STALE,
     PredictedVoxels,
     UserTracks,
 )
-
-pytestmark = pytest.mark.interpreted
 
 STEP, VOXEL_STEPS = 0.01, 200
 EDGE = STEP * VOXEL_STEPS
@@ -140,7 +138,7 @@ def test_a_teleport_is_said_and_what_was_before_is_dropped() -> None:
     assert around.record_pose(ME, now + 1 / 30, at(-30.0, -30.0), REACH)
     wanted = around.plan(now + 1 / 30, 0.5)
     assert cells(wanted.rows) == touched(-30.0, -30.0, REACH) and (wanted.need == 0).all()
-    assert cells(around.kept(now + 1 / 30)) == touched(-30.0, -30.0, REACH)
+    assert cells(around.kept(now + 1 / 30, 10.0)) == touched(-30.0, -30.0, REACH)
     assert not around.record_pose(ME, now + 2 / 30, at(-29.9, -30.0), REACH)
 
 
@@ -166,12 +164,85 @@ def test_who_leaves_is_forgotten() -> None:
     for user in (ME, YOU, other):
         walk(around, straight(1.0), user=user)
     assert around.users == [ME, YOU, other]
-    around.leave(YOU)
-    around.leave(YOU)
-    assert around.users == [ME, other]
     around.leave_client("client")
     assert around.users == [other] and len(around.plan(1.0, 0.1).rows)
     around.expire(29 / 30 + 10.0, 10.0)
     assert around.users == [other]
     around.expire(11.0, 10.0)
-    assert around.users == [] and len(around.plan(11.0, 0.1).rows) == 0 and around.kept(11.0).tolist() == []
+    assert (
+        around.users == []
+        and len(around.plan(11.0, 0.1).rows) == 0
+        and around.kept(11.0, 10.0).tolist() == []
+    )
+
+
+# --- against brute force over all voxels at many moments of the predicted path ---------------------------
+
+
+def gaps(index: SceneIndex, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances (k, v) from places (k, 3) to the boxes of all voxels."""
+    away = np.maximum(np.maximum(index.low - centers[:, None], centers[:, None] - index.high), 0)
+    return np.sqrt((away**2).sum(axis=2))
+
+
+@pytest.mark.parametrize("ring", [0.0, 0.6])
+@pytest.mark.parametrize(("side", "count", "reach"), [(6, 700, 0.4), (3, 300, 0.0)])
+def test_what_is_wanted_is_what_brute_force_finds(side: int, count: int, reach: float, ring: float) -> None:
+    """Three users in voxels that are scattered in space, each with a box of points inside it."""
+    rng = np.random.default_rng([side, count])
+    coordinates = np.unique(rng.integers(-side, side, (count, 3)), axis=0)
+    keys = voxel_keys(coordinates)
+    base = coordinates[np.argsort(keys)] * VOXEL_STEPS
+    ends = np.sort(rng.integers(0, VOXEL_STEPS, (2, len(base), 3)), axis=0)
+    low, high = base + ends[0], base + ends[1]
+    index = SceneIndex(np.sort(keys), low, high, low.min(axis=0), high.max(axis=0))
+    ahead, met = PREFETCH_OPTIONS._replace(ring=ring, settled=0.0, most_wanted=1000), 0
+    for turn in range(20):
+        around = UserTracks(index, VOXEL_STEPS, np.zeros(3), STEP, ahead)
+        expected: dict[int, tuple[float, float]] = {}
+        for user in range(3):
+            speed = rng.normal(0, 1, 3) * (0.0 if turn % 5 == 0 else rng.choice([0.3, 2.0, 8.0]))
+            place = low[rng.integers(len(low))] * STEP + rng.uniform(-0.2, 0.2, 3)
+            bend = rng.normal(0, 0.1, 3) * np.linalg.norm(speed)
+            for number in range(20):
+                at = place + speed * number / 30 + bend * (number / 30) ** 2
+                around.record_pose(("c", str(user)), number / 30, tuple(at.tolist()), reach)
+        now, horizon = 19 / 30, ahead.horizon(0.25)
+        wanted = around.plan(now, 0.25)
+        assert len(set(wanted.rows.tolist())) == len(wanted.rows) and (np.diff(wanted.need) >= 0).all()
+        wide = reach / STEP + 1.0
+        for path in around._planned_paths[0]:
+            along = np.linspace(0, 16, 801)
+            centers = np.column_stack([np.interp(along, np.arange(17), path[:, k]) for k in range(3)])
+            apart = gaps(index, centers)
+            # Between moments the ball moves at most half of what it moves from one to the next.
+            between = np.linalg.norm(np.diff(centers, axis=0), axis=1).max() / 2
+            for row in range(len(low)):
+                near = apart[0, row] - wide
+                late = [np.inf, np.inf]  # latest and earliest need that are right
+                for which, more in ((0, 1e-6), (1, 0.2 + between)):
+                    touched = np.flatnonzero(apart[:, row] <= wide + more)
+                    if len(touched):
+                        late[which] = (along[touched[0]] - which * along[1]) / 16 * horizon
+                    elif near <= ring / STEP and ring:
+                        late[which] = horizon * (1.0 + max(near, 0.0) / (ring / STEP))
+                known = expected.get(row, (np.inf, np.inf))
+                expected[row] = min(known[0], late[0]), min(known[1], late[1])
+        found = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+        for row, (latest, earliest) in expected.items():
+            assert earliest - 1e-4 <= found.get(row, np.inf) <= latest + 1e-4
+        met += len(found)
+    assert met > 5
+
+
+def test_turning_is_followed() -> None:
+    """A circle of 1.5 m at 1.5 m/s: half a second ahead the path is nearer than a straight line is."""
+    around, angle = make(), np.arange(16) / 30
+    for a in angle.tolist():
+        around.record_pose(ME, a, at(1.5 * np.cos(a), 1.5 * np.sin(a)), REACH)
+    around.plan(15 / 30, 0.0)
+    end, last = angle[-1] + 0.5, angle[-1]
+    truth = 1.5 * np.array([np.cos(end), np.sin(end)])
+    straight = 1.5 * np.array([np.cos(last), np.sin(last)]) + 0.75 * np.array([-np.sin(last), np.cos(last)])
+    found = around._planned_paths[0][0, -1, :2] * STEP
+    assert np.linalg.norm(found - truth) < np.linalg.norm(straight - truth) * 0.6

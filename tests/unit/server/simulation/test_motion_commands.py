@@ -8,7 +8,7 @@ from solidcloud.schemas.archive.rigid_pose import check_rigid
 from solidcloud.schemas.errors import BadRequestError, BadTransformError, UnknownAvatarError
 from solidcloud.schemas.scene.scene_file import Spawn
 from solidcloud.schemas.wire.motion_messages import FRAME_SECONDS, Wish
-from solidcloud.server.simulation.motion_commands import (
+from solidcloud.server.simulation.simulation import (
     LONGEST_FRAME,
     LONGEST_PAUSE,
     first_pose,

@@ -31,18 +31,17 @@ POINTS = np.array([[0.0, 0.0, 0.5], [0.0, 0.25, 1.0]])
 
 
 class Drifting:
-    """Stands in for effects whose outcome depends on all frames before it, and on what was skipped."""
+    """Stands in for effects whose outcome depends on all frames before it."""
 
     def __init__(self):
-        self.total, self.skips, self.reloads = 0.0, True, 0
+        self.total, self.reloads = 0.0, 0
 
-    def run(self, body, wish, seconds, budget=None, *, skip=None):
-        skipped = (["proximity"] if self.skips else []) if skip is None else list(skip)
-        self.total += float(wish[0, 3]) * seconds + len(body.avatar.points) + 0.1 * len(skipped)
+    def run(self, body, wish, seconds, budget=None):
+        self.total += float(wish[0, 3]) * seconds + len(body.avatar.points)
         body.pose = wish.copy()
         body.pose[1, 3] = self.total
         body.generations = (self.reloads, 0)
-        return Moved(pose=body.pose[None].copy(), skipped=skipped)
+        return Moved(pose=body.pose[None].copy())
 
 
 def simulated():
@@ -53,7 +52,7 @@ def simulated():
 
 @pytest.fixture
 def log(tmp_path):
-    """A log of 60 frames: users come and go, are refused, are timed out, change their avatars; effects are skipped."""
+    """A log of 60 frames: users come and go, are refused, are timed out, change their avatars."""
     rng = np.random.default_rng(8)
     simulation, path = simulated(), tmp_path / "log"
     for user in (AL, BO, CY):
@@ -68,7 +67,6 @@ def log(tmp_path):
                 pose[0, :3, 3] = rng.normal(size=3)
                 pose[0, 3, 3] = 1.0 + (rng.random() < 0.05)  # some that are none
                 turns.append(FrameCommand(users[user], Wish(seq=number, time=0.02 * number, pose=pose)))
-            simulation._pipeline.skips = bool(rng.random() < 0.3)
             simulation.step(turns, now=0.02 * number + 40.0 * (number > 30))
             if number == 20:
                 simulation.end(CY)
@@ -123,7 +121,7 @@ def test_a_wish_that_was_another_changes_what_comes_after(log, tmp_path):
     """An edit whose checksum was made to fit is found all the same, where it first tells."""
     whole = bytearray(log.read_bytes())
     at = whole.index(b"\xa5frame")
-    for _ in range(9):
+    for _ in range(8):  # to frame 9, whose first command is not refused
         at = whole.index(b"\xa5frame", at + 1)
     pose = whole.index(b"\xa4pose\xc4\x80", at) + 7
     whole[pose + 3 * 8] ^= 1  # the last bit of x
@@ -136,7 +134,7 @@ def test_a_wish_that_was_another_changes_what_comes_after(log, tmp_path):
     struct.pack_into("<I", whole, start + 8, zlib.crc32(bytes(whole[start + 12 : start + 12 + length])))
     (tmp_path / "edited").write_bytes(whole)
     found = replay(simulated(), read_log(tmp_path / "edited"))
-    assert found.frames == 60 and found.different >= 1 and found.first.frame == 10
+    assert found.frames == 60 and found.different >= 1 and found.first.frame == 9
 
 
 def test_a_refusal_that_is_none_now_is_a_difference(log):

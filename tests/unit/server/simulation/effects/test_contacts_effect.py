@@ -12,7 +12,7 @@ from solidcloud.schemas.scene.effect_table import Contacts
 from solidcloud.schemas.wire.motion_messages import ContactsReport
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects import contacts_effect as contacts
+from solidcloud.server.simulation.effects import report_effects as contacts
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 ROW = np.column_stack([np.arange(0, 4, 0.1), np.zeros(40), np.zeros(40)])

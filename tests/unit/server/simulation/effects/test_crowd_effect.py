@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_table import AnyEffect, Crowd, Ground, Slide, Step, Stop, Sweep
 from solidcloud.server.avatars.avatar_model import AvatarModel, make_avatar
-from solidcloud.server.simulation.effects import crowd_effect as crowd
+from solidcloud.server.simulation.effects import body_effects as crowd
 
 SMALL = ball(0.2, 12 if INTERPRETED else 60)
 CONTINUOUS: list[AnyEffect] = [Stop(), Sweep()]

@@ -13,8 +13,7 @@ from solidcloud.schemas.scene.effect_table import Proximity
 from solidcloud.schemas.wire.motion_messages import ProximityReport
 from solidcloud.server.avatars.avatar_model import make_avatar
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects.proximity_effect import make
-from solidcloud.server.simulation.world.separation_cache import CACHE_KEY
+from solidcloud.server.simulation.effects.report_effects import CACHE_KEY, make
 
 BALL = make_avatar([[0.0, 0, 0]], 0.1)
 GRID = np.stack(np.meshgrid(np.arange(0, 1, 0.05), np.arange(0, 1, 0.05), [0.0]), axis=-1).reshape(-1, 3)

@@ -1,19 +1,27 @@
 """`stop` and `sweep`: what is touched blocks, how near one stays, how one gets free, what is not known."""
 
+import copy
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import archive_cases
 import effect_rooms
 import numpy as np
 import pytest
 from effect_frames import flip_a_byte
-from effect_rooms import APART, RADIUS, at, play
+from effect_rooms import APART, RADIUS, Play, at, play
+from numpy.typing import NDArray
 from solidcloud.schemas.archive.archive import Archive
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.scene.effect_table import Slide, Stop, Sweep
 from solidcloud.schemas.scene.scene_file import SceneLimits
 from solidcloud.schemas.wire.answers import Verdict
+from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.avatars.avatar_model import make_avatar
+from solidcloud.server.simulation.effects import stop_effect
+from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
+from solidcloud.server.simulation.world.collision_world import World
 
 BALL = make_avatar([[0.0, 0, 0]], 0.2)
 TOUCH = RADIUS + 0.2  # from a scan point's centre
@@ -141,3 +149,38 @@ def test_a_wish_that_is_too_far_is_refused_and_changes_nothing(wall: archive_cas
         with pytest.raises(BadRequestError):
             game.go(body, (np.nan, 0, 0))
         np.testing.assert_array_equal(body.pose, at(-1, 0, 0))
+
+
+@pytest.mark.parametrize("poses", [[None], [at(0.03, 0.0, 0.01, 0.3), at(0.5, 0.2, 0.0)]])
+def test_alone_it_moves_like_the_kernel_that_other_effects_need(
+    wall: archive_cases.Case, poses: list[NDArray[np.float64] | None]
+) -> None:
+    """Also in contact, in turns and deep in a wall, with an archive as it lies and with two that were moved."""
+    rng, ends = np.random.default_rng(7), set()
+    with play(wall.archive, Stop()) as game:
+        archives = [copy.copy(game.scene.archives[0]) for _ in poses]
+        for archive, pose in zip(archives, poses, strict=True):
+            archive.pose, archive.inverse = pose, None if pose is None else np.linalg.inv(pose)
+        plays = []
+        for alone in (True, False):
+            world = World(SimpleNamespace(archives=archives), game.pipeline.file)
+            plays.append(Play(game.scene, world, make_pipeline(game.pipeline.file, world)))
+            if not alone:
+                runner: Any = plays[-1].pipeline.groups[0][0]
+                runner._walk = stop_effect._walk_in(world)
+        for turn in range(30):
+            avatar = (BALL, effect_rooms.person())[turn % 2]
+            start = at(*rng.uniform(-0.5, 0.5, 3) * [0.5, 1.0, 1.0], angle=rng.uniform(0, 6))
+            bodies = [game.body(avatar, start) for game in plays]
+            for _ in range(6):
+                wish = at(
+                    *bodies[0].pose[:3, 3] + rng.normal(0, 0.1, 3), angle=rng.uniform(0, 6) * (turn % 3 > 0)
+                )
+                moved = [game.pipeline.run(body, wish) for game, body in zip(plays, bodies, strict=True)]
+                assert encode(moved[0]) == encode(moved[1])
+                assert (bodies[0].clear, bodies[0].pose.tobytes()) == (
+                    bodies[1].clear,
+                    bodies[1].pose.tobytes(),
+                )
+                ends.add((moved[0].verdict, bool(moved[0].touched), moved[0].left > 0))
+    assert {verdict for verdict, *_ in ends} == {0, 1} and len(ends) > 3

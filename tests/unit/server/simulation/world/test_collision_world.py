@@ -20,7 +20,7 @@ from solidcloud.server.queries.context.query_budget import LateVoxels, QueryBudg
 from solidcloud.server.queries.resident_fast_path import ResidentQueries, SweepResult
 from solidcloud.server.runtime.stop_flag import NO_STOP
 from solidcloud.server.scene import Scene
-from solidcloud.server.simulation.effects import contacts_effect
+from solidcloud.server.simulation.effects import report_effects
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Hit
 from split_scans import several
@@ -110,7 +110,7 @@ def test_of_two_archives_at_the_same_distance_the_least_witness_is_named(
             swept = world.sweep(ball, above, at(0, 0, 0))
             assert swept.verdict == Verdict.CONTACT and swept.cloud is not None
             assert swept.cloud.tolist() == points[0].tolist()
-            runner = contacts_effect.make(Contacts(cluster_distance=0.0), None)
+            runner = report_effects.make(Contacts(cluster_distance=0.0), None)
             clusters = report(runner, world, body_of(ball), at(0, 0, 0)).clusters
             assert [cluster.cloud for cluster in clusters] == [tuple(place) for place in points.tolist()]
         asked = several(*[(cases[1 + i].archive, None) for i in order])

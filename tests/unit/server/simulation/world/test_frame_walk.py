@@ -8,7 +8,7 @@ from effect_rooms import INTERPRETED, Play
 from solidcloud.schemas.scene.effect_table import AnyEffect, Contacts, Crowd, Ground, Slide, Step, Stop, Sweep
 from solidcloud.schemas.wire.encoding import encode
 from solidcloud.server.simulation.effects.effect_pipeline import make_pipeline
-from solidcloud.server.simulation.world import walk_call
+from solidcloud.server.simulation.world import frame_walk
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body
 
@@ -49,12 +49,12 @@ def test_frames_are_the_same_whoever_answers_their_queries(
     person = effect_rooms.person()
     with effect_rooms.play(case.archive, *effects, up=up) as play:
         plays = [play]
-        monkeypatch.setattr(walk_call, "_ROWS", 2)
+        monkeypatch.setattr(frame_walk, "_ROWS", 2)
         for _ in range(2):
             world = World(play.scene, play.pipeline.file)
             plays.append(Play(play.scene, world, make_pipeline(play.pipeline.file, world)))
             world.walker.native = False
-        plays[2].pipeline._groups = [[runner] for runner in plays[2].pipeline.runners]
+        plays[2].pipeline.groups = [[runner] for group in plays[2].pipeline.groups for runner in group]
         bodies = [each.body(person, effect_rooms.at(-0.5, 0.0, -0.6)) for each in plays]
         way, touched, stepped = np.zeros(3), 0, 0
         for number in range(FRAMES):

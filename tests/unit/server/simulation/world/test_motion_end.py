@@ -15,6 +15,7 @@ from solidcloud.server.queries.context.query_budget import EXACT
 from solidcloud.server.scene import Scene
 from solidcloud.server.simulation.world.collision_world import World
 from solidcloud.server.simulation.world.frame import Body, Frame
+from solidcloud.server.simulation.world.frame_walk import walker_of
 
 MOTIONS = 6 if INTERPRETED else 80
 
@@ -42,7 +43,8 @@ def test_motions_end_where_clear_poses_are_found_step_by_step(
     person, hits, proved = effect_rooms.person(), 0, 0
     with Scene([placed], "room") as scene:
         fused, apart = World(scene, file), SweptOnly(scene, file)
-        apart.walker.native = False
+        walker_of(fused)
+        walker_of(apart).native = False
         scene.add_avatar("person", person.points, person.radius)
         scene.collide("person", effect_rooms.at(0.125, 0.0625, -0.75), margin=3.0)  # loads the voxels
         for number in range(MOTIONS):

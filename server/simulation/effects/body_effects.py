@@ -1,4 +1,13 @@
-"""Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
+"""Effects `crowd` and `objects`: other bodies are obstacles.
+
+Effect `crowd`: users do not walk through one another.
+
+The other users are obstacles at their current poses. Users whose turn came earlier in this frame
+have already moved; the replay log records the order. A user blocks the others and is not moved by
+them. Users that overlap, for example because they entered at the same place, may separate but not
+move deeper (body_obstacles.py).
+
+Effect `objects`: dynamic objects block users; pushable ones give way where there is space.
 
 Motion commands place a kinematic object (`Bodies.place_objects`), even into users. The user whose
 motion ends at a pushable object moves it: by the horizontal part of the remaining translation, as
@@ -18,16 +27,20 @@ from typing import Any
 
 import numpy as np
 
-from ....schemas.scene.effect_table import Objects
+from ....schemas.errors import BadRequestError
+from ....schemas.scene.effect_table import Crowd, Objects
 from ....schemas.scene.scene_file import ObjectItem
 from ....schemas.wire.answers import Verdict
-from ....schemas.wire.motion_messages import ObjectsReport
+from ....schemas.wire.motion_messages import CrowdReport, ObjectsReport
 from ...queries.context.query_budget import QueryBudget
+from ...queries.context.query_context import to_units
 from ..world.bodies import KINEMATIC, PUSHED, USER, Bodies
 from ..world.body_obstacles import BodyObstacle, warm_kernels
 from ..world.frame import Frame, Hit, Pose, Vec, lowest_height, translated
 from ..world.vectors import dot, horizontal, norm
 
+# Largest permitted margin of `crowd` [m].
+_MAX_MARGIN = 8.0
 # A pushed object stops this far before whatever stops it, along its way [m], as `stop` does for
 # users.
 _SKIN = 0.002
@@ -56,13 +69,54 @@ _LEVEL = 0.94
 _MAX_CONTACTS, _SAME_CONTACT = 4, 0.9
 
 
-def make(effect: Objects, world: Any) -> "ObjectsRunner":
-    """Create the effect of a scene.
-
-    Raises BadRequestError for invalid objects.
-    """
+def make(effect: Objects | Crowd, world: Any) -> "ObjectsRunner | CrowdRunner":
+    """Create an effect of a scene. Raise BadRequestError for a margin that is too large."""
     warm_kernels()
-    return ObjectsRunner(world, world.file.objects)
+    if isinstance(effect, Objects):
+        return ObjectsRunner(world, world.file.objects)
+    if effect.margin > _MAX_MARGIN:
+        raise BadRequestError(f"margin {effect.margin:g} m of crowd: expected at most {_MAX_MARGIN:g} m")
+    with world as seen:
+        bodies = Bodies(seen[0].data.arrays.origin, world.up)
+    return CrowdRunner(bodies, to_units(effect.margin, "margin"))
+
+
+class CrowdRunner:
+    """Effect that adds the other users to the obstacles of a frame.
+
+    bodies: the simulation updates them, and may replace them by those of another effect.
+    """
+
+    name = "crowd"
+
+    def __init__(self, bodies: Bodies, margin_units: int) -> None:
+        """Create the effect. margin_units: distance between users, exact units."""
+        self.bodies, self._margin_units = bodies, margin_units
+
+    def run(self, frame: Frame) -> None:
+        """Add the other users to the obstacles; the report counts those that block."""
+        self.bodies.begin()
+        frame.reports[self.name] = CrowdReport()
+        frame.obstacles.append(UserObstacle(self.name, self.bodies, frame, self._margin_units))
+
+
+class UserObstacle(BodyObstacle):
+    """Obstacle formed by the other users; it counts those that ended a motion."""
+
+    def __init__(self, name: str, bodies: Bodies, frame: Frame, margin_units: int) -> None:
+        """Create the obstacle for one frame of one user."""
+        body, stop = frame.body, frame.budget.stop
+        super().__init__(
+            name, bodies, USER, body.name, body.avatar, body.pose, margin_units=margin_units, stop=stop
+        )
+        self._met: set[str] = set()
+
+    def give_way(self, frame: Frame, hit: Hit, to: Pose) -> bool:
+        """Count the user that ended the motion; return False, because users do not give way."""
+        if self.is_own(hit):
+            self._met.add(hit.what)
+            frame.reports[self.name] = CrowdReport(len(self._met))
+        return False
 
 
 class ObjectsRunner:

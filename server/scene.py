@@ -94,7 +94,7 @@ class Scene(SceneTiles, SceneQuestions):
         open_store: OpenStore | None = None,
         radius_model: str | None = None,
         read_points: ReadPoints | None = None,
-        coarse_bytes: int | None = None,
+        level_bytes: int | None = None,
         archive_key: str | Path | None = None,
     ) -> "Scene":
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
@@ -108,7 +108,7 @@ class Scene(SceneTiles, SceneQuestions):
         them itself.
         read_points: returns the points (n, 3) of an avatar's file [m]; None: files are read as by
         `add_avatar`.
-        coarse_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
+        level_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
         tolerance before voxels are loaded; None: a sixteenth, 0: none.
         archive_key: file with the key with which all archives must be sealed, now and at each
         reload; refused with `open_store`. None: do not look at seals (`solidcloud seal`).
@@ -122,7 +122,7 @@ class Scene(SceneTiles, SceneQuestions):
         if is_scene_file(path):
             if open_store is not None or radius_model is not None:
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
-            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes, key)
+            return cls._open_file(path, name, budget_bytes, policy, read_points, level_bytes, key)
         metrics = RequestStats()
         archive = PlacedArchive.open(
             path,
@@ -132,7 +132,7 @@ class Scene(SceneTiles, SceneQuestions):
             open_store=open_store or sealed_store(key),
             radius_model=radius_model,
             took=metrics.loaded,
-            coarse_bytes=coarse_bytes,
+            level_bytes=level_bytes,
         )
         return cls([archive], archive.name, metrics)
 
@@ -144,7 +144,7 @@ class Scene(SceneTiles, SceneQuestions):
         budget_bytes: int,
         policy: str,
         read_points: ReadPoints | None,
-        coarse_bytes: int | None,
+        level_bytes: int | None,
         key: bytes | None,
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
@@ -156,7 +156,7 @@ class Scene(SceneTiles, SceneQuestions):
         metrics = RequestStats()
         with ExitStack() as stack:
             archives = open_archives(
-                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes, key
+                file, path, name, found, budget_bytes, policy, metrics.loaded, level_bytes, key
             )
             for archive in archives:
                 stack.callback(archive.close)

@@ -29,7 +29,6 @@ from .context.query_context import (
     pieces,
     to_units,
 )
-from .context.unloaded_voxels import drop_clear_voxels
 
 
 def collide(
@@ -58,12 +57,11 @@ def collide(
         found[which] = _level_verdicts(level, avatar, array[which], margin_units, budget, spent)
         return np.asarray(found[which] != UNKNOWN)
 
-    by_level, coarse = SettledPoses(data, array, budget, ask), drop_clear_voxels(data, avatar, array)
+    by_level = SettledPoses(data, array, budget, ask)
+    settled = by_level.drop
     if budget.late is not None:
-        coarse = drop_proved_voxels(data, avatar, array, margin_units, budget)
-    verdict, counts, reach = _verdicts(
-        data, avatar, array, margin_units, budget, spent, lambda reach: by_level.drop(coarse(reach))
-    )
+        settled = drop_proved_voxels(data, avatar, array, margin_units, budget)
+    verdict, counts, reach = _verdicts(data, avatar, array, margin_units, budget, spent, settled)
     verdict[by_level.settled] = found[by_level.settled]
     # A load may have proved the index wrong by now.
     if (data.nothing_clear or len(data.unknown)) and len(avatar.points):

@@ -117,7 +117,7 @@ def _pairs(
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            own = bound_missing(seen, held, avatar, poses, part, which, nearest.missing_bound, counts, budget)
+            own = bound_missing(seen, held, avatar, poses, part, which, nearest.missing_bound, counts)
             nearest_poses(
                 poses,
                 avatar.arrays,

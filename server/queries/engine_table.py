@@ -25,7 +25,6 @@ from ...schemas.wire.question_table import (
 )
 from ...schemas.wire.warming_parts import BUDGETS, MOTION
 from ..avatars.avatar_model import AvatarModel, make_avatar
-from ..residency.coarse_bounds import drop_clear_pairs
 from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
@@ -108,17 +107,8 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
     if part in (DISTANCE.name, BUDGETS):
         lacking = HeldVoxels(0, 0, ("not read",))
         reach = check_request(data, avatar, pose, data.radius_units)
-        bound_missing(
-            data,
-            lacking,
-            avatar,
-            pose,
-            reach,
-            np.zeros(1, np.int64),
-            np.zeros(1),
-            np.zeros((3, 1), np.uint32),
-            EXACT,
-        )
+        one, bound, counts = np.zeros(1, np.int64), np.zeros(1), np.zeros((3, 1), np.uint32)
+        bound_missing(data, lacking, avatar, pose, reach, one, bound, counts)
     if part in (RAYCAST.name, WITHIN.name) and data.level is not None:
         spent, origin = CostCounter(0.0, data.residency, data.broad.keys), np.zeros((1, 3), np.int64)
         if part == RAYCAST.name:
@@ -127,11 +117,6 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             bound_points_by_level(data.level, data.radius_units, origin, 1 << 20, EXACT, spent)
     if part == MOTION:
         _warm_late(data, avatar, pose)
-    if part == COLLIDE.name and data.coarse is not None:
-        # A load has stored the coarse bounds of a voxel: test them as if it were not resident.
-        reach = check_request(data, avatar, pose, data.radius_units)
-        nowhere = data.arrays._replace(where=np.full_like(data.arrays.where, -1))
-        drop_clear_pairs(nowhere, data.coarse.arrays, avatar.arrays, pose, reach)
 
 
 def _warm_late(data: SceneData, avatar: AvatarModel, pose: NDArray[np.float64]) -> None:

@@ -1,13 +1,13 @@
 """Bounds of a motion by voxels that are not in memory, for frames that do not wait.
 
 `sweep` sets these voxels aside. They end the motion where the first of them may be touched: by the
-cover spheres of the level of detail, if that is in memory; else by coarse bounds, or the voxel's
-box, by conservative advancement. late_voxels.py does the same for poses.
+cover spheres of the level of detail, if that is in memory; else by the voxel's box, by conservative
+advancement. late_voxels.py does the same for poses.
 """
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,9 @@ from ..kernels.nearest.missing_voxels import split_missing
 from .context.level_of_detail import asked, stoppable
 from .context.query_budget import QueryBudget
 from .context.query_context import SceneData
-from .context.unloaded_voxels import NO_COARSE
 
 # Limit of advances of one motion, and the least share of the motion that an advance must gain.
 _MAX_ADVANCES, _MIN_ADVANCE = 16, 1e-3
-# Most voxels that are bounded by their coarse bounds, some microseconds each an advance.
-_MAX_BOUNDED = 128
 # Rounding of placed points at both ends of an advance [exact units], besides `slip`.
 _ROUNDING = 4.0
 
@@ -112,15 +109,13 @@ def clear_until(
 def _clear_by_bounds(
     data: SceneData, avatar: AvatarModel, motions: Motions, rows: NDArray[np.int64], budget: QueryBudget
 ) -> NDArray[np.float64]:
-    """Return the fraction (k,) up to which voxels are proved clear by coarse bounds or boxes.
+    """Return the fraction (k,) up to which voxels are proved clear by their boxes.
 
     An advance is as long as the gap to the voxels takes at the motion's greatest speed.
     """
     where = data.arrays.where.copy()  # one of them may have been loaded since
     where[rows] = -1
     arrays = data.arrays._replace(where=where)
-    hurried = data.coarse is None or len(rows) > _MAX_BOUNDED
-    coarse: Any = NO_COARSE if hurried else data.coarse.arrays  # type: ignore[union-attr]
     starts, one, origin = np.array([0, len(rows)]), np.zeros(1, np.int64), np.zeros(3)
     left, pose = (np.empty_like(starts), np.empty_like(rows)), np.empty((1, 4, 4))
     until = np.zeros(len(motions.first))
@@ -134,9 +129,7 @@ def _clear_by_bounds(
         for _ in range(_MAX_ADVANCES):
             pose_between(first, last, until[i], motions.box, origin, pose[0])
             bound, counts = np.full(1, math.inf), np.zeros((3, 1), np.uint32)
-            split_missing(
-                pose, avatar.arrays, arrays, data.broad, coarse, reach, one, *left, bound, counts
-            )  # fmt: skip
+            split_missing(pose, avatar.arrays, arrays, data.broad, reach, one, *left, bound, counts)
             gap = (bound[0] * arrays.units_per_step * (1.0 - 1e-12) - held) / UNITS_PER_METRE
             if gap <= 0.0 or budget.stop:
                 break

@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...schemas.errors import CorruptError, MisleadingIndexError
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
@@ -32,9 +31,8 @@ class VoxelCache(CacheFacts):
 
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
     on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
-    on_loaded: called with the row and the runs of each loaded voxel, by the loading thread, before
-    the voxel is visible to other threads.  on_proved: called at the same point with the row of a
-    voxel that matches the index.  on_load_time: called after each load with its duration [s].
+    on_proved: called with the row of each loaded voxel, whose record matches the index, by the loading
+    thread, before the voxel is visible to other threads.  on_load_time: called after each load with its duration [s].
     stats: counts of the cache, written under its lock.
     misled: whether a loaded record contradicts the index. The index selects the voxels of a query;
     once it is wrong, it may have failed to select any voxel.
@@ -57,7 +55,6 @@ class VoxelCache(CacheFacts):
         self.buffer = ArenaBuffer(budget_bytes)
         self.where = np.full((len(store.sizes), 3), -1, np.int64)
         self.on_owed: Callable[[], None] | None = None
-        self.on_loaded: Callable[[int, NDArray[np.int64]], None] | None = None
         self.on_load_time: Callable[[float], None] | None = None
         self.on_proved: Callable[[int], None] | None = None
         self.misled = False
@@ -302,8 +299,6 @@ class VoxelCache(CacheFacts):
             where = self._store.load(row, self.buffer.arena, self._states.allocator.offsets[row])
             if self.on_proved is not None:
                 self.on_proved(row)
-            if self.on_loaded is not None:
-                self.on_loaded(row, where)  # before `end_load`, after which it may be evicted
         except CorruptError as error:
             fault, corrupt = str(error), True
             self.misled |= isinstance(error, MisleadingIndexError)

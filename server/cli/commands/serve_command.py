@@ -25,7 +25,7 @@ def serve(
             autocompletion=among("lru", "lru+prefetch", "distance", "s3fifo"),
         ),
     ] = "lru+prefetch",
-    coarse_bytes: Annotated[
+    level_bytes: Annotated[
         str | None,
         typer.Option(
             help="The part of --cache for levels of detail, such as 64MB; default: a sixteenth. 0B: use none."
@@ -125,7 +125,7 @@ def serve(
         max_avatar_clients=max_avatar_clients,
     )
     budget = parse_bytes(cache, "--cache")
-    coarse = None if coarse_bytes is None else parse_bytes(coarse_bytes, "--coarse-bytes")
+    level = None if level_bytes is None else parse_bytes(level_bytes, "--level-bytes")
     if archive_key is not None:
         read_archive_key(archive_key)
     if key_file is not None:
@@ -140,7 +140,7 @@ def serve(
         start.enter_context(warmed_in_parallel(what))
         scene = stack.enter_context(
             Scene.open(
-                what, name, budget_bytes=budget, policy=policy, coarse_bytes=coarse, archive_key=archive_key
+                what, name, budget_bytes=budget, policy=policy, level_bytes=level, archive_key=archive_key
             )
         )
         if log is not None:

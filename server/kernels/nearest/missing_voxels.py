@@ -1,8 +1,4 @@
-"""Lower bounds of the distance from voxels that are not in memory.
-
-The index bounds a voxel by a box. Coarse bounds, where they are stored, bound it by up to 128 nodes
-(kernels/collide/coarse_clearance.py), which follow its surfaces.
-"""
+"""Lower bounds of the distance from voxels that are not in memory, by their boxes in the index."""
 
 import math
 
@@ -10,12 +6,8 @@ import numpy as np
 
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.node_overlap import make_thresholds
-from ..core.placed_avatar import make_front, make_placed, place_front, place_root
-from ..core.scene_arrays import ROW_WORDS, ROWS_AT_ONCE, stopped
-from .nearest_pair import lower_bound
-
-U = np.uint64  # see placed_avatar.py
+from ..core.placed_avatar import make_placed, place_root
+from ..core.scene_arrays import ROWS_AT_ONCE, stopped
 
 
 @njit_no_refcount
@@ -35,44 +27,19 @@ def box_distance(root, placed, farthest, scene, index, voxel):
     return max(math.sqrt(square) * (1.0 - 1e-9) - root / scene.step * (1.0 + 1e-9) - error, 0.0)
 
 
-@njit_no_refcount
-def _coarse_gap(words, row, nodes, bounds, front, off, root):
-    """Return a lower bound of the distance of the avatar's points from any of `nodes` rows [steps].
-
-    words, row: of the slot.  bounds: (4, ...) float32, the avatar's front, `front` nodes.  off:
-    (3,) float32, from the frame to the voxel's low corner.  root: (4,) float32, the avatar's root.
-    The errors of placed coordinates are not included.
-    """
-    x, y, z = off[0], off[1], off[2]
-    gap = np.float32(np.inf)
-    for _ in range(nodes):
-        if lower_bound(words, row, root[0] - x, root[1] - y, root[2] - z, root[3]) < gap:
-            for i in range(front):
-                u = U(i)
-                near = lower_bound(
-                    words, row, bounds[0, u] - x, bounds[1, u] - y, bounds[2, u] - z, bounds[3, u]
-                )
-                gap = min(gap, near)
-        row += ROW_WORDS
-    return gap
-
-
 @nb.njit(nogil=True, cache=True)
-def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, rows, missing_bound, counts):
+def split_missing(poses, avatar, scene, index, reach, which, starts, rows, missing_bound, counts):
     """Separate the voxels in reach that are not resident, and bound their distance.
 
-    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses.  coarse:
-    CoarseArrays, perhaps without slots.  which: ascending numbers of poses.
+    poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses.
+    which: ascending numbers of poses.
     Writes starts (k + 1,) and rows, as long as those of `reach`: the resident voxels of the poses
     in `which`, in the same order, and none for other poses. For each pose in `which`, adds the
     number of the other voxels to counts[0] (3, k) uint32, and lowers missing_bound (k,) float64
     [steps] to their distance from the avatar's centres. Once the scene's stop flag is set, all
     voxels of the remaining poses count as missing, at distance 0.
     """
-    placed, front = make_placed(avatar), make_front(avatar)
-    root, off = np.empty(4, np.float32), np.empty(3, np.float32)
-    slots = coarse.count.shape[0]
-    slot_words = coarse.words.shape[0] // max(slots, 1)
+    placed = make_placed(avatar)
     left, number, ended = 0, 0, False
     for i in range(poses.shape[0]):
         starts[i] = left
@@ -85,7 +52,7 @@ def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, row
             counts[0, i] += np.uint32(reach.starts[i + 1] - reach.starts[i])
             continue
         m, scale = poses[i], reach.scales[i]
-        length, error, farthest = 0, 0.0, 0.0  # the front is not placed yet
+        farthest, is_placed = 0.0, False
         for at in range(reach.starts[i], reach.starts[i + 1]):
             if ended or (at % ROWS_AT_ONCE == 0 and stopped(scene.stop)):
                 ended = True
@@ -97,26 +64,10 @@ def split_missing(poses, avatar, scene, index, coarse, reach, which, starts, row
                 rows[left] = voxel
                 left += 1
                 continue
-            if length == 0:
-                extent, farthest = place_root(avatar, m, scale, placed, scene)
-                length = place_front(avatar, m, scale, placed, scene, extent, front.bounds)
-                thresholds = make_thresholds(
-                    reach.units[i], scene.units_per_step, extent, farthest, scene.voxel_steps
-                )
-                error = np.float64(thresholds.error)
-                for r in range(4):
-                    root[r] = placed.nodes[r, 0]
+            if not is_placed:
+                _, farthest = place_root(avatar, m, scale, placed, scene)
+                is_placed = True
             gap = box_distance(avatar.radius[0] * scale, placed, farthest, scene, index, voxel)
-            ended = stopped(scene.stop)  # the nodes of a voxel take some microseconds
-            if slots > 0 and coarse.slot[voxel] >= 0 and not ended:
-                slot = np.int64(coarse.slot[voxel])
-                for r in range(3):
-                    low = scene.coordinates[voxel, r] * scene.voxel_steps
-                    off[r] = np.float32(low - placed.frame[r])
-                nodes = _coarse_gap(
-                    coarse.words, slot * slot_words, coarse.count[slot], front.bounds, length, off, root
-                )  # fmt: skip
-                gap = max(gap, np.float64(nodes) - error)
             counts[0, i] += np.uint32(1)
             missing_bound[i] = min(missing_bound[i], gap)
     starts[poses.shape[0]] = left

@@ -31,7 +31,7 @@ from ...runtime.stop_flag import StopFlag
 from .query_budget import CostCounter, QueryBudget
 from .query_context import SceneData, as_held, find_proved_reach, in_unknown, kernel_poses, pieces, to_units
 from .signed_distance import distance_columns, signed_bound, signed_from_square, unknown_gaps
-from .unloaded_voxels import bound_missing, drop_clear_voxels
+from .unloaded_voxels import bound_missing
 
 # Capacity of the heap [pairs], beyond which the search is depth first: half a megabyte a request.
 HEAP_PAIRS = 1 << 14
@@ -147,7 +147,7 @@ def _gather(
         heap = max(HEAP_PAIRS, int(np.diff(part.starts).max(initial=0)))
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            part = bound_missing(seen, held, avatar, array, part, which, known.missing_bound, counts, budget)
+            part = bound_missing(seen, held, avatar, array, part, which, known.missing_bound, counts)
             if budget.deadline < math.inf:
                 _search_until(seen, avatar, array, part, which, heap, goal, budget, known, counts)
             else:
@@ -211,10 +211,7 @@ def collide_bounded(
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
-    # Without a deadline all voxels are loaded, and answers must not depend on what was resident.
-    late = budget.deadline < math.inf
-    clear = drop_clear_voxels(data, avatar, array) if late else lambda reach: reach
-    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent, clear)
+    around = find_proved_reach(data, avatar, array, data.radius_units + margin_units, budget, spent)
     radii = around.units - margin_units
     early = budget.tolerance_units
     # Both sides of the comparison are float64 sums: some units of slack make it valid for the exact

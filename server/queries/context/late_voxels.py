@@ -1,7 +1,7 @@
 """Voxels that a frame does not wait for: what proves it clear of them without a load.
 
 A budget with `late` loads nothing. A voxel that is not in memory is bounded by the level of detail,
-where that is in memory; else by its coarse bounds; else by its box. All points of a voxel lie within
+where that is in memory; else by its box. All points of a voxel lie within
 the cover spheres of the level's voxels that divide it, so a pose that is clear of these is clear of
 the voxel. Voxels that this does not settle are missing, and their loads are owed.
 """
@@ -19,7 +19,6 @@ from ...kernels.core.voxels_in_reach import VoxelsInReach
 from .level_of_detail import asked, stoppable
 from .query_budget import NO_LIMIT, QueryBudget
 from .query_context import LevelOfDetail, SceneData, as_held, check_request
-from .unloaded_voxels import drop_clear_voxels
 
 
 def drop_proved_voxels(
@@ -35,12 +34,10 @@ def drop_proved_voxels(
     poses: (k, 4, 4) float64, those of the reach.  margin_units: part of the reach beyond the radii
     of avatar and scan, exact units.
     """
-    coarse = drop_clear_voxels(data, avatar, poses)
 
     def drop(reach: VoxelsInReach) -> VoxelsInReach:
         if budget.late is None or not len(avatar.points):
             return reach
-        reach = coarse(reach)
         rows = reach.rows[: reach.starts[-1]]
         absent = np.flatnonzero(data.arrays.where[rows, 0] < 0)
         if data.level is None or not len(absent) or budget.stop:

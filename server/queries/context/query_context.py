@@ -25,7 +25,6 @@ from ...kernels.core import voxels_in_reach as pose_checks
 from ...kernels.core.array_references import SceneReferences
 from ...kernels.core.scene_arrays import SceneArrays, block_words
 from ...kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
-from ...residency.coarse_bounds import CoarseBounds
 from ...residency.index_proof import ProvedBounds
 from ...residency.voxel_cache import VoxelCache
 from ...residency.voxel_states import HeldVoxels
@@ -93,7 +92,6 @@ class SceneData(NamedTuple):
     unknown_everywhere: whether the build left out a scan with unknown bounds.
     keeps_scan: whether the arena stores the scan of each point.
     references: of the data with these radii, for kernels that are called once a pose.
-    coarse: coarse bounds of voxels that are not in memory; None if the scene has none.
     level: its level of detail; None if it has none.
     """
 
@@ -106,7 +104,6 @@ class SceneData(NamedTuple):
     unknown_everywhere: bool
     keeps_scan: bool
     references: SceneReferences
-    coarse: CoarseBounds | None = None
     level: LevelOfDetail | None = None
 
     @property
@@ -137,12 +134,7 @@ def to_units(metres: float, what: str) -> int:
     return round(metres * UNITS_PER_METRE)  # half to even
 
 
-def make_scene_data(
-    archive: Archive,
-    residency: VoxelCache,
-    bounds: ProvedBounds | None = None,
-    coarse: CoarseBounds | None = None,
-) -> SceneData:
+def make_scene_data(archive: Archive, residency: VoxelCache, bounds: ProvedBounds | None = None) -> SceneData:
     """Make the data of an archive whose voxels `residency` holds, with the archive's single radius.
 
     bounds: proved bounds shared with other data of the archive; None: new ones. Each load from now
@@ -166,7 +158,7 @@ def make_scene_data(
     )
     return SceneData(
         residency, arrays, bounds, bounds.index, to_units(header.radius, "radius of the archive"), header.unknown,
-        header.unknown_everywhere, header.scan_index, SceneReferences(), coarse,
+        header.unknown_everywhere, header.scan_index, SceneReferences(),
     )  # fmt: skip
 
 

@@ -224,7 +224,7 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
             scene.add_avatar("avatar", avatar, 0.005, client=client)
             options: QuestionOptions = {"budget_ms": 0.0} if number % 3 == 0 else {}
             answers = scene.collide("avatar", poses[part], client=client, **options)
-            over.append(scene.stats().resident_bytes + scene.stats().coarse_bytes > everything // 6)
+            over.append(scene.stats().resident_bytes + scene.stats().level_bytes > everything // 6)
             late = answers.verdict == Verdict.UNKNOWN
             unknown.append(int(late.sum()))
             assert not late.any() or options

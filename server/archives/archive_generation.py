@@ -21,7 +21,7 @@ from ..avatars.avatar_model import AvatarModel
 from ..queries.context.level_of_detail import open_level_data, with_level
 from ..queries.context.query_context import SceneData, make_scene_data, with_radius_model
 from ..queries.engine_table import warm_engines
-from ..residency.eviction import make_policy, prefetches
+from ..residency.eviction import EvictionPolicy, prefetches
 from ..residency.index_proof import ProvedBounds
 from ..residency.level_store import level_filler, open_level_store
 from ..residency.motion_prediction import User, UserTracks
@@ -116,7 +116,7 @@ class ArchiveGeneration:
         residency = VoxelCache(
             store,
             budget_bytes,
-            make_policy(policy, budget_bytes, around.path_distances),
+            EvictionPolicy(budget_bytes, policy),
             # What was given to the level may leave too little for a voxel.
             refuse_large=self._level is None or not level_given,
         )

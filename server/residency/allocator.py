@@ -224,7 +224,7 @@ class VoxelAllocator:
 
     def _evict(self, row: int, gone: Callable[[int], None]) -> None:
         self.evictions += 1
-        self.forget(row, evicted=True)
+        self.forget(row)
         gone(row)
 
     def evict_all_but(self, rows: Collection[int], gone: Callable[[int], None]) -> None:
@@ -236,14 +236,14 @@ class VoxelAllocator:
             self._move(row, offset, to)
             to += self.sizes[row]
 
-    def forget(self, row: int, *, evicted: bool = False) -> None:
+    def forget(self, row: int) -> None:
         """Release a voxel's run."""
         self.where[row] = -1
         offset = self.offsets.pop(row)
         del self._runs[bisect.bisect_left(self._runs, (offset, row))]
         self.buffer.release(offset, self.sizes[row])
         self.used_bytes -= self.sizes[row]
-        self.policy.removed(row, evicted=evicted)
+        self.policy.removed(row)
 
     def check(self) -> None:
         """Assert that the runs tile the buffer and that their bytes add up."""

@@ -10,7 +10,6 @@ from typing import NamedTuple
 from ...schemas.archive.level import open_level
 from ...schemas.errors import BadRequestError
 from .arena import ArenaBuffer
-from .eviction import make_policy
 from .voxel_cache import VoxelCache
 from .voxel_store import VoxelStore
 
@@ -56,7 +55,7 @@ def open_level_store(store: VoxelStore, budget_bytes: int, level_bytes: int | No
     if most < largest or budget_bytes - most < left:
         found.close()
         return None
-    return LevelStore(found, VoxelCache(found, most, make_policy("lru", most)), most)
+    return LevelStore(found, VoxelCache(found, most), most)
 
 
 def _all_bytes(store: VoxelStore) -> int:

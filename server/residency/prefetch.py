@@ -131,7 +131,6 @@ class Prefetcher:
             self._running_requests = None
             tracks.plan(self._clock(), 0.0)
             tracks.kept(self._clock())
-            tracks.path_distances([0])
             tracks.leave(user)
             tracks.plan(self._clock(), 0.0)
 

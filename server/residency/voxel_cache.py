@@ -20,7 +20,7 @@ import numpy as np
 from ...schemas.errors import CorruptError, MisleadingIndexError
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
 from .arena import ArenaBuffer
-from .eviction import EvictionPolicy, make_policy
+from .eviction import EvictionPolicy
 from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
 from .voxel_states import BackgroundLoad, CacheFacts, HeldVoxels, Hold, VoxelStates, voxel_sizes
 from .voxel_store import VoxelStore
@@ -60,7 +60,7 @@ class VoxelCache(CacheFacts):
         self.misled = False
         self._store = store
         self._sizes = [size if size <= budget_bytes else 0 for size in sizes]
-        self.policy = policy or make_policy("lru", budget_bytes)
+        self.policy = policy or EvictionPolicy(budget_bytes)
         self._states = VoxelStates(self.buffer, self._sizes, self.where, self.policy, store.archive.where)
         self._states.refuse_larger(sizes, budget_bytes)
         self.stats = self._states.stats

@@ -21,8 +21,8 @@ def serve(
     policy: Annotated[
         str,
         typer.Option(
-            help="Eviction policy of the voxel cache: lru, lru+prefetch, distance or s3fifo. All but lru prefetch.",
-            autocompletion=among("lru", "lru+prefetch", "distance", "s3fifo"),
+            help="Eviction policy of the voxel cache: lru, or lru+prefetch, which also loads voxels ahead of users.",
+            autocompletion=among("lru", "lru+prefetch"),
         ),
     ] = "lru+prefetch",
     level_bytes: Annotated[

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from solidcloud.server.residency.allocator import VoxelAllocator
 from solidcloud.server.residency.arena import ALIGNMENT as BLOCK
 from solidcloud.server.residency.arena import ArenaBuffer
-from solidcloud.server.residency.eviction import make_policy
+from solidcloud.server.residency.eviction import EvictionPolicy
 
 
 class Filled:
@@ -16,7 +16,7 @@ class Filled:
         self.buffer = ArenaBuffer(budget * BLOCK)
         self.where = np.full((len(sizes), 3), -1, np.int64)
         self.room = VoxelAllocator(
-            self.buffer, [s * BLOCK for s in sizes], self.where, make_policy("lru", budget * BLOCK)
+            self.buffer, [s * BLOCK for s in sizes], self.where, EvictionPolicy(budget * BLOCK)
         )
         self.gone: list[int] = []
 

@@ -25,7 +25,7 @@ from ...schemas.wire.question_table import (
 )
 from ...schemas.wire.warming_parts import BUDGETS, MOTION
 from ..avatars.avatar_model import AvatarModel, make_avatar
-from ..residency.voxel_states import HeldVoxels
+from ..residency.voxel_cache import HeldVoxels
 from .collide import collide
 from .contacts import contacts
 from .context.query_budget import EXACT, CostCounter, LateVoxels, QueryBudget

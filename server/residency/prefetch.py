@@ -16,8 +16,7 @@ from typing import Self
 
 from ..runtime.threads import start_loop
 from .motion_prediction import User, UserTracks
-from .voxel_cache import VoxelCache
-from .voxel_states import BackgroundLoad
+from .voxel_cache import BackgroundLoad, VoxelCache
 
 log = logging.getLogger(__name__)
 

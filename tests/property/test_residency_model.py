@@ -9,8 +9,7 @@ from fake_store import BLOCK, FakeStore
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from solidcloud.server.residency.voxel_cache import VoxelCache
-from solidcloud.server.residency.voxel_states import BackgroundLoad, HeldVoxels
+from solidcloud.server.residency.voxel_cache import BackgroundLoad, HeldVoxels, VoxelCache
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9
@@ -42,7 +41,6 @@ class ResidencyMachine(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.store = FakeStore(SIZES)
-
         self.residency = VoxelCache(self.store, BUDGET * BLOCK)
         self.residency.on_owed = lambda: None
         self.residency._changed.wait = _refuse  # type: ignore[method-assign,assignment]

@@ -26,8 +26,7 @@ from ...kernels.core.array_references import SceneReferences
 from ...kernels.core.scene_arrays import SceneArrays, block_words
 from ...kernels.core.voxels_in_reach import SceneIndex, VoxelsInReach, find_reach
 from ...residency.index_proof import ProvedBounds
-from ...residency.voxel_cache import VoxelCache
-from ...residency.voxel_states import HeldVoxels
+from ...residency.voxel_cache import HeldVoxels, VoxelCache
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .query_budget import CostCounter, QueryBudget
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from ...avatars.avatar_model import AvatarModel
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...kernels.nearest.missing_voxels import split_missing
-from ...residency.voxel_states import HeldVoxels
+from ...residency.voxel_cache import HeldVoxels
 from .query_context import SceneData
 
 

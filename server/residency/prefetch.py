@@ -130,6 +130,7 @@ class Prefetcher:
             self._running_requests = None
             tracks.plan(self._clock(), 0.0)
             tracks.kept(self._clock())
+            tracks.path_distances([0])
             tracks.leave(user)
             tracks.plan(self._clock(), 0.0)
 

@@ -1,4 +1,4 @@
-"""Arena: one buffer that holds all resident voxels; its free runs, and which voxel has which run.
+"""Arena: one buffer that holds all resident voxels, and the assignment of its bytes to them.
 
 Not thread-safe: `VoxelCache` calls it under its lock.
 """
@@ -32,10 +32,8 @@ SLACK = 1 / 32
 
 
 class ArenaBuffer:
-    """Best-fit allocator of a buffer of fixed size.
+    """Buffer of fixed size.
 
-    A run is a contiguous range of bytes. An allocation takes the shortest free run that suffices;
-    of equals, the one at the lowest offset.
     arena: array views that kernels read. The system commits pages when they are first written, so a
     large budget takes no memory until it is used.
     """
@@ -47,74 +45,19 @@ class ArenaBuffer:
         start = -raw.ctypes.data % ALIGNMENT
         buffer = raw[start : start + self.total_bytes]
         self.arena = Arena(buffer.view(np.float32), buffer.view(np.int32), buffer.view(np.uint16))
-        self._free: list[tuple[int, int]] = []  # (offset, bytes), ascending, never adjacent
-        self._by_size: list[tuple[int, int]] = []  # the same as (bytes, offset), ascending
-        if self.total_bytes:
-            self._put(0, 0, self.total_bytes)
 
     @staticmethod
     def rounded(size: int) -> int:
         """Return the bytes that a run of `size` bytes takes: whole cache lines."""
         return -(-size // ALIGNMENT) * ALIGNMENT
 
-    def allocate(self, size: int) -> int | None:
-        """Allocate a run of `size` bytes and return its offset, or None if no free run suffices."""
-        size = self.rounded(size)
-        at = bisect.bisect_left(self._by_size, (size, -1))
-        if at == len(self._by_size):
-            return None
-        offset = self._by_size[at][1]
-        self.take(offset, size)
-        return offset
-
-    def take(self, offset: int, size: int) -> None:
-        """Allocate the run of `size` bytes at `offset`, all of which is free."""
-        size = self.rounded(size)
-        i = bisect.bisect_right(self._free, (offset, self.total_bytes)) - 1
-        start, free = self._drop(i)
-        behind = start + free - offset - size
-        if behind:
-            self._put(i, offset + size, behind)
-        if offset > start:
-            self._put(i, start, offset - start)
-
-    def release(self, offset: int, size: int) -> None:
-        """Release an allocated run, joining it to its free neighbours."""
-        size = self.rounded(size)
-        i = bisect.bisect_left(self._free, (offset, 0))
-        if i < len(self._free) and offset + size == self._free[i][0]:
-            size += self._drop(i)[1]
-        if i > 0 and sum(self._free[i - 1]) == offset:
-            i -= 1
-            offset, before = self._drop(i)
-            size += before
-        self._put(i, offset, size)
-
-    def _put(self, i: int, offset: int, size: int) -> None:
-        """Insert a free run at position `i` in the order of offsets."""
-        self._free.insert(i, (offset, size))
-        bisect.insort(self._by_size, (size, offset))
-
-    def _drop(self, i: int) -> tuple[int, int]:
-        """Remove the free run at position `i` in the order of offsets, and return it."""
-        offset, size = self._free.pop(i)
-        del self._by_size[bisect.bisect_left(self._by_size, (size, offset))]
-        return offset, size
-
-    def largest_run(self) -> tuple[int, int]:
-        """Return the longest free run (offset, bytes), the last of equals; (-1, 0) if none."""
-        size, offset = self._by_size[-1] if self._by_size else (0, -1)
-        return offset, size
-
-    def free_runs(self) -> list[tuple[int, int]]:
-        """Return the free runs (offset, bytes), ascending."""
-        return list(self._free)
-
 
 class VoxelAllocator:
     """Allocation of the arena's bytes to the voxels that are resident or loading.
 
-    It evicts and moves voxels to make room. A run is a contiguous range of bytes.
+    It evicts and moves voxels to make room. A run is the contiguous range of bytes of a voxel, a gap
+    the free bytes between two runs. A voxel gets the beginning of the shortest gap that suffices; of
+    equals, of the one at the lowest offset.
     offsets: row -> byte offset.  used_bytes: the total of all runs.
     where: (v, 3) int64, see `VoxelCache`.  sizes: bytes of each row, rounded with
     `ArenaBuffer.rounded`.  pins, loading: rows in use, which are neither evicted nor moved.
@@ -137,6 +80,8 @@ class VoxelAllocator:
         self.used_bytes = 0
         self._address = buffer.arena.halves.ctypes.data
         self._runs: list[tuple[int, int]] = []  # (offset, row), ascending
+        self._gaps: list[tuple[int, int]] = []  # (bytes, offset), ascending, of those with bytes
+        self._add_gap(0)
 
     def allocate(
         self, row: int, keeps: Callable[[int], bool], *, scan: bool, most: int | None = None
@@ -149,19 +94,72 @@ class VoxelAllocator:
         most: limit of rows examined to find victims; None: all rows.
         Nothing is evicted if evicting everything allowed would free too few bytes. If free bytes
         are fragmented, more voxels are evicted than the size requires. If voxels that must stay lie
-        between the free runs, the allocation may fail although voxels were evicted.
+        between the gaps, the allocation may fail although voxels were evicted.
         """
         size = self.sizes[row]
-        offset = self.buffer.allocate(size)
+        offset = self._best_fit(size)
         if offset is None:
             offset = self._clear(size, keeps, most)
         if offset is None:
             return False
+        number = bisect.bisect_left(self._runs, (offset, row))
+        self._drop_gap(number)
+        self._runs.insert(number, (offset, row))
+        self._add_gap(number + 1)
         self.offsets[row] = offset
-        bisect.insort(self._runs, (offset, row))
         self.used_bytes += size
         self.policy.added(row, size, scan=scan)
         return True
+
+    def forget(self, row: int) -> int:
+        """Release a voxel's run; return its offset."""
+        self.where[row] = -1
+        offset = self.offsets.pop(row)
+        number = bisect.bisect_left(self._runs, (offset, row))
+        self._drop_gap(number)
+        self._drop_gap(number + 1)
+        del self._runs[number]
+        self._add_gap(number)
+        self.used_bytes -= self.sizes[row]
+        self.policy.removed(row)
+        return offset
+
+    def evict_all_but(self, rows: Collection[int]) -> None:
+        """Evict all voxels but these and move these together; none may be in use or loading."""
+        for row in [row for row in self.offsets if row not in rows]:
+            self._evict(row)
+        self._pack(0, len(self._runs))
+
+    # --- gaps ---
+
+    def _gap(self, number: int) -> tuple[int, int]:
+        """Return the gap before a run, or behind the last one: (bytes, offset)."""
+        low, high = 0, self.buffer.total_bytes
+        if number:
+            offset, row = self._runs[number - 1]
+            low = offset + self.sizes[row]
+        if number < len(self._runs):
+            high = self._runs[number][0]
+        return high - low, low
+
+    def _add_gap(self, number: int) -> None:
+        """List the gap before a run."""
+        gap = self._gap(number)
+        if gap[0]:
+            bisect.insort(self._gaps, gap)
+
+    def _drop_gap(self, number: int) -> None:
+        """Remove the gap before a run from the list, before one of its ends changes."""
+        gap = self._gap(number)
+        if gap[0]:
+            del self._gaps[bisect.bisect_left(self._gaps, gap)]
+
+    def _best_fit(self, size: int) -> int | None:
+        """Return the offset of the gap for `size` bytes; None if none suffices."""
+        at = bisect.bisect_left(self._gaps, (size, -1))
+        return self._gaps[at][1] if at < len(self._gaps) else None
+
+    # --- room for a voxel ---
 
     def _is_free(self, row: int) -> bool:
         """Return whether no thread uses or loads a voxel."""
@@ -172,12 +170,17 @@ class VoxelAllocator:
         rows = islice(self.policy.victims(), most)
         return (row for row in rows if self._is_free(row) and not keeps(row))
 
+    def _evict(self, row: int) -> int:
+        """Evict a voxel; return the offset of its run."""
+        self.stats.count_eviction(row)
+        return self.forget(row)
+
     def _clear(self, size: int, keeps: Callable[[int], bool], most: int | None) -> int | None:
         """Evict and move voxels for a run of `size` bytes; return its offset, or None on failure.
 
-        See `allocate` for the parameters. Free runs are joined around the last victim and around
-        the largest free run. While that does not suffice, more voxels are evicted, up to SLACK of
-        the buffer. After that, all runs are searched.
+        See `allocate` for the parameters. Gaps are joined around the last victim and around the
+        largest gap. While that does not suffice, more voxels are evicted, up to SLACK of the buffer.
+        After that, all runs are searched.
         """
         free, needed = self.buffer.total_bytes - self.used_bytes, list[int]()
         victims = self._victims(keeps, most)
@@ -201,132 +204,88 @@ class VoxelAllocator:
             free = self.buffer.total_bytes - self.used_bytes
             if not more or free >= all_at:
                 all_at = free + slack
-                offset = self._join(size, slice(0, len(self._runs)))
+                offset = self._join(size, 0, len(self._runs))
                 if offset is not None or not more:
                     return offset
-            near = self._evict(more.popleft())  # pinned voxels may separate it from the other free runs
+            near = self._evict(more.popleft())  # pinned voxels may separate it from the other gaps
 
     def _join_around(self, size: int, near: int) -> int | None:
-        """Allocate a run of `size` bytes, moving voxels together near an offset if needed.
+        """Make a gap of `size` bytes, moving voxels together near an offset if needed.
 
-        Search around the offset `near`, unless it is negative, and around the largest free run.
-        Return the run's offset, or None if there are too few free bytes.
+        Search around the offset `near`, unless it is negative, and around the largest gap. Return
+        the gap's offset, or None if there are too few free bytes.
         """
-        offset = self.buffer.allocate(size)
+        offset = self._best_fit(size)
         if offset is not None:
             return offset
-        looked = slice(0, 0)
-        largest, _ = self.buffer.largest_run()
+        looked, runs = (0, 0), self._runs
+        largest = self._gaps[-1][1] if self._gaps else -1
         for place in (near, largest) if near >= 0 else (largest,):
-            at = bisect.bisect_left(self._runs, (place, -1))
-            low = bisect.bisect_left(self._runs, (place - AROUND_SIZES * size, -1))
-            high = bisect.bisect_left(self._runs, (place + AROUND_SIZES * size, -1))
-            some = slice(max(0, min(at - AROUND, low)), min(len(self._runs), max(at + AROUND, high)))
-            if some == looked:
-                continue
-            offset, looked = self._join(size, some), some
-            if offset is not None:
-                return offset
+            at = bisect.bisect_left(runs, (place, -1))
+            low = bisect.bisect_left(runs, (place - AROUND_SIZES * size, -1))
+            high = bisect.bisect_left(runs, (place + AROUND_SIZES * size, -1))
+            some = max(0, min(at - AROUND, low)), min(len(runs), max(at + AROUND, high))
+            if some != looked:
+                offset, looked = self._join(size, *some), some
+                if offset is not None:
+                    return offset
         return None
 
-    def _join(self, size: int, some: slice) -> int | None:
-        """Join free bytes within a slice of the runs, in order of offset, and allocate `size`.
+    def _join(self, size: int, low: int, high: int) -> int | None:
+        """Make a gap of `size` bytes among the runs `low` to `high` - 1 by moving voxels together.
 
         Of the stretches with `size` free bytes and only movable voxels, choose the one with the
-        fewest bytes to move. Return the run's offset, or None if there is no such stretch.
+        fewest bytes to move. Return the gap's offset, or None if there is no such stretch.
         """
-        runs = self._runs[some]
-        low = self._end(some.start - 1) if some.start else 0
-        high = self._runs[some.stop][0] if some.stop < len(self._runs) else self.buffer.total_bytes
         best, moves = None, 0
         # The stretch begins at run `begin`; `free` and `held` are its free and used bytes.
-        begin, at, free, held = 0, low, 0, 0
-        first = low
-        for number, (offset, row) in enumerate([*runs, (high, -1)]):
-            free += offset - at
+        begin, free, held = low, 0, 0
+        for number in range(low, high + 1):
+            free += self._gap(number)[0]
             while free >= size:
                 if best is None or held < moves:
-                    best, moves = (first, begin, number), held
-                # Shorten the stretch from its beginning.
+                    best, moves = (begin, number), held
                 if begin == number:
                     break
-                start, gone = runs[begin]
-                free -= start - first
-                held -= self.sizes[gone]
-                first, begin = start + self.sizes[gone], begin + 1
-            if row < 0:
+                # Shorten the stretch from its beginning.
+                free -= self._gap(begin)[0]
+                held -= self.sizes[self._runs[begin][1]]
+                begin += 1
+            if number == high:
                 break
-            at = offset + self.sizes[row]
+            row = self._runs[number][1]
             if self._is_free(row):
                 held += self.sizes[row]
             else:
-                begin, first, free, held = number + 1, at, 0, 0
-        if best is None:
-            return None
-        to, begin, end = best
-        for offset, row in runs[begin:end]:
-            self._move(row, offset, to)
-            to += self.sizes[row]
-        return self.buffer.allocate(size)
+                begin, free, held = number + 1, 0, 0
+        return None if best is None else self._pack(*best)
 
-    def _end(self, number: int) -> int:
-        """Return the offset of the end of a run."""
-        offset, row = self._runs[number]
-        return offset + self.sizes[row]
-
-    def _move(self, row: int, offset: int, to: int) -> None:
-        """Move a voxel to a lower offset `to`, and update its row of `where`.
+    def _pack(self, begin: int, end: int) -> int:
+        """Move the voxels of runs `begin` to `end` - 1 together; return the offset of the gap behind.
 
         A row of `where` counts from the start of the arena in words, words and halfwords.
         """
-        size = self.sizes[row]
-        if to == offset:
-            return
-        ctypes.memmove(self._address + to, self._address + offset, size)
-        self.buffer.release(offset, size)
-        self.buffer.take(to, size)
-        # The order of the runs stays, because a voxel moves into the free bytes before it.
-        self._runs[bisect.bisect_left(self._runs, (offset, row))] = (to, row)
-        self.offsets[row] = to
-        shift = offset - to
-        self.where[row] -= (shift // 4, shift // 4, shift // 2)
-        self.stats.moved_bytes += size
-
-    def _evict(self, row: int) -> int:
-        """Evict a voxel; return the offset of its run."""
-        self.stats.count_eviction(row)
-        return self.forget(row)
-
-    def evict_all_but(self, rows: Collection[int]) -> None:
-        """Evict all voxels but these and move these together; none may be in use or loading."""
-        for row in [row for row in self.offsets if row not in rows]:
-            self._evict(row)
-        to = 0
-        for offset, row in list(self._runs):
-            self._move(row, offset, to)
-            to += self.sizes[row]
-
-    def forget(self, row: int) -> int:
-        """Release a voxel's run; return its offset."""
-        self.where[row] = -1
-        offset = self.offsets.pop(row)
-        del self._runs[bisect.bisect_left(self._runs, (offset, row))]
-        self.buffer.release(offset, self.sizes[row])
-        self.used_bytes -= self.sizes[row]
-        self.policy.removed(row)
-        return offset
+        to = self._gap(begin)[1]
+        for number in range(begin, end + 1):
+            self._drop_gap(number)
+        for number in range(begin, end):
+            offset, row = self._runs[number]
+            shift, size = offset - to, self.sizes[row]
+            if shift:
+                ctypes.memmove(self._address + to, self._address + offset, size)
+                self._runs[number] = (to, row)
+                self.offsets[row] = to
+                self.where[row] -= (shift // 4, shift // 4, shift // 2)
+                self.stats.moved_bytes += size
+            to += size
+        self._add_gap(end)
+        return to
 
     def check(self) -> None:
-        """Assert that the runs tile the buffer and that their bytes add up."""
-        held = sum(self.sizes[row] for row in self.offsets)
-        runs = sorted(
-            [(offset, self.sizes[row]) for row, offset in self.offsets.items()] + self.buffer.free_runs()
-        )
-        assert held == self.used_bytes <= self.buffer.total_bytes, (held, self.used_bytes)
-        at = 0
-        for offset, size in runs:
-            assert offset == at, (offset, at)
-            at += size
-        assert at == self.buffer.total_bytes
+        """Assert that runs and gaps tile the buffer and that their bytes add up."""
         assert self._runs == sorted((offset, row) for row, offset in self.offsets.items())
+        gaps = [self._gap(number) for number in range(len(self._runs) + 1)]
+        assert all(size >= 0 for size, _ in gaps) and self._gaps == sorted(gap for gap in gaps if gap[0])
+        assert self.used_bytes == sum(self.sizes[row] for row in self.offsets)
+        assert self.used_bytes + sum(size for size, _ in gaps) == self.buffer.total_bytes
         assert sorted(self.policy.victims()) == sorted(self.offsets)

@@ -1,7 +1,6 @@
-"""The arena: runs never overlap, never leave the buffer and join again; voxels are moved rather than evicted."""
+"""The arena: runs never overlap or leave the buffer, gaps join again, voxels are moved rather than evicted."""
 
 import re
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,57 +9,6 @@ from hypothesis import strategies as st
 from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer, VoxelAllocator
 from solidcloud.server.residency.cache_stats import CacheStats, ChangeLog
 from solidcloud.server.residency.eviction import EvictionPolicy
-
-
-@pytest.mark.parametrize("budget", [0, 1, 63])
-def test_a_budget_below_a_cache_line_holds_nothing(budget: int) -> None:
-    buffer = ArenaBuffer(budget)
-    assert buffer.free_runs() == [] and buffer.allocate(1) is None
-
-
-def test_runs_are_taken_best_fit_and_joined() -> None:
-    buffer = ArenaBuffer(64 * 6)
-    a, b, c = buffer.allocate(64), buffer.allocate(65), buffer.allocate(1)
-    assert (a, b, c) == (0, 64, 192)
-    assert buffer.free_runs() == [(256, 128)]
-    buffer.release(0, 64)
-    buffer.release(192, 1)  # joins what is free behind it
-    assert buffer.free_runs() == [(0, 64), (192, 192)]
-    assert buffer.allocate(64 * 4) is None, "256 bytes are free, but not in one run"
-    buffer.release(64, 65)  # joins both sides
-    assert buffer.free_runs() == [(0, 384)]
-    assert buffer.largest_run() == (0, 384)
-    assert buffer.allocate(384) == 0 and buffer.free_runs() == []
-    assert buffer.largest_run() == (-1, 0)
-    buffer.release(0, 128)
-    buffer.release(256, 64)
-    assert buffer.allocate(64) == 256, "the run that just suffices, though another comes first"
-
-
-def test_random_use_against_a_model(rng: np.random.Generator) -> None:
-    """The model: an array of owners, one a cache line."""
-    lines = 50
-    buffer, owners, held = ArenaBuffer(lines * ALIGNMENT), np.zeros(lines, int), {}
-    for number in range(1, 1500):
-        if held and rng.random() < 0.5:
-            owner = list(held)[rng.integers(len(held))]
-            buffer.release(*held.pop(owner))
-            owners[owners == owner] = 0
-        else:
-            size = int(rng.integers(1, 12 * ALIGNMENT))
-            taken = buffer.rounded(size) // ALIGNMENT
-            offset = buffer.allocate(size)
-            free = "".join("." if owner == 0 else "x" for owner in owners)
-            fits = [(len(run[0]), run.start()) for run in re.finditer(r"\.+", free) if len(run[0]) >= taken]
-            at = min(fits)[1] if fits else -1
-            assert (offset if offset is not None else -ALIGNMENT) == at * ALIGNMENT
-            if offset is not None:
-                owners[at : at + taken] = number
-                held[number] = (offset, size)
-        runs = buffer.free_runs()
-        assert buffer.largest_run()[1] == max((size for _, size in runs), default=0)
-        assert sum(size for _, size in runs) == (owners == 0).sum() * ALIGNMENT
-        assert all(a + size < b for (a, size), (b, _) in pairwise(runs))
 
 
 class Filled:
@@ -106,6 +54,47 @@ class Filled:
             run = self.buffer.arena.ints[offset // 4 : (offset + self.room.sizes[row]) // 4]
             assert (run == row).all()
             assert self.where[row].tolist() == [offset // 4, offset // 4 + 1, offset // 2 + 3]
+
+
+@pytest.mark.parametrize("budget", [0, 1, 63])
+def test_a_budget_below_a_cache_line_holds_nothing(budget: int) -> None:
+    assert ArenaBuffer(budget).total_bytes == 0
+    filled = Filled([1], 0)
+    assert not filled.make(0)
+    filled.check()
+
+
+def test_a_voxel_gets_the_shortest_gap_that_suffices() -> None:
+    filled = Filled([1, 2, 1, 2, 1, 1, 3], 8)
+    assert all(filled.make(row) for row in range(5))
+    assert list(filled.room.offsets.values()) == [0, 64, 192, 256, 384]
+    filled.room.forget(1)
+    assert filled.make(5) and filled.room.offsets[5] == 448, "one line is free there, two at 64"
+    filled.room.forget(2)
+    assert filled.make(6) and filled.room.offsets[6] == 64, "the gaps on both sides are joined"
+    assert filled.stats.moved_bytes == 0 and filled.gone == []
+    filled.check()
+
+
+def test_random_use_against_a_model(rng: np.random.Generator) -> None:
+    """The model: an array of owners, one a cache line. Nothing may be evicted or moved."""
+    lines, sizes = 50, rng.integers(1, 13, 1500).tolist()
+    filled, owners = Filled(sizes, lines), np.full(lines, -1)
+    for row, size in enumerate(sizes):
+        held = list(filled.room.offsets)
+        if held and rng.random() < 0.5:
+            gone = held[rng.integers(len(held))]
+            filled.room.forget(gone)
+            owners[owners == gone] = -1
+            continue
+        free = "".join("." if owner < 0 else "x" for owner in owners)
+        fits = [(len(run[0]), run.start()) for run in re.finditer(r"\.+", free) if len(run[0]) >= size]
+        assert filled.make(row, stays=frozenset(held)) == bool(fits)
+        if fits:
+            at = min(fits)[1]
+            assert filled.room.offsets[row] == at * ALIGNMENT
+            owners[at : at + size] = row
+        filled.room.check()
 
 
 def test_room_in_pieces_is_joined_by_moving() -> None:

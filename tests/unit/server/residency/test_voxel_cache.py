@@ -180,7 +180,7 @@ def test_who_waits_for_a_load_that_raises_is_answered() -> None:
     residency.check()
 
 
-@pytest.mark.parametrize("broken", ["bytes", "overlap", "lost run", "where", "pin"])
+@pytest.mark.parametrize("broken", ["bytes", "overlap", "lost gap", "where", "pin"])
 def test_check_finds_what_is_broken(broken: str) -> None:
     residency = VoxelCache(FakeStore([1, 1, 1]), 3 * BLOCK)
     take(residency, [0, 1])
@@ -189,8 +189,8 @@ def test_check_finds_what_is_broken(broken: str) -> None:
         residency._allocator.used_bytes += BLOCK
     elif broken == "overlap":
         residency._allocator.offsets[1] = residency._allocator.offsets[0]
-    elif broken == "lost run":
-        residency.buffer.allocate(BLOCK)
+    elif broken == "lost gap":
+        residency._allocator._gaps.clear()
     elif broken == "where":
         residency.where[1] = -1
     else:

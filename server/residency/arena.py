@@ -237,11 +237,12 @@ class VoxelAllocator:
         Of the stretches with `size` free bytes and only movable voxels, choose the one with the
         fewest bytes to move. Return the gap's offset, or None if there is no such stretch.
         """
-        best, moves = None, 0
+        best, moves, at = None, 0, self._gap(low)[1]
         # The stretch begins at run `begin`; `free` and `held` are its free and used bytes.
         begin, free, held = low, 0, 0
-        for number in range(low, high + 1):
-            free += self._gap(number)[0]
+        behind = (sum(self._gap(high)), -1)
+        for number, (offset, row) in enumerate([*self._runs[low:high], behind], low):
+            free += offset - at
             while free >= size:
                 if best is None or held < moves:
                     best, moves = (begin, number), held
@@ -251,9 +252,9 @@ class VoxelAllocator:
                 free -= self._gap(begin)[0]
                 held -= self.sizes[self._runs[begin][1]]
                 begin += 1
-            if number == high:
+            if row < 0:
                 break
-            row = self._runs[number][1]
+            at = offset + self.sizes[row]
             if self._is_free(row):
                 held += self.sizes[row]
             else:

@@ -112,7 +112,7 @@ class ArchiveGeneration:
         around = UserTracks(bounds.index, lattice.voxel_steps, lattice.origin, lattice.step)
         ahead = prefetches(policy)
         if self._level is not None:
-            budget_bytes -= self._level.bytes
+            budget_bytes -= self._level.residency.budget_bytes
         residency = VoxelCache(
             store,
             budget_bytes,
@@ -156,7 +156,7 @@ class ArchiveGeneration:
     @property
     def level_bytes(self) -> int:
         """Return the memory of the level of detail [bytes]."""
-        return 0 if self._level is None else self._level.bytes
+        return 0 if self._level is None else self._level.residency.budget_bytes
 
     @property
     def level_archive(self) -> Archive | None:

@@ -58,7 +58,7 @@ def collide(
         return np.asarray(found[which] != UNKNOWN)
 
     by_level = SettledPoses(data, array, budget, ask)
-    settled = by_level.drop
+    settled: Callable[[VoxelsInReach], VoxelsInReach] = by_level.drop
     if budget.late is not None:
         settled = drop_proved_voxels(data, avatar, array, margin_units, budget)
     verdict, counts, reach = _verdicts(data, avatar, array, margin_units, budget, spent, settled)

@@ -18,16 +18,11 @@ BUDGET_SHARE = 1 / 16
 
 
 class LevelStore(NamedTuple):
-    """Opened level. store: of its archive.  residency: its cache.  bytes: that the cache may take."""
+    """Opened level. store: of its archive.  residency: its cache.  fits: whether it holds all voxels."""
 
     store: VoxelStore
     residency: VoxelCache
-    bytes: int
-
-    @property
-    def fits(self) -> bool:
-        """Return whether all voxels of the level fit in its cache."""
-        return _all_bytes(self.store) <= self.bytes
+    fits: bool
 
 
 def open_level_store(store: VoxelStore, budget_bytes: int, level_bytes: int | None) -> LevelStore | None:
@@ -50,17 +45,13 @@ def open_level_store(store: VoxelStore, budget_bytes: int, level_bytes: int | No
     found = VoxelStore(level.folder, lambda _: level)
     largest = ArenaBuffer.rounded(int(found.sizes.max(initial=0)))
     most = max(largest, int(budget_bytes * BUDGET_SHARE)) if level_bytes is None else level_bytes
-    most = min(most, _all_bytes(found))
+    every = sum(ArenaBuffer.rounded(size) for size in found.sizes.tolist())
+    most = min(most, every)
     left = ArenaBuffer.rounded(int(store.sizes.max(initial=0))) if level_bytes is None else 0
     if most < largest or budget_bytes - most < left:
         found.close()
         return None
-    return LevelStore(found, VoxelCache(found, most), most)
-
-
-def _all_bytes(store: VoxelStore) -> int:
-    """Return the bytes of all voxels in memory."""
-    return sum(ArenaBuffer.rounded(size) for size in store.sizes.tolist())
+    return LevelStore(found, VoxelCache(found, most), every <= most)
 
 
 def level_filler(level: LevelStore | None) -> Callable[[], bool] | None:

@@ -394,7 +394,7 @@ class VoxelCache:
             seconds = time.perf_counter() - begin
             with self._lock:
                 self._loading.discard(row)
-                if fault:
+                if where is None or fault:
                     self._fail(row, fault, corrupt)
                 else:
                     self.where[row] = where

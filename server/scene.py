@@ -91,7 +91,7 @@ class Scene(SceneTiles, SceneQuestions):
         open_store: OpenStore | None = None,
         radius_model: str | None = None,
         read_points: ReadPoints | None = None,
-        coarse_bytes: int | None = None,
+        level_bytes: int | None = None,
     ) -> "Scene":
         """Open the folder of an archive, or a scene file (TOML) and everything that it names.
 
@@ -104,7 +104,7 @@ class Scene(SceneTiles, SceneQuestions):
         them itself.
         read_points: returns the points (n, 3) of an avatar's file [m]; None: files are read as by
         `add_avatar`.
-        coarse_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
+        level_bytes: the part of `budget_bytes` for levels of detail, which answer requests with a
         tolerance before voxels are loaded; None: a sixteenth, 0: none.
         Raise FormatError, CorruptError or ScanError for an invalid file, BadRequestError for an
         invalid scene file or a budget that is too small.
@@ -113,7 +113,7 @@ class Scene(SceneTiles, SceneQuestions):
         if is_scene_file(path):
             if open_store is not None or radius_model is not None:
                 raise BadRequestError(f"{path}: a scene file: expected no open_store and no radius_model")
-            return cls._open_file(path, name, budget_bytes, policy, read_points, coarse_bytes)
+            return cls._open_file(path, name, budget_bytes, policy, read_points, level_bytes)
         metrics = RequestStats()
         archive = PlacedArchive.open(
             path,
@@ -123,7 +123,7 @@ class Scene(SceneTiles, SceneQuestions):
             open_store=open_store or VoxelStore,
             radius_model=radius_model,
             took=metrics.loaded,
-            coarse_bytes=coarse_bytes,
+            level_bytes=level_bytes,
         )
         return cls([archive], archive.name, metrics)
 
@@ -135,7 +135,7 @@ class Scene(SceneTiles, SceneQuestions):
         budget_bytes: int,
         policy: str,
         read_points: ReadPoints | None,
-        coarse_bytes: int | None,
+        level_bytes: int | None,
     ) -> "Scene":
         """Open a scene file; see `open`. Errors name the file and the place in it."""
         file = read_scene(path)
@@ -146,7 +146,7 @@ class Scene(SceneTiles, SceneQuestions):
         metrics = RequestStats()
         with ExitStack() as stack:
             archives = open_archives(
-                file, path, name, found, budget_bytes, policy, metrics.loaded, coarse_bytes
+                file, path, name, found, budget_bytes, policy, metrics.loaded, level_bytes
             )
             for archive in archives:
                 stack.callback(archive.close)

@@ -133,9 +133,9 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     """Statistics of a scene's cache and of its users.
 
     generation: of the archive.  policy: name of the eviction policy.
-    budget_bytes: limit for decoded voxels, coarse bounds and levels of detail together.
+    budget_bytes: limit for decoded voxels and levels of detail together.
     resident_bytes: used by decoded voxels, `resident` of the `voxels` in the archive.
-    coarse_bytes: of coarse bounds and levels.  kept: voxels in which users stand.
+    level_bytes: of levels of detail.  kept: voxels in which users stand.
     The counters of `Counters` begin when this generation is first served.
 
     The following begin when the scene is first served.
@@ -157,7 +157,7 @@ class StatsAnswer(Counters, frozen=True, kw_only=True):
     policy: str = ""
     budget_bytes: int = 0
     resident_bytes: int = 0
-    coarse_bytes: int = 0
+    level_bytes: int = 0
     voxels: int = 0
     resident: int = 0
     kept: int = 0

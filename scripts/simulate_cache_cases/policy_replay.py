@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from solidcloud.server.residency.eviction import EvictionPolicy, make_policy
+from solidcloud.server.residency.eviction import EvictionPolicy, prefetches
 from solidcloud.server.residency.motion_prediction import PREFETCH_OPTIONS, PrefetchOptions
 from solidcloud.server.residency.prefetch import SILENCE
 
@@ -112,18 +112,16 @@ class Replay:
         budget_bytes: int,
         name: str,
         *,
-        prefetch: bool,
         loading: Loading = LOADING,
         ahead: PrefetchOptions = PREFETCH_OPTIONS,
     ) -> None:
         """Prepare an empty cache. name: of the policy."""
-        self.budget_bytes, self.prefetch, self.loading = budget_bytes, prefetch, loading
+        self.budget_bytes, self.prefetch, self.loading = budget_bytes, prefetches(name), loading
         self.tracks = town.user_tracks(ahead)
-        self.policy: EvictionPolicy = make_policy(name, budget_bytes, self.tracks.path_distances)
+        self.policy = EvictionPolicy(budget_bytes, name)
         self.sizes = town.sizes.tolist()
         self.costs = (loading.per_load + town.sizes * loading.per_byte).tolist()
         self.usual = float(np.quantile(self.costs, USUAL)) if self.costs else 0.0
-        self.sees = prefetch or name == "distance"
         self.resident: set[int] = set()  # loaded or being loaded: rows with allocated room
         self.bytes = 0
         self.ready: dict[int, float] = {}  # completion time of rows being loaded
@@ -148,7 +146,7 @@ class Replay:
             range(len(waits)), requests.rows, asked.user.tolist(), asked.time.tolist(), requests.first.tolist(),
             strict=True,
         )  # fmt: skip
-        if self.sees:
+        if self.prefetch:
             self.run_planned(requests, each, waits)
         else:
             self.run_some(each, asked.scan.tolist(), waits, -1)
@@ -275,7 +273,7 @@ class Replay:
 
     def evict(self, row: int) -> None:
         """Evict a row."""
-        self.policy.removed(row, evicted=True)
+        self.policy.removed(row)
         self.resident.remove(row)
         self.ready.pop(row, None)
         self.bytes -= self.sizes[row]
@@ -300,11 +298,10 @@ class Replay:
         self.tracks.expire(now, SILENCE)
         wanted = self.tracks.plan(now, self.usual)
         self.kept = frozenset(self.tracks.kept(now, SILENCE).tolist())
-        if self.prefetch:
-            self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
-            resident = self.resident
-            self.queue.clear()
-            self.queue.extend(each for each in self.need.items() if each[0] not in resident)
+        self.need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+        resident = self.resident
+        self.queue.clear()
+        self.queue.extend(each for each in self.need.items() if each[0] not in resident)
 
     def load_ahead(self, row: int, at: float) -> bool:
         """Begin a prefetch; return False where there is no room.

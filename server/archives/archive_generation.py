@@ -19,7 +19,7 @@ from ..avatars.avatar_model import AvatarModel
 from ..queries.context.level_of_detail import open_level_data, with_level
 from ..queries.context.query_context import SceneData, make_scene_data, make_tree, with_radius_model
 from ..queries.engine_table import warm_engines
-from ..residency.eviction import make_policy, prefetches
+from ..residency.eviction import EvictionPolicy, prefetches
 from ..residency.level_store import level_filler, open_level_store
 from ..residency.motion_prediction import User, UserTracks
 from ..residency.prefetch import Prefetcher
@@ -62,12 +62,12 @@ class ArchiveGeneration:
         number: int = 0,
         took: Callable[[float], None] | None = None,
         radius_model: str | None = None,
-        coarse_bytes: int | None = None,
+        level_bytes: int | None = None,
     ) -> None:
         """Open a generation whose first reader is the caller, which must `release` it.
 
-        budget_bytes: limit of memory for voxels, level and coarse bounds.  policy: see eviction.py.
-        coarse_bytes: of it for the level; None: see `open_level_store`.
+        budget_bytes: limit of memory for voxels and level.  policy: see eviction.py.
+        level_bytes: of it for the level; None: see `open_level_store`.
         number: of this generation.  took: called with the duration of each load [s].
         radius_model: the default; None: the archive's single radius. Raise BadRequestError for one
         that the archive does not store, FormatError for a level of detail, whose points are not all.
@@ -83,9 +83,9 @@ class ArchiveGeneration:
         self._lock = threading.Lock()
         self._readers = 1
         self._ending: threading.Thread | None = None
-        self._level = open_level_store(store, budget_bytes, coarse_bytes)
+        self._level = open_level_store(store, budget_bytes, level_bytes)
         try:
-            self._assemble(budget_bytes, policy, took, radius_model, is_coarse=coarse_bytes is not None)
+            self._assemble(budget_bytes, policy, took, radius_model, level_given=level_bytes is not None)
         except BaseException:
             if self._level is not None:
                 self._level.store.close()
@@ -98,9 +98,9 @@ class ArchiveGeneration:
         took: Callable[[float], None] | None,
         radius_model: str | None,
         *,
-        is_coarse: bool,
+        level_given: bool,
     ) -> None:
-        """Make caches, prefetcher and scene data. is_coarse: whether memory was given to the level.
+        """Make caches, prefetcher and scene data. level_given: whether memory was given to the level.
 
         The other parameters are as in `__init__`.
         """
@@ -109,21 +109,20 @@ class ArchiveGeneration:
         around = UserTracks(tree, lattice.origin, lattice.step)
         ahead = prefetches(policy)
         if self._level is not None:
-            budget_bytes -= self._level.bytes
+            budget_bytes -= self._level.residency.budget_bytes
         residency = VoxelCache(
             store,
             budget_bytes,
-            make_policy(policy, budget_bytes, around.path_distances),
+            EvictionPolicy(budget_bytes, policy),
             # What was given to the level may leave too little for a voxel.
-            refuse_large=self._level is None or not is_coarse,
+            refuse_large=self._level is None or not level_given,
         )
         residency.on_load_time = took
-        fill = level_filler(self._level)
         self.prefetcher = Prefetcher(
             residency,
             around,
             prefetch=ahead,
-            idle=fill,
+            idle=level_filler(self._level),
             level=None if self._level is None else self._level.residency,
         )
         figure = make_scene_data(store.archive, residency, tree)
@@ -133,7 +132,7 @@ class ArchiveGeneration:
                 self._level.store.archive,
                 self._level.residency,
                 store.archive,
-                settles_exact=ahead or is_coarse,
+                settles_exact=ahead or level_given,
             )
 
         def with_radii(text: str | None) -> SceneData:
@@ -150,9 +149,9 @@ class ArchiveGeneration:
         self.radius_model = with_model
 
     @property
-    def coarse_bytes(self) -> int:
-        """Return the memory of coarse bounds and of the level of detail [bytes]."""
-        return 0 if self._level is None else self._level.bytes
+    def level_bytes(self) -> int:
+        """Return the memory of the level of detail [bytes]."""
+        return 0 if self._level is None else self._level.residency.budget_bytes
 
     @property
     def level_archive(self) -> Archive | None:

@@ -51,19 +51,19 @@ class PlacedArchive:
         radius_model: str | None = None,
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
-        coarse_bytes: int | None = None,
+        level_bytes: int | None = None,
     ) -> None:
         """Serve the voxels of `store`; callers use `PlacedArchive.open`.
 
         name: of the scene, for messages.  open_store: opens the folder at each reload.
         pose: (4, 4), archive to world; None: the identity.
         took: called with the duration of each voxel load [s].
-        coarse_bytes: see `ArchiveGeneration`.
+        level_bytes: see `ArchiveGeneration`.
         Raise BadRequestError or BadTransformError for a pose that is not rigid.
         """
         self.name, self._folder, self._open_store = name, store.archive.folder, open_store
         self._budget_bytes, self._policy, self._radius_model = budget_bytes, policy, radius_model
-        self._took, self._coarse_bytes = took, coarse_bytes
+        self._took, self._level_bytes = took, level_bytes
         self.pose = archive_pose(pose)
         self.inverse = None if self.pose is None else inverse_pose(self.pose)
         self._opened = self._open(store, 0)
@@ -86,13 +86,13 @@ class PlacedArchive:
         radius_model: str | None = None,
         pose: ArrayLike | None = None,
         took: Callable[[float], None] | None = None,
-        coarse_bytes: int | None = None,
+        level_bytes: int | None = None,
     ) -> "PlacedArchive":
         """Open the archive in `folder`; see `Scene.open`."""
         store = open_store(folder)
         try:
             name = name or Path(folder).resolve().name
-            return cls(store, name, budget_bytes, policy, open_store, radius_model, pose, took, coarse_bytes)
+            return cls(store, name, budget_bytes, policy, open_store, radius_model, pose, took, level_bytes)
         except BaseException:
             store.close()
             raise
@@ -106,7 +106,7 @@ class PlacedArchive:
             number,
             self._took,
             self._radius_model,
-            self._coarse_bytes,
+            self._level_bytes,
         )
 
     def take(self) -> ArchiveGeneration:

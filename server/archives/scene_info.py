@@ -90,16 +90,16 @@ def make_stats(
     total, users = metrics.snapshot()
     counts = total.counts
     residencies = [opened.data.residency for opened in each]
-    coarse = [opened.coarse_bytes for opened in each]
+    level_bytes = sum(opened.level_bytes for opened in each)
     counters = [structs.asdict(residency.counters()) for residency in residencies]
     loads = [seconds for residency in residencies for seconds in residency.load_times()]
     return StatsAnswer(
         scene=name,
         generation=sum(opened.store.archive.header.generation for opened in each),
         policy=residencies[0].policy.name,
-        budget_bytes=sum(residency.budget_bytes for residency in residencies) + sum(coarse),
+        budget_bytes=sum(residency.budget_bytes for residency in residencies) + level_bytes,
         resident_bytes=sum(residency.resident_bytes for residency in residencies),
-        coarse_bytes=sum(coarse),
+        level_bytes=level_bytes,
         voxels=sum(len(opened.store.sizes) for opened in each),
         resident=sum(residency.resident for residency in residencies),
         kept=sum(len(residency.kept) for residency in residencies),

@@ -25,7 +25,7 @@ SCENE_METRICS = (
     Metric("gauge", "generation", "Generation of the served archive.", "generation"),
     Metric("gauge", "budget_bytes", "Memory budget of decoded voxels.", "budget_bytes"),
     Metric("gauge", "resident_bytes", "Memory used by decoded voxels.", "resident_bytes"),
-    Metric("gauge", "coarse_bytes", "Memory of coarse bounds and levels of detail.", "coarse_bytes"),
+    Metric("gauge", "level_bytes", "Memory of levels of detail.", "level_bytes"),
     Metric("gauge", "voxels", "Voxels of the archive.", "voxels"),
     Metric("gauge", "resident_voxels", "Voxels that are resident or being loaded.", "resident"),
     Metric("gauge", "kept_voxels", "Voxels that users are in.", "kept"),

@@ -10,7 +10,6 @@ from typing import NamedTuple
 from ...schemas.archive.level import open_level
 from ...schemas.errors import BadRequestError
 from .arena import ArenaBuffer
-from .eviction import make_policy
 from .voxel_cache import VoxelCache
 from .voxel_store import VoxelStore
 
@@ -19,49 +18,40 @@ BUDGET_SHARE = 1 / 16
 
 
 class LevelStore(NamedTuple):
-    """Opened level. store: of its archive.  residency: its cache.  bytes: that the cache may take."""
+    """Opened level. store: of its archive.  residency: its cache.  fits: whether it holds all voxels."""
 
     store: VoxelStore
     residency: VoxelCache
-    bytes: int
-
-    @property
-    def fits(self) -> bool:
-        """Return whether all voxels of the level fit in its cache."""
-        return _all_bytes(self.store) <= self.bytes
+    fits: bool
 
 
-def open_level_store(store: VoxelStore, budget_bytes: int, coarse_bytes: int | None) -> LevelStore | None:
+def open_level_store(store: VoxelStore, budget_bytes: int, level_bytes: int | None) -> LevelStore | None:
     """Open the level of an archive within a budget.
 
     Return None if there is no level, or if it gets too little memory for its largest voxel.
-    budget_bytes: of archive and level together.  coarse_bytes: of it for the level, 0: open none;
+    budget_bytes: of archive and level together.  level_bytes: of it for the level, 0: open none;
     None: a sixteenth, or enough for the largest voxel of the level, if the largest of the archive
     still fits. Less is taken if the level is smaller. Raise FormatError or CorruptError for a level
     that cannot be read, BadRequestError for a negative or too large number of bytes.
     """
-    if coarse_bytes is not None and not 0 <= coarse_bytes <= budget_bytes:
+    if level_bytes is not None and not 0 <= level_bytes <= budget_bytes:
         raise BadRequestError(
-            f"{coarse_bytes} bytes for the level of detail: expected 0 to {budget_bytes}, of which they are a part: "
-            "give a smaller --coarse-bytes or a larger --cache"
+            f"{level_bytes} bytes for the level of detail: expected 0 to {budget_bytes}, of which they are a part: "
+            "give a smaller --level-bytes or a larger --cache"
         )
-    level = open_level(store.archive) if coarse_bytes != 0 and store.is_as_stored else None
+    level = open_level(store.archive) if level_bytes != 0 and store.is_as_stored else None
     if level is None:
         return None
     found = VoxelStore(level.folder, lambda _: level)
     largest = ArenaBuffer.rounded(int(found.sizes.max(initial=0)))
-    most = max(largest, int(budget_bytes * BUDGET_SHARE)) if coarse_bytes is None else coarse_bytes
-    most = min(most, _all_bytes(found))
-    left = ArenaBuffer.rounded(int(store.sizes.max(initial=0))) if coarse_bytes is None else 0
+    most = max(largest, int(budget_bytes * BUDGET_SHARE)) if level_bytes is None else level_bytes
+    every = sum(ArenaBuffer.rounded(size) for size in found.sizes.tolist())
+    most = min(most, every)
+    left = ArenaBuffer.rounded(int(store.sizes.max(initial=0))) if level_bytes is None else 0
     if most < largest or budget_bytes - most < left:
         found.close()
         return None
-    return LevelStore(found, VoxelCache(found, most, make_policy("lru", most)), most)
-
-
-def _all_bytes(store: VoxelStore) -> int:
-    """Return the bytes of all voxels in memory."""
-    return sum(ArenaBuffer.rounded(size) for size in store.sizes.tolist())
+    return LevelStore(found, VoxelCache(found, most), every <= most)
 
 
 def level_filler(level: LevelStore | None) -> Callable[[], bool] | None:
@@ -80,21 +70,5 @@ def level_filler(level: LevelStore | None) -> Callable[[], bool] | None:
         # An unreadable voxel is reported by the request that loads it.
         level.residency.load_in_background(row, lambda _: False)
         return True
-
-    return fill_one
-
-
-def in_turn(*fillers: Callable[[], bool] | None) -> Callable[[], bool] | None:
-    """Return a function that calls each filler until it returns False; None without fillers."""
-    waiting = [filler for filler in fillers if filler is not None]
-    if not waiting:
-        return None
-
-    def fill_one() -> bool:
-        while waiting:
-            if waiting[0]():
-                return True
-            del waiting[0]
-        return False
 
     return fill_one

@@ -20,39 +20,32 @@ MAX_TURN_SECONDS = 0.025
 LOADS_WITHOUT_TURN = 4
 
 
-class LoadTurn:
-    """Turn of one request, or its place in the queue. come: set when the turn begins."""
-
-    __slots__ = ("come",)
-
-    def __init__(self) -> None:
-        """Wait in the queue."""
-        self.come = threading.Lock()
-        self.come.acquire()
-
-
 class LoadTurns:
-    """First-in, first-out queue of the requests that load voxels of one cache. Thread-safe."""
+    """First-in, first-out queue of the requests that load voxels of one cache. Thread-safe.
+
+    The turn of a request is a lock of its own, which is released when the turn begins.
+    """
 
     def __init__(self) -> None:
         """Let the first request have its turn at once."""
         self._lock = threading.Lock()
-        self._queue: deque[LoadTurn] = deque()
-        self._current: LoadTurn | None = None
+        self._queue: deque[threading.Lock] = deque()
+        self._current: threading.Lock | None = None
         self._since = 0.0  # when the current turn began, on the monotonic clock [s]
 
-    def take(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
+    def take(self, deadline: float, stop: StopFlag) -> "threading.Lock | None":
         """Wait for a turn and return it; return None if the deadline or the stop flag comes first.
 
         `give_back` ends the turn.
         deadline: on time.perf_counter()'s clock [s].
         """
-        turn = LoadTurn()
+        turn = threading.Lock()
+        turn.acquire()
         with self._lock:
             self._queue.append(turn)
             self._advance()
         while (left := seconds_to(deadline, stop)) != 0:
-            if turn.come.acquire(timeout=MAX_TURN_SECONDS if left is None else min(left, MAX_TURN_SECONDS)):
+            if turn.acquire(timeout=MAX_TURN_SECONDS if left is None else min(left, MAX_TURN_SECONDS)):
                 return turn
             with self._lock:
                 self._advance()
@@ -62,7 +55,7 @@ class LoadTurns:
                 return None
         return turn  # granted between the last wait and the deadline
 
-    def give_back(self, turn: LoadTurn | None) -> None:
+    def give_back(self, turn: "threading.Lock | None") -> None:
         """End a turn; do nothing for None or a turn that has ended or was superseded."""
         with self._lock:
             if turn is not None and turn is self._current:
@@ -74,4 +67,4 @@ class LoadTurns:
         now = time.monotonic()
         if self._queue and (self._current is None or now - self._since >= MAX_TURN_SECONDS):
             self._current, self._since = self._queue.popleft(), now
-            self._current.come.release()
+            self._current.release()

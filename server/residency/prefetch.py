@@ -16,8 +16,7 @@ from typing import Self
 
 from ..runtime.threads import start_loop
 from .motion_prediction import User, UserTracks
-from .voxel_cache import VoxelCache
-from .voxel_states import BackgroundLoad
+from .voxel_cache import BackgroundLoad, VoxelCache
 
 log = logging.getLogger(__name__)
 
@@ -171,10 +170,19 @@ class Prefetcher:
         self._urgent.clear()
 
     def _planned(self, now: float) -> tuple[dict[int, float], float]:
-        """Return the result of `_plan`, and the time of the next plan."""
-        begin = time.thread_time()
+        """Return the voxels that all users will need, and the time of the next plan.
+
+        The voxels come soonest first: row -> seconds until then. Update the set of voxels kept for
+        users' current positions.
+        """
+        begin, residency, tracks = time.thread_time(), self._residency, self._tracks
         try:
-            need = self._plan(now)
+            times = sorted(residency.load_times())
+            usual = times[int(LOAD_TIME_QUANTILE * (len(times) - 1))] if times else 0.0
+            tracks.expire(now, SILENCE)
+            wanted = tracks.plan(now, usual)
+            need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
+            residency.kept = self._within_share(tracks.kept(now, SILENCE).tolist(), need)
         except Exception:  # for example out of memory: requested voxels are loaded all the same
             log.exception("the prefetch plan failed")
             return {}, now + MAX_REST
@@ -219,19 +227,6 @@ class Prefetcher:
                 self._failed[row] = self._clock()
             return True
         return False
-
-    def _plan(self, now: float) -> dict[int, float]:
-        """Return the voxels that all users will need, soonest first: row -> seconds until then.
-
-        Update the set of voxels kept for users' current positions.
-        """
-        times = sorted(self._residency.load_times())
-        usual = times[int(LOAD_TIME_QUANTILE * (len(times) - 1))] if times else 0.0
-        self._tracks.expire(now, SILENCE)
-        wanted = self._tracks.plan(now, usual)
-        need = dict(zip(wanted.rows.tolist(), wanted.need.tolist(), strict=True))
-        self._residency.kept = self._within_share(self._tracks.kept(now, SILENCE).tolist(), need)
-        return need
 
     def _within_share(self, rows: list[int], need: dict[int, float]) -> frozenset[int]:
         """Select rows, soonest needed first, that fit together in KEPT_SHARE of the budget."""

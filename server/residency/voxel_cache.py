@@ -2,8 +2,17 @@
 
 [Fig12] section 4: "neighbour voxels to a user's position loaded and uncompressed into a LRU queue".
 A voxel is loaded once, however many requests wait for it, and the voxels of a request are pinned
-until it is answered. eviction.py selects the voxels to evict, allocator.py assigns bytes, and
+until it is answered. eviction.py selects the voxels to evict, arena.py assigns bytes, and
 prefetch.py loads voxels before a request needs them.
+
+A voxel is in one of four states:
+
+- absent: it has no bytes in the arena;
+- loading: it has bytes, and one thread fills them;
+- resident: its runs are in `where`;
+- failed: it has no bytes, and a fault. That of a corrupt record is permanent. Another ends with the
+  last hold on the voxel, so that it does not become resident during a kernel call that began
+  without it.
 
 A request pins all its voxels or none: it never waits for memory while holding pins. Two requests
 that each hold half of what the other needs therefore cannot deadlock.
@@ -12,29 +21,81 @@ that each hold half of what the other needs therefore cannot deadlock.
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
+from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...schemas.errors import CorruptError, MisleadingIndexError
+from ...schemas.errors import BadRequestError, CorruptError, MisleadingIndexError
+from ...schemas.wire.residency_messages import Residency
+from ...schemas.wire.stats import Counters
 from ..runtime.stop_flag import NO_STOP, StopFlag, seconds_to
-from .arena import ArenaBuffer
-from .eviction import EvictionPolicy, make_policy
-from .load_turns import LOADS_WITHOUT_TURN, LoadTurn, LoadTurns
-from .voxel_states import BackgroundLoad, CacheFacts, HeldVoxels, Hold, VoxelStates, voxel_sizes
+from .arena import ArenaBuffer, VoxelAllocator
+from .cache_stats import CacheStats, ChangeLog
+from .eviction import EvictionPolicy
+from .load_turns import LOADS_WITHOUT_TURN, LoadTurns
 from .voxel_store import VoxelStore
 
+# Voxels examined to find room for a prefetched one.
+MAX_CANDIDATES = 256
 
-class VoxelCache(CacheFacts):
+
+class HeldVoxels(NamedTuple):
+    """Result of a hold on voxels.
+
+    hits: voxels that were resident or being loaded.  misses: voxels that were not.
+    faults: one sentence for each unreadable voxel.
+    late: rows that were not resident by the deadline. They may become resident during the hold:
+    ignore them when reading `where` (`as_held`).
+    waited: time spent on loads, by this thread or others, and on waits for memory [s].
+    """
+
+    hits: int
+    misses: int
+    faults: tuple[str, ...]
+    late: tuple[int, ...] = ()
+    waited: float = 0.0
+
+
+class BackgroundLoad(Enum):
+    """Result of a load that no request waits for."""
+
+    RESIDENT = "the voxel is resident, or was"
+    NO_ROOM = "no voxel may be evicted for it"
+    FAILED = "the voxel cannot be read"
+
+
+class Hold:
+    """Context manager of a hold on voxels. A generator would cost a request twice as much."""
+
+    __slots__ = ("_cache", "_deadline", "_rows", "_scan", "_stop")
+
+    def __init__(
+        self, cache: "VoxelCache", rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag
+    ) -> None:
+        """Make a hold; call `VoxelCache.hold` instead."""
+        self._cache, self._rows, self._deadline, self._scan, self._stop = cache, rows, deadline, scan, stop
+
+    def __enter__(self) -> HeldVoxels:
+        """Wait until all readable voxels are resident, or for the deadline."""
+        return self._cache.acquire(self._rows, self._deadline, scan=self._scan, stop=self._stop)
+
+    def __exit__(self, *_: object) -> None:
+        """Release the voxels."""
+        self._cache.release(self._rows)
+
+
+class VoxelCache:
     """Resident voxels of one scene. Thread-safe.
 
     where: (v, 3) int64, a voxel's runs in the arena, -1 if not resident; kernels read it directly.
+    kept: rows at users' positions, evicted only if a request would not fit otherwise.
     on_owed: called when a load is owed to a request whose deadline came first, see `take_owed`.
-    on_loaded: called with the row and the runs of each loaded voxel, by the loading thread, before
-    the voxel is visible to other threads.  on_proved: called at the same point with the row of a
-    voxel that matches the index.  on_load_time: called after each load with its duration [s].
+    on_proved: called with the row of each loaded voxel, whose record matches the index, by the
+    loading thread, before the voxel is visible to other threads.  on_load_time: called after each
+    load with its duration [s].
     stats: counts of the cache, written under its lock.
     misled: whether a loaded record contradicts the index. The index selects the voxels of a query;
     once it is wrong, it may have failed to select any voxel.
@@ -52,25 +113,42 @@ class VoxelCache(CacheFacts):
 
         Raise BadRequestError for a larger voxel, or without `refuse_large`, give it a permanent fault.
         """
-        sizes = voxel_sizes(store.sizes, budget_bytes, refuse_large=refuse_large)
-        self.budget_bytes = budget_bytes
-        self.buffer = ArenaBuffer(budget_bytes)
-        self.where = np.full((len(store.sizes), 3), -1, np.int64)
+        sizes = [ArenaBuffer.rounded(int(size)) for size in store.sizes]
+        largest = max(sizes, default=0)
+        if refuse_large and budget_bytes < largest:
+            raise BadRequestError(
+                f"cache of {budget_bytes} bytes: the largest voxel takes {largest}: give a larger --cache, "
+                "or build with a smaller --voxel"
+            )
+        self.budget_bytes, self.buffer = budget_bytes, ArenaBuffer(budget_bytes)
+        self.where = np.full((len(sizes), 3), -1, np.int64)
+        self.kept: frozenset[int] = frozenset()
         self.on_owed: Callable[[], None] | None = None
-        self.on_loaded: Callable[[int, NDArray[np.int64]], None] | None = None
-        self.on_load_time: Callable[[float], None] | None = None
         self.on_proved: Callable[[int], None] | None = None
+        self.on_load_time: Callable[[float], None] | None = None
         self.misled = False
+        self.policy = policy or EvictionPolicy(budget_bytes)
         self._store = store
         self._sizes = [size if size <= budget_bytes else 0 for size in sizes]
-        self.policy = policy or make_policy("lru", budget_bytes)
-        self._states = VoxelStates(self.buffer, self._sizes, self.where, self.policy, store.archive.where)
-        self._states.refuse_larger(sizes, budget_bytes)
-        self.stats = self._states.stats
+        self._pins: dict[int, int] = {}  # row -> number of holds
+        self._loading: set[int] = set()
+        self._faults = {
+            row: f"{store.archive.where(row)}: takes {size} bytes of a cache of {budget_bytes}: give a larger --cache"
+            for row, size in enumerate(sizes)
+            if size > budget_bytes
+        }
+        self._passing: set[int] = set()  # rows whose fault ends with the last hold
+        self._owed: dict[int, None] = {}  # rows that requests did not get in time, in that order
+        self.stats = CacheStats(self._sizes)
+        self._allocator = VoxelAllocator(
+            self.buffer, self._sizes, self.where, self.policy, self.stats, self._pins, self._loading
+        )
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._turns = LoadTurns()
-        self._waiting_requests = 0  # number of requests that wait
+        self._waiting_requests = 0  # number of requests that load voxels or wait for them
+
+    # --- holds ---
 
     def hold(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
@@ -94,178 +172,116 @@ class VoxelCache(CacheFacts):
 
     def use(self, rows: Sequence[int], *, scan: bool = False) -> None:
         """Record a use of resident voxels; call it inside `frozen`."""
-        stats = self.stats
         for row in rows:
             self.policy.used(row, scan=scan)
-        stats.hits += len(rows)
-        if stats.fresh:
-            stats.count_used(rows)
+        self.stats.count_used(rows)
 
     def acquire(
         self, rows: Sequence[int], deadline: float = math.inf, *, scan: bool = False, stop: StopFlag = NO_STOP
     ) -> HeldVoxels:
         """Begin a hold; the caller must call `release` unless this raises."""
-        if deadline == -math.inf:
-            return self._acquire_resident(rows, scan)
-        begin = time.perf_counter()
-        many = len(self._states.missing(rows)) > LOADS_WITHOUT_TURN
-        turn = self._take_turn(deadline, stop) if many else None
-        try:
-            return self._acquire(rows, deadline, scan, stop, begin)
-        finally:
-            if turn is not None:
+        with self._lock:
+            if deadline == -math.inf:
+                held = self._pin_resident(rows, scan)
+            elif self._loading.isdisjoint(rows) and all(map(self._allocator.offsets.__contains__, rows)):
+                self._pin(rows)
+                self.use(rows, scan=scan)
+                return HeldVoxels(len(rows), 0, ())
+            else:
+                held = None
+                absent = len(self._absent(rows))
+                self._waiting_requests += 1
+        if held is None:
+            turn = None
+            try:
+                if absent > LOADS_WITHOUT_TURN:
+                    turn = self._turns.take(deadline, stop)
+                held = self._load_and_pin(rows, deadline, scan, stop)
+            finally:
                 self._turns.give_back(turn)
-
-    def _acquire_resident(self, rows: Sequence[int], scan: bool) -> HeldVoxels:
-        """Begin a hold on the voxels that are resident; the loads of the others are owed."""
-        with self._changed:
-            self._states.pin(rows)
-            there, faults, late = self._states.sort_out(rows)
-            self.use(there, scan=scan)
-            self.stats.late += len(late)
-            if self.on_owed is not None:
-                self._states.owed.update(dict.fromkeys(late))
-        if late:
-            self._notify_owed()
-        return HeldVoxels(len(there), 0, faults, late)
-
-    def _take_turn(self, deadline: float, stop: StopFlag) -> LoadTurn | None:
-        """Wait for a turn to load; `_waiting_requests` counts the request meanwhile."""
-        with self._changed:
-            self._waiting_requests += 1
-        try:
-            return self._turns.take(deadline, stop)
-        finally:
-            with self._changed:
-                self._waiting_requests -= 1
-                self._changed.notify_all()
-
-    def _acquire(
-        self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag, begin: float
-    ) -> HeldVoxels:
-        """Begin a hold. begin: time of the call of `acquire` on time.perf_counter()'s clock [s]."""
-        states = self._states
-        mine, hits, waits, settled = self._reserve(rows, deadline, scan, stop)
-        if settled:
-            return HeldVoxels(len(rows), 0, ())  # all are resident and pinned
-        try:
-            wanted = mine
-            # Each further round does loads that other requests abandoned at their deadlines.
-            while True:
-                self._load(wanted, deadline, stop)
-                with self._changed:
-                    while not states.settled(rows) and self._wait(deadline, stop):
-                        pass
-                    late_now = seconds_to(deadline, stop) == 0
-                    wanted = [] if late_now else [row for row in rows if row in states.abandoned]
-                    if not wanted:
-                        faults = tuple(fault for row in rows if (fault := states.fault(row)))
-                        late = tuple(
-                            row for row in rows if not (states.fault(row) or states.is_resident(row))
-                        )
-                        self._waiting_requests -= 1
-                        self.stats.late += len(late)
-                        # A request that is stopped before its deadline needs nothing more.
-                        if self.on_owed is not None and late and time.perf_counter() >= deadline:
-                            states.owed.update(dict.fromkeys(late))
-                        states.is_owed_free |= bool(late)
-                        self._changed.notify_all()
-                        break
-                    states.abandoned.difference_update(wanted)
-        except BaseException:
-            with self._changed:
-                self._waiting_requests -= 1
-            self.release(rows)
-            raise
-        if states.is_owed_free:
-            self._notify_owed()
-        # If the only missing voxels have faults known before this call, the request did not wait.
-        waited = time.perf_counter() - begin if mine or waits or late else 0.0
-        return HeldVoxels(hits, len(mine), faults, late, waited)
+                with self._lock:
+                    self._waiting_requests -= 1
+                    self._changed.notify_all()
+        on_owed = self.on_owed
+        if held.late and on_owed is not None:
+            on_owed()  # without the lock: it may start a thread
+        return held
 
     def release(self, rows: Sequence[int]) -> None:
         """End a hold."""
-        with self._changed:
-            self._states.unpin(rows)
+        with self._lock:
+            self._unpin(rows)
             self._changed.notify_all()
-        if self._states.is_owed_free:
-            self._notify_owed()
 
-    def _notify_owed(self) -> None:
-        """Call `on_owed`, which may start a thread, without the lock."""
-        self._states.is_owed_free = False
-        on_owed = self.on_owed
-        if on_owed is not None:
-            on_owed()
+    def _pin_resident(self, rows: Sequence[int], scan: bool) -> HeldVoxels:
+        """Begin a hold on the voxels that are resident; the loads of the others are owed."""
+        self._pin(rows)
+        there, faults, late = self._sort_out(rows)
+        self.use(there, scan=scan)
+        self._owe(late)
+        return HeldVoxels(len(there), 0, faults, late)
 
-    def _reserve(
-        self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag
-    ) -> tuple[list[int], int, bool, bool]:
-        """Pin all rows and make room for those that this caller is to load.
-
-        Return
-
-        - the rows to load; none if there is no room before the deadline,
-        - the number of other rows that are resident or being loaded (not those with a fault),
-        - whether other threads are loading some of the rows,
-        - whether all rows are resident. If not, `_waiting_requests` counts this request.
-
-        If this raises, nothing is pinned.
-        """
+    def _load_and_pin(self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag) -> HeldVoxels:
+        """Begin a hold, loading what is absent and waiting for the loads of others."""
         taken = self.bytes_of(rows)
         if taken > self.buffer.total_bytes:
             raise ValueError(f"{len(rows)} voxels take {taken} bytes, over the budget: ask in pieces")
-        states, offsets = self._states, self._states.allocator.offsets
-        with self._changed:
-            states.pin(rows)
-            mine = states.missing(rows)
-            settled = not mine and states.all_resident(rows)
-            if not settled:
-                self._waiting_requests += 1
-                try:
-                    mine = self._make_room(rows, mine, deadline, scan, stop)
-                except BaseException:
-                    self._waiting_requests -= 1
-                    self._changed.notify_all()
-                    raise
-            new = set(mine)
-            there = [row for row in rows if row in offsets and row not in new] if not settled else rows
-            self.use(there, scan=scan)
-            if settled:
-                return [], len(rows), False, True
-            self.stats.missed(mine)
-            self.stats.waited(there, states.loading)
-            waits = not states.loading.isdisjoint(there)
-            states.loading.update(mine)
-            return mine, len(there), waits, False
-
-    def _make_room(
-        self, rows: Sequence[int], mine: list[int], deadline: float, scan: bool, stop: StopFlag
-    ) -> list[int]:
-        """Make room for the rows `mine` among `rows`, which this caller has pinned; wait if needed.
-
-        Return the rows to load, none if the deadline comes before there is room. If this raises,
-        the rows are no longer pinned.
-        """
-        states = self._states
+        begin, counts = time.perf_counter(), None
         while True:
+            with self._lock:
+                mine = self._reserve(rows, deadline, scan, stop)
+                if counts is None:
+                    counts = self._count(rows, mine, scan)
             try:
-                if states.allocate_all(mine, scan):
-                    return mine
+                self._load(mine, deadline, stop)
+                with self._lock:
+                    while not self._loading.isdisjoint(rows) and self._wait(deadline, stop):
+                        pass
+                    _, faults, late = self._sort_out(rows)
+                    if not late or seconds_to(deadline, stop) == 0:
+                        # A request that is stopped before its deadline needs nothing more.
+                        self._owe(late, needed=time.perf_counter() >= deadline)
+                        break
+                    self._unpin(rows)  # another request left one of them at its deadline: begin anew
             except BaseException:
-                states.unpin(rows)
+                self.release(rows)
                 raise
-            states.unpin(rows)
-            if states.pins or states.loading:
-                has_room = self._wait(deadline, stop)
-            else:
+        hits, misses, waits = counts
+        # If the only missing voxels have faults known before this call, the request did not wait.
+        waited = time.perf_counter() - begin if misses or waits or late else 0.0
+        return HeldVoxels(hits, misses, faults, late, waited)
+
+    def _reserve(self, rows: Sequence[int], deadline: float, scan: bool, stop: StopFlag) -> list[int]:
+        """Pin the rows and allocate bytes for those that are absent, which the caller is to load.
+
+        Return them; none if there is no room before the deadline. If this raises, nothing is pinned.
+        """
+        while True:
+            self._pin(rows)
+            absent = self._absent(rows)
+            try:
+                if self._allocate_all(absent, scan):
+                    self._loading.update(absent)
+                    return absent
+            except BaseException:
+                self._unpin(rows)
+                raise
+            self._unpin(rows)
+            if not self._pins and not self._loading:
                 # No other request holds anything: this caller's voxels lie between the free runs.
-                states.evict_all_but(rows)
-                has_room = True
-            states.pin(rows)
-            mine = states.missing(rows)
-            if not has_room:
+                self._allocator.evict_all_but(set(rows))
+            elif not self._wait(deadline, stop):
+                self._pin(rows)
                 return []
+
+    def _count(self, rows: Sequence[int], mine: list[int], scan: bool) -> tuple[int, int, bool]:
+        """Count a request that is to load the rows `mine`; return hits, misses, and whether it waits."""
+        new = set(mine)
+        there = [row for row in rows if self.is_resident(row) and row not in new]
+        self.use(there, scan=scan)
+        self.stats.count_missed(mine)
+        self.stats.count_waits(there, self._loading)
+        return len(there), len(mine), not self._loading.isdisjoint(there)
 
     def _wait(self, deadline: float, stop: StopFlag) -> bool:
         """Wait until another thread changes the state; return False at the deadline or on stop."""
@@ -274,64 +290,132 @@ class VoxelCache(CacheFacts):
                 break
         return seconds_to(deadline, stop) != 0
 
-    def _abandon(self, rows: list[int]) -> None:
-        """Leave loads that have not begun to the other requests that hold these rows."""
-        with self._changed:
-            self._states.abandon(rows)
-            self._changed.notify_all()
+    def _pin(self, rows: Sequence[int]) -> None:
+        """Begin a hold on rows."""
+        for row in rows:
+            self._pins[row] = self._pins.get(row, 0) + 1
+
+    def _unpin(self, rows: Sequence[int]) -> None:
+        """End a hold on rows."""
+        for row in rows:
+            self._pins[row] -= 1
+            if not self._pins[row]:
+                del self._pins[row]
+                if row in self._passing:
+                    self._passing.discard(row)
+                    del self._faults[row]
+
+    # --- states ---
+
+    def is_resident(self, row: int) -> bool:
+        """Return whether a voxel is resident or being loaded."""
+        return row in self._allocator.offsets
+
+    def _absent(self, rows: Iterable[int]) -> list[int]:
+        """Return the rows that are absent."""
+        return [row for row in rows if not self.is_resident(row) and row not in self._faults]
+
+    def _sort_out(self, rows: Sequence[int]) -> tuple[list[int], tuple[str, ...], tuple[int, ...]]:
+        """Return the resident rows, the faults of the failed ones, and the other rows, which are late."""
+        there = [row for row in rows if row in self._allocator.offsets and row not in self._loading]
+        faults = tuple(self._faults[row] for row in rows if row in self._faults)
+        settled = {*there, *self._faults}
+        return there, faults, tuple(row for row in rows if row not in settled)
+
+    def _owe(self, late: Sequence[int], *, needed: bool = True) -> None:
+        """Count late voxels; their loads are owed if the request still needed them."""
+        self.stats.late += len(late)
+        if needed and self.on_owed is not None:
+            self._owed.update(dict.fromkeys(late))
+
+    def take_owed(self) -> int | None:
+        """Return the voxel whose load has been owed longest; None if no load is owed."""
+        with self._lock:
+            while self._owed:
+                row = next(iter(self._owed))
+                del self._owed[row]
+                if self._absent([row]):
+                    return row
+        return None
+
+    def _allocate_all(self, rows: Sequence[int], scan: bool) -> bool:
+        """Make room for every row, or for none. Voxels at users' positions are evicted last."""
+        done = 0
+        try:
+            for row in rows:
+                if not (
+                    self._allocator.allocate(row, self.kept.__contains__, scan=scan)
+                    or self._allocator.allocate(row, lambda _: False, scan=scan)
+                ):
+                    break
+                done += 1
+        finally:
+            if done < len(rows):
+                for row in rows[:done]:
+                    self._allocator.forget(row)
+        return done == len(rows)
+
+    # --- loads ---
 
     def _load(self, rows: list[int], deadline: float, stop: StopFlag) -> None:
-        """Load reserved rows: each is resident or faulty afterwards, or is left to others."""
-        for number, row in enumerate(rows):
-            if seconds_to(deadline, stop) == 0:
-                self._abandon(rows[number:])
-                return
-            try:
-                self._load_one(row)
-            except BaseException as error:
-                with self._changed:
-                    for left in rows[number + 1 :]:
-                        self._states.fail(left, f"not loaded ({error!r}): ask again")
+        """Load reserved rows: each is resident or failed afterwards.
+
+        Those whose load has not begun by the deadline, or before another one raises, are absent.
+        """
+        done = 0
+        try:
+            while done < len(rows) and seconds_to(deadline, stop) != 0:
+                done += 1
+                self._load_one(rows[done - 1])
+        finally:
+            if done < len(rows):
+                with self._lock:
+                    for row in rows[done:]:
+                        self._loading.discard(row)
+                        self._allocator.forget(row)
                     self._changed.notify_all()
-                raise
 
     def _load_one(self, row: int) -> bool:
         """Load a voxel whose bytes are allocated; return whether it is resident then."""
         begin, where, fault, corrupt = time.perf_counter(), None, "", False
         try:
-            where = self._store.load(row, self.buffer.arena, self._states.allocator.offsets[row])
+            where = self._store.load(row, self.buffer.arena, self._allocator.offsets[row])
             if self.on_proved is not None:
                 self.on_proved(row)
-            if self.on_loaded is not None:
-                self.on_loaded(row, where)  # before `end_load`, after which it may be evicted
         except CorruptError as error:
             fault, corrupt = str(error), True
             self.misled |= isinstance(error, MisleadingIndexError)
         except OSError as error:
-            fault = f"cannot be read ({error}): check the disk"
+            fault = f"{self._store.archive.where(row)}: cannot be read ({error}): check the disk"
         except BaseException as error:
-            with self._changed:
-                self._states.fail(row, f"not loaded ({error!r}): ask again")
-                self._changed.notify_all()
+            fault = f"{self._store.archive.where(row)}: not loaded ({error!r}): ask again"
             raise
-        with self._changed:
-            if where is None:
-                self._states.fail(row, fault, corrupt=corrupt)
-            else:
-                self._states.end_load(row, where, seconds := time.perf_counter() - begin)
-            self._changed.notify_all()
-        if where is not None and self.on_load_time is not None:
+        finally:
+            seconds = time.perf_counter() - begin
+            with self._lock:
+                self._loading.discard(row)
+                if where is None or fault:
+                    self._fail(row, fault, corrupt)
+                else:
+                    self.where[row] = where
+                    self.stats.count_load(row, seconds)
+                self._changed.notify_all()
+        if not fault and self.on_load_time is not None:
             self.on_load_time(seconds)
-        return where is not None
+        return not fault
 
-    def take_owed(self) -> int | None:
-        """Return the voxel whose load has been owed longest; None if no load is owed."""
-        with self._lock:
-            return self._states.take_owed()
+    def _fail(self, row: int, fault: str, corrupt: bool) -> None:
+        """Record a failed load: permanently if `corrupt`, else for requests that hold the row."""
+        self.stats.count_failure(row)
+        self._allocator.forget(row)
+        if corrupt or row in self._pins:
+            self._faults[row] = fault
+            if not corrupt:
+                self._passing.add(row)
 
     def wait_until_idle(self) -> None:
         """Wait until no request waits for voxels."""
-        with self._changed:
+        with self._lock:
             while self._waiting_requests:
                 self._changed.wait()
 
@@ -345,23 +429,84 @@ class VoxelCache(CacheFacts):
         owed: whether an earlier request needed the voxel. Raise errors of the load that are not
         faults of the record, such as MemoryError.
         """
-        with self._changed:
+        with self._lock:
             if not owed:
                 self.wait_until_idle()
-            states = self._states
-            if row in states.allocator.offsets:
+            if self.is_resident(row):
                 return BackgroundLoad.RESIDENT
-            if states.fault(row):
+            if row in self._faults:
                 return BackgroundLoad.FAILED
-            if not states.allocate_for_prefetch(row, may_evict):
+            kept = self.kept
+            if not self._allocator.allocate(
+                row, lambda other: other in kept or not may_evict(other), scan=False, most=MAX_CANDIDATES
+            ):
                 return BackgroundLoad.NO_ROOM
-            states.loading.add(row)
+            self._loading.add(row)
             if not owed:
-                self.stats.begun_ahead(row)
+                self.stats.count_prefetch(row)
         return BackgroundLoad.RESIDENT if self._load_one(row) else BackgroundLoad.FAILED
 
+    # --- facts ---
+
+    @property
+    def resident(self) -> int:
+        """Return the number of voxels resident or being loaded."""
+        return len(self._allocator.offsets)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Return the bytes of the voxels resident or being loaded."""
+        return self._allocator.used_bytes
+
+    @property
+    def evictions(self) -> int:
+        """Return the number of voxels evicted to make room for others."""
+        return self.stats.evicted
+
+    def bytes_of(self, rows: Sequence[int]) -> int:
+        """Return the bytes that these voxels take when resident."""
+        return sum(self._sizes[row] for row in rows)
+
+    def recent(self) -> list[int]:
+        """Return the index rows of the resident voxels, in order of eviction."""
+        with self._lock:
+            return [row for row in self.policy.victims() if row not in self._loading]
+
+    def counters(self) -> Counters:
+        """Return the statistics of the cache."""
+        with self._lock:
+            return self.stats.counters()
+
+    def load_times(self) -> list[float]:
+        """Return the durations of the last loads [s], unordered."""
+        with self._lock:
+            return list(self.stats.times)
+
+    def follow(self) -> ChangeLog:
+        """Return a log of all changes from now on, until `unfollow`."""
+        log = ChangeLog()
+        with self._lock:
+            self.stats.logs += (log,)
+        return log
+
+    def unfollow(self, log: ChangeLog) -> None:
+        """End a log."""
+        with self._lock:
+            self.stats.logs = tuple(other for other in self.stats.logs if other is not log)
+
+    def take_changes(self, log: ChangeLog) -> tuple[dict[int, Residency], bool]:
+        """Return the changes in a log, by index row, and whether some are missing; begin it anew."""
+        with self._lock:
+            return log.take()
+
     def check(self) -> None:
-        """Assert the invariants of the states between two operations."""
-        with self._changed:
-            self._states.check()
-            assert self._waiting_requests >= 0
+        """Assert the invariants between two operations: bytes add up, and runs do not overlap."""
+        with self._lock:
+            self._allocator.check()
+            offsets = set(self._allocator.offsets)
+            resident = {int(row) for row in np.flatnonzero(self.where[:, 0] >= 0)}
+            assert resident == offsets - self._loading and self._loading <= offsets
+            assert offsets.isdisjoint(self._faults) and self._passing <= self._faults.keys()
+            assert all(count > 0 for count in self._pins.values())
+            assert self.stats.fresh <= offsets and self._waiting_requests >= 0
+            self.stats.check()

@@ -1,6 +1,6 @@
 """Changes of what is resident of a scene, as they happen.
 
-A log (residency/change_log.py) collects the changes of each archive under its cache's lock. A
+A log (residency/cache_stats.py) collects the changes of each archive under its cache's lock. A
 reader takes them at its own rate, so no load or eviction waits for a reader.
 """
 
@@ -22,7 +22,7 @@ from ...schemas.wire.residency_messages import (
 )
 from ..archives.archive_generation import ArchiveGeneration
 from ..archives.placed_archive import PlacedArchive
-from ..residency.change_log import ChangeLog
+from ..residency.cache_stats import ChangeLog
 from ..residency.voxel_cache import VoxelCache
 
 

@@ -154,13 +154,13 @@ def open_archives(
     budget_bytes: int,
     policy: str,
     took: Callable[[float], None],
-    coarse_bytes: int | None = None,
+    level_bytes: int | None = None,
 ) -> list[PlacedArchive]:
     """Open the archives of a scene, which the caller closes.
 
     name: of the scene.  budget_bytes: limit of decoded voxels, all archives together.
     policy: eviction policy, see eviction.py.  took: called with the duration of each voxel load
-    [s].  coarse_bytes: of the budget for levels, see `Scene.open`.
+    [s].  level_bytes: of the budget for levels, see `Scene.open`.
     Raise the errors of opening, prefixed with the place in the scene file, after closing all.
     """
     with error_location(path, "$.archives"):
@@ -178,7 +178,7 @@ def open_archives(
                     radius_model=file.radius_model,
                     pose=item.pose,
                     took=took,
-                    coarse_bytes=None if coarse_bytes is None else coarse_bytes * budget // sum(budgets),
+                    level_bytes=None if level_bytes is None else level_bytes * budget // sum(budgets),
                 )
             stack.callback(archive.close)
             opened.append(archive)

@@ -191,7 +191,7 @@ def test_the_command_serves_metrics_and_top_shows_them(
     port = free_port()
     where = f"http://127.0.0.1:{port}/metrics"
     with (
-        server(archive, endpoint, "--metrics-port", str(port), "--policy", "s3fifo") as process,
+        server(archive, endpoint, "--metrics-port", str(port), "--policy", "lru") as process,
         Client(endpoint, scene="hall") as client,
     ):
         client.add_avatar("al", BODY, RADIUS)
@@ -200,7 +200,7 @@ def test_the_command_serves_metrics_and_top_shows_them(
         with urllib.request.urlopen(where, timeout=DEADLINE) as reply:
             text = reply.read().decode()
         assert 'solidcloud_requests_total{scene="hall"} 3.0' in text
-        assert 'solidcloud_scene_info{policy="s3fifo",scene="hall"} 1.0' in text
+        assert 'solidcloud_scene_info{policy="lru",scene="hall"} 1.0' in text
         assert (
             f'client="{public_id(client._connection.client_id)}"' in text
             and client._connection.client_id not in text
@@ -210,8 +210,7 @@ def test_the_command_serves_metrics_and_top_shows_them(
             assert run(["top", "--connect", endpoint, "--once", *more]) == 0
             shown = capsys.readouterr().out
             assert (
-                "hall, policy s3fifo" in shown
-                and f"{public_id(client._connection.client_id)[:6]} al" in shown
+                "hall, policy lru" in shown and f"{public_id(client._connection.client_id)[:6]} al" in shown
             )
             assert re.search(r"^requests +3 ", shown, re.MULTILINE)
         assert run(["top", "--connect", endpoint, "--json"]) == 0

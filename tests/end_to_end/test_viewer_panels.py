@@ -59,7 +59,7 @@ def test_plots_show_frame_times_and_the_cache(browser: Any, url: str) -> None:
         assert {"effect stop", "effect ground", "effect contacts", "trip", "worst"} <= set(last)
         assert 0 < sum(last[name] for name in last if name.startswith("effect ")) < 1000
         assert last["trip"] <= last["worst"]
-        assert 0 < last["voxels"] + last["bounds"] < last["budget"]
+        assert 0 < last["voxels"] + last["levels"] < last["budget"]
         figures = viewed.page.locator("#instruments figure")
         assert figures.count() == 5
         frames = figures.first.inner_text()

@@ -138,7 +138,7 @@ def test_changes_arrive_as_a_user_walks(client: Client, scene: Scene) -> None:
         eventually(walked)
         eventually(lambda: known.voxels == resident(client))
         assert known.lists == 1, "nothing was lost"
-    eventually(lambda: not scene.residency._states.logs)
+    eventually(lambda: not scene.residency.stats.logs)
 
 
 def test_two_clients_follow_and_one_ends(client: Client, scene: Scene, endpoint: str) -> None:
@@ -147,7 +147,7 @@ def test_two_clients_follow_and_one_ends(client: Client, scene: Scene, endpoint:
             eventually(lambda: one.lists == two.lists == 1)
         before = one.messages
         eventually(lambda: one.messages > before + 1)
-        assert len(scene.residency._states.logs) == 1, "one log for all clients"
+        assert len(scene.residency.stats.logs) == 1, "one log for all clients"
 
 
 def test_a_restarted_server_is_followed(scene: Scene, endpoint: str) -> None:

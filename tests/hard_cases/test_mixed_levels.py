@@ -57,7 +57,7 @@ class PartStore(VoxelStore):
 def opened(archive: Path, body: NDArray[np.float64], rows: set[int]) -> Iterator[Scene]:
     """Open an archive of which only these voxels can be read; they and its whole level are in memory."""
     store, room = PartStore(archive), 1 << 24
-    with Scene.open(archive, budget_bytes=2 * room, coarse_bytes=room, open_store=lambda _: store) as scene:
+    with Scene.open(archive, budget_bytes=2 * room, level_bytes=room, open_store=lambda _: store) as scene:
         store.rows = rows
         with scene.archives[0].take() as generation:
             level = generation._level

@@ -5,51 +5,47 @@ from pathlib import Path
 import archive_cases
 import numpy as np
 import pytest
-from coarse_tops import open_made
+from numpy.typing import NDArray
 from solidcloud.schemas.wire.answers import Verdict
-from solidcloud.server.avatars.avatar_model import make_avatar
-from solidcloud.server.kernels.nearest.missing_voxels import split_missing
+from solidcloud.server.kernels.core.scene_arrays import Arena
+from solidcloud.server.residency.voxel_store import VoxelStore
 from solidcloud.server.scene import Scene
 
 # UTM and ECEF, in whole metres.
 SHIFTS = [(0, 0, 0), (500_000, 5_600_000, 100), (4_027_894, 307_045, 4_919_475)]
 
 
-@pytest.mark.case(
-    32, "bounds of a voxel out of memory, from its nodes: the same at the origin, at UTM and at ECEF"
-)
-def test_case_32_coarse_bounds_are_the_same_everywhere(tmp_path: Path) -> None:
-    """A floor and a wall fill the box of a voxel, and bodies hang between them."""
+class UnreadableStore(VoxelStore):
+    """Store of an archive of which no voxel can be read."""
+
+    def load(self, row: int, arena: Arena, offset: int) -> NDArray[np.int64]:
+        """Fail."""
+        raise OSError(5, "Input/output error")
+
+
+@pytest.mark.case(32, "bounds of a voxel that cannot be read: the same at the origin, at UTM and at ECEF")
+def test_case_32_boxes_bound_what_is_not_in_memory(tmp_path: Path) -> None:
+    """Bodies hang outside the box of a voxel with a floor and a wall."""
     side = np.stack(np.meshgrid(*[np.linspace(0.05, 3.95, 30)] * 2), axis=-1).reshape(-1, 2)
     flat = np.column_stack([side, np.full(len(side), 0.05)])
     scan = np.rint(np.concatenate([flat, np.roll(flat, 1, axis=1)]) * 2.0**14) * 2.0**-14
-    body = make_avatar(
-        np.rint(np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3)) * 2.0**14) * 2.0**-14, 0.01
-    )
-    places = np.array([(2.0, 2.0, 1.0), (2.0, 2.0, 0.375), (1.0, 3.0, 2.0), (2.5, 3.0, 3.0)])
-    true = [np.linalg.norm((body.points + place)[:, None] - scan, axis=-1).min() for place in places]
+    body = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3))
+    body = np.rint(body * 2.0**14) * 2.0**-14
+    places = np.array([(2.0, 2.0, 5.0), (-0.5, 2.0, 1.0), (5.0, 5.0, 4.5), (2.0, -1.0, -1.0)])
+    true = [np.linalg.norm((body + place)[:, None] - scan, axis=-1).min() - 0.03 for place in places]
     found = []
     for number, shift in enumerate(SHIFTS):
         (tmp_path / str(number)).mkdir()
         case = archive_cases.build(
             tmp_path / str(number), scan + np.array(shift), voxel=4.0, radius=0.02, resolution=2.0**-14
         )
-        made = open_made(case.archive)
         poses = np.array([archive_cases.pose_of(np.eye(3), place + shift) for place in places])
-        reach = made.reach(body, poses, 2 << 26)
-        bounds = []
-        for _ in range(2):
-            bound, counts = np.full(len(poses), np.inf), np.zeros((3, len(poses)), np.uint32)
-            split_missing(
-                poses, body.arrays, made.arrays, made.broad, made.coarse.arrays, reach, np.arange(len(poses)),
-                np.empty_like(reach.starts), np.empty_like(reach.rows), bound, counts,
-            )  # fmt: skip
-            bounds.append(bound * made.arrays.step)
-            made.fill()
-        boxes, nodes = bounds
-        assert (boxes <= nodes).all() and (nodes <= true).all() and (counts[0] == 1).all()
-        assert boxes.max() == 0.0 and nodes.min() > 0.05
-        found.append(nodes)
+        with Scene.open(case.archive, level_bytes=0, open_store=UnreadableStore) as scene:
+            scene.add_avatar("body", body, 0.01)
+            bounds = scene.distance("body", poses, 4.0)
+        assert (bounds.voxels_missing == 1).all() and np.isinf(bounds.upper).all()
+        assert (bounds.lower <= true).all() and bounds.lower.min() > 0.2
+        found.append(bounds.lower)
     assert np.ptp(found, axis=0).max() <= 2.0**-20
 
 

@@ -58,7 +58,7 @@ def test_what_a_frame_is_told_without_waiting_is_true(
         scan = (stored, info.origin, info.lattice_step, radii, avatar, 0.02)
         judged = naive_distance.distance_by_radii(*scan, poses, 5.0)
         signed = np.array([math.inf if found is None else found.signed for found in judged])
-        with Scene.open(case.archive, policy=policy, coarse_bytes=level) as scene:
+        with Scene.open(case.archive, policy=policy, level_bytes=level) as scene:
             with scene.archives[0].take() as opened:
                 data, where = opened.radius_model(model), opened.data.residency.where
                 known = rng.random(len(where)) < rng.choice([0.0, 0.5, 1.0])

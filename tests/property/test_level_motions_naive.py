@@ -51,7 +51,7 @@ def test_what_a_level_settles_is_true(
         )
         stored, radii = radius_class_archives.stored_radii(case.archive, model)
         motions = "avatar", poses[:-1], poses[1:], margin
-        with Scene.open(case.archive, coarse_bytes=0) as scene:
+        with Scene.open(case.archive, level_bytes=0) as scene:
             scene.add_avatar("avatar", avatar, 0.02)
             info = scene.info()
             true = scene.sweep(*motions, radius_model=model)
@@ -76,7 +76,7 @@ def test_what_a_level_settles_is_true(
                 assert np.isfinite(swept.witness_cloud[touched]).all()
                 at = [k for k in np.flatnonzero(touched) if swept.upper[k] == 1.0]
                 assert (signed[1:][at] <= margin + 1e-7).all()
-            with Scene.open(case.archive, budget_bytes=room, coarse_bytes=room) as alone:
+            with Scene.open(case.archive, budget_bytes=room, level_bytes=room) as alone:
                 alone.add_avatar("avatar", avatar, 0.02)
                 for late in ({}, {"budget_ms": 0.0}):
                     swept = alone.sweep(*motions, **options, **late)
@@ -89,10 +89,10 @@ def test_what_a_level_settles_is_true(
                     assert (found.pairs_found == counted.pairs_found)[found.exact].all()
                     assert (signed[found.verdict == Verdict.CLEAR] > margin).all()
                     assert alone.residency.resident == 0
-        with Scene.open(case.archive, coarse_bytes=room) as kept:
+        with Scene.open(case.archive, level_bytes=room) as kept:
             kept.add_avatar("avatar", avatar, 0.02)
             assert said(kept.sweep(*motions, radius_model=model)) == said(true)
-        with Scene.open(case.archive, coarse_bytes=room) as kept:
+        with Scene.open(case.archive, level_bytes=room) as kept:
             kept.add_avatar("avatar", avatar, 0.02)
             assert said(kept.contacts("avatar", poses, 5, margin, radius_model=model)) == said(counted)
 

@@ -59,7 +59,7 @@ def test_without_a_voxel_everything_said_is_true(
         signed = np.array([math.inf if found is None else found.signed for found in judged])
         within = np.where(signed <= reach, signed, np.inf)
         room = level_bytes(case.archive)
-        with Scene.open(case.archive, coarse_bytes=0) as scene:
+        with Scene.open(case.archive, level_bytes=0) as scene:
             scene.add_avatar("avatar", avatar, 0.02)
             true = scene.sweep("avatar", poses[:-1], poses[1:], margin, radius_model=model)
         for tolerance in TOLERANCES:
@@ -67,7 +67,7 @@ def test_without_a_voxel_everything_said_is_true(
                 "radius_model": model,
                 **({"tolerance": tolerance} if tolerance else {}),
             }
-            with Scene.open(case.archive, budget_bytes=room, coarse_bytes=room) as alone:
+            with Scene.open(case.archive, budget_bytes=room, level_bytes=room) as alone:
                 alone.add_avatar("avatar", avatar, 0.02)
                 touch = alone.collide("avatar", poses, margin, **options)
                 said = signed + 1e-9

@@ -83,7 +83,7 @@ def test_bounds_hold_and_are_close_enough(
         hits = naive_rays.raycast(lattice, *space, radii, *rays, reach).distance
         near = naive_rays.within(lattice, *space, loose, reach).distance
         room = level_bytes(case.archive)
-        kept: dict[str, Any] = {"coarse_bytes": room} if prefetch else {}
+        kept: dict[str, Any] = {"level_bytes": room} if prefetch else {}
         with Scene.open(case.archive) as warm:
             exact = [
                 query.node_visits
@@ -109,7 +109,7 @@ def test_bounds_hold_and_are_close_enough(
         with Scene.open(case.archive, **kept) as cold:
             point = cold.within(loose, reach, relative_tolerance=0.3, radius_model=model)
             judge(point, near, reach, np.maximum(1e-3, 0.3 * near), True)
-        with Scene.open(case.archive, budget_bytes=room, coarse_bytes=room) as alone:
+        with Scene.open(case.archive, budget_bytes=room, level_bytes=room) as alone:
             for tolerance in TOLERANCES:
                 for late in ({}, {"budget_ms": 0.0}):
                     options = {**scene_options(tolerance, model), **late}

@@ -4,15 +4,12 @@ the budget holds."""
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 from fake_store import BLOCK, FakeStore
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from solidcloud.server.residency.eviction import POLICIES, make_policy
-from solidcloud.server.residency.voxel_cache import VoxelCache
-from solidcloud.server.residency.voxel_states import BackgroundLoad, HeldVoxels
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from solidcloud.server.residency.voxel_cache import BackgroundLoad, HeldVoxels, VoxelCache
 
 SIZES = [1, 1, 2, 3, 1, 4, 2, 1, 5, 2]  # cache lines
 BUDGET = 9
@@ -44,13 +41,7 @@ class ResidencyMachine(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.store = FakeStore(SIZES)
-        self.begin("lru")
-
-    @initialize(policy=st.sampled_from(POLICIES))
-    def begin(self, policy: str) -> None:
-        """An empty residency under a policy; to `distance`, greater rows are farther."""
-        order = make_policy(policy, BUDGET * BLOCK, lambda rows: np.array(rows, np.float64))
-        self.residency = VoxelCache(self.store, BUDGET * BLOCK, order)
+        self.residency = VoxelCache(self.store, BUDGET * BLOCK)
         self.residency.on_owed = lambda: None
         self.residency._changed.wait = _refuse  # type: ignore[method-assign,assignment]
         self.open: list[Holding] = []

@@ -135,7 +135,7 @@ def test_no_voxel_size_changes_an_answer(tmp_path: Path, kind: str, seed: int) -
     for size in SIZES:
         case = build(tmp_path, points, size, models=radius_class_archives.STORED)
         for budget in BUDGETS:
-            with Scene.open(case.archive, budget_bytes=budget, coarse_bytes=0) as scene:
+            with Scene.open(case.archive, budget_bytes=budget, level_bytes=0) as scene:
                 scene.add_avatar("body", avatar, BODY_RADIUS)
                 for model in MODELS:
                     for name, ask in asked.items():
@@ -167,7 +167,7 @@ def test_no_voxel_size_changes_a_contact_of_many_points_at_once(tmp_path: Path) 
     last[:, 1, 0], last[:, 0, 1] = np.sin(angle), -np.sin(angle)
     found = []
     for size in SIZES:
-        with Scene.open(build(tmp_path, floor, size).archive, coarse_bytes=0) as scene:
+        with Scene.open(build(tmp_path, floor, size).archive, level_bytes=0) as scene:
             scene.add_avatar("feet", feet, BODY_RADIUS)
             answers = scene.sweep("feet", first, last)
         assert 50 < (answers.upper <= 1).sum() < 200 and (answers.lower > 0).all()

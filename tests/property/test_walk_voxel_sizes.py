@@ -70,6 +70,6 @@ def test_a_cache_of_a_few_voxels_changes_no_walk(archives: list[Path]) -> None:
     budget = 9 * ArenaBuffer.rounded(int(store.sizes.max())) // 8
     with play(archives[0], *EFFECTS) as game:
         expected = walks(game).tobytes()
-    with play(archives[0], *EFFECTS, budget_bytes=budget, coarse_bytes=0) as game:
+    with play(archives[0], *EFFECTS, budget_bytes=budget, level_bytes=0) as game:
         assert walks(game).tobytes() == expected
         assert game.scene.residency.evictions > 100

@@ -97,7 +97,7 @@ def opened(archive: Path, question: str) -> Iterator[Scene]:
     With a deadline, how much of a level is loaded by then depends on the clock: these questions have
     no level.
     """
-    with Scene.open(archive, coarse_bytes=0 if "bounded" in question else None) as scene:
+    with Scene.open(archive, level_bytes=0 if "bounded" in question else None) as scene:
         # Like an avatar of 8,000 points and more, whose leaf nodes are too many for a front, "deep"
         # has a front of inner nodes.
         for name, most in (("small", avatar.MAX_FRONT), ("deep", 3)):

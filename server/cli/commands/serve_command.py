@@ -21,11 +21,11 @@ def serve(
     policy: Annotated[
         str,
         typer.Option(
-            help="Eviction policy of the voxel cache: lru, lru+prefetch, distance or s3fifo. All but lru prefetch.",
-            autocompletion=among("lru", "lru+prefetch", "distance", "s3fifo"),
+            help="Eviction policy of the voxel cache: lru, or lru+prefetch, which also loads voxels ahead of users.",
+            autocompletion=among("lru", "lru+prefetch"),
         ),
     ] = "lru+prefetch",
-    coarse_bytes: Annotated[
+    level_bytes: Annotated[
         str | None,
         typer.Option(
             help="The part of --cache for levels of detail, such as 64MB; default: a sixteenth. 0B: use none."
@@ -117,7 +117,7 @@ def serve(
         max_avatar_clients=max_avatar_clients,
     )
     budget = parse_bytes(cache, "--cache")
-    coarse = None if coarse_bytes is None else parse_bytes(coarse_bytes, "--coarse-bytes")
+    level = None if level_bytes is None else parse_bytes(level_bytes, "--level-bytes")
     if key_file is not None:
         read_given_key(key_file)  # raises before the archive is opened and warmed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # until `serve_scenes` waits for signals
@@ -129,7 +129,7 @@ def serve(
             rehearse(what, files)
         start.enter_context(warmed_in_parallel(what))
         scene = stack.enter_context(
-            Scene.open(what, name, budget_bytes=budget, policy=policy, coarse_bytes=coarse)
+            Scene.open(what, name, budget_bytes=budget, policy=policy, level_bytes=level)
         )
         if log is not None:
             stack.enter_context(recorded(scene, what, log))

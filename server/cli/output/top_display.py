@@ -97,12 +97,12 @@ def scene_view(before: Sample | None, now: Sample) -> RenderableType:
 
 def budget_line(stats: StatsAnswer) -> str:
     """Format the memory in use against the budget, with a bar."""
-    used = stats.resident_bytes + stats.coarse_bytes
+    used = stats.resident_bytes + stats.level_bytes
     share = used / stats.budget_bytes if stats.budget_bytes else 0.0
     full = min(BAR, round(BAR * share))
-    coarse = f", {bytes_text(stats.coarse_bytes)} coarse" if stats.coarse_bytes else ""
+    level = f", {bytes_text(stats.level_bytes)} for levels of detail" if stats.level_bytes else ""
     bar = "█" * full + "░" * (BAR - full)
-    return f"{bar} {share:.0%}  {bytes_text(used)} of {bytes_text(stats.budget_bytes)}{coarse}"
+    return f"{bar} {share:.0%}  {bytes_text(used)} of {bytes_text(stats.budget_bytes)}{level}"
 
 
 def _table(first: str, *numbers: str) -> Table:

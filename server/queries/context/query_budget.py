@@ -20,8 +20,7 @@ from ....schemas.wire.answers import Cost
 from ....schemas.wire.question_rules import Question
 from ...kernels.core.placed_avatar import MAX_REACH_UNITS
 from ...kernels.core.scene_arrays import NO_LIMIT as NO_LIMIT
-from ...residency.voxel_cache import VoxelCache
-from ...residency.voxel_states import HeldVoxels
+from ...residency.voxel_cache import HeldVoxels, VoxelCache
 from ...runtime.stop_flag import NO_STOP, StopFlag, StoppedError, stop_at
 
 _A = TypeVar("_A", bound=Cost)

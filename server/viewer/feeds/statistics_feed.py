@@ -113,7 +113,7 @@ def sample(before: Reading, now: Reading) -> dict[str, Any] | None:
         "totals": {name: getattr(new, name) for name in _COUNTERS},
         "memory": {
             "voxels": new.resident_bytes,
-            "bounds": new.coarse_bytes,
+            "levels": new.level_bytes,
             "budget": new.budget_bytes,
             "resident": new.resident,
             "total": new.voxels,

@@ -99,8 +99,8 @@ def _ask(
     archive: Path, avatar: Floats, pose: Floats, tolerance: float | None, query: Query
 ) -> tuple[int, float, int]:
     """Ask about one pose with nothing in memory: bytes read, wait [s], voxels loaded."""
-    coarse = 0 if tolerance is None else BUDGET // 16
-    with Scene.open(archive, budget_bytes=BUDGET, coarse_bytes=coarse) as scene:
+    level = 0 if tolerance is None else BUDGET // 16
+    with Scene.open(archive, budget_bytes=BUDGET, level_bytes=level) as scene:
         scene.add_avatar(AVATAR, avatar)
         drop_cache(archive)
         before, begin = bytes_read() or 0, time.perf_counter()

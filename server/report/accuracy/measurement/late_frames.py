@@ -22,7 +22,7 @@ WALKING = (*CONTINUOUS, "slide", "step", "ground")
 class FrameWalk(NamedTuple):
     """Frames along one walk.
 
-    share: of the decoded scene in memory.  memory_bytes: the same.  coarse: whether all of it is for
+    share: of the decoded scene in memory.  memory_bytes: the same.  level_only: whether all of it is for
     the level of detail; otherwise for voxels and level, by default.  late: of the session.
     effects: of the scene.  frames: number.
     slow: frames longer than FRAME_SECONDS.  longest_ms, median_ms: of a frame.
@@ -35,7 +35,7 @@ class FrameWalk(NamedTuple):
 
     share: float
     memory_bytes: int
-    coarse: bool
+    level_only: bool
     late: str
     effects: str
     frames: int
@@ -55,7 +55,7 @@ def late_walk(
     walk: Floats,
     share: float,
     *,
-    coarse: bool,
+    level_only: bool,
     late: str,
     effects: tuple[str, ...],
     folder: Path,
@@ -70,13 +70,13 @@ def late_walk(
     target = folder / "late.toml"
     with new_file(target) as file:
         file.write((text + "".join(f'[[effects]]\neffect = "{each}"\n\n' for each in effects)).encode())
-    with Scene.open(target, coarse_bytes=0) as judge:
+    with Scene.open(target, level_bytes=0) as judge:
         judge.add_avatar(AVATAR, avatar)
         judge.collide(AVATAR, walk)
         decoded = judge.info().resident_bytes
         memory = int(decoded * share)
-        level = memory if coarse else None
-        with Scene.open(target, budget_bytes=memory, policy="lru+prefetch", coarse_bytes=level) as scene:
+        level = memory if level_only else None
+        with Scene.open(target, budget_bytes=memory, policy="lru+prefetch", level_bytes=level) as scene:
             scene.add_avatar(AVATAR, avatar)
             scene.warm()  # as a server does
             drop_cache(archive)
@@ -88,7 +88,7 @@ def late_walk(
         crossed |= swept == Verdict.CONTACT
     behind = float(np.linalg.norm(poses[1:, :3, 3] - walk[:, :3, 3], axis=1).max())
     return FrameWalk(
-        share, memory, coarse, late, "+".join(effects), len(times), int((times > FRAME_SECONDS).sum()),
+        share, memory, level_only, late, "+".join(effects), len(times), int((times > FRAME_SECONDS).sum()),
         float(times.max()) * 1e3, float(np.median(times)) * 1e3,
         float(used.max()) * 1e3, float(np.median(used)) * 1e3, float(stopped.mean()), behind,
         int((crossed & (verdict[:-1] == Verdict.CLEAR)).sum()),

@@ -34,7 +34,7 @@ def walk_rows(
     most: maximum number of frames.  tick: called after each row.
     """
     poses = along(walk, SPEED / RATE)[:most]
-    with Scene.open(archive, coarse_bytes=0) as scene:
+    with Scene.open(archive, level_bytes=0) as scene:
         scene.add_avatar(AVATAR, avatar)
         truly = scene.collide(AVATAR, poses).verdict
         decoded = scene.info().resident_bytes
@@ -52,7 +52,7 @@ def _walk(archive: Path, avatar: Floats, poses: Floats, truly: np.ndarray, row: 
         scene = Scene.open(
             archive,
             budget_bytes=row.memory_bytes,
-            coarse_bytes=row.memory_bytes if row.kind == "bounds" else 0,
+            level_bytes=row.memory_bytes if row.kind == "bounds" else 0,
         )
     except BadRequestError:
         return row._replace(note="the largest voxel does not fit")

@@ -68,7 +68,7 @@ export function addPlotsPanel(app) {
     title: "Memory of the cache", unit: "MiB", format: bytes,
     series: [
       { name: "voxels", label: "voxels", colour: "#5fd3c4", kind: "area" },
-      { name: "bounds", label: "bounds", colour: "#8a7bd8", kind: "area" },
+      { name: "levels", label: "levels of detail", colour: "#8a7bd8", kind: "area" },
     ],
   });
   const text = note(body, "No statistics yet.");
@@ -96,9 +96,9 @@ export function addPlotsPanel(app) {
 
   /** Use the effects that the scene runs, in their order, and the budget. */
   function name() {
-    const { effects, memory: { budget, voxels, bounds } } = last;
+    const { effects, memory: { budget, voxels, levels } } = last;
     // An axis up to a budget that is hardly used would show nothing.
-    const near = voxels + bounds > 0.1 * budget;
+    const near = voxels + levels > 0.1 * budget;
     const now = `${effects.map(([effect]) => effect)}${near}`;
     if (now === named) return;
     named = now;
@@ -116,9 +116,9 @@ export function addPlotsPanel(app) {
     const now = last ? last.time + Math.max(0, performance.now() - arrived - 200) / 1000 : 0;
     for (const chart of charts) chart.draw(samples, now);
     if (!last) return;
-    const { totals, memory: { voxels, bounds, budget, resident, total } } = last;
-    const share = (100 * (voxels + bounds)) / budget;
-    text.textContent = `${resident.toLocaleString("en")} of ${total.toLocaleString("en")} voxels in memory; with bounds and levels of detail ${bytes((voxels + bounds) / MIB)} of `
+    const { totals, memory: { voxels, levels, budget, resident, total } } = last;
+    const share = (100 * (voxels + levels)) / budget;
+    text.textContent = `${resident.toLocaleString("en")} of ${total.toLocaleString("en")} voxels in memory; with levels of detail ${bytes((voxels + levels) / MIB)} of `
       + `the budget of ${bytes(budget / MIB)} (${share < 1 ? share.toFixed(2) : share.toFixed(0)} %). Since the server began: `
       + `${totals.hits.toLocaleString("en")} hits, ${totals.misses.toLocaleString("en")} misses, ${totals.prefetched.toLocaleString("en")} prefetched, `
       + `${totals.wasted.toLocaleString("en")} of them wasted, ${totals.evicted.toLocaleString("en")} evicted.`;
@@ -130,7 +130,7 @@ export function addPlotsPanel(app) {
 function flat({ time, effects, rates, memory }, own) {
   return {
     time, ...own, ...rates,
-    voxels: memory.voxels / MIB, bounds: memory.bounds / MIB, budget: memory.budget / MIB,
+    voxels: memory.voxels / MIB, levels: memory.levels / MIB, budget: memory.budget / MIB,
     ...Object.fromEntries(effects.map(([effect, seconds]) => [`effect ${effect}`, 1e3 * seconds])),
   };
 }

@@ -65,7 +65,7 @@ def test_every_count_is_there_under_a_name_as_prometheus_wants_it() -> None:
     assert own["solidcloud_resident_bytes"] == numbers["resident_bytes"]
     assert own["solidcloud_resident_voxels"] == numbers["resident"]
     assert ("solidcloud_scene_info", {"scene": "hall", "policy": "lru"}, 1.0) in found
-    gauges = {"generation", "budget_bytes", "resident_bytes", "coarse_bytes", "voxels", "resident", "kept"}
+    gauges = {"generation", "budget_bytes", "resident_bytes", "level_bytes", "voxels", "resident", "kept"}
     assert sum(name.endswith("_total") for name in own) == len(set(FIELDS) - gauges)
 
 

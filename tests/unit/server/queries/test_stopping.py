@@ -33,7 +33,7 @@ def stopped_already(reason: str) -> StopFlag:
 
 def assert_nothing_held(residency: VoxelCache) -> None:
     residency.check()
-    assert not residency._states.pins and not residency._waiting_requests and not residency._states.loading
+    assert not residency._pins and not residency._waiting_requests and not residency._loading
 
 
 @pytest.fixture

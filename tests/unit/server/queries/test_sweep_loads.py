@@ -15,13 +15,13 @@ def test_a_motion_asked_alone_from_an_empty_cache_has_the_bits_of_the_last_of_ma
     poses = archive_cases.near_poses(rng, points, avatar, 40, 0.6)
     first, last = poses[:-1], poses[1:]
     case = archive_cases.build(tmp_path, points, voxel=0.3, degree=2, leaf=1, cell_points=1)
-    with Scene.open(case.archive, coarse_bytes=0) as warm:
+    with Scene.open(case.archive, level_bytes=0) as warm:
         warm.add_avatar("avatar", avatar, 0.02)
         warm.sweep("avatar", first, last)
         all_loaded = warm.sweep("avatar", first, last)
         assert all_loaded.misses == 0 and len(set(all_loaded.verdict.tolist())) == 2
     for k in range(len(first)):
-        with Scene.open(case.archive, coarse_bytes=0) as cold:
+        with Scene.open(case.archive, level_bytes=0) as cold:
             cold.add_avatar("avatar", avatar, 0.02)
             alone = cold.sweep("avatar", first[k : k + 1], last[k : k + 1])
         found = alone.verdict[0], alone.lower[0], alone.upper[0], alone.steps[0], alone.node_visits[0]

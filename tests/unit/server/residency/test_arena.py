@@ -1,59 +1,159 @@
-"""The arena: runs that never overlap, never leave the buffer, and join again."""
+"""The arena: runs never overlap or leave the buffer, gaps join again, voxels are moved rather than evicted."""
 
 import re
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from solidcloud.server.residency.arena import ALIGNMENT, ArenaBuffer, VoxelAllocator
+from solidcloud.server.residency.cache_stats import CacheStats, ChangeLog
+from solidcloud.server.residency.eviction import EvictionPolicy
+
+
+class Filled:
+    """A room whose runs are filled with their row numbers, as a load would."""
+
+    def __init__(self, sizes: list[int], budget: int) -> None:
+        self.buffer = ArenaBuffer(budget * ALIGNMENT)
+        self.where = np.full((len(sizes), 3), -1, np.int64)
+        bytes_of, self.stats = [s * ALIGNMENT for s in sizes], CacheStats([s * ALIGNMENT for s in sizes])
+        self.log, self.pins = ChangeLog(), set[int]()
+        self.stats.logs = (self.log,)
+        self.room = VoxelAllocator(
+            self.buffer,
+            bytes_of,
+            self.where,
+            EvictionPolicy(budget * ALIGNMENT),
+            self.stats,
+            self.pins,
+            set(),
+        )
+
+    @property
+    def gone(self) -> list[int]:
+        """Return the rows evicted so far, in order."""
+        return list(self.log.changes)
+
+    def make(self, row: int, stays: frozenset[int] = frozenset(), most: int | None = None) -> bool:
+        """Make room for a row that is not there; `stays` neither go nor move."""
+        room = self.room
+        self.pins.clear()
+        self.pins.update(stays)
+        if not room.allocate(row, lambda _: False, scan=False, most=most):
+            return False
+        offset = room.offsets[row]
+        self.where[row] = (offset // 4, offset // 4 + 1, offset // 2 + 3)
+        self.buffer.arena.ints[offset // 4 : (offset + room.sizes[row]) // 4] = row
+        return True
+
+    def check(self) -> None:
+        """Every run is whole, and `where` says where."""
+        self.room.check()
+        for row, offset in self.room.offsets.items():
+            run = self.buffer.arena.ints[offset // 4 : (offset + self.room.sizes[row]) // 4]
+            assert (run == row).all()
+            assert self.where[row].tolist() == [offset // 4, offset // 4 + 1, offset // 2 + 3]
 
 
 @pytest.mark.parametrize("budget", [0, 1, 63])
 def test_a_budget_below_a_cache_line_holds_nothing(budget: int) -> None:
-    buffer = ArenaBuffer(budget)
-    assert buffer.free_runs() == [] and buffer.allocate(1) is None
+    assert ArenaBuffer(budget).total_bytes == 0
+    filled = Filled([1], 0)
+    assert not filled.make(0)
+    filled.check()
 
 
-def test_runs_are_taken_best_fit_and_joined() -> None:
-    buffer = ArenaBuffer(64 * 6)
-    a, b, c = buffer.allocate(64), buffer.allocate(65), buffer.allocate(1)
-    assert (a, b, c) == (0, 64, 192)
-    assert buffer.free_runs() == [(256, 128)]
-    buffer.release(0, 64)
-    buffer.release(192, 1)  # joins what is free behind it
-    assert buffer.free_runs() == [(0, 64), (192, 192)]
-    assert buffer.allocate(64 * 4) is None, "256 bytes are free, but not in one run"
-    buffer.release(64, 65)  # joins both sides
-    assert buffer.free_runs() == [(0, 384)]
-    assert buffer.largest_run() == (0, 384)
-    assert buffer.allocate(384) == 0 and buffer.free_runs() == []
-    assert buffer.largest_run() == (-1, 0)
-    buffer.release(0, 128)
-    buffer.release(256, 64)
-    assert buffer.allocate(64) == 256, "the run that just suffices, though another comes first"
+def test_a_voxel_gets_the_shortest_gap_that_suffices() -> None:
+    filled = Filled([1, 2, 1, 2, 1, 1, 3], 8)
+    assert all(filled.make(row) for row in range(5))
+    assert list(filled.room.offsets.values()) == [0, 64, 192, 256, 384]
+    filled.room.forget(1)
+    assert filled.make(5) and filled.room.offsets[5] == 448, "one line is free there, two at 64"
+    filled.room.forget(2)
+    assert filled.make(6) and filled.room.offsets[6] == 64, "the gaps on both sides are joined"
+    assert filled.stats.moved_bytes == 0 and filled.gone == []
+    filled.check()
 
 
 def test_random_use_against_a_model(rng: np.random.Generator) -> None:
-    """The model: an array of owners, one a cache line."""
-    lines = 50
-    buffer, owners, held = ArenaBuffer(lines * ALIGNMENT), np.zeros(lines, int), {}
-    for number in range(1, 1500):
+    """The model: an array of owners, one a cache line. Nothing may be evicted or moved."""
+    lines, sizes = 50, rng.integers(1, 13, 1500).tolist()
+    filled, owners = Filled(sizes, lines), np.full(lines, -1)
+    for row, size in enumerate(sizes):
+        held = list(filled.room.offsets)
         if held and rng.random() < 0.5:
-            owner = list(held)[rng.integers(len(held))]
-            buffer.release(*held.pop(owner))
-            owners[owners == owner] = 0
-        else:
-            size = int(rng.integers(1, 12 * ALIGNMENT))
-            taken = buffer.rounded(size) // ALIGNMENT
-            offset = buffer.allocate(size)
-            free = "".join("." if owner == 0 else "x" for owner in owners)
-            fits = [(len(run[0]), run.start()) for run in re.finditer(r"\.+", free) if len(run[0]) >= taken]
-            at = min(fits)[1] if fits else -1
-            assert (offset if offset is not None else -ALIGNMENT) == at * ALIGNMENT
-            if offset is not None:
-                owners[at : at + taken] = number
-                held[number] = (offset, size)
-        runs = buffer.free_runs()
-        assert buffer.largest_run()[1] == max((size for _, size in runs), default=0)
-        assert sum(size for _, size in runs) == (owners == 0).sum() * ALIGNMENT
-        assert all(a + size < b for (a, size), (b, _) in pairwise(runs))
+            gone = held[rng.integers(len(held))]
+            filled.room.forget(gone)
+            owners[owners == gone] = -1
+            continue
+        free = "".join("." if owner < 0 else "x" for owner in owners)
+        fits = [(len(run[0]), run.start()) for run in re.finditer(r"\.+", free) if len(run[0]) >= size]
+        assert filled.make(row, stays=frozenset(held)) == bool(fits)
+        if fits:
+            at = min(fits)[1]
+            assert filled.room.offsets[row] == at * ALIGNMENT
+            owners[at : at + size] = row
+        filled.room.check()
+
+
+def test_room_in_pieces_is_joined_by_moving() -> None:
+    filled = Filled([1] * 6 + [2], 6)
+    assert all(filled.make(row) for row in range(6))
+    for row in (1, 4):
+        filled.room.forget(row)
+    assert filled.make(6) and filled.gone == []
+    # Between the two holes stood 2 and 3; one stretch of those two had to be moved, by one block.
+    assert filled.stats.moved_bytes == 2 * ALIGNMENT
+    filled.check()
+
+
+def test_what_stays_is_not_moved_and_others_go_instead() -> None:
+    filled = Filled([1] * 6 + [2], 6)
+    assert all(filled.make(row) for row in range(6))
+    for row in (1, 4):
+        filled.room.forget(row)
+    before = dict(filled.room.offsets)
+    assert filled.make(6, stays=frozenset({2, 3}))
+    assert filled.gone == [0]
+    assert all(filled.room.offsets[row] == before[row] for row in (2, 3))
+    filled.check()
+
+
+def test_nothing_goes_where_all_that_may_is_too_little() -> None:
+    filled = Filled([1, 1, 1, 3], 3)
+    assert all(filled.make(row) for row in range(3))
+    assert not filled.make(3, stays=frozenset({2}))
+    assert not filled.make(3, most=2)
+    assert filled.gone == [] and filled.stats.evicted == 0
+    assert filled.make(3) and filled.gone == [0, 1, 2]
+    filled.check()
+
+
+@given(
+    sizes=st.lists(st.integers(1, 5), min_size=1, max_size=12),
+    steps=st.lists(st.tuples(st.integers(0, 11), st.sets(st.integers(0, 11), max_size=4)), max_size=40),
+)
+@settings(max_examples=200, deadline=None, derandomize=True)
+def test_whatever_comes_and_goes_stays_whole(sizes: list[int], steps: list[tuple[int, set[int]]]) -> None:
+    """A row is refused only where those that stay leave no room in one run, however the others are placed."""
+    budget = max(12, max(sizes))
+    filled = Filled(sizes, budget)
+    for row, stays in steps:
+        row %= len(sizes)
+        if row in filled.room.offsets:
+            filled.room.forget(row)
+            continue
+        held = {other: filled.room.offsets[other] for other in stays if other in filled.room.offsets}
+        made = filled.make(row, stays=frozenset(stays))
+        assert all(filled.room.offsets[other] == offset for other, offset in held.items())
+        assert made == (_longest_gap(held, sizes, budget) >= sizes[row])
+        filled.check()
+
+
+def _longest_gap(held: dict[int, int], sizes: list[int], budget: int) -> int:
+    """Blocks of the longest stretch without any of these."""
+    at, longest = 0, 0
+    for row, offset in sorted(held.items(), key=lambda item: item[1]):
+        longest, at = max(longest, offset // ALIGNMENT - at), offset // ALIGNMENT + sizes[row]
+    return max(longest, budget - at)

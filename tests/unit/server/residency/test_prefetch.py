@@ -76,7 +76,7 @@ def until(condition: Callable[[], bool]) -> bool:
 def test_what_is_wanted_is_loaded_soonest_first_and_counted() -> None:
     table = Table([1] * 5, 5)
     order: list[int] = []
-    table.residency.on_loaded = lambda row, where: order.append(row)
+    table.residency.on_proved = order.append
     table.wishes.wanted = {3: 0.5, 1: 0.1, 4: 2.0}
     with table.prefetcher:
         table.see()

@@ -17,8 +17,7 @@ from solidcloud.schemas.wire.answers import Verdict
 from solidcloud.schemas.wire.requests import QuestionOptions
 from solidcloud.server.kernels.core.scene_arrays import Arena
 from solidcloud.server.residency.eviction import POLICIES
-from solidcloud.server.residency.voxel_cache import VoxelCache
-from solidcloud.server.residency.voxel_states import HeldVoxels
+from solidcloud.server.residency.voxel_cache import HeldVoxels, VoxelCache
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
@@ -172,7 +171,7 @@ def test_who_waits_for_a_load_that_raises_is_answered() -> None:
         first = pool.submit(take, residency, [0])
         assert store.wait_for_load(0, DEADLINE)
         second = pool.submit(take, residency, [0])
-        while residency._states.pins.get(0, 0) < 2:
+        while residency._pins.get(0, 0) < 2:
             pass
         store.gate.set()
         with pytest.raises(MemoryError):
@@ -181,21 +180,21 @@ def test_who_waits_for_a_load_that_raises_is_answered() -> None:
     residency.check()
 
 
-@pytest.mark.parametrize("broken", ["bytes", "overlap", "lost run", "where", "pin"])
+@pytest.mark.parametrize("broken", ["bytes", "overlap", "lost gap", "where", "pin"])
 def test_check_finds_what_is_broken(broken: str) -> None:
     residency = VoxelCache(FakeStore([1, 1, 1]), 3 * BLOCK)
     take(residency, [0, 1])
     residency.check()
     if broken == "bytes":
-        residency._states.allocator.used_bytes += BLOCK
+        residency._allocator.used_bytes += BLOCK
     elif broken == "overlap":
-        residency._states.allocator.offsets[1] = residency._states.allocator.offsets[0]
-    elif broken == "lost run":
-        residency.buffer.allocate(BLOCK)
+        residency._allocator.offsets[1] = residency._allocator.offsets[0]
+    elif broken == "lost gap":
+        residency._allocator._gaps.clear()
     elif broken == "where":
         residency.where[1] = -1
     else:
-        residency._states.pins[1] = 0
+        residency._pins[1] = 0
     with pytest.raises(AssertionError):
         residency.check()
 
@@ -224,7 +223,7 @@ def test_eight_threads_and_a_tiny_budget_change_no_answer(
             scene.add_avatar("avatar", avatar, 0.005, client=client)
             options: QuestionOptions = {"budget_ms": 0.0} if number % 3 == 0 else {}
             answers = scene.collide("avatar", poses[part], client=client, **options)
-            over.append(scene.stats().resident_bytes + scene.stats().coarse_bytes > everything // 6)
+            over.append(scene.stats().resident_bytes + scene.stats().level_bytes > everything // 6)
             late = answers.verdict == Verdict.UNKNOWN
             unknown.append(int(late.sum()))
             assert not late.any() or options

@@ -10,8 +10,7 @@ import pytest
 import synthetic_scans
 from fake_store import BLOCK, FakeStore
 from solidcloud.server.queries.context.query_context import as_held
-from solidcloud.server.residency.voxel_cache import VoxelCache
-from solidcloud.server.residency.voxel_states import HeldVoxels
+from solidcloud.server.residency.voxel_cache import HeldVoxels, VoxelCache
 from solidcloud.server.scene import Scene
 
 pytestmark = pytest.mark.interpreted
@@ -55,10 +54,10 @@ def test_who_does_not_wait_gets_what_is_there_and_evicts_nothing() -> None:
     store.gate.clear()  # a load would block
     with residency.hold([0, 1, 2, 3], -np.inf) as held:
         assert held == HeldVoxels(2, 0, (), (0, 2)), "more than fit together may be asked for"
-        assert residency.resident == 2 and residency._states.pins == {0: 1, 1: 1, 2: 1, 3: 1}
+        assert residency.resident == 2 and residency._pins == {0: 1, 1: 1, 2: 1, 3: 1}
     assert store.loads == {1: 1, 3: 1} and woken == [1]
     assert [residency.take_owed() for _ in range(3)] == [0, 2, None]
-    assert not residency._states.pins
+    assert not residency._pins
     residency.check()
 
 
@@ -99,7 +98,7 @@ def test_a_load_that_was_not_begun_is_taken_over_by_who_waits_for_it() -> None:
         hurried = pool.submit(take, residency, [0, 1], deadline)
         assert store.wait_for_load(0, PATIENCE)
         patient = pool.submit(take, residency, [1])
-        while residency._states.pins.get(1, 0) < 2 or time.perf_counter() < deadline:
+        while residency._pins.get(1, 0) < 2 or time.perf_counter() < deadline:
             time.sleep(0.001)
         store.gate.set()
         assert hurried.result(PATIENCE).late in ((1,), ()), "unless the other was faster to load it"
@@ -134,7 +133,7 @@ def test_many_in_a_hurry_leave_nobody_without_an_answer() -> None:
         for held, hurried in pool.map(one, range(600), timeout=10 * PATIENCE):
             assert hurried or not held.late
     residency.check()
-    assert not residency._states.pins and not residency._states.loading and not residency._states.abandoned
+    assert not residency._pins and not residency._loading
 
 
 def test_a_kernel_does_not_see_what_comes_late(tmp_path: Path) -> None:

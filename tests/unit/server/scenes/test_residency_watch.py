@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from solidcloud.schemas.errors import BadRequestError
 from solidcloud.schemas.wire.residency_messages import Residency, ResidencyChanges
-from solidcloud.server.residency import change_log
+from solidcloud.server.residency import cache_stats
 from solidcloud.server.scene import Scene
 
 AVATAR = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
@@ -75,13 +75,13 @@ def test_changes_follow_the_cache(case: archive_cases.Case) -> None:
                 assert known == resident(scene)
             assert evicted > 20
         scene.residency.check()
-        assert not scene.residency._states.logs, "nothing is collected without a reader"
+        assert not scene.residency.stats.logs, "nothing is collected without a reader"
 
 
 def test_changes_beyond_the_limit_are_said_to_be_lost(
     case: archive_cases.Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(change_log, "MAX_CHANGED_VOXELS", 2)
+    monkeypatch.setattr(cache_stats, "MAX_CHANGED_VOXELS", 2)
     rng = np.random.default_rng(3)
     with opened(case) as scene, scene.residency_changes() as changes:
         changes.take()

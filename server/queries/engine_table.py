@@ -29,16 +29,14 @@ from ..residency.coarse_bounds import drop_clear_pairs
 from ..residency.voxel_states import HeldVoxels
 from .collide import collide
 from .contacts import contacts
-from .context.query_budget import EXACT, CostCounter, LateVoxels, QueryBudget
+from .context.query_budget import EXACT, LateVoxels, QueryBudget
 from .context.query_context import SceneData, check_request
 from .context.unloaded_voxels import bound_missing
 from .distance import distance
 from .objects import objects
-from .raycast import ask_level as bound_rays_by_level
 from .raycast import raycast
 from .resident_fast_path import collide_fast
 from .sweep import sweep
-from .within import ask_level as bound_points_by_level
 from .within import within
 
 
@@ -119,12 +117,6 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
             np.zeros((3, 1), np.uint32),
             EXACT,
         )
-    if part in (RAYCAST.name, WITHIN.name) and data.level is not None:
-        spent, origin = CostCounter(0.0, data.residency, data.broad.keys), np.zeros((1, 3), np.int64)
-        if part == RAYCAST.name:
-            bound_rays_by_level(data.level, origin, samples["directions"], 1 << 20, EXACT, spent)
-        else:
-            bound_points_by_level(data.level, data.radius_units, origin, 1 << 20, EXACT, spent)
     if part == MOTION:
         _warm_late(data, avatar, pose)
     if part == COLLIDE.name and data.coarse is not None:

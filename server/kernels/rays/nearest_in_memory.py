@@ -45,7 +45,7 @@ def nearest_in_memory(held, place, reach, stop, rows, found):
         if scene.where[voxel, 0] < 0:
             return -1, False, 0
         limit = search_voxel(
-            scene, voxel, units, 0, 0.0, 0.0, 0.0, MAX_RESIDENT_PATH_VISITS, best, limit, stack, bounds, order
+            scene, voxel, units, 0, 0.0, MAX_RESIDENT_PATH_VISITS, best, limit, stack, bounds, order
         )
     visits = np.int64(best.counts[1, 0])
     if visits >= MAX_RESIDENT_PATH_VISITS or stopped(stop):

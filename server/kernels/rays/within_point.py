@@ -18,8 +18,8 @@ from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import U32
 from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units
-from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, point_class, stopped
-from .rays import STACK, is_less, push_sorted
+from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, stopped
+from .rays import STACK, is_less
 
 U = np.uint64  # see placed_avatar.py
 
@@ -131,7 +131,7 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @njit_no_refcount
-def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys):
+def search_voxel(scene, voxel, at_units, i, near, visits, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
     near: exact units, as in VoxelLists. A bound of a node holds for its children; no bound
@@ -156,12 +156,11 @@ def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best
     rows[0], depth = base, 1
     bounds[0] = max(_below_node(words, base, x, y, z, np.inf)[0], near * per_unit + error)
     nearest = math.sqrt(np.float64(limit))
-    allowed = max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0
     while depth > 0:
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        if bound > nearest - allowed or spent >= visits or stopped(scene.stop):
+        if bound > nearest or spent >= visits or stopped(scene.stop):
             if bound <= nearest:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
@@ -170,7 +169,6 @@ def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best
             tests += LANES
             limit = _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit)
             nearest = math.sqrt(np.float64(limit))
-            allowed = max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0
             continue
         spent += ints[row + COUNT] & COUNTED
         begin = depth
@@ -200,12 +198,12 @@ def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best
 
 
 @nb.njit(nogil=True, cache=True)
-def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share, visits, best):
+def search_points(at_units, reach, lists, cursor, held, scene, visits, best):
     """Search for the scan points nearest to k query points, along their lists.
 
     Each search runs up to the first voxel that is not held.
-    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS.  share: of the distance of
-    the point found, allowed beside the tolerance. Other arguments as in `rays.follow_rays`.
+    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. Other arguments as in
+    `rays.follow_rays`.
     """
     rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for i in range(cursor.shape[0]):
@@ -215,8 +213,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share,
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
             nearest = math.sqrt(np.float64(limit)) * (1.0 + 2.0**-52)
-            far = near > nearest - (max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0)
-            if far or best.counts[1, i] >= visits or stopped(scene.stop):
+            if near > nearest or best.counts[1, i] >= visits or stopped(scene.stop):
                 if near <= nearest:
                     best.unseen[i] = min(best.unseen[i], near)
                 cursor[i] = end
@@ -228,87 +225,6 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share,
                 best.unseen[i] = min(best.unseen[i], near)
             else:
                 limit = search_voxel(
-                    scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys
+                    scene, voxel, at_units, i, near, visits, best, limit, rows, bounds, keys
                 )  # fmt: skip
             cursor[i] = at + 1
-
-
-@njit_no_refcount
-def _bound(scene, voxel, at_units, i, least, below, reach, rows, bounds):
-    """Return a lower bound of the distance of point i from one resident voxel of a level of detail.
-
-    Exact units; no more than `below`, which is returned if nothing within reach is nearer. In a
-    leaf node, nothing is nearer than the node, which encloses the scene's points themselves, nor
-    than the cover of one of its representatives.
-    least: cover radius of deficit 0 [exact units].
-    """
-    words, ints, halves = scene.words, scene.ints, scene.halves
-    per_unit = 1.0 / scene.units_per_step
-    mask = np.uint64(scene.radius_deficit.shape[0] - 1)
-    cx = scene.coordinates[voxel, 0] * scene.voxel_steps
-    cy = scene.coordinates[voxel, 1] * scene.voxel_steps
-    cz = scene.coordinates[voxel, 2] * scene.voxel_steps
-    x = np.float64(at_units[i, 0] - lattice_to_units(cx, scene.units_per_step)) * per_unit
-    y = np.float64(at_units[i, 1] - lattice_to_units(cy, scene.units_per_step)) * per_unit
-    z = np.float64(at_units[i, 2] - lattice_to_units(cz, scene.units_per_step)) * per_unit
-    farthest = max(abs(x), abs(y), abs(z), np.float64(max(abs(cx), abs(cy), abs(cz))))
-    error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
-    base = scene.where[voxel, 0]
-    rows[0], bounds[0], depth = base, 0.0, 1
-    while depth > 0:
-        if stopped(scene.stop):
-            return 0.0
-        depth -= 1
-        row, above = rows[depth], bounds[depth]
-        bound = max((above - error) * scene.units_per_step, 0.0)
-        if bound >= below:
-            continue
-        first, count = ints[row + FIRST], ints[row + COUNT] & COUNTED
-        if first >= 0:
-            begin, limit = depth, min(below, reach) * per_unit + error
-            for child in range(base + first * ROW_WORDS, base + (first + count) * ROW_WORDS, ROW_WORDS):
-                away, _ = _below_node(words, child, x, y, z, limit)
-                if away <= limit:
-                    push_sorted(rows, bounds, begin, depth, child, max(away, above))
-                    depth += 1
-            continue
-        block_at = scene.where[voxel, 1] + ~first * scene.block_words
-        lane_at = scene.where[voxel, 2] + ~first * 3 * LANES
-        at_x = U(lane_at)
-        at_y, at_z = at_x + U(LANES), at_x + U(2 * LANES)
-        for j in range(count):
-            dx = np.float64(ints[block_at]) + np.float64(halves[at_x + U(j)]) - x
-            dy = np.float64(ints[block_at + 1]) + np.float64(halves[at_y + U(j)]) - y
-            dz = np.float64(ints[block_at + 2]) + np.float64(halves[at_z + U(j)]) - z
-            apart = (math.sqrt(dx * dx + dy * dy + dz * dz) * (1.0 - 2.0**-50) - error) * scene.units_per_step
-            cover = least - np.float64(scene.radius_deficit[point_class(ints, block_at, j, mask)])
-            below = min(below, max(apart - cover, bound))
-    return below
-
-
-@nb.njit(nogil=True, cache=True)
-def bound_points(at_units, reach, least, lists, cursor, held, scene, best):
-    """Lower best.value to lower bounds of the distances of points from a scene, by its level of detail.
-
-    scene: the level, with cover spheres.  least: see `_bound`, the farthest that a point of the
-    scene lies outside of the box of its voxel's representatives.  lists: of voxels within reach and
-    that. Other arguments as for `search_points`. Only `value` and `unseen` of `best` are written.
-    """
-    rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
-    limit = np.float64(reach)
-    for i in range(cursor.shape[0]):
-        end = lists.starts[i + 1]
-        while cursor[i] < end and (held[lists.rows[cursor[i]]] or stopped(scene.stop)):
-            voxel, near = lists.rows[cursor[i]], max(lists.near[cursor[i]] - least, 0.0)
-            if stopped(scene.stop):
-                best.unseen[i], cursor[i] = 0.0, end
-            elif near > best.value[i]:
-                cursor[i] = end
-            else:
-                if scene.where[voxel, 0] < 0:
-                    best.unseen[i] = min(best.unseen[i], near)
-                else:
-                    best.value[i] = _bound(
-                        scene, voxel, at_units, i, least, best.value[i], limit, rows, bounds
-                    )  # fmt: skip
-                cursor[i] += 1

@@ -13,6 +13,7 @@ from ....schemas.kernels import compiling as nb
 from ....schemas.kernels.morton import morton_code
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import box_square, has_box
+from ..core.normal_codes import add_sums
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from ..core.voxels_in_reach import find_key
 from .rays import STACK
@@ -118,16 +119,7 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums, directions, heights):
             pz = oz + np.int64(halves[at_z + U(j)])
             if px * px + py * py + pz * pz > square:
                 continue
-            sums[0] += 1
-            sums[1] += px
-            sums[2] += py
-            sums[3] += pz
-            sums[4] += px * px
-            sums[5] += py * py
-            sums[6] += pz * pz
-            sums[7] += py * pz
-            sums[8] += pz * px
-            sums[9] += px * py
+            add_sums(sums, px, py, pz)
             for k in range(directions.shape[0]):
                 height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]
                 heights[k] = max(heights[k], height)

@@ -17,7 +17,7 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
     """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
-    kernels/rays/within_point.py has the definition. A point is `outside` if its reach, a cube of
+    kernels/rays/points.py has the definition. A point is `outside` if its reach, a cube of
     exact units, leaves the box of all scan points. Verdicts, bounds and budget are as for
     `raycast`. Raise BadRequestError.
     """

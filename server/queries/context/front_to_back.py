@@ -17,8 +17,8 @@ from ....schemas.archive.voxel_grid import MAX_COORDINATE
 from ....schemas.errors import BadRequestError
 from ....schemas.wire.requests import make_vectors
 from ...kernels.core.voxel_tree import VoxelLists, VoxelTree, list_voxels
+from ...kernels.rays.points import search_points
 from ...kernels.rays.rays import ClosestHits, RayBatch, follow_rays
-from ...kernels.rays.within_point import search_points
 from ...residency.index_proof import ENTRIES_AT_ONCE
 from ...runtime.stop_flag import StopFlag
 from .query_budget import CostCounter, QueryBudget

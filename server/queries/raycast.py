@@ -55,7 +55,6 @@ def raycast(
     if not 0 <= reach <= MAX_RAY_REACH:
         raise BadRequestError(f"reach {reach!r}: expected 0 to {MAX_RAY_REACH:g} metres")
     reach_units = to_units(reach, "reach")
-
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     best = search_front_to_back(data, units, unit, reach_units, budget, spent)

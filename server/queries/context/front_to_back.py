@@ -45,7 +45,8 @@ def make_origins(
 
 def _part(best: ClosestHits, rows: slice) -> ClosestHits:
     """Return views of some rows, and a contiguous copy of their counts, to be written back."""
-    return ClosestHits(*(column[rows] for column in best[:-1]), best.counts[:, rows].copy())
+    value, square, lattice, unseen, counts = best
+    return ClosestHits(value[rows], square[rows], lattice[rows], unseen[rows], counts[:, rows].copy())
 
 
 def search_front_to_back(

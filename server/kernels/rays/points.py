@@ -197,17 +197,16 @@ def _search_voxel(scene, voxel, at_units, i, near, visits, best, limit, rows, bo
 
 
 @nb.njit(nogil=True, cache=True)
-def search_points(at_units, reach, lists, cursor, held, scene, visits, best):
+def search_points(points, lists, cursor, held, scene, visits, best):
     """Search for the scan points nearest to k query points, along their lists.
 
     Each search runs up to the first voxel that is not held.
-    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS. Other arguments as in
-    `rays.follow_rays`.
+    points: RayBatch whose reach is at most MAX_REACH_UNITS. Other arguments as in `rays.follow_rays`.
     """
     rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for i in range(cursor.shape[0]):
         end = lists.starts[i + 1]
-        limit = best.square[i] if best.square[i] >= 0 else np.int64(reach) * np.int64(reach)
+        limit = best.square[i] if best.square[i] >= 0 else np.int64(points.reach) * np.int64(points.reach)
         while cursor[i] < end:
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
@@ -224,8 +223,8 @@ def search_points(at_units, reach, lists, cursor, held, scene, visits, best):
                 best.unseen[i] = min(best.unseen[i], near)
             else:
                 limit = _search_voxel(
-                    scene, voxel, at_units, i, near, visits, best, limit, rows, bounds, keys
-                )  # fmt: skip
+                    scene, voxel, points.origin, i, near, visits, best, limit, rows, bounds, keys
+                )
             cursor[i] = at + 1
 
 

@@ -112,6 +112,7 @@ def _search(
     the search unfinished, when an unproved voxel comes next.
     """
     until = budget.deadline if budget.late is None else -math.inf
+    kernel = follow_rays if len(rays.direction) else search_points
     cursor = lists.starts[:-1].copy()
     while (open_ := cursor < lists.starts[1:]).any():
         if budget.spent:
@@ -124,10 +125,7 @@ def _search(
         held[rows] = True
         with data.residency.hold(rows.tolist(), until, scan=budget.scan, stop=budget.stop) as found:
             held[list(found.late)] = False  # another thread may be writing them
-            if len(rays.direction):
-                follow_rays(rays, lists, cursor, held, data.arrays, budget.visits, best)
-            else:
-                search_points(rays.origin, rays.reach, lists, cursor, held, data.arrays, budget.visits, best)
+            kernel(rays, lists, cursor, held, data.arrays, budget.visits, best)
         if budget.late is not None and found.late:
             _pass_late(lists, cursor, list(found.late), best)
         spent.add(found, int(looked[rows].sum()))

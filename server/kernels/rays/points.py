@@ -203,10 +203,11 @@ def search_points(points, lists, cursor, held, scene, visits, best):
     Each search runs up to the first voxel that is not held.
     points: RayBatch whose reach is at most MAX_REACH_UNITS. Other arguments as in `rays.follow_rays`.
     """
+    at_units, reach = points.origin, np.int64(points.reach)
     rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for i in range(cursor.shape[0]):
         end = lists.starts[i + 1]
-        limit = best.square[i] if best.square[i] >= 0 else np.int64(points.reach) * np.int64(points.reach)
+        limit = best.square[i] if best.square[i] >= 0 else reach * reach
         while cursor[i] < end:
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
@@ -223,8 +224,8 @@ def search_points(points, lists, cursor, held, scene, visits, best):
                 best.unseen[i] = min(best.unseen[i], near)
             else:
                 limit = _search_voxel(
-                    scene, voxel, points.origin, i, near, visits, best, limit, rows, bounds, keys
-                )
+                    scene, voxel, at_units, i, near, visits, best, limit, rows, bounds, keys
+                )  # fmt: skip
             cursor[i] = at + 1
 
 

@@ -28,7 +28,7 @@ from ..schemas.wire.path_messages import PathRequest, answers_to_part, check_pat
 from ..schemas.wire.question_rules import Question, request_fields
 from ..schemas.wire.question_table import QUESTIONS
 from ..schemas.wire.request_limits import MAX_POSES
-from ..schemas.wire.requests import QuestionOptions, has_tolerance_or_budget, make_positions
+from ..schemas.wire.requests import has_tolerance_or_budget, make_positions
 from ..schemas.wire.scene_messages import AvatarInfo, ReloadAnswer, SceneInfo
 from ..schemas.wire.stats import StatsAnswer, StatsRequest
 from ..schemas.wire.tile_messages import TileAnswer, VoxelsAnswer, tile_request, voxels_request
@@ -76,7 +76,7 @@ class Client(QueryMethods):
     no server answered.
     """
 
-    known_options = QuestionOptions.__optional_keys__
+    own_options = frozenset[str]()
 
     def __init__(
         self,
@@ -214,8 +214,7 @@ class Client(QueryMethods):
         listed as `UNKNOWN`.
         """
         fields = request_fields(question, arguments, options)
-        if not self.known_options.issuperset(options):
-            self.refuse_options(question, options)
+        self.check_options(question, options)
         return self._ask_in_batches(question, fields, options)
 
     def _ask_in_batches(

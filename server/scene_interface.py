@@ -9,7 +9,7 @@ import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
-from typing import Any, NamedTuple, NoReturn, Protocol, Self, TypeVar, Unpack
+from typing import Any, NamedTuple, Protocol, Self, TypeVar, Unpack
 
 import numpy as np
 from msgspec import structs
@@ -58,6 +58,18 @@ class QueryOptions(QuestionOptions, total=False):
     stop: StopFlag
 
 
+class TolerantOptions(QueryOptions, total=False):
+    """Options of a query that takes a tolerance [m]."""
+
+    tolerance: float
+
+
+class DistanceOptions(TolerantOptions, total=False):
+    """Options of `distance`."""
+
+    relative_tolerance: float
+
+
 class QueryMethods:
     """The queries that have one answer each. `Scene` and `Client` implement `ask`.
 
@@ -67,11 +79,12 @@ class QueryMethods:
     and from rotations of float32 numbers, which are rounded too far to be accepted.
     margin: distance below which two spheres count as in contact [m].
     reach: farthest distance worth reporting [m].
-    options: tolerance [m], relative_tolerance, budget_ms, budget_visits and radius_model: WIRE.md.
+    options: budget_ms, budget_visits, radius_model, and of some queries tolerance [m] and
+    relative_tolerance: WIRE.md.
     """
 
-    # Names of the options that `ask` takes.
-    known_options: frozenset[str] = QueryOptions.__optional_keys__
+    # Names of the options that `ask` takes besides those of the question.
+    own_options: frozenset[str] = QueryOptions.__optional_keys__
 
     def ask(self, question: Question[_A], *arguments: Any, **options: Any) -> _A:
         """Answer a question.
@@ -81,23 +94,25 @@ class QueryMethods:
         """
         raise NotImplementedError
 
-    def refuse_options(self, question: Question[Any], options: Mapping[str, Any]) -> NoReturn:
-        """Raise TypeError for the options that are not known, and suggest one that is."""
-        takes = [*question.parameters, *sorted(self.known_options)]
-        name = next(name for name in options if name not in self.known_options)
-        raise TypeError(
-            f"{type(self).__name__}.{question.name}() got an unexpected keyword argument {name!r}: "
-            f"{suggestion_for(name, takes)}it takes {', '.join(takes)}"
-        )
+    def check_options(self, question: Question[Any], options: Mapping[str, Any]) -> None:
+        """Raise TypeError for an option that is not known, and suggest one that is."""
+        known = question.options | self.own_options
+        for name in options:
+            if name not in known:
+                takes = [*question.parameters, *sorted(known)]
+                raise TypeError(
+                    f"{type(self).__name__}.{question.name}() got an unexpected keyword argument {name!r}: "
+                    f"{suggestion_for(name, takes)}it takes {', '.join(takes)}"
+                )
 
     def collide(
-        self, name: str, poses: Any, margin: float = 0.0, **options: Unpack[QueryOptions]
+        self, name: str, poses: Any, margin: float = 0.0, **options: Unpack[TolerantOptions]
     ) -> CollideAnswers:
         """Test for k poses if an avatar touches the scene."""
         return self.ask(COLLIDE, name, poses, margin, **options)
 
     def distance(
-        self, name: str, poses: Any, reach: float = DEFAULT_REACH, **options: Unpack[QueryOptions]
+        self, name: str, poses: Any, reach: float = DEFAULT_REACH, **options: Unpack[DistanceOptions]
     ) -> DistanceAnswers:
         """Measure for k poses the distance from an avatar to the scene, up to `reach`: 1 m.
 
@@ -112,7 +127,7 @@ class QueryMethods:
         limit: int = 100,
         margin: float = 0.0,
         cluster_distance: float | None = None,
-        **options: Unpack[QueryOptions],
+        **options: Unpack[TolerantOptions],
     ) -> ContactsAnswers:
         """List for k poses the pairs in contact: the deepest `limit` of each, and all clusters."""
         return self.ask(CONTACTS, name, poses, limit, margin, cluster_distance, **options)
@@ -123,7 +138,7 @@ class QueryMethods:
         pose_from: Any,
         pose_to: Any,
         margin: float = 0.0,
-        **options: Unpack[QueryOptions],
+        **options: Unpack[TolerantOptions],
     ) -> SweepAnswers:
         """Find for k motions between two poses the first contact of an avatar with the scene.
 

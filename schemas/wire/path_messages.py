@@ -13,7 +13,7 @@ from .arrays import Poses, array_fields
 from .question_rules import Rows, suggestion_for
 from .question_table import path_questions, question_of
 from .request_limits import MAX_CONTACTS
-from .requests import Count, Duration, Length, ModelName, Name, QuestionRequest, Request, Share
+from .requests import Count, Duration, Length, ModelName, Name, Request, Share
 
 _A = TypeVar("_A", bound=Cost)
 
@@ -67,7 +67,7 @@ def check_path_parameters(op: str, parameters: dict[str, Any]) -> None:
     if op not in questions:
         raise BadRequestError(f"op {op!r} along a path: expected one of {', '.join(questions)}")
     own = questions[op]
-    taken = (*own.parameters, *QuestionRequest.__struct_fields__)
+    taken = (*own.parameters, *sorted(own.options))
     for name in parameters:
         if name not in taken:
             raise BadRequestError(

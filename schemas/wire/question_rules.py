@@ -22,7 +22,7 @@ from ..errors import BadRequestError, InternalError
 from .answer_facts import Fact
 from .answers import Cost, Verdict
 from .arrays import ArrayType, Poses, array_fields
-from .requests import Length, QuestionRequest, make_objects, make_vectors
+from .requests import OPTIONS, Length, QuestionRequest, TolerantRequest, make_objects, make_vectors
 
 A = TypeVar("A", bound=Cost)
 
@@ -145,9 +145,13 @@ class Question(Generic[A]):
 
     @cached_property
     def fields(self) -> tuple[str, ...]:
-        """Return the fields that only this question's request has."""
-        options = QuestionRequest.__struct_fields__
-        return tuple(name for name in self.request.__struct_fields__ if name not in options)
+        """Return the fields of the request that are arguments of the method."""
+        return tuple(name for name in self.request.__struct_fields__ if name not in OPTIONS)
+
+    @cached_property
+    def options(self) -> frozenset[str]:
+        """Return the fields of the request that are options of the method."""
+        return frozenset(OPTIONS).intersection(self.request.__struct_fields__)
 
     @cached_property
     def arguments(self) -> tuple[str, ...]:
@@ -161,9 +165,10 @@ class Question(Generic[A]):
 
     @cached_property
     def other_defaults(self) -> dict[str, Any]:
-        """Return the defaults that differ from those of `QuestionRequest`."""
-        usual = {field.name: field.default for field in struct_fields(QuestionRequest)}
-        return {name: self.defaults[name] for name in usual if self.defaults[name] != usual[name]}
+        """Return the defaults of options that differ from those of `TolerantRequest`."""
+        usual = {field.name: field.default for field in struct_fields(TolerantRequest)}
+        own = self.options.intersection(usual)
+        return {name: self.defaults[name] for name in own if self.defaults[name] != usual[name]}
 
     @cached_property
     def required(self) -> tuple[str, ...]:
@@ -364,7 +369,7 @@ def _conversions(kind: type[QuestionRequest]) -> tuple[tuple[str, Callable[[Any,
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if hint == Poses:
             found.append((name, make_poses))
-        elif name in QuestionRequest.__struct_fields__:
+        elif name in OPTIONS:
             continue
         elif hint == Length:
             found.append((name, lambda value, _: float(value)))

@@ -79,40 +79,42 @@ class AddAvatarRequest(Request, frozen=True):
 class QuestionRequest(Request, frozen=True, kw_only=True):
     """Parameters that every query takes.
 
-    tolerance: separation up to which contact may be reported, and allowed distance between bounds
-    [m]; 0: exact.
-    relative_tolerance: allowed distance between the bounds of a distance, as a share of the distance
-    between the centres; if it is above 0, a millimetre is allowed at any distance. Only `distance`
-    and `within` use it.
     budget_ms: time for loading and computing together [ms]; null: no limit.
     budget_visits: node visits per pose (ray, point, motion); null: no limit.
     radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
     optional factor as in local:0.8, or fixed:METRES; null: the scene's default.
     """
 
-    tolerance: Length = 0.0
-    relative_tolerance: Share = 0.0
     budget_ms: Duration | None = None
     budget_visits: Count | None = None
     radius_model: ModelName | None = None
 
     def arguments(self) -> tuple[Any, ...]:
-        """Return the fields that only this request has, in the order of the query's method."""
-        return tuple([getattr(self, name) for name in self.__struct_fields__ if name not in _OPTIONS])
+        """Return the fields that are arguments, in the order of the query's method."""
+        return tuple([getattr(self, name) for name in self.__struct_fields__ if name not in OPTIONS])
 
     def options(self) -> dict[str, Any]:
-        """Return the fields of `QuestionRequest`, by name."""
-        return {name: getattr(self, name) for name in _OPTIONS}
+        """Return the fields that are in `OPTIONS`, by name."""
+        return {name: getattr(self, name) for name in self.__struct_fields__ if name in OPTIONS}
 
 
-_OPTIONS = QuestionRequest.__struct_fields__
+class TolerantRequest(QuestionRequest, frozen=True, kw_only=True):
+    """Parameters of a query that takes a tolerance.
+
+    tolerance: separation up to which contact may be reported, and allowed distance between bounds
+    [m]; 0: exact.
+    """
+
+    tolerance: Length = 0.0
+
+
+# Fields that are options of the query methods, and not arguments: of each request those that it has.
+OPTIONS = ("relative_tolerance", *TolerantRequest.__struct_fields__)
 
 
 class QuestionOptions(TypedDict, total=False):
     """Fields of `QuestionRequest` as keyword arguments, for this module and every query method."""
 
-    tolerance: float
-    relative_tolerance: float
     budget_ms: float | None
     budget_visits: int | None
     radius_model: str | None
@@ -125,7 +127,7 @@ def has_tolerance_or_budget(options: Mapping[str, Any]) -> bool:
     )
 
 
-class CollideRequest(QuestionRequest, frozen=True):
+class CollideRequest(TolerantRequest, frozen=True):
     """Test, for each pose, if an avatar touches the scene.
 
     avatar: the name under which it was added.
@@ -138,19 +140,22 @@ class CollideRequest(QuestionRequest, frozen=True):
     margin: Length = 0.0
 
 
-class DistanceRequest(QuestionRequest, frozen=True):
+class DistanceRequest(TolerantRequest, frozen=True):
     """Measure, for each pose, the distance from an avatar to the scene, and its nearest points.
 
     avatar, poses: as in CollideRequest.
     reach: farthest distance worth reporting [m], finite and >= 0.
+    relative_tolerance: allowed distance between the bounds of a distance, as a share of the distance
+    between the centres; if it is above 0, a millimetre is allowed at any distance.
     """
 
     avatar: Name
     poses: Poses
     reach: Length = DEFAULT_REACH
+    relative_tolerance: Share = 0.0
 
 
-class ContactsRequest(QuestionRequest, frozen=True):
+class ContactsRequest(TolerantRequest, frozen=True):
     """List, for each pose, the pairs of points in contact.
 
     avatar, poses, margin: as in CollideRequest.
@@ -166,7 +171,7 @@ class ContactsRequest(QuestionRequest, frozen=True):
     cluster_distance: Length | None = None
 
 
-class SweepRequest(QuestionRequest, frozen=True, kw_only=True):
+class SweepRequest(TolerantRequest, frozen=True, kw_only=True):
     """Find, for each motion between two poses, the first contact of an avatar with the scene.
 
     avatar, margin: as in CollideRequest.

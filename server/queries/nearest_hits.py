@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,13 +12,14 @@ from ...schemas.archive.voxel_grid import MAX_COORDINATE
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.reach import Items, VoxelLists, find_lists
-from ..kernels.rays.rays import ClosestHits
+from ..kernels.rays.rays import ClosestHits, RayBatch
 from .context.query_budget import CostCounter, QueryBudget
 from .context.query_context import SceneData
 from .resolve import Steps, drop_items, resolve
 
 # Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14
+_NONE = np.empty((0, 3))
 
 
 def make_origins(
@@ -34,25 +35,20 @@ def make_origins(
     return array, np.rint((array - data.arrays.origin) * UNITS_PER_METRE).astype(np.int64)
 
 
-# search(rows, lists, which, cursor, state, best): `Search` for the rays or points of a slice of rows.
-SearchHits = Callable[
-    [slice, ClosestHits, VoxelLists, NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]], None
-]
-
-
 def find_hits(
     data: SceneData,
+    kernel: Callable[..., None],
     at_units: NDArray[np.int64],
     direction: NDArray[np.float64] | None,
     reach_units: int,
     radius_units: int,
-    search: SearchHits,
     budget: QueryBudget,
     spent: CostCounter,
 ) -> Steps[ClosestHits]:
     """Find the first hits of k rays (direction (k, 3)) or the points nearest to k points (None).
 
-    radius_units: of the scan's largest sphere; 0 if radii do not count.
+    kernel: `follow_rays` or `search_points`.  radius_units: of the scan's largest sphere; 0 if radii do
+    not count.
     `unseen` of the result bounds what was not examined. Add the cost to `spent`.
     """
     k, per_step = len(at_units), data.arrays.units_per_step
@@ -65,9 +61,14 @@ def find_hits(
         part = ClosestHits(
             best.value[rows], best.square[rows], best.lattice[rows], best.unseen[rows], best.counts[:, rows].copy()
         )  # fmt: skip
-        lists = _list(
-            data, at_units[rows], None if direction is None else direction[rows], reach_units, radius_units
-        )
+        along = None if direction is None else direction[rows]
+        lists = _list(data, at_units[rows], along, reach_units, radius_units)
+        batch = RayBatch(at_units[rows], _NONE if along is None else along, reach_units, radius_units)
+
+        def search(
+            lists: VoxelLists, *state: NDArray[Any], batch: RayBatch = batch, part: ClosestHits = part
+        ) -> None:
+            kernel(batch, lists, *state, data.arrays, part)
 
         def settle(lists: VoxelLists, part: ClosestHits = part) -> Steps[VoxelLists]:
             """Drop the rays that hit something before their next voxel."""
@@ -77,7 +78,7 @@ def find_hits(
             return drop_items(lists, ahead > found_units(part))
             yield  # it is a generator
 
-        left = yield from resolve(data, lists, partial(search, rows, part), budget, spent, settle)
+        left = yield from resolve(data, lists, search, budget, spent, settle)
         np.minimum(best.unseen[rows], np.minimum(lists.unseen, left) * per_step, out=best.unseen[rows])
         best.counts[:, rows] = part.counts
     if data.nothing_clear:  # a load may have proved the index wrong

@@ -73,8 +73,7 @@ def objects(
     common with the other's mask. The scene's group is SCENE_GROUP, and its mask has all bits.
     margin: of each pair, and of each object with the scene [m].
     NUMERICS.md N5 defines contact, also between two objects: kernels/bodies/body_pairs.py. A radius
-    model applies to the scan's spheres and not to objects. The tolerance is ignored, because these
-    answers could not express which of them are approximate. Visits are counted for each object and
+    model applies to the scan's spheres and not to objects. Visits are counted for each object and
     each pair. Pairs left untested by a budget are listed as UNKNOWN.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
@@ -90,7 +89,7 @@ def objects(
         if budget.spent:
             verdict[rows] = UNKNOWN
             continue
-        found = collide_fast(data, model, checked.poses[rows], margin, budget._replace(tolerance=0.0))
+        found = collide_fast(data, model, checked.poses[rows], margin, budget)
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)

@@ -1,7 +1,6 @@
 """Query `raycast`: the first scan point's sphere that each ray hits."""
 
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,8 +10,7 @@ from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import RaycastAnswers
 from ...schemas.wire.requests import make_vectors
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.core.reach import VoxelLists
-from ..kernels.rays.rays import ClosestHits, RayBatch, follow_rays
+from ..kernels.rays.rays import follow_rays
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
 from .nearest_hits import find_hits, make_origins, verdict_and_bounds
@@ -67,12 +65,7 @@ def raycast_steps(
     if data.radius_units > MAX_REACH_UNITS:
         raise BadRequestError("the scan's radius is over 16 m: rays cannot be tested exactly against it")
     reach_units = to_units(reach, "reach")
-
-    def search(rows: slice, best: ClosestHits, lists: VoxelLists, *progress: NDArray[Any]) -> None:
-        rays = RayBatch(units[rows], unit[rows], reach_units, data.radius_units)
-        follow_rays(rays, lists, *progress, data.arrays, best)
-
-    best = yield from find_hits(data, units, unit, reach_units, data.radius_units, search, budget, spent)
+    best = yield from find_hits(data, follow_rays, units, unit, reach_units, data.radius_units, budget, spent)
     verdict, lower, upper, exact = verdict_and_bounds(best.value, best.unseen, reach_units)
     hit, cloud, normal = _where(data, world, units, unit, best)
     ends = np.stack([units.astype(np.float64), units + float(reach_units) * unit])

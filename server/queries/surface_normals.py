@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.archive.archive import Archive
 from ...schemas.errors import BadRequestError, CorruptError
 from ..kernels.core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code, squared_reach
-from ..kernels.rays.near_points import add_near, voxels_near
+from ..kernels.rays.surface import add_near, voxels_near
 from ..runtime.stop_flag import NO_STOP, StopFlag, StoppedError
 from .context.query_context import SceneData, parts_that_fit
 

@@ -1,7 +1,6 @@
 """Query `within`: the scan point nearest to each query point."""
 
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,9 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...schemas.errors import BadRequestError
 from ...schemas.wire.answers import WithinAnswers
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
-from ..kernels.core.reach import VoxelLists
-from ..kernels.rays.rays import ClosestHits
-from ..kernels.rays.within_point import search_points
+from ..kernels.rays.points import search_points
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, to_units
 from .nearest_hits import find_hits, found_units, make_origins, verdict_and_bounds
@@ -29,8 +26,8 @@ def within_steps(
     """Find the scan point nearest to each of k query points, centre to centre, ignoring radii.
 
     points: (k, 3) float64, world [m].  reach: inclusive [m], at most 16.
-    kernels/rays/within_point.py has the definition. A point is `outside` if its reach, a cube of
-    exact units, leaves the box of all scan points. Verdicts and bounds are as for `raycast`.
+    kernels/rays/points.py has the definition. A point is `outside` if its reach, a cube of exact
+    units, leaves the box of all scan points. Verdicts and bounds are as for `raycast`.
     Raise BadRequestError.
     """
     spent = CostCounter(time.perf_counter(), data.residency, data.keys)
@@ -38,11 +35,7 @@ def within_steps(
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:
         raise BadRequestError(f"reach {reach!r}: expected at most 16 m: larger squares do not fit in 63 bits")
-
-    def search(rows: slice, best: ClosestHits, lists: VoxelLists, *progress: NDArray[Any]) -> None:
-        search_points(units[rows], reach_units, lists, *progress, data.arrays, best)
-
-    best = yield from find_hits(data, units, None, reach_units, 0, search, budget, spent)
+    best = yield from find_hits(data, search_points, units, None, reach_units, 0, budget, spent)
     verdict, lower, upper, exact = verdict_and_bounds(found_units(best), best.unseen, reach_units)
     cloud: NDArray[np.float64] = np.full((len(units), 3), np.nan)
     touched = best.square >= 0

@@ -66,8 +66,8 @@ class SceneQuestions(QueryMethods):
         client: owner of the avatars.
         options: the remaining fields by name, and
 
-        - tolerance [m], relative_tolerance, budget_ms and budget_visits: see
-          server/queries/context/query_budget.py,
+        - budget_ms and budget_visits, and tolerance [m] and relative_tolerance of questions that take
+          them: see server/queries/context/query_budget.py,
         - radius_model: size of the scan's spheres, see schemas/archive/radius_model.py; None: the
           scene's default,
         - stop: stop flag that ends the work early.
@@ -78,8 +78,8 @@ class SceneQuestions(QueryMethods):
         """
         complete = len(arguments) == len(question.arguments)
         given = arguments if complete else question.all_arguments(arguments, options)
-        if options and not self.known_options.issuperset(options):
-            self.refuse_options(question, options)
+        if options:
+            self.check_options(question, options)
         if question.other_defaults:
             options = question.other_defaults | options
         if self._alone is None or question.whole:

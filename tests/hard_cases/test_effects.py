@@ -73,7 +73,7 @@ HELPERS = {
     "server.queries.surface_normals": {"slide", "ground", "step"},
     "server.simulation.world.frame_walk": MOVING,
     "server.kernels.walk.walk_frame": MOVING,
-    "server.kernels.rays.near_points": MOVING,
+    "server.kernels.rays.surface": MOVING,
 }
 # All that needs no objects of its own.
 EVERY_EFFECT = msgspec.convert(

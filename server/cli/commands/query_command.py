@@ -87,12 +87,15 @@ def query(
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="Distance by which contact may be reported early [m]; default 0, for sweep 1e-6."),
+        typer.Option(
+            help="collide, distance, contacts, sweep: distance by which contact may be reported early [m]; default "
+            "0, for sweep 1e-6."
+        ),
     ] = None,
     relative_tolerance: Annotated[
         float | None,
         typer.Option(
-            help="distance, within: allowed error as a share of the gap between centres, 0.3 for 30 %; default 0."
+            help="distance: allowed error as a share of the gap between centres, 0.3 for 30 %; default 0."
         ),
     ] = None,
     budget_ms: Annotated[

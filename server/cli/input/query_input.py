@@ -15,7 +15,7 @@ from ....schemas.wire.path_messages import part_to_answers
 from ....schemas.wire.question_rules import Question
 from ....schemas.wire.question_table import OBJECTS, QUESTIONS, join_answers, path_questions
 from ....schemas.wire.request_limits import MAX_FRAME_SECONDS
-from ....schemas.wire.requests import QuestionRequest, make_positions
+from ....schemas.wire.requests import make_positions
 from ...scene_interface import AvatarShape
 from .pose_file import read_objects, read_poses, read_rays
 from .scan_bounds import BodyPlaces, Places, PointPlaces, RayPlaces, box_of
@@ -35,7 +35,6 @@ _FILES = {
 AVATAR_OPTIONS = ("avatar_up", "avatar_units", "avatar_hollow")
 # Options that are not sent as parameters.
 _NOT_SENT = frozenset({*_FILES.values(), *AVATAR_OPTIONS, "radius", "along"})
-_COMMON_OPTIONS = QuestionRequest.__struct_fields__
 
 ReadPoints = Callable[[Path], NDArray[np.float64]]
 # Returns the shape of an avatar's file for the radius that was given.
@@ -96,10 +95,9 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
         if along not in path_questions():
             raise BadRequestError(f"--along {along}: expected one of {', '.join(path_questions())}")
         needed, others = _options(QUESTIONS[along])
-        others = (*others, "along", *_COMMON_OPTIONS)
+        others = (*others, "along")
     else:
         needed, others = _options(QUESTIONS[op])
-        others = (*others, *_COMMON_OPTIONS)
     takes = ", ".join(map(_option, (*needed, *others)))
     for name in given:
         if name not in (*needed, *others):
@@ -111,12 +109,13 @@ def check_query(op: str, options: dict[str, Any]) -> Query:
 
 
 def _options(question: Question[Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the required and the optional options of a question, besides those common to all."""
+    """Return the required and the optional options of a question."""
     files = dict.fromkeys(_FILES[name] for name in question.arguments if name in _FILES)
     of_avatar = ("radius", *AVATAR_OPTIONS) if question.about_avatars else ()
     parameters = question.parameters
     needed = (*files, *(name for name in parameters if name in question.required))
-    return needed, (*of_avatar, *(name for name in parameters if name not in question.required))
+    others = (name for name in parameters if name not in question.required)
+    return needed, (*of_avatar, *others, *sorted(question.options))
 
 
 def ask(

@@ -9,6 +9,7 @@ import numpy as np
 from ....schemas.archive.voxel import MAX_LEVELS
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
+from ..core.normal_codes import add_sums
 
 # Steps per metre of the differences that are summed for a normal: with a reach of a metre, the sums
 # over eight million points fit 63 bits.
@@ -21,22 +22,13 @@ _ROUNDED = 1.0 + 1e-9
 
 @njit_no_refcount
 def add_difference(x, y, z, sums):
-    """Add a point's difference to another one [m] to sums (10,) for `normal_code`."""
-    a, b, c = (
+    """Add a point's difference to another one [m] to the sums for `normal_code`."""
+    add_sums(
+        sums,
         np.int64(np.rint(x * PATCH_STEPS)),
         np.int64(np.rint(y * PATCH_STEPS)),
         np.int64(np.rint(z * PATCH_STEPS)),
     )
-    sums[0] += 1
-    sums[1] += a
-    sums[2] += b
-    sums[3] += c
-    sums[4] += a * a
-    sums[5] += b * b
-    sums[6] += c * c
-    sums[7] += b * c
-    sums[8] += c * a
-    sums[9] += a * b
 
 
 @nb.njit(nogil=True, cache=True)

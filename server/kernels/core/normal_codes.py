@@ -125,6 +125,21 @@ def decode_normal(code):
     return x / length, y / length, z / length
 
 
+@nb.njit(nogil=True, inline="always")
+def add_sums(sums, a, b, c):
+    """Add one point's difference (a, b, c), int64 [steps], to the sums for `normal_code`."""
+    sums[0] += 1
+    sums[1] += a
+    sums[2] += b
+    sums[3] += c
+    sums[4] += a * a
+    sums[5] += b * b
+    sums[6] += c * c
+    sums[7] += b * c
+    sums[8] += c * a
+    sums[9] += a * b
+
+
 @nb.njit(nogil=True, cache=True)
 def normal_code(sums):
     """Return the code, uint16, of the normal at a point.

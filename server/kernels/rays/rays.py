@@ -43,10 +43,10 @@ STACK = MAX_LEVELS * 15 + 16
 
 
 class RayBatch(NamedTuple):
-    """Batch of k rays.
+    """Batch of k rays, or of k query points.
 
-    origin: (k, 3) int64.  direction: (k, 3) float64 unit vectors.  reach, radius: int64, radius of
-    the scan's largest sphere; exact units.
+    origin: (k, 3) int64.  direction: (k, 3) float64 unit vectors; (0, 3) for points.
+    reach, radius: int64, radius of the scan's largest sphere, 0 for points; exact units.
     """
 
     origin: NDArray[np.int64]

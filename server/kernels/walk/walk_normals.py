@@ -5,7 +5,7 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ..core.normal_codes import NO_NORMAL, SUMS, decode_normal, normal_code
 from ..core.reach import all_resident
-from ..rays.near_points import add_near, voxels_near
+from ..rays.surface import add_near, voxels_near
 from .walk_queries import ask_at, pair_of
 from .walk_state import (
     ARCHIVE,

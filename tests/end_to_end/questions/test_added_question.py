@@ -85,7 +85,7 @@ def test_it_is_asked_over_zenoh(scene: Scene, built: Built, monkeypatch: pytest.
     with served(scene) as endpoint, client_of(endpoint) as client:
         assert client.ask(COUNT_WITHIN, points, REACH).count.tolist() == expected
         monkeypatch.setattr(client_module, "BATCH_POSES", 7)
-        found = client.ask(COUNT_WITHIN, points, reach=REACH, tolerance=0.0)
+        found = client.ask(COUNT_WITHIN, points, reach=REACH)
         assert found.count.tolist() == expected and len(found.verdict) == len(points)
         with pytest.raises(BadRequestError, match="reach is -1"):
             client.ask(COUNT_WITHIN, points, -1.0)

@@ -137,6 +137,10 @@ def test_distance_has_a_reach_of_a_metre(scene: Scene, client: Client) -> None:
         (lambda scene: scene.contacts("al", POSES, margn=2.0), r"\.contacts\(\) .*did you mean 'margin'\?"),
         (lambda scene: scene.sweep("al", POSES, ENDS, budget=3), r"\.sweep\(\) .*did you mean 'budget_"),
         (lambda scene: scene.raycast(RAYS, RAYS, 1.0, model="mean"), r"\.raycast\(\) .*'model'"),
+        (
+            lambda scene: scene.raycast(RAYS, RAYS, 1.0, tolerance=0.1),
+            r"\.raycast\(\) .*'tolerance': it takes reach",
+        ),
         (lambda scene: scene.within(RAYS, 1.0, xyz=1), r"\.within\(\) .*'xyz': it takes reach"),
         (lambda scene: scene.objects([], radius=1), r"\.objects\(\) .*did you mean 'radius_model'\?"),
         (

@@ -9,7 +9,6 @@ import wire_sections
 from solidcloud.schemas.wire.answers import Part
 from solidcloud.schemas.wire.path_messages import PathOperation, PathRequest
 from solidcloud.schemas.wire.question_table import QUESTIONS, path_questions, question_of
-from solidcloud.schemas.wire.requests import QuestionRequest
 from solidcloud.server.cli.commands.query_command import query
 from solidcloud.server.queries.engine_table import ENGINES
 from solidcloud.server.scene_interface import QueryMethods
@@ -29,14 +28,14 @@ def test_a_question_has_a_method_an_engine_and_options(question):
     method = list(inspect.signature(getattr(QueryMethods, question.name)).parameters)[1:-1]
     assert [name.replace("name", "avatar") for name in method] == list(question.arguments)
     options = inspect.signature(query).parameters
-    assert {*question.parameters, *QuestionRequest.__struct_fields__} <= set(options)
+    assert {*question.parameters, *question.options} <= set(options)
 
 
 def test_paths_are_of_the_questions_with_parts():
     assert get_args(PathOperation) == tuple(path_questions())
     assert set(get_args(Part)) == {question.part for question in path_questions().values()}
     for question in path_questions().values():
-        assert set(question.parameters) <= set(PathRequest.__struct_fields__)
+        assert {*question.parameters, *question.options} <= set(PathRequest.__struct_fields__)
         assert issubclass(question.part, question.answers)
 
 

@@ -62,17 +62,6 @@ def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
     assert len(answers.pairs) == 300 * 299 // 2 and (answers.pair_verdict == CONTACT).all()
 
 
-def test_a_tolerance_changes_no_answer(data: SceneData) -> None:
-    """WIRE.md: `objects` do not use it, because their answers could not state where they are early."""
-    poses = at(0, 0.9, 1.9, 9)
-    poses[3, :3, 3] = synthetic_scans.make_scan("plane", 1, 50)[0] + [0, 0, 1]
-    asked = data, [BALL] * 4, poses, [1] * 4, [1, 1, 1, 1 | SCENE_GROUP]
-    exact, tolerant = (objects(*asked, budget=QueryBudget(tolerance=tolerance)) for tolerance in (0.0, 10.0))
-    assert exact.pairs.tolist() == [[0, 1], [1, 2]] and exact.verdict[3] == CLEAR
-    for name in ("verdict", "pairs", "pair_verdict", "node_visits", "point_tests", "pair_tests"):
-        assert np.array_equal(getattr(exact, name), getattr(tolerant, name)), name
-
-
 def test_objects_at_the_farthest_place_are_exact(data: SceneData) -> None:
     """Two points 2 mm apart, 1.9e9 m from the origin, which takes 57 bits of exact units."""
     far, poses = make_avatar([[9e8, 0, 0]], 0.0), at(1e9 - 0.002, 1e9)

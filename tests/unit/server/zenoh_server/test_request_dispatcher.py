@@ -87,25 +87,19 @@ def test_every_operation_answers_in_both_encodings(service, encoding):
 
 
 EFFORT = {
-    "tolerance": 0.5,
-    "relative_tolerance": 0.25,
     "budget_ms": 20.0,
     "budget_visits": 7,
     "radius_model": "local:0.5",
 }
-PLAIN = {
-    "tolerance": 0.0,
-    "relative_tolerance": 0.0,
-    "budget_ms": None,
-    "budget_visits": None,
-    "radius_model": None,
-}
+PLAIN = {"budget_ms": None, "budget_visits": None, "radius_model": None}
+TOLERANT = EFFORT | {"tolerance": 0.5}
+LOOSE = TOLERANT | {"relative_tolerance": 0.25}
 POSES = np.tile(np.eye(4), (3, 1, 1))
 ONE = [ObjectEntry("al"), ObjectEntry("al", 2, 5)]
 REQUESTS = [
-    (CollideRequest("al", POSES, 0.125, **EFFORT), 3, ("al", 0.125), EFFORT),
-    (DistanceRequest("al", POSES, 0.75, **EFFORT), 3, ("al", 0.75), EFFORT),
-    (ContactsRequest("al", POSES, 9, 0.125, 0.5), 3, ("al", 9, 0.125, 0.5), PLAIN),
+    (CollideRequest("al", POSES, 0.125, **TOLERANT), 3, ("al", 0.125), TOLERANT),
+    (DistanceRequest("al", POSES, 0.75, **LOOSE), 3, ("al", 0.75), LOOSE),
+    (ContactsRequest("al", POSES, 9, 0.125, 0.5), 3, ("al", 9, 0.125, 0.5), PLAIN | {"tolerance": 0.0}),
     (
         SweepRequest(avatar="al", pose_from=POSES, pose_to=POSES, margin=0.125),
         3,

@@ -11,6 +11,7 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_boxes import box_square, has_box
+from ..core.normal_codes import add_sums
 from ..core.reach import REACH_STACK, list_item
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS
 from .rays import STACK
@@ -72,16 +73,7 @@ def _add_near(scene, voxel, x, y, z, square, rows, sums, directions, heights):
             pz = oz + np.int64(halves[at_z + U(j)])
             if px * px + py * py + pz * pz > square:
                 continue
-            sums[0] += 1
-            sums[1] += px
-            sums[2] += py
-            sums[3] += pz
-            sums[4] += px * px
-            sums[5] += py * py
-            sums[6] += pz * pz
-            sums[7] += py * pz
-            sums[8] += pz * px
-            sums[9] += px * py
+            add_sums(sums, px, py, pz)
             for k in range(directions.shape[0]):
                 height = (px * directions[k, 0] + py * directions[k, 1]) + pz * directions[k, 2]
                 heights[k] = max(heights[k], height)

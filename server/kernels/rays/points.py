@@ -14,13 +14,15 @@ import math
 
 import numpy as np
 
+from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
+from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.node_overlap import U32
 from ..core.placed_avatar import MAX_REACH_UNITS, lattice_to_units
-from ..core.reach import MISSING, NOT_HELD, state_of
+from ..core.reach import MISSING, NOT_HELD, REACH_STACK, all_resident, list_item, state_of
 from ..core.scene_arrays import COUNT, COUNTED, FIRST, LANES, ROW_WORDS, stopped
-from .rays import STACK, is_less
+from .rays import STACK, ClosestHits, is_less
 
 U = np.uint64  # see placed_avatar.py
 
@@ -132,24 +134,20 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @njit_no_refcount
-def search_voxel(scene, voxel, at_units, i, near, best, limit, rows, bounds, keys):
+def _search_voxel(scene, voxel, at_units, i, near, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
     near: exact units, as in VoxelLists. A bound of a node holds for its children.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
-    farthest, x, y, z = 0.0, 0.0, 0.0, 0.0
-    for r in range(3):
-        corner = scene.coordinates[voxel, r] * scene.voxel_steps
-        away = np.float64(at_units[i, r] - lattice_to_units(corner, scene.units_per_step)) * per_unit
-        farthest = max(farthest, abs(away), abs(np.float64(corner)))
-        if r == 0:
-            x = away
-        elif r == 1:
-            y = away
-        else:
-            z = away
+    cx = scene.coordinates[voxel, 0] * scene.voxel_steps
+    cy = scene.coordinates[voxel, 1] * scene.voxel_steps
+    cz = scene.coordinates[voxel, 2] * scene.voxel_steps
+    x = np.float64(at_units[i, 0] - lattice_to_units(cx, scene.units_per_step)) * per_unit
+    y = np.float64(at_units[i, 1] - lattice_to_units(cy, scene.units_per_step)) * per_unit
+    z = np.float64(at_units[i, 2] - lattice_to_units(cz, scene.units_per_step)) * per_unit
+    farthest = max(abs(x), abs(y), abs(z), np.float64(max(abs(cx), abs(cy), abs(cz))))
     error = 2.0 * per_unit + (farthest + scene.voxel_steps) * 2.0**-45
     base = scene.where[voxel, 0]
     spent, tests = np.int64(best.counts[1, i]) + 1, np.int64(best.counts[2, i])
@@ -199,17 +197,17 @@ def search_voxel(scene, voxel, at_units, i, near, best, limit, rows, bounds, key
 
 
 @nb.njit(nogil=True, cache=True)
-def search_points(at_units, reach, lists, which, cursor, state, scene, best):
+def search_points(points, lists, which, cursor, state, scene, best):
     """Search for the scan points nearest to the points numbered in `which`, each from its cursor on.
 
-    at_units: (k, 3) int64.  reach: exact units, at most MAX_REACH_UNITS.  Other arguments as in
-    `rays.follow_rays`.
+    points: RayBatch whose reach is at most MAX_REACH_UNITS. Other arguments as in `rays.follow_rays`.
     """
+    at_units, reach = points.origin, np.int64(points.reach)
     rows, bounds, keys = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
     for number in range(which.shape[0]):
         i = which[number]
         end = lists.starts[i + 1]
-        limit = best.square[i] if best.square[i] >= 0 else np.int64(reach) * np.int64(reach)
+        limit = best.square[i] if best.square[i] >= 0 else reach * reach
         while cursor[i] < end and not stopped(scene.stop):
             at = cursor[i]
             near, voxel = lists.near[at] * scene.units_per_step, lists.rows[at]
@@ -223,5 +221,41 @@ def search_points(at_units, reach, lists, which, cursor, state, scene, best):
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                limit = search_voxel(scene, voxel, at_units, i, near, best, limit, rows, bounds, keys)
+                limit = _search_voxel(scene, voxel, at_units, i, near, best, limit, rows, bounds, keys)
             cursor[i] = at + 1
+
+
+@nb.njit(nogil=True, cache=True)
+def nearest_in_memory(held, place, reach, stop, found):
+    """Find the scan point nearest to a place, where all voxels in reach are resident.
+
+    held: reference to the scene's arrays.  place: (x, y, z), world [m].  reach: at most 16 m.
+    stop: (1,) int64, the request's stop flag.  found: (3,) float64, set to the point's centre, world
+    [m]. Writes held.one, the voxels in reach.
+    Returns the number of rows, -1: not answered; whether a point is in reach; and node visits.
+    """
+    scene, lists, center = with_flag(held.scene, stop), held.one.reach.lists, np.empty(3)
+    units, best = np.empty((1, 3), np.int64), ClosestHits(
+        np.full(1, np.inf), np.full(1, -1, np.int64), np.zeros((1, 3), np.int64), np.full(1, np.inf),
+        np.zeros((3, 1), np.uint32),
+    )  # fmt: skip
+    for r in range(3):
+        away = place[r] - scene.origin[r]
+        units[0, r] = np.int64(np.rint(away * UNITS_PER_METRE))
+        center[r] = away / scene.step
+    limit = np.int64(np.rint(reach * UNITS_PER_METRE))
+    limit *= limit
+    stack, bounds, order = np.empty(STACK, np.int64), np.empty(STACK), np.empty(STACK)
+    span = reach / scene.step + 1.0  # a step more exceeds what rounding loses
+    count = list_item(
+        held.tree, center, center, span, 0.0, stop, np.empty(REACH_STACK, np.int64), lists.rows, lists.near, 0
+    )  # fmt: skip
+    if not all_resident(scene.where, lists.rows, count):
+        return -1, False, 0
+    for voxel in lists.rows[:count]:
+        limit = _search_voxel(scene, voxel, units, 0, 0.0, best, limit, stack, bounds, order)
+    if stopped(stop):
+        return -1, False, 0
+    for r in range(3):
+        found[r] = best.lattice[0, r] * scene.step + scene.origin[r]
+    return count, best.square[0] >= 0, np.int64(best.counts[1, 0])

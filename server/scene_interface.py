@@ -67,7 +67,7 @@ class QueryMethods:
     and from rotations of float32 numbers, which are rounded too far to be accepted.
     margin: distance below which two spheres count as in contact [m].
     reach: farthest distance worth reporting [m].
-    options: tolerance [m], relative_tolerance, budget_ms, budget_visits and radius_model: WIRE.md.
+    options: tolerance [m], relative_tolerance, budget_ms and radius_model: WIRE.md.
     """
 
     # Names of the options that `ask` takes.

@@ -5,7 +5,7 @@ A client therefore fails before it sends a request that a server would refuse.
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Annotated, Any, TypedDict, get_type_hints
 
@@ -85,7 +85,6 @@ class QuestionRequest(Request, frozen=True, kw_only=True):
     between the centres; if it is above 0, a millimetre is allowed at any distance. Only `distance`
     and `within` use it.
     budget_ms: time for loading and computing together [ms]; null: no limit.
-    budget_visits: node visits per pose (ray, point, motion); null: no limit.
     radius_model: sizes of the scan's spheres: mean, local, border or local+border, each with an
     optional factor as in local:0.8, or fixed:METRES; null: the scene's default.
     """
@@ -93,7 +92,6 @@ class QuestionRequest(Request, frozen=True, kw_only=True):
     tolerance: Length = 0.0
     relative_tolerance: Share = 0.0
     budget_ms: Duration | None = None
-    budget_visits: Count | None = None
     radius_model: ModelName | None = None
 
     def arguments(self) -> tuple[Any, ...]:
@@ -114,15 +112,7 @@ class QuestionOptions(TypedDict, total=False):
     tolerance: float
     relative_tolerance: float
     budget_ms: float | None
-    budget_visits: int | None
     radius_model: str | None
-
-
-def has_tolerance_or_budget(options: Mapping[str, Any]) -> bool:
-    """Return True if the options of a query allow anything but an exact answer."""
-    return bool(options.get("tolerance")) or any(
-        options.get(name) is not None for name in ("budget_ms", "budget_visits")
-    )
 
 
 class CollideRequest(QuestionRequest, frozen=True):

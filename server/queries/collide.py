@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
@@ -15,10 +14,9 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
 from ..kernels.core.voxels_in_reach import VoxelsInReach
-from .context.anytime_search import collide_bounded
 from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
-from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
+from .context.level_of_detail import SettledPoses, after_deadline, asked, level_budget
+from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
     SceneData,
@@ -39,15 +37,12 @@ def collide(
 
     poses: (k, 4, 4) float64, avatar to world, rigid or with a uniform scale, bits used as given.
     margin: distance at or below which two spheres are in contact [m].
-    budget: a limited one is passed to `collide_bounded`. With a tolerance, CONTACT means a pair
-    within margin plus tolerance, and CLEAR none within the margin; the answer has bounds.
-    The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read or
-    a scan was left out there, and that no contact was found elsewhere. NUMERICS.md N5 has the
-    definition. Raise BadRequestError, BadTransformError, TooLargeError.
+    budget: with a tolerance, CONTACT means a pair within margin plus tolerance, and CLEAR none
+    within the margin; the answer has bounds.
+    The verdict is CONTACT, CLEAR or UNKNOWN. UNKNOWN means that a voxel in reach cannot be read, a
+    scan was left out there or the deadline passed, and that no contact was found elsewhere.
+    NUMERICS.md N5 has the definition. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    if budget.limited:
-        answers = collide_bounded(data, avatar, poses, margin, budget)
-        return _with_level_verdicts(data, avatar, poses, margin, budget, answers)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     margin_units = to_units(margin, "margin")
@@ -65,6 +60,11 @@ def collide(
         data, avatar, array, margin_units, budget, spent, lambda reach: by_level.drop(coarse(reach))
     )
     verdict[by_level.settled] = found[by_level.settled]
+    which, late = np.flatnonzero(verdict == UNKNOWN), after_deadline(data, budget)
+    if late is not None and len(which):
+        level, own = late
+        by_late_level = asked(lambda: _level_verdicts(level, avatar, array[which], margin_units, own, spent))
+        verdict[which] = UNKNOWN if by_late_level is None else by_late_level
     # A load may have proved the index wrong by now.
     if (data.nothing_clear or len(data.unknown)) and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)
@@ -99,7 +99,7 @@ def _verdicts(
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held)
-            collide_poses(poses, avatar.arrays, seen.arrays, part, which, early, NO_LIMIT, verdict, counts)
+            collide_poses(poses, avatar.arrays, seen.arrays, part, which, early, verdict, counts)
         spent.add(held)
     return verdict, counts, reach
 
@@ -143,37 +143,6 @@ def clear_by_level(
     spent.add_level(own)
     lost = in_unknown(reach.boxes, level.covers.unknown, level.covers.nothing_clear)
     return np.asarray((covered == CLEAR) & ~lost)
-
-
-def _with_level_verdicts(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: ArrayLike,
-    margin: float,
-    budget: QueryBudget,
-    answers: CollideAnswers,
-) -> CollideAnswers:
-    """Return the answers of a request with a deadline, with those of its level where voxels are missing."""
-    which = np.flatnonzero((answers.verdict == UNKNOWN) & (answers.voxels_missing > 0))
-    if data.level is None or budget.deadline == math.inf or not len(which) or budget.stop:
-        return answers
-    array, margin_units = kernel_poses(poses)[which], to_units(margin, "margin")
-    spent = CostCounter(0.0, data.residency, data.broad.keys)
-    level = stoppable(data.level, budget)
-    found = asked(lambda: _level_verdicts(level, avatar, array, margin_units, budget, spent))
-    if found is None:
-        return answers
-    if data.nothing_clear:
-        found[found == CLEAR] = UNKNOWN
-    clear, touched = which[found == CLEAR], which[(found == CONTACT) | (found == EARLY)]
-    verdict, lower, upper, exact = (
-        column.copy() for column in (answers.verdict, answers.lower, answers.upper, answers.exact)
-    )
-    rounded = margin_units / UNITS_PER_METRE
-    verdict[clear], lower[clear], exact[clear] = CLEAR, min(float(margin), rounded), True
-    within = float(np.nextafter(max(float(margin), rounded) + budget.tolerance, math.inf))
-    verdict[touched], upper[touched] = CONTACT, np.minimum(upper[touched], within)
-    return structs.replace(answers, verdict=verdict, lower=lower, upper=upper, exact=exact)
 
 
 def verdict_bounds(

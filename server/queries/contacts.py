@@ -4,7 +4,6 @@ It serves clash detection: it returns where and how deep two bodies touch, and a
 `collide` only returns whether they touch.
 """
 
-import math
 import operator
 import time
 from typing import Any
@@ -44,7 +43,7 @@ from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .collide import clear_by_level
 from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, asked, stoppable
+from .context.level_of_detail import SettledPoses, after_deadline, asked
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
@@ -61,9 +60,7 @@ from .context.signed_distance import signed_from_square
 # Limit on the pairs and clusters listed by one request, over all poses [bytes]. Converting them to
 # columns temporarily takes some three times as much. The wire's largest message holds an eighth.
 MAX_BYTES = 256 << 20
-# Node visits between two checks of the clock, about a millisecond; and, without a deadline, between
-# two checks of the size of the lists.
-SLICE_VISITS = 1 << 15
+# Node visits between two checks of the size of the lists.
 SIZE_VISITS = 1 << 19
 # Initial capacity in cells, a power of two and at least LANES. A kernel doubles it as needed, up to
 # MAX_CELLS, which take 200 MB.
@@ -92,7 +89,7 @@ def contacts(
     The deepest pair has the least |a - b| - r_a - r_b, with r_b of the scan point's own sphere,
     compared exactly and not by the rounded figure. Each of several coincident points forms a pair.
     Ties are ordered by scan point, avatar centre, avatar row, scan number.
-    budget: a budget may leave pairs out; `exact` is then false, the pairs counted are the least
+    budget: a deadline may leave pairs out; `exact` is then false, the pairs counted are the least
     number, and the listed ones are in contact but may not be the deepest. With a tolerance, and
     where voxels are late, the scene's level of detail may prove a pose clear without them; pairs
     are counted exactly all the same, because a count cannot end early (DESIGN.md, "Tolerance").
@@ -122,7 +119,7 @@ def contacts(
     memory = _empty_memory(limit)
     if len(avatar.points):
         edges = _edges(reach, edge_units, data.arrays.units_per_step)
-        options = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, budget.visits, MAX_CELLS)
+        options = ContactOptions(avatar.rows, edges, data.keeps_scan, limit, MAX_CELLS)
         parts = list(pieces(reach, data.residency, budget.share, budget.stop))
         for number, (which, rows, part) in enumerate(parts):
             # A pose that is split over several pieces is alone in each, and the pieces are
@@ -130,21 +127,21 @@ def contacts(
             closes = (
                 number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
             )
-            if budget.spent:
-                memory = _gather(data, avatar, array, part, which, options, closes, budget, memory, tally)
+            if budget.stop:
+                memory = _gather(data, avatar, array, part, which, options, closes, memory, tally)
                 continue
             with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
-                memory = _gather(seen, avatar, array, part, which, options, closes, budget, memory, tally)
+                memory = _gather(seen, avatar, array, part, which, options, closes, memory, tally)
             spent.add(held)
     columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
     verdict, exact = columns["verdict"], columns["exact"]
-    late = np.flatnonzero((verdict == Verdict.UNKNOWN) & (columns["voxels_missing"] > 0))
-    if data.level is not None and budget.deadline < math.inf and len(late) and not budget.stop:
-        level = stoppable(data.level, budget)
-        clear = asked(lambda: ask(level, late))
+    which, late = np.flatnonzero(verdict == Verdict.UNKNOWN), after_deadline(data, budget)
+    if late is not None and len(which):
+        level, own = late
+        clear = asked(lambda: clear_by_level(level, avatar, array[which], margin_units, own, spent))
         if clear is not None and not data.nothing_clear:
-            verdict[late[clear]], exact[late[clear]] = Verdict.CLEAR, True
+            verdict[which[clear]], exact[which[clear]] = Verdict.CLEAR, True
     return ContactsAnswers(**columns, **spent.fields())
 
 
@@ -191,22 +188,18 @@ def _gather(
     which: NDArray[np.int64],
     options: ContactOptions,
     closes: bool,
-    budget: QueryBudget,
     memory: ContactState,
     tally: ContactResults,
 ) -> ContactState:
-    """Search one piece until it is complete or the deadline passes; mark unfinished poses as cut.
+    """Search one piece until it is complete or the stop flag is set; mark unfinished poses as cut.
 
     part: voxels in reach of the poses `which`.  closes: whether the piece completes its last pose.
     memory: state of the search between pieces, in and out.  tally: results, written.
     """
     memory.cursor[:] = 0, -1, 0
-    pause = SIZE_VISITS if budget.deadline == math.inf else SLICE_VISITS
     while memory.cursor[0] < len(which):
-        if budget.spent:
-            options = options._replace(visits=-1)
         memory = gather_contacts(
-            poses, avatar.arrays, data.arrays, part, which, options, closes, pause, memory, tally
+            poses, avatar.arrays, data.arrays, part, which, options, closes, SIZE_VISITS, memory, tally
         )
         _check_room(memory)
     return memory

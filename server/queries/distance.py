@@ -9,19 +9,17 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas.archive.units import UNITS_PER_METRE
-from ...schemas.wire.answers import DistanceAnswers, Verdict
+from ...schemas.wire.answers import DistanceAnswers
 from ..avatars.avatar_model import AvatarModel
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
-from .context.anytime_search import TOLERANCE_SLACK, distance_bounded
 from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, asked, level_budget, stoppable
-from .context.query_budget import EXACT, NO_LIMIT, CostCounter, QueryBudget
+from .context.level_of_detail import SettledPoses, after_deadline, asked, level_budget
+from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
     SceneData,
@@ -36,6 +34,8 @@ from .context.unloaded_voxels import bound_missing
 
 # Rounding of square roots and of placed points in a bound [exact units].
 _ROUNDING = 4.0
+# Conversion to metres widens bounds by some exact units; a smaller tolerance has no effect.
+_TOLERANCE_SLACK = 8.0
 
 
 def distance(
@@ -48,21 +48,20 @@ def distance(
     together are at most 16 m.
     budget: with a tolerance, the pair found may be farther than the nearest one by as much as it
     allows; `lower` and `upper` then bound the distance.
-    If a voxel in reach is missing or a scan was left out, the distance is that of the nearest
-    examined pair, and exact only if nothing missing can contain a nearer pair.
-    Raise BadRequestError, BadTransformError, TooLargeError.
+    If a voxel in reach is missing, a scan was left out or the deadline passed, the distance is that
+    of the nearest examined pair, and exact only if nothing that was not examined can contain a
+    nearer pair. Raise BadRequestError, BadTransformError, TooLargeError.
     """
-    if budget.limited:
-        answers = distance_bounded(data, avatar, poses, reach, budget)
-        return _with_level_distances(data, avatar, poses, reach, budget, answers)
     begin = time.perf_counter()
     array = kernel_poses(poses)
     reach_units = to_units(reach, "reach")
     spent = CostCounter(begin, data.residency, data.broad.keys)
     found = no_pairs(len(array))
 
+    one_radius = len(data.arrays.radius_deficit) == 1  # the level does not know the radius of its points
+
     def ask(level: LevelOfDetail, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        if len(data.arrays.radius_deficit) > 1:  # the level does not know the radius of its points
+        if not one_radius:
             return np.zeros(len(which), bool)
         of_level = _search_level(level, avatar, array[which], reach_units, budget, spent)
         settled = _settled(of_level, reach_units, budget)
@@ -77,6 +76,13 @@ def distance(
     nearest, counts, around = _pairs(data, avatar, array, reach_units, budget, spent, settled)
     for column, own in zip(nearest, found, strict=True):
         column[by_level.settled] = own[by_level.settled]
+    open_ = (nearest.missing_bound < np.inf) & ((counts[0] > 0) | bool(budget.stop))
+    which, late = np.flatnonzero(open_), after_deadline(data, budget)
+    if late is not None and one_radius and len(which):
+        level, rest = late
+        by_level_late = asked(lambda: _search_level(level, avatar, array[which], reach_units, rest, spent))
+        if by_level_late is not None:
+            _narrow(nearest, which, by_level_late.pairs)
     if len(avatar.points):
         np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
     return DistanceAnswers(
@@ -108,7 +114,7 @@ def _pairs(
     k, residency = len(poses), data.residency
     around = find_proved_reach(data, avatar, poses, data.radius_units + reach_units, budget, spent, settled)
     nearest, counts = no_pairs(k), np.zeros((3, k), np.uint32)
-    tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - TOLERANCE_SLACK)
+    tolerance = max(0.0, budget.between_bounds * UNITS_PER_METRE - _TOLERANCE_SLACK)
     if not len(avatar.points):
         return nearest, counts, around
     for which, rows, part in pieces(around, residency, budget.share, budget.stop):
@@ -128,7 +134,6 @@ def _pairs(
                 which,
                 budget.relative,
                 tolerance,
-                NO_LIMIT,
                 nearest,
                 counts,
             )
@@ -190,44 +195,14 @@ def _settled(found: _LevelDistances, reach_units: int, budget: QueryBudget) -> N
     """Return which poses (k,) the level answers within the tolerance, or without any pair in reach."""
     with np.errstate(invalid="ignore"):  # no pair within reach: inf - inf, or no share of inf
         allowed = np.fmax(budget.between_bounds * UNITS_PER_METRE, budget.relative * found.lower)
-        near = found.nearest - found.lower <= allowed - TOLERANCE_SLACK
+        near = found.nearest - found.lower <= allowed - _TOLERANCE_SLACK
     return np.where(np.isfinite(found.nearest), near, found.lower > found.radii + reach_units)
 
 
-def _with_level_distances(
-    data: SceneData,
-    avatar: AvatarModel,
-    poses: ArrayLike,
-    reach: float,
-    budget: QueryBudget,
-    answers: DistanceAnswers,
-) -> DistanceAnswers:
-    """Return the answers of a request with a deadline, with closer bounds where voxels are missing."""
-    which = np.flatnonzero(~answers.exact & (answers.voxels_missing > 0))
-    one_radius = len(data.arrays.radius_deficit) == 1
-    if data.level is None or budget.deadline == math.inf or not len(which) or not one_radius or budget.stop:
-        return answers
-    array, reach_units = kernel_poses(poses)[which], to_units(reach, "reach")
-    spent = CostCounter(0.0, data.residency, data.broad.keys)
-    level = stoppable(data.level, budget)
-    found = asked(lambda: _search_level(level, avatar, array, reach_units, budget, spent))
-    if found is None:
-        return answers
-    if data.nothing_clear:
-        found.pairs.missing_bound[:] = 0.0
-    own = found.reach._replace(units=found.radii + reach_units)
-    columns = distance_columns(
-        data, own, reach, reach_units, found.pairs, np.zeros((3, len(which)), np.uint32)
-    )
-    closer = columns["upper"] < answers.upper[which]
-    at = which[closer]
-    changed = {}
-    for name in ("signed_distance", "upper", "witness_avatar", "witness_cloud", "normal"):
-        changed[name] = getattr(answers, name).copy()
-        changed[name][at] = columns[name][closer]
-    lower = answers.lower.copy()
-    lower[which] = np.minimum(np.maximum(lower[which], columns["lower"]), changed["upper"][which])
-    verdict = answers.verdict.copy()
-    verdict[which[changed["upper"][which] <= 0]] = Verdict.CONTACT
-    verdict[which[lower[which] > 0]] = Verdict.CLEAR
-    return structs.replace(answers, lower=lower, verdict=verdict, **changed)
+def _narrow(nearest: NearestPairs, which: NDArray[np.int64], found: NearestPairs) -> None:
+    """Narrow the bounds of the poses `which` by what the level knows of them; one radius."""
+    known = nearest.square[which]
+    nearer = (found.square >= 0) & ((known < 0) | (found.square < known))
+    nearest.square[which[nearer]] = found.square[nearer]
+    nearest.pair[which[nearer]] = found.pair[nearer]
+    nearest.missing_bound[which] = np.maximum(nearest.missing_bound[which], found.missing_bound)

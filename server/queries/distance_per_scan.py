@@ -54,7 +54,7 @@ def separation_per_scan(
     of its deepest pair, except for the last bits: if the separations of several pairs differ only
     by rounding, it is that of one of them. A point whose number belongs to no scan counts as
     ANY_SCAN.
-    budget: a budget may leave pairs out; `exact` is then false.
+    budget: a deadline may leave pairs out; `exact` is then false.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     poses = kernel_poses(np.asarray(pose)[None])
@@ -68,15 +68,13 @@ def separation_per_scan(
     nearer = NearestPerScan(np.full(scans + 1, np.inf), np.full(scans + 1, reach.units[0]))
     counts, exact = np.zeros(3, np.int64), True
     for _, rows, part in pieces(reach, data.residency, budget.share, budget.stop):
-        if budget.spent:
+        if budget.stop:
             exact = False
             break
         with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             arrays = as_held(data, held).arrays
             exact &= bool(
-                nearest_by_scan(
-                    poses, avatar.arrays, arrays, part, margin_units, budget.visits, nearer, counts
-                )
+                nearest_by_scan(poses, avatar.arrays, arrays, part, margin_units, nearer, counts)
             )
     exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
     found = np.flatnonzero(nearer.gaps < np.inf).tolist()

@@ -4,7 +4,6 @@ An engine takes the data of one archive, the avatar if the question is about one
 the request in their order, and `budget`. `objects` takes avatars, poses, groups, masks and margin.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,7 +22,7 @@ from ...schemas.wire.question_table import (
     SWEEP,
     WITHIN,
 )
-from ...schemas.wire.warming_parts import BUDGETS, MOTION
+from ...schemas.wire.warming_parts import MOTION
 from ..avatars.avatar_model import AvatarModel, make_avatar
 from ..residency.coarse_bounds import drop_clear_pairs
 from ..residency.voxel_states import HeldVoxels
@@ -97,15 +96,7 @@ def warm_engines(data: SceneData, place: Sequence[float], part: str) -> None:
         run(QUESTIONS[part], EXACT)
     if part == COLLIDE.name:
         run(COLLIDE, QueryBudget(tolerance=1e-3))
-    if part == BUDGETS:
-        # These limits are too large to be reached here.
-        for budget in (
-            QueryBudget(tolerance=1e-3, visits=1 << 20),
-            QueryBudget(deadline=time.perf_counter() + 3600.0),
-        ):
-            for question in QUESTIONS.values():
-                run(question, budget)
-    if part in (DISTANCE.name, BUDGETS):
+    if part == DISTANCE.name:
         lacking = HeldVoxels(0, 0, ("not read",))
         reach = check_request(data, avatar, pose, data.radius_units)
         bound_missing(

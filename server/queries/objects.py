@@ -25,8 +25,6 @@ from .resident_fast_path import collide_fast
 
 # Group of the scene: an object whose mask lacks this bit is not tested against the scene.
 SCENE_GROUP = 1 << 31
-# Pairs tested between two checks of a deadline.
-PAIRS_PER_CHECK = 64
 # Largest distance of an object from the dataset's origin [m]: 2^37 m in exact units do not fit in
 # 63 bits. No object this far away is compared with the scene, but objects are compared with one
 # another everywhere.
@@ -211,7 +209,7 @@ def find_pairs(checked: CheckedObjects, origin: NDArray[np.float64]) -> tuple[ND
 def _touching_pairs(
     checked: CheckedObjects, origin: NDArray[np.float64], budget: QueryBudget
 ) -> ObjectContacts:
-    """Test the pairs; without a deadline, those of the same two avatars in one kernel call."""
+    """Test the pairs, those of the same two avatars in one kernel call."""
     pairs, filtered = find_pairs(checked, origin)
     kinds = checked.model_of[pairs]
     # Contact is symmetric, so two avatars are tested in one order only.
@@ -227,22 +225,17 @@ def _touching_pairs(
     counters = np.zeros(2, np.int64)
     tested = 0
     for first, last in zip(firsts.tolist(), [*firsts[1:].tolist(), len(order)], strict=False):
-        if budget.spent:
+        if budget.stop:
             break
         rows = order[first:last]
         a, b = divmod(int(kind[rows[0]]), models)
-        step = PAIRS_PER_CHECK if budget.deadline < np.inf else len(rows)
-        for begin in range(0, len(rows), step):
-            if budget.spent:
-                break
-            part = rows[begin : begin + step]
-            found = np.empty(len(part), np.uint8)
-            touch_pairs(
-                checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.scales, checked.units,
-                ordered[part], checked.margin_units, origin, budget.visits, budget.stop.flag, found, counters,
-            )  # fmt: skip
-            verdict[part] = found
-            tested += len(part)
+        found = np.empty(len(rows), np.uint8)
+        touch_pairs(
+            checked.models[a].arrays, checked.models[b].arrays, checked.poses, checked.scales, checked.units,
+            ordered[rows], checked.margin_units, origin, budget.stop.flag, found, counters,
+        )  # fmt: skip
+        verdict[rows] = found
+        tested += len(rows)
     listed = verdict != CLEAR
     visits, tests = counters.tolist()
     return ObjectContacts(pairs[listed].astype(np.int32), verdict[listed], tested, filtered, visits, tests)

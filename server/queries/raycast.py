@@ -51,7 +51,7 @@ def raycast(
     kernels/rays/rays.py has the definition. A ray is `outside` if either of its ends, o or
     o + reach u in exact units, leaves the box of all scan points.
     The verdict is CONTACT if a sphere is hit, CLEAR if none is, and UNKNOWN if none was found but
-    something in reach could not be examined or exceeded the budget. If that could hide a nearer
+    something in reach could not be examined in time. If that could hide a nearer
     hit, `exact` is false and `lower` bounds its distance. With a tolerance, `lower` may be below
     `upper` by at most the tolerance, and the scene's level of detail answers rays whose voxels are
     not in memory, if it knows them that well. Raise BadRequestError.
@@ -114,7 +114,7 @@ def _first_hits(
         if covers:
             bound_rays(rays, lists, cursor, held, data.arrays, best)
         else:
-            follow_rays(rays, lists, cursor, held, data.arrays, tolerance, budget.visits, best)
+            follow_rays(rays, lists, cursor, held, data.arrays, tolerance, best)
 
     return search_front_to_back(
         data, units, unit, reach_units, data.radius_units, budget, kernel, spent, level

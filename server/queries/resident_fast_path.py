@@ -7,7 +7,6 @@ The engine is called instead if
 - a voxel in reach has to be loaded, or more than MAX_FAST_VOXELS are in reach,
 - the avatar has more than MAX_FAST_POINTS points, or the reach of `distance` exceeds
 MAX_FAST_REACH,
-- the request has a budget of time or visits, or
 - a scan was left out of the archive, or a load proved its index wrong (not for `sweep`).
 
 The kernel runs under the lock of the resident set, which saves pinning its voxels: more than half
@@ -71,7 +70,6 @@ def collide_fast(
         len(array) != 1
         or len(avatar.points) > MAX_FAST_POINTS
         or budget.tolerance
-        or budget.limited
         or _has_unknown(data)
     ):
         return collide(data, avatar, array, margin, budget)
@@ -110,7 +108,7 @@ def distance_fast(
     """
     begin = time.perf_counter()
     poses = kernel_poses(np.asarray(pose)[None])
-    if reach > MAX_FAST_REACH or len(avatar.points) > MAX_FAST_POINTS or budget.limited or _has_unknown(data):
+    if reach > MAX_FAST_REACH or len(avatar.points) > MAX_FAST_POINTS or _has_unknown(data):
         return distance(data, avatar, poses, reach, budget)
     reach_units = to_units(reach, "reach")
     residency = data.residency
@@ -224,7 +222,7 @@ class ResidentQueries:
 
         skin: distance to keep from a contact [m], for `SweepResult.end`; negative: not requested.
         """
-        if self._small and not budget.limited:
+        if self._small:
             residency, rows, result = data.residency, self._rows, self._result
             self._first[:], self._last[:] = pose_from, pose_to
             held = data.references.to(data.arrays, data.broad)
@@ -243,8 +241,8 @@ class ResidentQueries:
         answers = sweep(data, self.avatar, pose_from[None], pose_to[None], tolerance=tolerance, budget=budget)
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
         touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
-        # A budget may leave places unexamined too.
-        partial = budget.limited or bool(data.arrays.stop.item(0)) or _has_unknown(data)
+        # A stop may leave places unexamined too.
+        partial = bool(data.arrays.stop.item(0)) or _has_unknown(data)
         return SweepResult(
             verdict,
             float(answers.lower[0]),
@@ -322,7 +320,7 @@ class ResidentQueries:
 
     def collide(self, data: SceneData, pose: Pose, budget: QueryBudget) -> tuple[Verdict, int]:
         """Return verdict and node visits of `collide` for a pose (4, 4)."""
-        if self._small and not budget.limited and not _has_unknown(data):
+        if self._small and not _has_unknown(data):
             residency, rows = data.residency, self._rows
             held = data.references.to(data.arrays, data.broad)
             poses, verdict, counts = self._poses, self._verdict, self._counts

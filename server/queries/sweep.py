@@ -17,13 +17,11 @@ from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
+from .context.level_of_detail import after_deadline
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
 from .late_sweep import AbsentVoxels, Motions, clear_until
 from .sweep_by_level import DEFAULT_TOLERANCE, SweepsByLevel, cold_motions
-
-# Motions of one kernel call if there is a deadline, which is checked between calls.
-_PER_CALL = 64
 
 
 def _check(
@@ -122,10 +120,8 @@ def sweep(
     tolerance: how far any avatar point may move between `lower` and `upper` [m]; the tolerance of
     `budget` if that is larger.
     The verdict is CONTACT in [lower, upper]; CLEAR; or UNKNOWN from `lower` on: something is
-    missing there, the budget was spent, or a graze of some hundredths of a micrometre cannot be
+    missing there, the deadline passed, or a graze of some hundredths of a micrometre cannot be
     distinguished from a touch. A contact found after an unknown place is CONTACT with exact=False.
-    A motion that is clear with a budget of visits is clear with a larger one. A contact found may
-    be lost with a larger budget, which may be spent on an unresolved place before it.
     If the budget has a tolerance, or where voxels are late, the scene's level of detail is asked
     before they are loaded: how far the motion is clear, and whether a contact is near enough to
     that place. With a budget that does not wait for loads, late_sweep.py bounds the motion by absent
@@ -145,11 +141,11 @@ def sweep(
     absent = None if budget.late is None else AbsentVoxels()
     level = SweepsByLevel(data, max(tolerance, budget.tolerance), budget, ask)
     answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, level, absent)
-    which = np.flatnonzero((answers.verdict == Verdict.UNKNOWN) & (answers.voxels_missing > 0))
-    if budget.deadline == np.inf or not len(which) or budget.stop:
+    which, late = np.flatnonzero(answers.verdict == Verdict.UNKNOWN), after_deadline(data, budget)
+    if late is None or not len(which):
         return answers
-    found = level.find_clear(kernel_poses(pose_from)[which], kernel_poses(pose_to)[which])
-    if found is None:
+    found = level.find_clear(*late, kernel_poses(pose_from)[which], kernel_poses(pose_to)[which])
+    if found is None or data.nothing_clear:
         return answers
     lower, verdict, exact = answers.lower.copy(), answers.verdict.copy(), answers.exact.copy()
     lower[which] = np.maximum(lower[which], found.lower)
@@ -189,9 +185,8 @@ def _sweep(
     world = first, last
     data, first, last, origin = _from_origin(data, first, last)
     progress = SweepProgress(
-        np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan),
-        np.full(k, budget.visits, np.int64),
-    )  # fmt: skip
+        np.zeros(k), np.ones(k), np.ones(k), np.full(k, np.inf), np.zeros(k), np.full((k, 2, 3), np.nan)
+    )
     counts, outside = np.zeros((4, k), np.uint32), np.zeros(k, bool)
     proved = np.ones(k)
     if not len(avatar.points) or not k:
@@ -253,20 +248,15 @@ def _sweep(
             near = absent.set_aside(starts, rows, data.arrays.where)
         around = VoxelsInReach(scales, units, *near, boxes, outside)
         for part, held_rows, reach in pieces(around, residency, budget.share, budget.stop):
-            chunk = len(part) if budget.deadline == np.inf else _PER_CALL
             if budget.stop:
                 progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
                 continue
             with residency.hold(held_rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
                 seen = as_held(data, held)
-                for at in range(0, len(part), chunk):
-                    if budget.spent:
-                        progress.visits[part[at:]] = -1
-                    advance_segments(
-                        box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose,
-                        seen.arrays, data.broad, reach.starts, reach.rows, part[at : at + chunk], tolerance, scratch,
-                        progress, counts,
-                    )  # fmt: skip
+                advance_segments(
+                    box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, seen.arrays,
+                    data.broad, reach.starts, reach.rows, part, tolerance, scratch, progress, counts,
+                )  # fmt: skip
             spent.add(held)
         which = _next_round(which, progress, proved)
         if budget.stop:
@@ -360,4 +350,4 @@ def _next_round(
     doubt = looked & ((lower < end) | touches) & (proved[which] >= 1.0)
     proved[which[doubt]] = lower[doubt]
     progress.at[which] = np.where(looked, end, at)
-    return which[looked & ~touches & (end < 1.0) & (progress.visits[which] >= 0)]
+    return which[looked & ~touches & (end < 1.0)]

@@ -13,7 +13,7 @@ from ...schemas.wire.answers import SweepAnswers, Verdict
 from ..kernels.motion.sweep_segments import SweepProgress
 from .context.level_of_detail import asked, level_budget, stoppable
 from .context.query_budget import QueryBudget
-from .context.query_context import SceneData
+from .context.query_context import LevelOfDetail, SceneData
 
 # `tolerance` of a request that gives none [m].
 DEFAULT_TOLERANCE = 1e-6
@@ -47,9 +47,11 @@ class SweepsByLevel:
         self._budget, self._ask = budget, ask
         self._within = max(tolerance * _LEVEL_SHARE, _LEVEL_LEAST)
 
-    def find_clear(self, first: NDArray[np.float64], last: NDArray[np.float64]) -> SweepAnswers | None:
+    def find_clear(
+        self, level: LevelOfDetail, budget: QueryBudget, first: NDArray[np.float64], last: NDArray[np.float64]
+    ) -> SweepAnswers | None:
         """Return what cover spheres prove of motions: `lower` and CLEAR hold, nothing else does."""
-        return None if self._level is None else self._sweep(self._level.covers, first, last)
+        return self._sweep(level.covers, budget, first, last)
 
     def settle(
         self,
@@ -65,7 +67,9 @@ class SweepsByLevel:
         first, last: (k, 4, 4), world.  proved: see `_next_round`, written for motions in contact.
         Without a tolerance only a clear motion is settled, and nothing else changes.
         """
-        found = self.find_clear(first[which], last[which])
+        if self._level is None:
+            return which[:0]
+        found = self.find_clear(self._level, self._budget, first[which], last[which])
         if found is None:
             return which[:0]
         clear = found.verdict == Verdict.CLEAR
@@ -75,8 +79,9 @@ class SweepsByLevel:
         touch = which[~clear]
         lower = found.lower[~clear]
         progress.at[touch] = np.maximum(progress.at[touch], lower)
-        assert self._level is not None
-        own = self._sweep(self._level.points, first[touch], last[touch]) if len(touch) else None
+        own = None
+        if len(touch):
+            own = self._sweep(self._level.points, self._budget, first[touch], last[touch])
         if own is None:
             return which[clear]
         with np.errstate(invalid="ignore"):  # a motion that stands still: 0 times infinity
@@ -89,10 +94,10 @@ class SweepsByLevel:
         return np.concatenate([which[clear], touch])
 
     def _sweep(
-        self, data: SceneData, first: NDArray[np.float64], last: NDArray[np.float64]
+        self, data: SceneData, budget: QueryBudget, first: NDArray[np.float64], last: NDArray[np.float64]
     ) -> SweepAnswers | None:
-        """Sweep through the spheres of a level; return None if they reach too far for the request."""
-        return asked(lambda: self._ask(data, first, last, self._within, level_budget(self._budget)))
+        """Sweep through the spheres of a level; return None as `asked` does."""
+        return asked(lambda: self._ask(data, first, last, self._within, level_budget(budget)))
 
 
 def cold_motions(

@@ -79,7 +79,7 @@ def _nearest(
     ) -> None:
         part = units[first:last]
         search_points(
-            part, reach_units, lists, cursor, held, data.arrays, tolerance, share, budget.visits, best
+            part, reach_units, lists, cursor, held, data.arrays, tolerance, share, best
         )
 
     return search_front_to_back(data, units, None, reach_units, 0, budget, kernel, spent, level)

@@ -52,10 +52,8 @@ from ..core.scene_arrays import (
     COUNTED,
     FIRST,
     LANES,
-    MAX_RESIDENT_PATH_VISITS,
     ROW_WORDS,
     node_class,
-    should_end,
     stopped,
 )
 from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
@@ -83,13 +81,13 @@ def _collide_voxel(
     shift, frame, step = placed.shift, placed.frame, scene.step
     off_x, off_y, off_z = location.x, location.y, location.z
     thresholds, mask = by_class.threshold, by_class.mask
-    by_size, threshold, stop, most = mask > U(0), thresholds[0], scene.stop, counters[2]
+    by_size, threshold, stop = mask > U(0), thresholds[0], scene.stop
     early = scratch.early
     tolerant = early[1] > np.float32(0.0)
     x, y, z, radius = nodes[0, 0] - off_x, nodes[1, 0] - off_y, nodes[2, 0] - off_z, nodes[3, 0]
     stack[0, 0], stack[0, 1], stack[0, 2] = location.rows, 0, count
     depth = 1
-    while depth > 0 and not should_end(stop, counters[0], most):
+    while depth > 0 and not stopped(stop):
         depth -= 1
         row, at, count = stack[U(depth), 0], stack[U(depth), 1], stack[U(depth), 2]
         first = np.int64(ints[U(row + FIRST)])
@@ -196,22 +194,19 @@ def _first_voxel(scene, rows, begin, end, placed):
 
 
 @nb.njit(nogil=True, cache=True)
-def collide_poses(poses, avatar, scene, reach, which, tolerance, most, verdict, counts):
+def collide_poses(poses, avatar, scene, reach, which, tolerance, verdict, counts):
     """Answer `collide` for the poses numbered in `which`: one call a request, with all voxels.
 
     poses: (k, 4, 4), checked.  avatar: not empty.  reach: VoxelsInReach of these poses
     (voxels_in_reach.py); a voxel in it that is not resident is counted as missing.  tolerance:
-    exact units by which a pair may exceed the reach and still end the search, as EARLY.  most: node
-    visits of a pose, beyond which its search ends.
+    exact units by which a pair may exceed the reach and still end the search, as EARLY.
     Accumulates into verdict (k,) uint8 and counts (3, k) uint32 (voxels missing, node visits, point
     tests), whose initial values are CLEAR and 0. A pose may therefore be answered in pieces: a
     contact, early or not, overrides a missing voxel, and a missing voxel overrides CLEAR. Once the scene's stop
-    flag is set, poses without a contact so far become UNKNOWN; a pose whose search ends early does
-    too.
+    flag is set, poses without a contact so far become UNKNOWN.
     """
     placed, front, scratch = make_placed(avatar), make_front(avatar), make_collide_scratch(avatar)
     by_class = make_class_thresholds(scene.radius_deficit)
-    scratch.counters[2] = most
     _collide_poses(
         poses, avatar, scene, reach, which, tolerance, verdict, counts, placed, front, by_class, scratch
     )
@@ -276,7 +271,7 @@ def _collide_poses(
             if found != CLEAR:
                 verdict[i] = found
                 break
-            if should_end(scene.stop, scratch.counters[0], scratch.counters[2]):
+            if stopped(scene.stop):
                 verdict[i] = UNKNOWN
                 break
         counts[1, i] += np.uint32(scratch.counters[0])
@@ -308,8 +303,8 @@ def collide_resident(poses, body, radius, other_units, tolerance, held, stop, ro
     pose by pose; outside (k,) bool; and verdict and counts, as `collide_poses` does. The remaining
     arrays of `VoxelsInReach` are local: arrays created here cost a tenth of arrays passed in.
     Returns (fault, pose, value found), as `check_poses` does, and the number of rows. -1 rows: not
-    answered, because a voxel has to be loaded, the rows do not fit, or a search ended early
-    (scene.stop, MAX_RESIDENT_PATH_VISITS); verdict and counts are then unchanged.
+    answered, because a voxel has to be loaded, the rows do not fit, or the request was stopped;
+    verdict and counts are then unchanged.
     """
     avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
     k = poses.shape[0]
@@ -323,7 +318,5 @@ def collide_resident(poses, body, radius, other_units, tolerance, held, stop, ro
         if scene.where[rows[at], 0] < 0:
             return fault, pose, found, -1
     if avatar.radius.shape[0] > 0:
-        collide_poses(
-            poses, avatar, scene, reach, np.arange(k), tolerance, MAX_RESIDENT_PATH_VISITS, verdict, counts
-        )
+        collide_poses(poses, avatar, scene, reach, np.arange(k), tolerance, verdict, counts)
     return fault, pose, found, rows_or_reset(needed, verdict, counts)

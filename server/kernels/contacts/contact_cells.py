@@ -74,7 +74,6 @@ class ContactOptions(NamedTuple):
     edges: (k,) int64, edge of a cell [steps].
     with_scan: whether the arena holds scan numbers.
     limit: number of pairs to list for each pose.
-    visits: node visits a pose; -1: time is up, examine nothing more.
     cells: limit of the table of cells, a power of two.
     """
 
@@ -82,7 +81,6 @@ class ContactOptions(NamedTuple):
     edges: NDArray[np.int64]
     with_scan: bool
     limit: int
-    visits: int
     cells: int
 
 

@@ -230,8 +230,8 @@ def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, 
     of its poses; they are then listed.
     pause: node visits after which the call returns with the work unfinished, 1 or more. The work is
     finished when state.cursor[0] == len(which). Until then, call again with the returned memory,
-    unless its table of cells has reached `options.cells` and has no space for LANES more. A pose
-    that has cost `options.visits` with work left is cut. Adds to `results`.
+    unless its table of cells has reached `options.cells` and has no space for LANES more. Once the
+    scene's stop flag is set, poses with work left are cut. Adds to `results`.
     """
     placed = make_placed(avatar)
     scratch = ContactScratch(
@@ -248,7 +248,7 @@ def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, 
         end = reach.starts[i + 1]
         if cursor[1] < 0:
             cursor[1], cursor[2] = reach.starts[i], 0
-        if cursor[1] < end and options.visits >= 0:
+        if cursor[1] < end:
             extent, farthest = place_nodes(avatar, poses[i], reach.scales[i], placed, scene)
             _set_thresholds(reach.units[i], extent, farthest, scene, scratch)
             scratch.bound[0] = listing_bound(
@@ -262,14 +262,10 @@ def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, 
                     continue
                 before = results.counts[1, i]
                 short = state.sizes[CELLS] + LANES > state.cells.table.shape[0]
-                # Over the budget, and not merely suspended for lack of space?
-                if before >= options.visits and not (short and cursor[2] > 0):
-                    break
                 if stopped(scene.stop):
                     break
                 if left <= 0 or (short and state.cells.table.shape[0] >= options.cells):
                     return state
-                stop = min(np.int64(options.visits), before + left)
                 if short:
                     # Here and not in the descent: a loop that changes a tuple of arrays counts
                     # their references in every iteration, which took a third of the time.
@@ -278,7 +274,7 @@ def gather_contacts(poses, avatar, scene, reach, which, options, closes, pause, 
                         state.stack, state.pairs, state.clusters,
                     )  # fmt: skip
                 _gather_voxel(
-                    avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results, stop
+                    avatar, poses[i], i, placed, scene, voxel, options, state, scratch, results, before + left
                 )
                 left -= results.counts[1, i] - before
                 if cursor[2] == 0:

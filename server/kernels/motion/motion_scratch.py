@@ -57,13 +57,7 @@ else:
 def make_scratch(avatar):
     """Allocate the scratch for an avatar, not empty. It serves one motion at a time."""
     progress = SweepProgress(
-        np.zeros(1),
-        np.ones(1),
-        np.ones(1),
-        np.zeros(1),
-        np.zeros(1),
-        np.zeros((1, 2, 3)),
-        np.zeros(1, np.int64),
+        np.zeros(1), np.ones(1), np.ones(1), np.zeros(1), np.zeros(1), np.zeros((1, 2, 3))
     )
     one = OneMotion(
         np.empty((1, 4, 4)), np.empty((1, 4, 4)), np.empty(1), np.empty(1, np.int64), np.empty(1, np.int64),

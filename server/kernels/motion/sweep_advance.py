@@ -40,7 +40,7 @@ def advance_segments(
         i = which[number]
         if starts[i + 1] == starts[i]:
             continue
-        if progress.visits[i] < 0 or stopped(scene.stop):
+        if stopped(scene.stop):
             progress.lower[i] = min(progress.lower[i], progress.at[i])
             continue
         motion = make_motion(first[i], last[i], box, scene.origin)
@@ -59,7 +59,7 @@ def advance_segments(
             if scene.where[row, 0] < 0:
                 counts[0, i] += np.uint32(1)
                 gap = min(gap, entry_fraction(begin, end, span, index.low[row], index.high[row]))
-        moving.counters[0], moving.counters[1], moving.counters[3] = 0, 0, progress.visits[i]
+        moving.counters[0], moving.counters[1] = 0, 0
         sweep = AvatarSweep(
             motion,
             avatar,
@@ -80,7 +80,6 @@ def advance_segments(
         if upper < INFINITE and upper <= progress.upper[i]:
             _name_witness(sweep, upper, upper == progress.upper[i], progress.witness[i])
             progress.upper[i] = upper
-        progress.visits[i] -= moving.counters[0]
         counts[1, i] += np.uint32(moving.counters[0])
         counts[2, i] += np.uint32(moving.counters[1])
         counts[3, i] += np.uint32(steps)

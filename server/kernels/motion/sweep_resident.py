@@ -10,7 +10,7 @@ import numpy as np
 from ....schemas.kernels import compiling as nb
 from ....schemas.wire.answers import Verdict
 from ..core.kernel_decorators import njit_no_refcount
-from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, SceneArrays, stopped
+from ..core.scene_arrays import SceneArrays, stopped
 from ..core.voxels_in_reach import SIMILARITY_TOLERANCE, VALID, check_poses
 from .motion_end import MIN_MOTION, longest_way, skin_fraction, write_point
 from .screw_motion import make_motion, pose_at
@@ -86,7 +86,7 @@ def sweep_resident(
         scene.units_per_step, scene.voxel_steps, scene.block_words, scene.radius_deficit, stop,
     )  # fmt: skip
     progress.at[0], progress.end[0], progress.lower[0], progress.speed[0] = 0.0, 1.0, 1.0, 0.0
-    progress.upper[0], progress.visits[0] = np.inf, MAX_RESIDENT_PATH_VISITS
+    progress.upper[0] = np.inf
     for n in range(4):
         counts[n, 0] = np.uint32(0)
     needed = plan_in_space(
@@ -105,7 +105,7 @@ def sweep_resident(
             box, first, last, avatar, radius, other_units, scales, units, one.loose, from_zero, index, one.starts, rows,
             one.which, tolerance, scratch, progress, counts,
         )  # fmt: skip
-        if progress.visits[0] < 0 or stopped(stop):
+        if stopped(stop):
             return _NOT_ANSWERED
         proved = progress.lower[0]
     upper = progress.upper[0]

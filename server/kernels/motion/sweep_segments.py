@@ -35,7 +35,6 @@ class SweepProgress(NamedTuple):
     upper: the earliest contact found, inf: none.
     speed: upper bound of the speed of the fastest avatar point [m per unit of t].
     witness: (k, 2, 3), the pair's centres, avatar and scan, world [m].
-    visits: (k,) int64, node visits left.
     """
 
     at: NDArray[np.float64]
@@ -44,7 +43,6 @@ class SweepProgress(NamedTuple):
     upper: NDArray[np.float64]
     speed: NDArray[np.float64]
     witness: NDArray[np.float64]
-    visits: NDArray[np.int64]
 
 
 class PlanSpace(NamedTuple):

@@ -167,7 +167,7 @@ def _search_leaves(
 
 
 @njit_no_refcount
-def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, visits, nearer, scratch):
+def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, nearer, scratch):
     """Search one resident voxel for each scan's nearest pair; return whether to the end."""
     words, ints = scene.words, scene.ints
     base = scene.where[voxel, 0]
@@ -193,8 +193,6 @@ def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, vi
                 avatar, m, a, ~a_first, placed, scene, voxel, row, reach_units, margin_units, nearer, scratch
             )
             continue
-        if counts[1] >= visits:
-            return False
         if b_first < 0 or (a_first >= 0 and nodes[3, a] > words[row + 3]):
             counts[1] += held[a]
             threshold = thresholds[node_class(ints, row, mask)]
@@ -220,14 +218,14 @@ def _search_voxel(avatar, m, placed, scene, voxel, reach_units, margin_units, vi
 
 
 @nb.njit(nogil=True, cache=True)
-def nearest_by_scan(poses, avatar, scene, reach, margin_units, visits, nearer, counts):
+def nearest_by_scan(poses, avatar, scene, reach, margin_units, nearer, counts):
     """Compute the least signed separation of each scan from an avatar, within a margin.
 
     poses: (1, 4, 4), one pose, checked.  avatar: not empty.  scene: with scan numbers.  reach:
     VoxelsInReach of the pose; a voxel in it that is not resident is counted as missing.
-    margin_units: the part of the reach that is not the radii.  visits: node visits after which no
-    further node is opened.  nearer: initially inf and reach.units, or as a call for other voxels
-    left it.  counts: (3,) int64, voxels missing, node visits, point tests; added to.
+    margin_units: the part of the reach that is not the radii.  nearer: initially inf and
+    reach.units, or as a call for other voxels left it.  counts: (3,) int64, voxels missing, node
+    visits, point tests; added to.
     Returns whether all resident voxels were searched completely.
     """
     m, units = poses[0], reach.units[0]
@@ -257,7 +255,5 @@ def nearest_by_scan(poses, avatar, scene, reach, margin_units, visits, nearer, c
         if scene.where[voxel, 0] < 0:
             counts[0] += 1
         else:
-            done &= _search_voxel(
-                avatar, m, placed, scene, voxel, units, margin_units, visits, nearer, scratch
-            )
+            done &= _search_voxel(avatar, m, placed, scene, voxel, units, margin_units, nearer, scratch)
     return done

@@ -15,7 +15,6 @@ from ....schemas.kernels import compiling as nb
 from ..core.array_references import with_flag
 from ..core.kernel_decorators import njit_no_refcount
 from ..core.placed_avatar import lattice_to_units
-from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS
 from ..core.voxels_in_reach import VALID, VoxelsInReach, find_reach
 from .nearest_pair import NearestPairs
 from .nearest_search import nearest_poses
@@ -58,7 +57,7 @@ def nearest_resident(poses, body, radius, radius_units, reach_units, reach, held
     [m]; inf and NaN where no pair is within reach.
     Returns (fault, pose, value found), as `check_poses` does, then the number of rows, outside,
     node visits, point tests. -1 rows: not answered, because a voxel has to be loaded, the rows do
-    not fit, or the search ended early (scene.stop, MAX_RESIDENT_PATH_VISITS).
+    not fit, or the request was stopped.
     """
     avatar, scene, index = body.avatar, with_flag(held.scene, stop), held.index
     outside = np.zeros(1, np.bool_)
@@ -79,10 +78,9 @@ def nearest_resident(poses, body, radius, radius_units, reach_units, reach, held
     counts = np.zeros((3, 1), np.uint32)
     if needed > 0:
         nearest_poses(
-            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), 0.0, 0.0,
-            MAX_RESIDENT_PATH_VISITS, nearest, counts,
-        )  # fmt: skip
-        if nearest.missing_bound[0] < np.inf:  # all is resident: the search ended early
+            poses, avatar, scene, index, around, reach_units, np.zeros(1, np.int64), 0.0, 0.0, nearest, counts
+        )
+        if nearest.missing_bound[0] < np.inf:  # all is resident: the request was stopped
             return fault, pose, found, -1, False, 0, 0
     _write_result(
         nearest.square[0], nearest.pair[0], nearest.deficit[0], units[0] - reach_units, reach, scene, result

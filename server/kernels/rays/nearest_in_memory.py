@@ -8,7 +8,7 @@ import numpy as np
 from ....schemas.archive.units import UNITS_PER_METRE
 from ....schemas.kernels import compiling as nb
 from ..core.array_references import with_flag
-from ..core.scene_arrays import MAX_RESIDENT_PATH_VISITS, stopped
+from ..core.scene_arrays import stopped
 from .near_points import voxels_in_box
 from .rays import STACK, ClosestHits
 from .within_point import search_voxel
@@ -44,11 +44,9 @@ def nearest_in_memory(held, place, reach, stop, rows, found):
     for voxel in rows[:count]:
         if scene.where[voxel, 0] < 0:
             return -1, False, 0
-        limit = search_voxel(
-            scene, voxel, units, 0, 0.0, 0.0, 0.0, MAX_RESIDENT_PATH_VISITS, best, limit, stack, bounds, order
-        )
+        limit = search_voxel(scene, voxel, units, 0, 0.0, 0.0, 0.0, best, limit, stack, bounds, order)
     visits = np.int64(best.counts[1, 0])
-    if visits >= MAX_RESIDENT_PATH_VISITS or stopped(stop):
+    if stopped(stop):
         return -1, False, 0
     for r in range(3):
         found[r] = best.lattice[0, r] * scene.step + scene.origin[r]

@@ -240,11 +240,11 @@ def push_sorted(rows, bounds, begin, depth, row, bound):
 
 
 @njit_no_refcount
-def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, deficits):
+def _follow(scene, voxel, rays, i, ray, near, tolerance, best, rows, bounds, deficits):
     """Follow ray i through the tree of one resident voxel, front to back; update `best`.
 
     deficits: `scene.radius_deficit` in float64 [steps].  near: exact units, as in VoxelLists. A
-    bound of a node holds for its children; no bound therefore gets worse with more visits.
+    bound of a node holds for its children.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -270,7 +270,7 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        if bound > best.value[i] - tolerance or spent >= visits or stopped(scene.stop):
+        if bound > best.value[i] - tolerance or stopped(scene.stop):
             if bound <= best.value[i]:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
@@ -294,14 +294,14 @@ def _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bou
 
 
 @nb.njit(nogil=True, cache=True)
-def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
+def follow_rays(rays, lists, cursor, held, scene, tolerance, best):
     """Follow each ray along its list, from its cursor up to the first voxel that is not held.
 
-    One call serves one round. Once the scene's stop flag is set, no more visits are spent.
+    One call serves one round. Once the scene's stop flag is set, all rays are finished.
     lists: VoxelLists of these rays.  cursor: (k,) int64, entries processed; a ray whose cursor is
     at the end of its list is finished.  held: (v,) bool, voxels that do not change during this
-    call; a held voxel that is not resident is counted as missing.  tolerance: exact units.  visits:
-    node visits a ray. Updates cursor and best.
+    call; a held voxel that is not resident is counted as missing.  tolerance: exact units.
+    Updates cursor and best.
     """
     ray = np.empty(12)
     rows, bounds = np.empty(STACK, np.int64), np.empty(STACK)
@@ -314,7 +314,7 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
         while cursor[i] < end:
             at = cursor[i]
             near, voxel = lists.near[at], lists.rows[at]
-            if near > best.value[i] - tolerance or best.counts[1, i] >= visits or stopped(scene.stop):
+            if near > best.value[i] - tolerance or stopped(scene.stop):
                 if near <= best.value[i]:
                     best.unseen[i] = min(best.unseen[i], near)
                 cursor[i] = end
@@ -325,5 +325,5 @@ def follow_rays(rays, lists, cursor, held, scene, tolerance, visits, best):
                 best.counts[0, i] += np.uint32(1)
                 best.unseen[i] = min(best.unseen[i], near)
             else:
-                _follow(scene, voxel, rays, i, ray, near, tolerance, visits, best, rows, bounds, deficits)
+                _follow(scene, voxel, rays, i, ray, near, tolerance, best, rows, bounds, deficits)
             cursor[i] = at + 1

@@ -131,11 +131,10 @@ def _test_block(scene, voxel, row, x, y, z, error, at_units, i, best, limit):
 
 
 @njit_no_refcount
-def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys):
+def search_voxel(scene, voxel, at_units, i, near, tolerance, share, best, limit, rows, bounds, keys):
     """Search one resident voxel, nearest nodes first; update `best` and return the lowered limit.
 
-    near: exact units, as in VoxelLists. A bound of a node holds for its children; no bound
-    therefore gets worse with more visits.
+    near: exact units, as in VoxelLists. A bound of a node holds for its children.
     """
     words, ints = scene.words, scene.ints
     per_unit = 1.0 / scene.units_per_step
@@ -161,7 +160,7 @@ def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best
         depth -= 1
         row, above = rows[depth], bounds[depth]
         bound = (above - error) * scene.units_per_step
-        if bound > nearest - allowed or spent >= visits or stopped(scene.stop):
+        if bound > nearest - allowed or stopped(scene.stop):
             if bound <= nearest:
                 best.unseen[i] = min(best.unseen[i], max(bound, 0.0))
             continue
@@ -200,7 +199,7 @@ def search_voxel(scene, voxel, at_units, i, near, tolerance, share, visits, best
 
 
 @nb.njit(nogil=True, cache=True)
-def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share, visits, best):
+def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share, best):
     """Search for the scan points nearest to k query points, along their lists.
 
     Each search runs up to the first voxel that is not held.
@@ -216,7 +215,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share,
             near, voxel = lists.near[at], lists.rows[at]
             nearest = math.sqrt(np.float64(limit)) * (1.0 + 2.0**-52)
             far = near > nearest - (max(tolerance, share * nearest) if best.square[i] >= 0 else 0.0)
-            if far or best.counts[1, i] >= visits or stopped(scene.stop):
+            if far or stopped(scene.stop):
                 if near <= nearest:
                     best.unseen[i] = min(best.unseen[i], near)
                 cursor[i] = end
@@ -228,7 +227,7 @@ def search_points(at_units, reach, lists, cursor, held, scene, tolerance, share,
                 best.unseen[i] = min(best.unseen[i], near)
             else:
                 limit = search_voxel(
-                    scene, voxel, at_units, i, near, tolerance, share, visits, best, limit, rows, bounds, keys
+                    scene, voxel, at_units, i, near, tolerance, share, best, limit, rows, bounds, keys
                 )  # fmt: skip
             cursor[i] = at + 1
 

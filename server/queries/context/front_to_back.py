@@ -28,8 +28,6 @@ from .query_context import SceneData, prove
 
 # Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14
-# The same with a deadline, which is checked between batches and rounds: some 10 ms of work.
-TIMED_BATCH = 1 << 11
 
 
 def make_origins(
@@ -97,11 +95,10 @@ def search_front_to_back(
     best = make_best(k)
     bounds = data.bounds
     tree, index_tree = bounds.trees()
-    batch = BATCH if budget.deadline == math.inf else TIMED_BATCH
     until = budget.deadline if budget.late is None else -math.inf
-    for begin in range(0, k, batch):
-        end = min(begin + batch, k)
-        if budget.spent:
+    for begin in range(0, k, BATCH):
+        end = min(begin + BATCH, k)
+        if budget.stop:
             best.unseen[begin:] = 0.0
             break
         part = _part(best, begin, end)
@@ -116,7 +113,7 @@ def search_front_to_back(
         settled: NDArray[np.bool_] = np.zeros(end - begin, bool)
         clear_until = np.zeros(end - begin)
         while (open_ := cursor < lists.starts[1:]).any():
-            if budget.spent:
+            if budget.stop:
                 part.unseen[open_] = np.minimum(part.unseen[open_], lists.near[cursor[open_]])
                 break
             rows = _next_rows(data, lists, cursor, open_)

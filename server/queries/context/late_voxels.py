@@ -17,7 +17,7 @@ from ...kernels.collide.collide_poses import collide_poses
 from ...kernels.collide.early_contact import CLEAR, UNKNOWN
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from .level_of_detail import asked, stoppable
-from .query_budget import NO_LIMIT, QueryBudget
+from .query_budget import QueryBudget
 from .query_context import LevelOfDetail, SceneData, as_held, check_request
 from .unloaded_voxels import drop_clear_voxels
 
@@ -93,7 +93,7 @@ def _clear_of_level(
     with covers.residency.hold(needed, -math.inf) as held:
         seen = as_held(covers, held)
         which = np.arange(len(rows))
-        collide_poses(poses[pose_of], avatar.arrays, seen.arrays, own, which, 0, NO_LIMIT, verdict, counts)
+        collide_poses(poses[pose_of], avatar.arrays, seen.arrays, own, which, 0, verdict, counts)
     if covers.nothing_clear:
         verdict[:] = UNKNOWN
     return np.asarray(verdict == CLEAR)

@@ -21,14 +21,15 @@ from ....schemas.archive.voxel_grid import voxel_keys
 from ....schemas.errors import BadRequestError, TooLargeError
 from ...kernels.core.voxels_in_reach import VoxelsInReach
 from ...residency.voxel_cache import VoxelCache
-from .query_budget import QueryBudget
+from ...runtime.stop_flag import StoppedError
+from .query_budget import QueryBudget, with_deadline
 from .query_context import LevelOfDetail, SceneData, make_scene_data, with_stop
 
 _A = TypeVar("_A")
 
-# Time after a request's deadline in which it may begin to load voxels of the level [s]. Without it,
-# a request with no time at all would have no bounds until another has loaded them.
-LEVEL_GRACE = 2e-3
+# Time after a request's deadline in which the level is asked about what is still open [s]: a load of
+# one of its voxels and a few milliseconds of search.
+LEVEL_GRACE = 0.01
 
 
 class LevelData(NamedTuple):
@@ -132,13 +133,13 @@ class SettledPoses:
 
 
 def asked(ask: Callable[[], _A]) -> _A | None:
-    """Return what a query of the level finds; None if its spheres reach too far for the request.
+    """Return what a query of the level finds; None if its spheres reach too far, or it was stopped.
 
     The scene has accepted the request. The cover spheres are larger than the scene's.
     """
     try:
         return ask()
-    except (BadRequestError, TooLargeError):
+    except (BadRequestError, TooLargeError, StoppedError):
         return None
 
 
@@ -149,11 +150,16 @@ def stoppable(level: LevelOfDetail, budget: QueryBudget) -> LevelOfDetail:
 
 
 def level_budget(budget: QueryBudget) -> QueryBudget:
-    """Return the budget of an exact query of the level for a request with `budget`.
+    """Return the budget of an exact query of the level for a request with `budget`."""
+    return QueryBudget(deadline=budget.deadline, scan=budget.scan, stop=budget.stop)
 
-    With a deadline, loads of the level may begin until `LEVEL_GRACE` after the deadline.
+
+def after_deadline(data: SceneData, budget: QueryBudget) -> tuple[LevelOfDetail, QueryBudget] | None:
+    """Return the level, and the budget, for what a request leaves open at its deadline.
+
+    Return None without a deadline or a level, or if something else stopped the request.
     """
-    until = (
-        max(budget.deadline, time.perf_counter() + LEVEL_GRACE) if budget.deadline < math.inf else math.inf
-    )
-    return QueryBudget(deadline=until, scan=budget.scan, stop=budget.stop)
+    if data.level is None or budget.deadline == math.inf or budget.stop.reason:
+        return None
+    own = with_deadline(budget, max(budget.deadline, time.perf_counter()) + LEVEL_GRACE)
+    return stoppable(data.level, own), own

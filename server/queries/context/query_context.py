@@ -257,7 +257,7 @@ def prove(data: SceneData, rows: Sequence[int], budget: QueryBudget, spent: Cost
     """
     residency = data.residency
     for part in parts_that_fit(residency, rows, int(residency.buffer.total_bytes * budget.share)):
-        if budget.spent or budget.late is not None:
+        if budget.stop or budget.late is not None:
             return
         with residency.hold(part, budget.loads_until(), scan=True, stop=budget.stop) as held:
             pass

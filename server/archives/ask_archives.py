@@ -73,12 +73,12 @@ def ask_each(
             data = opened.data if radius_model is None else opened.radius_model(radius_model)
             ask, scan = prepare(archives[0], opened)
             own = budget._replace(scan=True) if scan else budget
-            return ask_until_stopped(question, k, own, partial(ask, with_stop(data, own.stop), own))
+            return ask_until_stopped(question, k, own, partial(ask, with_stop(data, own.request), own))
     answers: list[_A] = []
     first = 0
     for archive in archives:
         with archive.take() as opened:
-            data = with_stop(opened.radius_model(radius_model), budget.stop)
+            data = with_stop(opened.radius_model(radius_model), budget.request)
             ask, scan = prepare(archive, opened)
             own = budget._replace(scan=scan)
             found = ask_until_stopped(question, k, own, partial(ask, data, own))

@@ -98,7 +98,7 @@ def _verdicts(
             verdict[which[verdict[which] == CLEAR]] = UNKNOWN
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            seen = as_held(data, held)
+            seen = as_held(data, held, budget)
             collide_poses(poses, avatar.arrays, seen.arrays, part, which, early, verdict, counts)
         spent.add(held)
     return verdict, counts, reach

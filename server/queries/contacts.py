@@ -54,6 +54,7 @@ from .context.query_context import (
     kernel_poses,
     pieces,
     to_units,
+    with_stop,
 )
 from .context.signed_distance import signed_from_square
 
@@ -128,10 +129,11 @@ def contacts(
                 number + 1 == len(parts) or len(which) > 1 or parts[number + 1][0].tolist() != which.tolist()
             )
             if budget.stop:
-                memory = _gather(data, avatar, array, part, which, options, closes, memory, tally)
+                seen = with_stop(data, budget.stop)
+                memory = _gather(seen, avatar, array, part, which, options, closes, memory, tally)
                 continue
             with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-                seen = as_held(data, held)
+                seen = as_held(data, held, budget)
                 memory = _gather(seen, avatar, array, part, which, options, closes, memory, tally)
             spent.add(held)
     columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)

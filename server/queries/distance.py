@@ -122,7 +122,7 @@ def _pairs(
             nearest.missing_bound[which] = 0.0
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            seen = as_held(data, held)
+            seen = as_held(data, held, budget)
             own = bound_missing(seen, held, avatar, poses, part, which, nearest.missing_bound, counts, budget)
             nearest_poses(
                 poses,

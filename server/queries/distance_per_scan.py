@@ -72,10 +72,8 @@ def separation_per_scan(
             exact = False
             break
         with data.residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-            arrays = as_held(data, held).arrays
-            exact &= bool(
-                nearest_by_scan(poses, avatar.arrays, arrays, part, margin_units, nearer, counts)
-            )
+            arrays = as_held(data, held, budget).arrays
+            exact &= bool(nearest_by_scan(poses, avatar.arrays, arrays, part, margin_units, nearer, counts))
     exact &= counts[0] == 0 and not in_unknown(reach.boxes, data.unknown, data.nothing_clear)[0]
     found = np.flatnonzero(nearer.gaps < np.inf).tolist()
     separations = {ANY_SCAN if number == scans else number: float(nearer.gaps[number]) for number in found}

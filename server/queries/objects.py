@@ -18,7 +18,7 @@ from ..avatars.avatar_model import AvatarModel
 from ..kernels.bodies.body_pairs import CLEAR, UNKNOWN, bound_objects, sweep_and_prune, touch_pairs
 from ..kernels.core.placed_avatar import MAX_REACH_UNITS
 from ..kernels.core.voxels_in_reach import check_poses
-from ..runtime.stop_flag import NO_STOP
+from ..runtime.stop_flag import NO_STOP, StoppedError
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import SceneData, kernel_poses, refuse, to_units, with_stop
 from .resident_fast_path import collide_fast
@@ -77,8 +77,8 @@ def objects(
     margin: of each pair, and of each object with the scene [m].
     NUMERICS.md N5 defines contact, also between two objects: kernels/bodies/body_pairs.py. A radius
     model applies to the scan's spheres and not to objects. The tolerance is ignored, because these
-    answers could not express which of them are approximate. Visits are counted for each object and
-    each pair. Pairs left untested by a budget are listed as UNKNOWN.
+    answers could not express which of them are approximate. Pairs left untested by a deadline are
+    listed as UNKNOWN.
     Raise BadRequestError, BadTransformError, TooLargeError.
     """
     begin = time.perf_counter()
@@ -90,10 +90,11 @@ def objects(
         rows = np.flatnonzero((checked.model_of == number) & ((checked.masks & SCENE_GROUP) > 0))
         if not len(rows):
             continue
-        if budget.spent:
+        try:
+            found = collide_fast(data, model, checked.poses[rows], margin, budget._replace(tolerance=0.0))
+        except StoppedError:
             verdict[rows] = UNKNOWN
             continue
-        found = collide_fast(data, model, checked.poses[rows], margin, budget._replace(tolerance=0.0))
         verdict[rows], outside[rows] = found.verdict, found.outside
         counts[:, rows] = found.voxels_missing, found.node_visits, found.point_tests
         spent.add_cost(found)

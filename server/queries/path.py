@@ -81,7 +81,13 @@ def path_question(
     scales, units = np.empty(len(poses)), np.empty(len(poses), np.int64)
     other += data.radius_units
     fault, pose, found = check_poses(
-        poses, avatar.arrays.radius, avatar.radius, other, with_stop(data, budget.stop).arrays, scales, units
+        poses,
+        avatar.arrays.radius,
+        avatar.radius,
+        other,
+        with_stop(data, budget.request).arrays,
+        scales,
+        units,
     )
     refuse(fault, pose, found)
 
@@ -94,7 +100,7 @@ def path_question(
             question,
             end - start,
             own,
-            lambda: engine(with_stop(data, own.stop), avatar, *what, **given, budget=own),
+            lambda: engine(with_stop(data, own.request), avatar, *what, **given, budget=own),
         )
 
     return ask, question.items_along(len(poses))

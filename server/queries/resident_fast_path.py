@@ -66,12 +66,7 @@ def collide_fast(
     """Answer `collide`, in one kernel call if there is one pose and the fast path applies."""
     begin = time.perf_counter()
     array = kernel_poses(poses)
-    if (
-        len(array) != 1
-        or len(avatar.points) > MAX_FAST_POINTS
-        or budget.tolerance
-        or _has_unknown(data)
-    ):
+    if len(array) != 1 or len(avatar.points) > MAX_FAST_POINTS or budget.tolerance or _has_unknown(data):
         return collide(data, avatar, array, margin, budget)
     residency = data.residency
     rows, outside = np.empty(MAX_FAST_VOXELS, np.int64), np.zeros(1, bool)
@@ -80,7 +75,7 @@ def collide_fast(
     body, held = refer_to_avatar(avatar.arrays), data.references.to(data.arrays, data.broad)
     with residency.frozen():
         fault, pose, found, needed = held.call(
-            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, data.arrays.stop, rows,
+            collide_resident, array, body, avatar.radius, other_units, 0, held.reference, budget.stop.flag, rows,
             outside, verdict, counts,
         )  # fmt: skip
         if needed > 0:
@@ -118,7 +113,7 @@ def distance_fast(
     with residency.frozen():
         fault, at, found, needed, outside, visits, tests = held.call(
             nearest_resident, poses, body, avatar.radius, data.radius_units, reach_units, float(reach), held.reference,
-            data.arrays.stop, rows, result,
+            budget.stop.flag, rows, result,
         )  # fmt: skip
         if needed > 0:
             residency.use(rows[:needed].tolist(), scan=budget.scan)
@@ -229,7 +224,7 @@ class ResidentQueries:
             with residency.frozen():
                 needed, verdict, visits, _, _ = held.call(
                     sweep_resident, self._first, self._last, self.body.reference, self._scratch, self.avatar.radius,
-                    data.radius_units, self._box, held.reference, data.arrays.stop, data.unknown, data.nothing_clear,
+                    data.radius_units, self._box, held.reference, budget.stop.flag, data.unknown, data.nothing_clear,
                     max(tolerance, budget.tolerance), skin, rows, result,
                 )  # fmt: skip
                 if needed > 0:
@@ -242,7 +237,7 @@ class ResidentQueries:
         verdict, exact = _VERDICTS[answers.verdict[0]], bool(answers.exact[0])
         touches, missing = verdict == Verdict.CONTACT, int(answers.voxels_missing[0])
         # A stop may leave places unexamined too.
-        partial = bool(data.arrays.stop.item(0)) or _has_unknown(data)
+        partial = bool(budget.stop) or _has_unknown(data)
         return SweepResult(
             verdict,
             float(answers.lower[0]),
@@ -330,7 +325,7 @@ class ResidentQueries:
             with residency.frozen():
                 fault, at, found, needed = held.call(
                     collide_resident, poses, self.body.reference, self.avatar.radius, data.radius_units,
-                    budget.tolerance_units, held.reference, data.arrays.stop, rows, self._outside, verdict, counts,
+                    budget.tolerance_units, held.reference, budget.stop.flag, rows, self._outside, verdict, counts,
                 )  # fmt: skip
                 if needed > 0:
                     self.use(residency, rows[:needed].tolist())

@@ -252,7 +252,7 @@ def _sweep(
                 progress.lower[part] = np.minimum(progress.lower[part], progress.at[part])
                 continue
             with residency.hold(held_rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
-                seen = as_held(data, held)
+                seen = as_held(data, held, budget)
                 advance_segments(
                     box, first, last, avatar.arrays, avatar.radius, other_units, scales, units, loose, seen.arrays,
                     data.broad, reach.starts, reach.rows, part, tolerance, scratch, progress, counts,

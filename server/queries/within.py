@@ -78,9 +78,7 @@ def _nearest(
         best: ClosestHits,
     ) -> None:
         part = units[first:last]
-        search_points(
-            part, reach_units, lists, cursor, held, data.arrays, tolerance, share, best
-        )
+        search_points(part, reach_units, lists, cursor, held, data.arrays, tolerance, share, best)
 
     return search_front_to_back(data, units, None, reach_units, 0, budget, kernel, spent, level)
 

@@ -261,7 +261,7 @@ def _terms(
     """Return the scene data and the budget of a request with these options."""
     budget = make_budget(tolerance, relative_tolerance, budget_ms, stop)
     data = opened.data if radius_model is None else opened.radius_model(radius_model)
-    return with_stop(data, budget.stop), budget
+    return with_stop(data, budget.request), budget
 
 
 def _count(question: Question[Any], rows: ArrayLike) -> int:

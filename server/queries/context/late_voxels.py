@@ -48,7 +48,7 @@ def drop_proved_voxels(
         pose_of = np.repeat(np.arange(len(poses)), np.diff(reach.starts))
         level = stoppable(data.level, budget)
         pairs = pose_of[absent], rows[absent]
-        clear = asked(lambda: _clear_of_level(level, avatar, poses, margin_units, *pairs))
+        clear = asked(lambda: _clear_of_level(level, avatar, poses, margin_units, *pairs, budget))
         if clear is None or not clear.any():
             return reach
         kept = np.ones(len(rows), bool)
@@ -67,6 +67,7 @@ def _clear_of_level(
     margin_units: int,
     pose_of: NDArray[np.int64],
     rows: NDArray[np.int64],
+    budget: QueryBudget,
 ) -> NDArray[np.bool_]:
     """Return which pairs (n,) of a pose and a voxel of the scene the level proves clear.
 
@@ -91,7 +92,7 @@ def _clear_of_level(
     verdict, counts = np.full(len(rows), CLEAR, np.uint8), np.zeros((3, len(rows)), np.uint32)
     needed = np.unique(own.rows[:-1]).tolist()
     with covers.residency.hold(needed, -math.inf) as held:
-        seen = as_held(covers, held)
+        seen = as_held(covers, held, budget)
         which = np.arange(len(rows))
         collide_poses(poses[pose_of], avatar.arrays, seen.arrays, own, which, 0, verdict, counts)
     if covers.nothing_clear:

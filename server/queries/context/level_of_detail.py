@@ -144,14 +144,14 @@ def asked(ask: Callable[[], _A]) -> _A | None:
 
 
 def stoppable(level: LevelOfDetail, budget: QueryBudget) -> LevelOfDetail:
-    """Return the same level for a request that only its stop flag ends early."""
-    covers, points = (with_stop(data, budget.stop) for data in (level.covers, level.points))
+    """Return the same level for the broad phase of a request."""
+    covers, points = (with_stop(data, budget.request) for data in (level.covers, level.points))
     return level._replace(covers=covers, points=points)
 
 
 def level_budget(budget: QueryBudget) -> QueryBudget:
     """Return the budget of an exact query of the level for a request with `budget`."""
-    return QueryBudget(deadline=budget.deadline, scan=budget.scan, stop=budget.stop)
+    return budget._replace(tolerance=0.0, relative=0.0, share=1.0, late=None)
 
 
 def after_deadline(data: SceneData, budget: QueryBudget) -> tuple[LevelOfDetail, QueryBudget] | None:

@@ -58,7 +58,7 @@ class QueryBudget(NamedTuple):
     share: share of the cache for the voxels held at a time. If not all fit, work counts depend on
     it; verdicts never do.
     stop: ends the work early once it is set; what was not examined by then is unknown.
-    request: the flag of the whole request, which its deadline does not set.
+    request: the flag of the whole request, which its deadline does not set: for its broad phase.
     late: None: voxels that are not in memory are loaded. Otherwise no load is waited for: such
     voxels are bounded (late_voxels.py), their loads are owed, and they are counted here.
     """

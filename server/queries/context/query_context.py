@@ -187,7 +187,7 @@ def with_radius_model(data: SceneData, archive: Archive, text: str | None) -> Sc
 
 
 def with_stop(data: SceneData, stop: StopFlag) -> SceneData:
-    """Return the same scene for a request that only `stop` ends early."""
+    """Return the same scene for kernels that `stop` ends early."""
     return (
         data if data.arrays.stop is stop.flag else data._replace(arrays=data.arrays._replace(stop=stop.flag))
     )
@@ -371,11 +371,13 @@ def _only(reach: VoxelsInReach, pose: int, rows: list[int]) -> VoxelsInReach:
     return reach._replace(starts=starts, rows=np.array(rows, np.int64))
 
 
-def as_held(data: SceneData, held: HeldVoxels) -> SceneData:
+def as_held(data: SceneData, held: HeldVoxels, budget: QueryBudget) -> SceneData:
     """Return what a kernel may read during a hold: late voxels appear as not resident.
 
-    They may become resident during the hold.
+    They may become resident during the hold. The kernel ends at the deadline of `budget`, the broad
+    phase does not: a request whose time is up still knows what is out of reach.
     """
+    data = with_stop(data, budget.stop)
     if not held.late:
         return data
     where = data.arrays.where.copy()  # other threads write only rows that are late or not held

@@ -74,8 +74,8 @@ def test_it_counts_as_brute_force_does(scene: Scene, built: Built) -> None:
         scene.ask(COUNT_WITHIN, points, -1.0)
 
 
-def test_a_budget_leaves_no_point_clear(scene: Scene, built: Built) -> None:
-    found = scene.ask(COUNT_WITHIN, points=places(built), reach=REACH, budget_visits=0)
+def test_a_deadline_leaves_no_point_clear(scene: Scene, built: Built) -> None:
+    found = scene.ask(COUNT_WITHIN, points=places(built), reach=REACH, budget_ms=0)
     assert set(found.verdict.tolist()) == {Verdict.UNKNOWN} and not found.exact.any()
 
 

@@ -60,7 +60,7 @@ def ask_all(scene: Scene, poses: NDArray[np.float64], model: str | None) -> Iter
     yield scene.sweep("al", poses, ends, radius_model=model)
     yield scene.raycast(places, ways, 3.0, radius_model=model)
     yield scene.within(places, 0.5)
-    yield scene.collide("al", poses, 0.01, budget_visits=40, tolerance=1e-3, radius_model=model)
+    yield scene.collide("al", poses, 0.01, tolerance=1e-3, radius_model=model)
     scene.residency.check()
 
 

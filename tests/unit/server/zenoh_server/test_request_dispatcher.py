@@ -90,14 +90,12 @@ EFFORT = {
     "tolerance": 0.5,
     "relative_tolerance": 0.25,
     "budget_ms": 20.0,
-    "budget_visits": 7,
     "radius_model": "local:0.5",
 }
 PLAIN = {
     "tolerance": 0.0,
     "relative_tolerance": 0.0,
     "budget_ms": None,
-    "budget_visits": None,
     "radius_model": None,
 }
 POSES = np.tile(np.eye(4), (3, 1, 1))

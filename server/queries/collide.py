@@ -26,6 +26,7 @@ from .context.query_context import (
     kernel_poses,
     pieces,
     to_units,
+    with_voxels,
 )
 from .context.unloaded_voxels import drop_clear_voxels
 
@@ -95,7 +96,8 @@ def _verdicts(
     residency, early = data.residency, budget.tolerance_units
     for which, rows, part in pieces(reach, residency, budget.share, budget.stop):
         if budget.stop:
-            verdict[which[verdict[which] == CLEAR]] = UNKNOWN
+            left = with_voxels(part, which)
+            verdict[left[verdict[left] == CLEAR]] = UNKNOWN
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held, budget)

@@ -28,6 +28,7 @@ from .context.query_context import (
     kernel_poses,
     pieces,
     to_units,
+    with_voxels,
 )
 from .context.signed_distance import distance_columns, unknown_gaps
 from .context.unloaded_voxels import bound_missing
@@ -119,7 +120,7 @@ def _pairs(
         return nearest, counts, around
     for which, rows, part in pieces(around, residency, budget.share, budget.stop):
         if budget.stop:
-            nearest.missing_bound[which] = 0.0
+            nearest.missing_bound[with_voxels(part, which)] = 0.0
             continue
         with residency.hold(rows, budget.loads_until(), scan=budget.scan, stop=budget.stop) as held:
             seen = as_held(data, held, budget)

@@ -352,6 +352,11 @@ def pieces(
         yield np.array(which), list(held), reach
 
 
+def with_voxels(reach: VoxelsInReach, which: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return those of the poses `which` that have a voxel in reach."""
+    return which[reach.starts[which + 1] > reach.starts[which]]
+
+
 def distinct_rows(rows: NDArray[np.int64], voxels: int, stop: StopFlag) -> NDArray[np.int64]:
     """Return the distinct values of `rows`, ascending; perhaps not all after a stop."""
     if len(rows) <= _ROWS_AT_ONCE:

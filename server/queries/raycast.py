@@ -17,7 +17,7 @@ from .context.front_to_back import make_origins, search_front_to_back, verdict_a
 from .context.level_hits import HitsByLevel, LevelHits
 from .context.level_of_detail import level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, to_units
+from .context.query_context import LevelOfDetail, SceneData, to_units, with_stop
 
 # A cover sphere is larger by this [exact units]: more than the rounding of m on any ray (rays.py), so
 # that the first of them is hit no later than any sphere within it, but for the rounding of s.
@@ -57,6 +57,7 @@ def raycast(
     not in memory, if it knows them that well. Raise BadRequestError.
     """
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    data = with_stop(data, budget.stop)
     world, units = make_origins(data, origins, "origins")
     unit = make_directions(directions)
     if len(world) != len(unit):

@@ -17,7 +17,7 @@ from .context.front_to_back import make_origins, search_front_to_back, verdict_a
 from .context.level_hits import HitsByLevel, LevelHits, found_units
 from .context.level_of_detail import level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import LevelOfDetail, SceneData, to_units
+from .context.query_context import LevelOfDetail, SceneData, to_units, with_stop
 
 
 def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget = EXACT) -> WithinAnswers:
@@ -30,6 +30,7 @@ def within(data: SceneData, points: ArrayLike, reach: float, budget: QueryBudget
     nearest one by as much as it allows. Raise BadRequestError.
     """
     spent = CostCounter(time.perf_counter(), data.residency, data.broad.keys)
+    data = with_stop(data, budget.stop)
     _, units = make_origins(data, points, "points")
     reach_units = to_units(reach, "reach")
     if reach_units > MAX_REACH_UNITS:

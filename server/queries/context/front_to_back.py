@@ -24,7 +24,7 @@ from ...residency.index_proof import ENTRIES_AT_ONCE
 from ...runtime.stop_flag import StopFlag
 from .level_hits import HitsByLevel, found_units
 from .query_budget import CostCounter, QueryBudget
-from .query_context import SceneData, prove, with_stop
+from .query_context import SceneData, prove
 
 # Rays or points whose lists are in memory at a time.
 BATCH = 1 << 14
@@ -91,7 +91,7 @@ def search_front_to_back(
     level: asked about rays whose next voxel is not resident, and about those that a deadline left.
     `unseen` of the result bounds what a deadline left unfinished. Add the cost to `spent`.
     """
-    k, data = len(at_units), with_stop(data, budget.stop)
+    k = len(at_units)
     best = make_best(k)
     bounds = data.bounds
     tree, index_tree = bounds.trees()

@@ -32,10 +32,12 @@ def both(built: Built) -> Iterator[Scene]:
         yield scene
 
 
-def test_time_that_is_up_leaves_nothing_clear(both: Scene, built: Built, rng: np.random.Generator) -> None:
+def test_time_that_is_up_says_nothing_wrong(both: Scene, built: Built, rng: np.random.Generator) -> None:
     poses = near(rng, np.vstack(built.points), 10)
     exact = both.collide("al", poses)
-    assert both.collide("al", poses, budget_ms=0.0).verdict.tolist() == [2] * 10
+    late = both.collide("al", poses, budget_ms=0.0).verdict
+    known = late != 2  # by the level of detail
+    assert (late[known] == exact.verdict[known]).all()
     found = both.collide("al", poses, budget_ms=60_000.0)
     assert found.verdict.tolist() == exact.verdict.tolist()
     assert set(both.sweep("al", poses, np.roll(poses, 1, axis=0), budget_ms=0.0).verdict.tolist()) <= {1, 2}

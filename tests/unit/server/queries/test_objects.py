@@ -52,8 +52,10 @@ def test_a_pair_needs_each_group_in_the_other_mask(data: SceneData) -> None:
 
 def test_a_deadline_that_has_passed_leaves_all_unknown(data: SceneData) -> None:
     late = make_budget(budget_ms=0)
-    answers = objects(data, [BALL] * 3, at(0, 0.5, 9), [1] * 3, [1, 1 | SCENE_GROUP, 1], budget=late)
-    assert answers.verdict.tolist() == [CLEAR, UNKNOWN, CLEAR]
+    poses = at(0, 0.5, 9)
+    poses[2, :3, 3] = synthetic_scans.make_scan("plane", 1, 50)[0]
+    answers = objects(data, [BALL] * 3, poses, [1] * 3, [1, 1 | SCENE_GROUP, SCENE_GROUP], budget=late)
+    assert answers.verdict.tolist() == [CLEAR, CLEAR, UNKNOWN], "the second is out of all reach"
     assert answers.pairs.tolist() == [[0, 1]] and answers.pair_verdict.tolist() == [UNKNOWN]
     assert answers.pairs_tested == 0 and answers.misses == 0
     soon = make_budget(budget_ms=600_000)

@@ -15,7 +15,7 @@ from ..kernels.collide.collide_poses import collide_poses
 from ..kernels.collide.early_contact import CLEAR, CONTACT, EARLY, UNKNOWN, write_verdict_bounds
 from ..kernels.core.voxels_in_reach import VoxelsInReach
 from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, after_deadline, asked, level_budget
+from .context.level_of_detail import SettledPoses, ask_after_deadline, level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
@@ -61,11 +61,14 @@ def collide(
         data, avatar, array, margin_units, budget, spent, lambda reach: by_level.drop(coarse(reach))
     )
     verdict[by_level.settled] = found[by_level.settled]
-    which, late = np.flatnonzero(verdict == UNKNOWN), after_deadline(data, budget)
-    if late is not None and len(which):
-        level, own = late
-        by_late_level = asked(lambda: _level_verdicts(level, avatar, array[which], margin_units, own, spent))
-        verdict[which] = UNKNOWN if by_late_level is None else by_late_level
+    which = np.flatnonzero(verdict == UNKNOWN)
+    if len(which):
+
+        def ask_late(level: LevelOfDetail, own: QueryBudget) -> NDArray[np.uint8]:
+            return _level_verdicts(level, avatar, array[which], margin_units, own, spent)
+
+        late = ask_after_deadline(data, budget, ask_late)
+        verdict[which] = UNKNOWN if late is None else late
     # A load may have proved the index wrong by now.
     if (data.nothing_clear or len(data.unknown)) and len(avatar.points):
         lost = in_unknown(reach.boxes, data.unknown, data.nothing_clear)

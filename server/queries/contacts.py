@@ -43,7 +43,7 @@ from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..runtime.stop_flag import NO_STOP
 from .collide import clear_by_level
 from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, after_deadline, asked
+from .context.level_of_detail import SettledPoses, ask_after_deadline
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
@@ -138,10 +138,13 @@ def contacts(
             spent.add(held)
     columns = _columns(data, reach, margin_units, tally, memory, len(avatar.points) > 0)
     verdict, exact = columns["verdict"], columns["exact"]
-    which, late = np.flatnonzero(verdict == Verdict.UNKNOWN), after_deadline(data, budget)
-    if late is not None and len(which):
-        level, own = late
-        clear = asked(lambda: clear_by_level(level, avatar, array[which], margin_units, own, spent))
+    which = np.flatnonzero(verdict == Verdict.UNKNOWN)
+    if len(which):
+
+        def ask_late(level: LevelOfDetail, own: QueryBudget) -> NDArray[np.bool_]:
+            return clear_by_level(level, avatar, array[which], margin_units, own, spent)
+
+        clear = ask_after_deadline(data, budget, ask_late)
         if clear is not None and not data.nothing_clear:
             verdict[which[clear]], exact[which[clear]] = Verdict.CLEAR, True
     return ContactsAnswers(**columns, **spent.fields())

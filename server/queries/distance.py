@@ -18,7 +18,7 @@ from ..kernels.core.voxels_in_reach import VoxelsInReach
 from ..kernels.nearest.nearest_pair import NearestPairs
 from ..kernels.nearest.nearest_search import nearest_poses
 from .context.late_voxels import drop_proved_voxels
-from .context.level_of_detail import SettledPoses, after_deadline, asked, level_budget
+from .context.level_of_detail import SettledPoses, ask_after_deadline, level_budget
 from .context.query_budget import EXACT, CostCounter, QueryBudget
 from .context.query_context import (
     LevelOfDetail,
@@ -78,12 +78,15 @@ def distance(
     for column, own in zip(nearest, found, strict=True):
         column[by_level.settled] = own[by_level.settled]
     open_ = (nearest.missing_bound < np.inf) & ((counts[0] > 0) | bool(budget.stop))
-    which, late = np.flatnonzero(open_), after_deadline(data, budget)
-    if late is not None and one_radius and len(which):
-        level, rest = late
-        by_level_late = asked(lambda: _search_level(level, avatar, array[which], reach_units, rest, spent))
-        if by_level_late is not None:
-            _narrow(nearest, which, by_level_late.pairs)
+    which = np.flatnonzero(open_)
+    if one_radius and len(which):
+
+        def ask_late(level: LevelOfDetail, own: QueryBudget) -> NearestPairs:
+            return _search_level(level, avatar, array[which], reach_units, own, spent).pairs
+
+        late = ask_after_deadline(data, budget, ask_late)
+        if late is not None:
+            _narrow(nearest, which, late)
     if len(avatar.points):
         np.minimum(nearest.missing_bound, unknown_gaps(data, around), out=nearest.missing_bound)
     return DistanceAnswers(

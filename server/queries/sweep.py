@@ -17,9 +17,18 @@ from ..kernels.motion.sweep_advance import advance_segments
 from ..kernels.motion.sweep_segments import SweepProgress, avatar_box, find_unknown_regions, plan_segments
 from ..residency.index_proof import ENTRIES_AT_ONCE
 from ..runtime.stop_flag import StopFlag
-from .context.level_of_detail import after_deadline
+from .context.level_of_detail import ask_after_deadline
 from .context.query_budget import EXACT, CostCounter, QueryBudget
-from .context.query_context import SceneData, as_held, kernel_poses, pieces, prove, refuse, to_units
+from .context.query_context import (
+    LevelOfDetail,
+    SceneData,
+    as_held,
+    kernel_poses,
+    pieces,
+    prove,
+    refuse,
+    to_units,
+)
 from .late_sweep import AbsentVoxels, Motions, clear_until
 from .sweep_by_level import DEFAULT_TOLERANCE, SweepsByLevel, cold_motions
 
@@ -141,10 +150,14 @@ def sweep(
     absent = None if budget.late is None else AbsentVoxels()
     level = SweepsByLevel(data, max(tolerance, budget.tolerance), budget, ask)
     answers = _sweep(data, avatar, pose_from, pose_to, margin, tolerance, budget, level, absent)
-    which, late = np.flatnonzero(answers.verdict == Verdict.UNKNOWN), after_deadline(data, budget)
-    if late is None or not len(which):
+    which = np.flatnonzero(answers.verdict == Verdict.UNKNOWN)
+    if not len(which):
         return answers
-    found = level.find_clear(*late, kernel_poses(pose_from)[which], kernel_poses(pose_to)[which])
+
+    def ask_late(late: LevelOfDetail, own: QueryBudget) -> SweepAnswers:
+        return level.find_clear(late, own, kernel_poses(pose_from)[which], kernel_poses(pose_to)[which])
+
+    found = ask_after_deadline(data, budget, ask_late)
     if found is None or data.nothing_clear:
         return answers
     lower, verdict, exact = answers.lower.copy(), answers.verdict.copy(), answers.exact.copy()

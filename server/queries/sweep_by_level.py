@@ -49,9 +49,9 @@ class SweepsByLevel:
 
     def find_clear(
         self, level: LevelOfDetail, budget: QueryBudget, first: NDArray[np.float64], last: NDArray[np.float64]
-    ) -> SweepAnswers | None:
+    ) -> SweepAnswers:
         """Return what cover spheres prove of motions: `lower` and CLEAR hold, nothing else does."""
-        return self._sweep(level.covers, budget, first, last)
+        return self._ask(level.covers, first, last, self._within, level_budget(budget))
 
     def settle(
         self,
@@ -67,9 +67,10 @@ class SweepsByLevel:
         first, last: (k, 4, 4), world.  proved: see `_next_round`, written for motions in contact.
         Without a tolerance only a clear motion is settled, and nothing else changes.
         """
-        if self._level is None:
+        level = self._level
+        if level is None:
             return which[:0]
-        found = self.find_clear(self._level, self._budget, first[which], last[which])
+        found = asked(lambda: self.find_clear(level, self._budget, first[which], last[which]))
         if found is None:
             return which[:0]
         clear = found.verdict == Verdict.CLEAR
@@ -79,9 +80,8 @@ class SweepsByLevel:
         touch = which[~clear]
         lower = found.lower[~clear]
         progress.at[touch] = np.maximum(progress.at[touch], lower)
-        own = None
-        if len(touch):
-            own = self._sweep(self._level.points, self._budget, first[touch], last[touch])
+        exact = level_budget(self._budget)
+        own = asked(lambda: self._ask(level.points, first[touch], last[touch], self._within, exact))
         if own is None:
             return which[clear]
         with np.errstate(invalid="ignore"):  # a motion that stands still: 0 times infinity
@@ -92,12 +92,6 @@ class SweepsByLevel:
         progress.witness[touch, 0] = own.witness_avatar[near]
         progress.witness[touch, 1] = own.witness_cloud[near]
         return np.concatenate([which[clear], touch])
-
-    def _sweep(
-        self, data: SceneData, budget: QueryBudget, first: NDArray[np.float64], last: NDArray[np.float64]
-    ) -> SweepAnswers | None:
-        """Sweep through the spheres of a level; return None as `asked` does."""
-        return asked(lambda: self._ask(data, first, last, self._within, level_budget(budget)))
 
 
 def cold_motions(

@@ -104,8 +104,8 @@ class SceneQuestions(QueryMethods):
             except StoppedError:
                 answers = unknown_answers(question, _count(question, rows), budget)
             else:
-                if budget.stop:
-                    answers = structs.replace(answers, stopped=budget.stop.reason)
+                if budget.stopped:
+                    answers = structs.replace(answers, stopped=budget.stopped)
         self._metrics.answered(*user, answers)
         return answers
 

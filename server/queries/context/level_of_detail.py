@@ -154,12 +154,15 @@ def level_budget(budget: QueryBudget) -> QueryBudget:
     return budget._replace(tolerance=0.0, relative=0.0, share=1.0, late=None)
 
 
-def after_deadline(data: SceneData, budget: QueryBudget) -> tuple[LevelOfDetail, QueryBudget] | None:
-    """Return the level, and the budget, for what a request leaves open at its deadline.
+def ask_after_deadline(
+    data: SceneData, budget: QueryBudget, ask: Callable[[LevelOfDetail, QueryBudget], _A]
+) -> _A | None:
+    """Ask the level, in a budget of its own, about what a request leaves open at its deadline.
 
-    Return None without a deadline or a level, or if something else stopped the request.
+    Return None without a deadline or a level, if something else stopped the request, or as `asked`.
     """
-    if data.level is None or budget.deadline == math.inf or budget.stop.reason:
+    if data.level is None or budget.deadline == math.inf or budget.stopped:
         return None
     own = with_deadline(budget, max(budget.deadline, time.perf_counter()) + LEVEL_GRACE)
-    return stoppable(data.level, own), own
+    level = stoppable(data.level, own)
+    return asked(lambda: ask(level, own))

@@ -73,6 +73,11 @@ class QueryBudget(NamedTuple):
     request: StopFlag = NO_STOP
 
     @property
+    def stopped(self) -> str:
+        """Return why something else than its deadline stopped the request; "" if nothing did."""
+        return self.stop.reason or self.request.reason
+
+    @property
     def between_bounds(self) -> float:
         """Return the distance that two bounds may lie apart, however small the distance [m]."""
         return max(self.tolerance, LEAST_RELATIVE if self.relative > 0.0 else 0.0)
@@ -195,10 +200,10 @@ def ask_until_stopped(question: Question[_A], k: int, budget: QueryBudget, ask: 
         answers = ask()
     except StoppedError:
         return unknown_answers(question, k, budget)
-    return structs.replace(answers, stopped=budget.stop.reason) if budget.stop else answers
+    return structs.replace(answers, stopped=budget.stopped) if budget.stopped else answers
 
 
 def unknown_answers(question: Question[_A], k: int, budget: QueryBudget) -> _A:
     """Return `Question.unknown` for the k items of a stopped request, with the reason."""
     answers = question.unknown(k, bounded=budget.tolerance > 0.0)
-    return structs.replace(answers, stopped=budget.stop.reason)
+    return structs.replace(answers, stopped=budget.stopped)
